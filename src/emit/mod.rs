@@ -1,0 +1,1 @@
+//! Sinks: model folders, PLY files, containers, rows.

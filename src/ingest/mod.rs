@@ -1,0 +1,1 @@
+//! Sources: model folders, PLY files and sequences, containers, cameras.

@@ -1,0 +1,24 @@
+//! Shrinks trained dynamic (4D) Gaussian-splatting models after training.
+//!
+//! The program is one pipeline; the modules are its stations, in layers that only look downward:
+//!
+//! | layer | modules | what lives there |
+//! |---|---|---|
+//! | L0 | crate [`gseq`] | bytes, columns, tiles |
+//! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
+//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`] | pure mathematics: slices in, values out |
+//! | L3 | [`ingest`], [`stream`], [`emit`] | files, threads, terminals |
+
+//! | L5 | [`cli`] | arguments and exit codes |
+
+pub mod deform;
+pub mod emit;
+pub mod error;
+pub mod ingest;
+pub mod merge;
+pub mod model;
+pub mod pass;
+pub mod recipe;
+pub mod score;
+pub mod select;
+pub mod stats;

@@ -1,0 +1,3 @@
+//! The `splatsieve` command.
+
+fn main() {}

@@ -1,0 +1,1 @@
+//! Motion-consistent merging by moment matching (METHOD section 5).

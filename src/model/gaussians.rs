@@ -1,0 +1,224 @@
+//! The state of a block of Gaussians at one instant, as planes of f32.
+
+use std::ops::{BitAnd, BitOr};
+
+use super::sh_coefficients;
+
+/// One attribute of `len` Gaussians: `width` planes, plane `c` holding component `c` of every
+/// Gaussian. Planes keep the inner loops of projection and statistics contiguous.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Column {
+    width: usize,
+    len: usize,
+    data: Vec<f32>,
+}
+
+impl Column {
+    /// `width × len` zeros.
+    pub fn zeros(width: usize, len: usize) -> Self {
+        Column { width, len, data: vec![0.0; width * len] }
+    }
+
+    /// Components per Gaussian.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there are no Gaussians.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Makes room for `len` Gaussians; the values are unspecified until written.
+    pub fn resize(&mut self, len: usize) {
+        self.len = len;
+        self.data.resize(self.width * len, 0.0);
+    }
+
+    /// Component `c` of every Gaussian.
+    pub fn plane(&self, c: usize) -> &[f32] {
+        &self.data[c * self.len..(c + 1) * self.len]
+    }
+
+    /// Component `c` of every Gaussian, to write.
+    pub fn plane_mut(&mut self, c: usize) -> &mut [f32] {
+        &mut self.data[c * self.len..(c + 1) * self.len]
+    }
+
+    /// All planes, one after the other: `[width, len]`.
+    pub fn planes(&self) -> &[f32] {
+        &self.data
+    }
+
+    /// All planes, to write: `[width, len]`.
+    pub fn planes_mut(&mut self) -> &mut [f32] {
+        &mut self.data
+    }
+
+    /// The first `W` components of Gaussian `i`.
+    pub fn row<const W: usize>(&self, i: usize) -> [f32; W] {
+        std::array::from_fn(|c| self.data[c * self.len + i])
+    }
+
+    /// Writes the first `W` components of Gaussian `i`.
+    pub fn set_row<const W: usize>(&mut self, i: usize, row: [f32; W]) {
+        for (c, value) in row.into_iter().enumerate() {
+            self.data[c * self.len + i] = value;
+        }
+    }
+}
+
+/// Gaussians at one instant in stored encoding: position, wxyz quaternion (not necessarily unit),
+/// natural log of the scales, opacity logit, spherical harmonics.
+///
+/// Plane `3·k + channel` of `sh` is coefficient `k` of a channel (red, green, blue).
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Gaussians {
+    /// `[3]`, scene units.
+    pub position: Column,
+    /// `[4]`, wxyz, any length.
+    pub rotation: Column,
+    /// `[3]`, natural log of scene units.
+    pub log_scale: Column,
+    /// `[1]`, logit of the opacity.
+    pub opacity_logit: Column,
+    /// `[3·(degree + 1)²]`.
+    pub sh: Column,
+}
+
+impl Gaussians {
+    /// `len` Gaussians with every value zero.
+    pub fn zeros(len: usize, sh_degree: usize) -> Self {
+        Gaussians {
+            position: Column::zeros(3, len),
+            rotation: Column::zeros(4, len),
+            log_scale: Column::zeros(3, len),
+            opacity_logit: Column::zeros(1, len),
+            sh: Column::zeros(3 * sh_coefficients(sh_degree), len),
+        }
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.position.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Makes room for `len` Gaussians; the values are unspecified until written.
+    pub fn resize(&mut self, len: usize) {
+        for column in Columns::ALL.iter() {
+            self.column_mut(column).resize(len);
+        }
+    }
+
+    /// The column of a single-column set.
+    ///
+    /// # Panics
+    /// If `which` is not exactly one column.
+    pub fn column(&self, which: Columns) -> &Column {
+        match which {
+            Columns::POSITION => &self.position,
+            Columns::ROTATION => &self.rotation,
+            Columns::LOG_SCALE => &self.log_scale,
+            Columns::OPACITY => &self.opacity_logit,
+            Columns::SH => &self.sh,
+            _ => panic!("one column expected, {which:?} given"),
+        }
+    }
+
+    /// The column of a single-column set, to write.
+    ///
+    /// # Panics
+    /// If `which` is not exactly one column.
+    pub fn column_mut(&mut self, which: Columns) -> &mut Column {
+        match which {
+            Columns::POSITION => &mut self.position,
+            Columns::ROTATION => &mut self.rotation,
+            Columns::LOG_SCALE => &mut self.log_scale,
+            Columns::OPACITY => &mut self.opacity_logit,
+            Columns::SH => &mut self.sh,
+            _ => panic!("one column expected, {which:?} given"),
+        }
+    }
+}
+
+/// A set of columns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Columns(u8);
+
+impl Columns {
+    /// No column.
+    pub const NONE: Columns = Columns(0);
+    /// `position`.
+    pub const POSITION: Columns = Columns(1);
+    /// `rotation`.
+    pub const ROTATION: Columns = Columns(2);
+    /// `log_scale`.
+    pub const LOG_SCALE: Columns = Columns(4);
+    /// `opacity_logit`.
+    pub const OPACITY: Columns = Columns(8);
+    /// `sh`.
+    pub const SH: Columns = Columns(16);
+    /// Every column.
+    pub const ALL: Columns = Columns(31);
+
+    /// Whether every column of `other` is in this set.
+    pub const fn contains(self, other: Columns) -> bool {
+        self.0 & other.0 == other.0
+    }
+
+    /// Whether the set is empty.
+    pub const fn is_empty(self) -> bool {
+        self.0 == 0
+    }
+
+    /// This set and the columns of `other`.
+    pub const fn with(self, other: Columns) -> Columns {
+        Columns(self.0 | other.0)
+    }
+
+    /// This set without the columns of `other`.
+    pub const fn without(self, other: Columns) -> Columns {
+        Columns(self.0 & !other.0)
+    }
+
+    /// The columns of the set, one at a time, in storage order.
+    pub fn iter(self) -> impl Iterator<Item = Columns> {
+        (0..5).map(|bit| Columns(1 << bit)).filter(move |&one| self.contains(one))
+    }
+
+    /// Name of a single column as the container and messages spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Columns::POSITION => "position",
+            Columns::ROTATION => "rotation",
+            Columns::LOG_SCALE => "log_scale",
+            Columns::OPACITY => "opacity_logit",
+            Columns::SH => "sh",
+            _ => "several columns",
+        }
+    }
+}
+
+impl BitOr for Columns {
+    type Output = Columns;
+    fn bitor(self, other: Columns) -> Columns {
+        self.with(other)
+    }
+}
+
+impl BitAnd for Columns {
+    type Output = Columns;
+    fn bitand(self, other: Columns) -> Columns {
+        Columns(self.0 & other.0)
+    }
+}

@@ -1,0 +1,30 @@
+//! The vocabulary: Gaussians at an instant, sequences of them, cameras, rows of statistics.
+
+mod camera;
+mod gaussians;
+mod rows;
+
+pub use camera::{Camera, Rig, Schedule, Shot, Split};
+pub use gaussians::{Column, Columns, Gaussians};
+pub use rows::{Flags, Rows};
+
+/// Zeroth spherical-harmonic basis constant: colour = 0.5 + SH_C0 · f_dc.
+pub const SH_C0: f64 = 0.282_094_791_773_878_14;
+
+/// Number of spherical-harmonic coefficients per channel of degree `d`: (d + 1)².
+pub const fn sh_coefficients(degree: usize) -> usize {
+    (degree + 1) * (degree + 1)
+}
+
+/// What is known of a sequence before any frame is read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SequenceInfo {
+    /// N, Gaussians in every frame.
+    pub count: usize,
+    /// Time stamp of each of the T frames, strictly increasing.
+    pub times: Vec<f64>,
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub sh_degree: usize,
+    /// Columns that may differ between frames; all others hold the same values in every frame.
+    pub varying: Columns,
+}

@@ -1,0 +1,66 @@
+//! One row of statistics per Gaussian (METHOD section 1), as arrays over Gaussians.
+
+/// What was odd about a Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Flags(pub u8);
+
+impl Flags {
+    /// Some value in some frame was NaN or infinite.
+    pub const NON_FINITE: u8 = 1;
+    /// The quaternion was zero in some frame; the identity was used.
+    pub const ZERO_ROTATION: u8 = 2;
+    /// D fell below the noise floor of its f32 positions and was set to 0.
+    pub const SNAPPED_D: u8 = 4;
+    /// κ fell below the noise floor of its f32 positions and was set to 0.
+    pub const SNAPPED_KAPPA: u8 = 8;
+
+    /// Whether any of `bits` is set.
+    pub fn has(self, bits: u8) -> bool {
+        self.0 & bits != 0
+    }
+}
+
+/// Statistics of N Gaussians; every array has N entries.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Rows {
+    /// D, trajectory magnitude: root mean square step, scene units per frame.
+    pub d: Vec<f64>,
+    /// κ, mean norm of the second difference, scene units per frame².
+    pub kappa: Vec<f64>,
+    /// V, variance of the opacity over the life span.
+    pub v: Vec<f64>,
+    /// Life span in frames.
+    pub life: Vec<u32>,
+    /// C, mean projected (or visible) coverage, pixels.
+    pub c: Vec<f64>,
+    /// E, anisotropy: largest over smallest canonical scale.
+    pub e: Vec<f64>,
+    /// Fraction of (frame, view) pairs in which the Gaussian is alive and touches the image.
+    pub vis: Vec<f64>,
+    /// What was odd.
+    pub flags: Vec<Flags>,
+}
+
+impl Rows {
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.d.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.d.is_empty()
+    }
+
+    /// Appends the rows of the next block.
+    pub fn append(&mut self, next: &mut Rows) {
+        self.d.append(&mut next.d);
+        self.kappa.append(&mut next.kappa);
+        self.v.append(&mut next.v);
+        self.life.append(&mut next.life);
+        self.c.append(&mut next.c);
+        self.e.append(&mut next.e);
+        self.vis.append(&mut next.vis);
+        self.flags.append(&mut next.flags);
+    }
+}

@@ -1,0 +1,331 @@
+//! Every hyper-parameter of a run: presets, recipe files over them, flags over those.
+//!
+//! What a parameter means is written beside its value in `paper.toml`; the types here only give
+//! each its range.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result};
+
+/// Text of preset `paper`, with a comment on every parameter.
+pub const PAPER: &str = include_str!("paper.toml");
+/// Text of preset `default`.
+pub const DEFAULT: &str = include_str!("default.toml");
+
+/// All hyper-parameters; see `paper.toml` for the meaning of each.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// The pass over all frames.
+    pub scan: Scan,
+    /// Normalisation and weights.
+    pub score: Score,
+    /// Stages 1 and 2.
+    pub select: Select,
+    /// Stage 3.
+    pub merge: Merge,
+}
+
+/// Parameters of the pass over all frames.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Scan {
+    pub alpha_min: f64,
+    pub motion: Motion,
+    pub snap_noise: bool,
+    pub coverage: Coverage,
+    pub non_finite: NonFinite,
+}
+
+/// Which steps count as motion and what they are divided by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Motion {
+    /// The paper's divisors; steps across gaps of the life span count.
+    Literal,
+    /// Only steps inside one run of life frames, divided by their number.
+    Runs,
+}
+
+/// What C measures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Coverage {
+    /// Area of the projected 3σ ellipse inside the image × opacity.
+    Projected,
+}
+
+/// What to do with a Gaussian that holds NaN or infinity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NonFinite {
+    /// Stop and name the Gaussians.
+    Error,
+    /// Prune it.
+    Drop,
+    /// Keep it as it is.
+    Keep,
+}
+
+/// Parameters of the scores.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Score {
+    pub w_static: f64,
+    pub w_dynamic: f64,
+    pub lambda: f64,
+    pub anisotropy: Anisotropy,
+    pub mu: f64,
+    pub eta: f64,
+    pub xi: f64,
+    pub weigh_motion_by_life: bool,
+    pub norm_epsilon: f64,
+    pub clip_norm: bool,
+    pub exact_percentiles: bool,
+}
+
+/// What E measures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Anisotropy {
+    /// s_max / s_min.
+    Ratio,
+    /// ln(s_max / s_mid).
+    Log,
+}
+
+/// Parameters of stages 1 and 2.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Select {
+    pub keep_fraction: f64,
+    pub tau_static: f64,
+    pub tau_dynamic: f64,
+    pub low_priority: LowPriority,
+}
+
+/// What becomes of Gaussians outside stage 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LowPriority {
+    /// Pruned.
+    Drop,
+    /// Judged by stage 2 like the candidates.
+    Rescue,
+}
+
+/// Parameters of stage 3.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Merge {
+    pub length_unit: LengthUnit,
+    pub max_neighbors: usize,
+    pub max_scale_ratio: f64,
+    pub max_color_difference: f64,
+    pub trajectory: Trajectory,
+    pub motion_noise: f64,
+    pub max_drift: f64,
+    pub max_dead_time: f64,
+    pub placement: Placement,
+    pub opacity: ProxyOpacity,
+    pub sh_high: ShHigh,
+    pub passes: Vec<MergePass>,
+}
+
+/// Thresholds of one merge pass.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct MergePass {
+    pub epsilon: f64,
+    pub d0: f64,
+    pub rho: f64,
+    pub tau_m: f64,
+}
+
+/// Unit of the merge lengths.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LengthUnit {
+    /// Scene units.
+    Scene,
+    /// The scene extent.
+    Extent,
+}
+
+/// How trajectories are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Trajectory {
+    /// The paper's mean cosine of velocities.
+    Cosine,
+    /// (2Σ a·b + 2nσ²) / (Σ‖a‖² + Σ‖b‖² + 2nσ²).
+    Alignment,
+}
+
+/// Where a proxy is placed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Placement {
+    /// At the weighted mean.
+    Mean,
+    /// At the leader, with second moments about it.
+    Leader,
+}
+
+/// How the opacity of a proxy follows from its members'.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ProxyOpacity {
+    /// Clamped sum.
+    Sum,
+    /// 1 − Π(1 − α).
+    Union,
+    /// Σ α·area / area of the proxy, clamped.
+    Area,
+}
+
+/// Where the higher bands of a proxy come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ShHigh {
+    /// Weighted average.
+    Average,
+    /// The heaviest member.
+    Heaviest,
+}
+
+impl Recipe {
+    /// The preset of that name.
+    pub fn preset(name: &str) -> Result<Recipe> {
+        Ok(toml::from_str(preset_text(name)?).expect("presets parse: tested"))
+    }
+
+    /// A recipe file's text: any subset of the parameters, over the preset named by its first key
+    /// `preset` (or `fallback`). A table `[provenance]`, as written beside results, is ignored.
+    pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
+        let mut over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
+        over.remove("provenance");
+        let name = match over.remove("preset") {
+            None => fallback.to_owned(),
+            Some(toml::Value::String(name)) => name,
+            Some(other) => return Err(format!("preset: expected a name, found {other}")),
+        };
+        let base = preset_text(&name).map_err(|e| e.to_string())?;
+        let mut table: toml::Table = toml::from_str(base).expect("presets parse: tested");
+        overlay(&mut table, over);
+        let recipe: Recipe = table.try_into().map_err(|e: toml::de::Error| e.to_string())?;
+        recipe.validate()?;
+        Ok(recipe)
+    }
+
+    /// The parameters as TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a recipe is plain data")
+    }
+
+    /// Checks every range; the message names the parameter.
+    pub fn validate(&self) -> std::result::Result<(), String> {
+        let in_unit = |x: f64| (0.0..=1.0).contains(&x);
+        let nonnegative = |x: f64| x >= 0.0;
+        let finite = |x: f64| x.is_finite() && x >= 0.0;
+        let Merge { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } = self.merge;
+        let mut checks = vec![
+            ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
+            ("score.w_static", self.score.w_static, finite(self.score.w_static), "finite, 0 or more"),
+            ("score.w_dynamic", self.score.w_dynamic, finite(self.score.w_dynamic), "finite, 0 or more"),
+            ("score.lambda", self.score.lambda, finite(self.score.lambda), "finite, 0 or more"),
+            ("score.mu", self.score.mu, finite(self.score.mu), "finite, 0 or more"),
+            ("score.eta", self.score.eta, finite(self.score.eta), "finite, 0 or more"),
+            ("score.xi", self.score.xi, finite(self.score.xi), "finite, 0 or more"),
+            ("score.norm_epsilon", self.score.norm_epsilon, finite(self.score.norm_epsilon), "finite, 0 or more"),
+            ("select.keep_fraction", self.select.keep_fraction, in_unit(self.select.keep_fraction), "0 to 1"),
+            ("select.tau_static", self.select.tau_static, finite(self.select.tau_static), "finite, 0 or more"),
+            ("select.tau_dynamic", self.select.tau_dynamic, finite(self.select.tau_dynamic), "finite, 0 or more"),
+            ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
+            ("merge.max_color_difference", max_color_difference, nonnegative(max_color_difference), "0 or more"),
+            ("merge.motion_noise", motion_noise, finite(motion_noise), "finite, 0 or more"),
+            ("merge.max_drift", max_drift, nonnegative(max_drift), "0 or more"),
+            ("merge.max_dead_time", max_dead_time, nonnegative(max_dead_time), "0 or more"),
+            (
+                "merge.max_neighbors",
+                self.merge.max_neighbors as f64,
+                (1..=1024).contains(&self.merge.max_neighbors),
+                "1 to 1024",
+            ),
+        ];
+        for pass in &self.merge.passes {
+            checks.extend([
+                ("merge.passes.epsilon", pass.epsilon, finite(pass.epsilon), "finite, 0 or more"),
+                ("merge.passes.d0", pass.d0, nonnegative(pass.d0), "0 or more"),
+                ("merge.passes.rho", pass.rho, (-1.0..=1.0).contains(&pass.rho), "-1 to 1"),
+                ("merge.passes.tau_m", pass.tau_m, (-1.0..=1.0).contains(&pass.tau_m), "-1 to 1"),
+            ]);
+        }
+        match checks.iter().find(|check| !check.2) {
+            Some((name, value, _, range)) => Err(format!("{name}: expected {range}, found {value}")),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Text of the preset of that name.
+pub fn preset_text(name: &str) -> Result<&'static str> {
+    match name {
+        "paper" => Ok(PAPER),
+        "default" => Ok(DEFAULT),
+        _ => Err(Error::usage(format!("no preset is called {name:?}; there are: paper, default"))),
+    }
+}
+
+/// Replaces the leaves of `base` by those of `over`; keys that `base` lacks are added, to be
+/// refused by the typed parse.
+fn overlay(base: &mut toml::Table, over: toml::Table) {
+    for (key, value) in over {
+        match (base.get_mut(&key), value) {
+            (Some(toml::Value::Table(inner)), toml::Value::Table(over)) => overlay(inner, over),
+            (_, value) => {
+                base.insert(key, value);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_parse_and_are_in_range() {
+        for name in ["paper", "default"] {
+            Recipe::preset(name).unwrap().validate().unwrap();
+        }
+    }
+
+    #[test]
+    fn effective_recipe_reads_back_as_itself() {
+        let recipe = Recipe::preset("paper").unwrap();
+        assert_eq!(Recipe::from_toml(&recipe.to_toml(), "default").unwrap(), recipe);
+    }
+
+    #[test]
+    fn partial_recipe_changes_only_what_it_names() {
+        let recipe = Recipe::from_toml("preset = \"paper\"\n[score]\nmu = 2.0\n", "default").unwrap();
+        let mut expected = Recipe::preset("paper").unwrap();
+        expected.score.mu = 2.0;
+        assert_eq!(recipe, expected);
+    }
+
+    #[test]
+    fn unknown_and_out_of_range_parameters_are_named() {
+        assert!(Recipe::from_toml("[score]\nnu = 1.0\n", "paper").unwrap_err().contains("nu"));
+        let message = Recipe::from_toml("[select]\nkeep_fraction = 1.5\n", "paper").unwrap_err();
+        assert!(message.contains("select.keep_fraction") && message.contains("1.5"), "{message}");
+        let message = Recipe::from_toml("[select]\ntau_static = nan\n", "paper").unwrap_err();
+        assert!(message.contains("select.tau_static"), "{message}");
+    }
+}

@@ -1,0 +1,1 @@
+//! Robust normalisation and scores (METHOD sections 2 and 3).

@@ -1,0 +1,1 @@
+//! Sampling and pruning (METHOD section 4).
