@@ -11,6 +11,7 @@
 
 //! | L5 | [`cli`] | arguments and exit codes |
 
+pub mod cli;
 pub mod deform;
 pub mod emit;
 pub mod error;
@@ -22,3 +23,4 @@ pub mod recipe;
 pub mod score;
 pub mod select;
 pub mod stats;
+pub mod stream;

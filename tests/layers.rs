@@ -36,9 +36,11 @@ fn uses(line: &str) -> Vec<String> {
             Some(list) => list.split('}').next().unwrap_or("").split(',').collect(),
             None => vec![rest],
         };
-        found.extend(names.into_iter().map(|name| {
-            name.trim().chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>()
-        }));
+        found.extend(
+            names
+                .into_iter()
+                .map(|name| name.trim().chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>()),
+        );
     }
     found
 }

@@ -3,9 +3,13 @@
 //! What a parameter means is written beside its value in `paper.toml`; the types here only give
 //! each its range.
 
+mod parameters;
+
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
+
+pub use parameters::{Parameter, parameters};
 
 /// Text of preset `paper`, with a comment on every parameter.
 pub const PAPER: &str = include_str!("paper.toml");
@@ -221,6 +225,23 @@ impl Recipe {
         let recipe: Recipe = table.try_into().map_err(|e: toml::de::Error| e.to_string())?;
         recipe.validate()?;
         Ok(recipe)
+    }
+
+    /// This recipe with one parameter set from its text: a TOML value, or a bare word for a name.
+    pub fn with(&self, section: &str, key: &str, value: &str) -> std::result::Result<Recipe, String> {
+        let number = value.parse::<f64>().map(toml::Value::Float);
+        let whole = value.parse::<i64>().map(toml::Value::Integer);
+        let truth = value.parse::<bool>().map(toml::Value::Boolean);
+        let mut table = toml::Table::try_from(self).map_err(|e| e.to_string())?;
+        let slot =
+            table.get_mut(section).and_then(|t| t.get_mut(key)).ok_or(format!("no parameter {section}.{key}"))?;
+        *slot = match slot {
+            toml::Value::Integer(_) => whole.map_err(|e| e.to_string())?,
+            toml::Value::Float(_) => number.map_err(|e| e.to_string())?,
+            toml::Value::Boolean(_) => truth.map_err(|e| e.to_string())?,
+            _ => toml::Value::String(value.to_owned()),
+        };
+        table.try_into().map_err(|e: toml::de::Error| e.to_string())
     }
 
     /// The parameters as TOML.

@@ -1,0 +1,5 @@
+//! Arguments and exit codes.
+
+mod recipe_flags;
+
+pub use recipe_flags::RecipeFlags;

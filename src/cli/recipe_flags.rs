@@ -1,0 +1,157 @@
+//! One flag per hyper-parameter, made from the list in `recipe`, so that none can be forgotten.
+
+use std::fs;
+use std::path::PathBuf;
+
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
+
+use crate::error::{Error, Result};
+use crate::recipe::{MergePass, Recipe, parameters};
+
+const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a documented file)";
+
+/// The recipe as the command line gives it: a preset or a file, and single parameters over it.
+#[derive(Debug, Clone, Default)]
+pub struct RecipeFlags {
+    preset: Option<String>,
+    file: Option<PathBuf>,
+    /// (section, key, value as TOML)
+    set: Vec<(String, String, String)>,
+    passes: Vec<MergePass>,
+}
+
+impl RecipeFlags {
+    /// The effective recipe.
+    pub fn recipe(&self) -> Result<Recipe> {
+        let fallback = self.preset.as_deref().unwrap_or("default");
+        let mut recipe = match &self.file {
+            None => Recipe::preset(fallback)?,
+            Some(path) => {
+                let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
+                Recipe::from_toml(&text, fallback)
+                    .map_err(|message| Error::usage(format!("{}: {message}", path.display())))?
+            }
+        };
+        for (section, key, value) in &self.set {
+            recipe = recipe.with(section, key, value).map_err(|message| {
+                Error::usage(format!("--{}: {value:?} does not fit: {}", key.replace('_', "-"), message.trim_end()))
+            })?;
+        }
+        if !self.passes.is_empty() {
+            recipe.merge.passes.clone_from(&self.passes);
+        }
+        recipe.validate().map_err(Error::usage)?;
+        Ok(recipe)
+    }
+}
+
+impl Args for RecipeFlags {
+    fn augment_args(command: Command) -> Command {
+        let mut command = command
+            .arg(Arg::new("preset").long("preset").value_parser(["default", "paper"]).help(
+                "Where the parameters start from: `default`, the best known, or `paper`, the paper to the letter",
+            ))
+            .arg(
+                Arg::new("recipe")
+                    .long("recipe")
+                    .value_name("FILE")
+                    .value_parser(clap::value_parser!(PathBuf))
+                    .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run"),
+            );
+        for parameter in parameters() {
+            let mut arg = Arg::new(parameter.key.clone())
+                .long(parameter.key.replace('_', "-"))
+                .value_name("VALUE")
+                .help(parameter.doc)
+                .help_heading(HEADING)
+                .hide_short_help(true)
+                .allow_negative_numbers(true);
+            if parameter.boolean {
+                arg = arg.num_args(0..=1).require_equals(true).default_missing_value("true").value_name("true|false");
+            }
+            command = command.arg(arg);
+        }
+        command.arg(
+            Arg::new("merge_pass")
+                .long("merge-pass")
+                .value_name("EPSILON,D0,RHO,TAU_M")
+                .action(clap::ArgAction::Append)
+                .value_parser(parse_pass)
+                .help("A merge pass instead of the recipe's; give it once per pass")
+                .help_heading(HEADING)
+                .hide_short_help(true),
+        )
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for RecipeFlags {
+    fn from_arg_matches(matches: &ArgMatches) -> std::result::Result<Self, clap::Error> {
+        let mut flags = RecipeFlags::default();
+        flags.update_from_arg_matches(matches)?;
+        Ok(flags)
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> std::result::Result<(), clap::Error> {
+        self.preset = matches.get_one::<String>("preset").cloned();
+        self.file = matches.get_one::<PathBuf>("recipe").cloned();
+        self.set = parameters()
+            .into_iter()
+            .filter_map(|p| Some((p.section, p.key.clone(), matches.get_one::<String>(&p.key)?.clone())))
+            .collect();
+        self.passes = matches.get_many::<MergePass>("merge_pass").into_iter().flatten().copied().collect();
+        Ok(())
+    }
+}
+
+fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
+    let numbers: Vec<f64> = text
+        .split(',')
+        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
+        .collect::<std::result::Result<_, _>>()?;
+    match numbers[..] {
+        [epsilon, d0, rho, tau_m] => Ok(MergePass { epsilon, d0, rho, tau_m }),
+        _ => Err(format!("expected four numbers EPSILON,D0,RHO,TAU_M, found {}", numbers.len())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(args: &[&str]) -> Result<Recipe> {
+        let command = RecipeFlags::augment_args(Command::new("t").no_binary_name(true));
+        let matches = command.try_get_matches_from(args).map_err(|e| Error::usage(e.to_string()))?;
+        RecipeFlags::from_arg_matches(&matches).unwrap().recipe()
+    }
+
+    #[test]
+    fn flags_override_the_preset() {
+        let recipe =
+            parse(&["--preset", "paper", "--mu", "2", "--exact-percentiles", "--low-priority", "rescue"]).unwrap();
+        let mut expected = Recipe::preset("paper").unwrap();
+        expected.score.mu = 2.0;
+        expected.score.exact_percentiles = true;
+        expected.select.low_priority = crate::recipe::LowPriority::Rescue;
+        assert_eq!(recipe, expected);
+    }
+
+    #[test]
+    fn merge_passes_replace_the_recipes() {
+        let recipe = parse(&["--merge-pass", "0.1,1,0.5,0.25", "--merge-pass", "0.2,1,0.5,0.25"]).unwrap();
+        assert_eq!(recipe.merge.passes.len(), 2);
+        assert_eq!(recipe.merge.passes[1], MergePass { epsilon: 0.2, d0: 1.0, rho: 0.5, tau_m: 0.25 });
+    }
+
+    #[test]
+    fn a_value_that_does_not_fit_names_its_flag() {
+        for args in [["--mu", "many"], ["--low-priority", "maybe"], ["--keep-fraction", "1.5"]] {
+            let message = parse(&args).unwrap_err().to_string();
+            assert!(message.contains(args[0]) || message.contains("keep_fraction"), "{message}");
+        }
+        assert!(parse(&["--merge-pass", "1,2"]).unwrap_err().to_string().contains("four numbers"));
+    }
+}
