@@ -5,17 +5,48 @@ use std::ops::Range;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 
+/// Which Gaussians of a sequence a reader covers.
+#[derive(Debug, Clone)]
+pub enum Ids<'a> {
+    /// Consecutive ones.
+    Range(Range<usize>),
+    /// Any, in any order.
+    List(&'a [u32]),
+}
+
+impl Ids<'_> {
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        match self {
+            Ids::Range(range) => range.len(),
+            Ids::List(list) => list.len(),
+        }
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The ids one by one.
+    pub fn iter(&self) -> impl Iterator<Item = usize> {
+        let (range, list) = match self {
+            Ids::Range(range) => (range.clone(), &[][..]),
+            Ids::List(list) => (0..0, *list),
+        };
+        range.chain(list.iter().map(|&id| id as usize))
+    }
+}
+
 /// A sequence of Gaussians that can be read block by block, frame by frame, in any order, from
 /// several threads. The same (Gaussian, frame) always gives the same bits, whatever the block.
 pub trait FrameSource: Send + Sync {
     /// Size, time stamps and varying columns.
     fn info(&self) -> &SequenceInfo;
 
-    /// A reader over the Gaussians of `range`. What does not change with time is prepared here once.
-    fn open(&self, range: Range<usize>) -> Result<Box<dyn BlockReader + '_>>;
-
-    /// The same sequence reduced to the Gaussians `ids` (strictly increasing).
-    fn subset(&self, ids: &[u32]) -> Result<Box<dyn FrameSource + '_>>;
+    /// A reader over the Gaussians `ids`, in that order. What does not change with time is prepared
+    /// here once.
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
 }
 
 /// Reads one block of Gaussians at any frame.

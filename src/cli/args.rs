@@ -1,0 +1,300 @@
+//! The command line, declared.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+use super::RecipeFlags;
+
+const EXAMPLES: &str = "\
+Examples:
+  splatsieve demo                                        a built-in scene, no files needed
+  splatsieve compress model --cameras data -o small      a trained 4DGaussians model, drop-in result
+  splatsieve compress model --cameras data -o small --target-ratio 0.3
+  splatsieve compress frames/ -o small.gseq --preset paper
+  splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
+  splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq";
+
+/// Shrinks trained dynamic Gaussian-splatting models, without retraining.
+#[derive(Debug, Parser)]
+#[command(name = "splatsieve", version, about, before_help = EXAMPLES, max_term_width = 110)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub verb: Verb,
+    /// Threads to work on; the result does not depend on it. Default: all.
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub threads: Option<u16>,
+}
+
+/// The verbs.
+#[derive(Debug, Subcommand)]
+pub enum Verb {
+    /// Write a smaller model that the same renderer opens
+    Compress(Compress),
+    /// Write the statistics and scores of every Gaussian as .npz or .csv
+    Score(Score),
+    /// Pack any input into a .gseq container
+    Pack(Pack),
+    /// Say what an input holds
+    Info(Info),
+    /// Check every byte of a .gseq container
+    Verify(Verify),
+    /// Write a .gseq container's frames as a folder of PLY files
+    Unpack(Unpack),
+    /// Save the complete frames of a .gseq container that was cut short
+    Recover(Recover),
+    /// Generate a small dynamic scene, compress it, say what happened
+    Demo(Demo),
+    /// Print a recipe file with every parameter documented
+    Recipe(RecipeVerb),
+    /// Print a completion script for a shell
+    Completions(Completions),
+}
+
+/// What to read.
+#[derive(Debug, Args)]
+pub struct Input {
+    /// 4DGaussians model folder, folder of PLY frames, one .ply, or .gseq
+    pub input: PathBuf,
+    /// Training iteration of a model folder [default: the largest]
+    #[arg(long, value_name = "K")]
+    pub iteration: Option<u32>,
+    /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub frames: Option<u32>,
+}
+
+/// From where to look.
+#[derive(Debug, Args)]
+pub struct Cameras {
+    /// transforms*.json, cameras.json, poses_bounds.npy, or a folder with one [default: beside the model's
+    /// data if cfg_args names it, else a virtual rig]
+    #[arg(long, value_name = "PATH")]
+    pub cameras: Option<PathBuf>,
+    /// Picture size where the cameras name none
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    pub size: Option<(u32, u32)>,
+    /// Which of the cameras' pictures to score with
+    #[arg(long, value_enum, default_value_t = SplitArg::Train)]
+    pub split: SplitArg,
+}
+
+/// A part of a data set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum SplitArg {
+    /// Pictures the model was trained on
+    Train,
+    /// Held-out pictures
+    Test,
+    /// Both
+    All,
+}
+
+/// `compress`
+#[derive(Debug, Args)]
+pub struct Compress {
+    #[command(flatten)]
+    pub input: Input,
+    #[command(flatten)]
+    pub cameras: Cameras,
+    /// Where to write: a folder, NAME.gseq or NAME.ply
+    #[arg(short, long, value_name = "PATH")]
+    pub output: PathBuf,
+    /// What to write [default: by the output's name; a folder is of the input's own kind]
+    #[arg(long = "as", value_enum, value_name = "KIND")]
+    pub kind: Option<OutputKind>,
+    /// Exactly this many Gaussians in the output
+    #[arg(long, value_name = "N", conflicts_with = "target_ratio")]
+    pub target_count: Option<u64>,
+    /// Exactly this fraction of the Gaussians in the output
+    #[arg(long, value_name = "R")]
+    pub target_ratio: Option<f64>,
+    /// Prune, do not merge
+    #[arg(long, conflicts_with = "merge_only")]
+    pub prune_only: bool,
+    /// Merge, do not prune
+    #[arg(long)]
+    pub merge_only: bool,
+    #[command(flatten)]
+    pub overrides: Overrides,
+    /// Say what would happen; write nothing
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub overwrite: bool,
+    /// Print the summary as JSON
+    #[arg(long)]
+    pub json: bool,
+    #[command(flatten)]
+    pub recipe: RecipeFlags,
+}
+
+/// What the user knows better.
+#[derive(Debug, Args)]
+pub struct Overrides {
+    /// Keep every Gaussian inside this box (at the reference frame), unmerged
+    #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = parse_box, allow_hyphen_values = true)]
+    pub keep_box: Option<[f64; 6]>,
+    /// Keep these Gaussians, unmerged: a file with one id per line, or a list such as 3,10-20
+    #[arg(long, value_name = "FILE|IDS")]
+    pub keep_ids: Option<String>,
+    /// Drop these Gaussians: a file with one id per line, or a list such as 3,10-20
+    #[arg(long, value_name = "FILE|IDS")]
+    pub drop_ids: Option<String>,
+}
+
+/// Kinds of output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum OutputKind {
+    /// 4DGaussians model folder
+    Model,
+    /// Container
+    Gseq,
+    /// Folder with one PLY per frame
+    PlySequence,
+    /// One PLY: the canonical cloud of a model, or a sequence of one frame
+    Ply,
+}
+
+/// `score`
+#[derive(Debug, Args)]
+pub struct Score {
+    #[command(flatten)]
+    pub input: Input,
+    #[command(flatten)]
+    pub cameras: Cameras,
+    /// rows.npz (arrays D kappa V life C E vis static_score dynamic_score score keep) or rows.csv
+    #[arg(short, long, value_name = "FILE")]
+    pub output: PathBuf,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub overwrite: bool,
+    #[command(flatten)]
+    pub recipe: RecipeFlags,
+}
+
+/// `pack`
+#[derive(Debug, Args)]
+pub struct Pack {
+    #[command(flatten)]
+    pub input: Input,
+    #[command(flatten)]
+    pub cameras: Cameras,
+    /// Container to write
+    #[arg(short, long, value_name = "FILE.gseq")]
+    pub output: PathBuf,
+    /// Store tiles as they are, to be used in place
+    #[arg(long, conflicts_with = "level")]
+    pub raw: bool,
+    /// zstd level
+    #[arg(long, value_name = "1-19", default_value_t = 1, value_parser = clap::value_parser!(i32).range(1..=19))]
+    pub level: i32,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+/// `info`
+#[derive(Debug, Args)]
+pub struct Info {
+    #[command(flatten)]
+    pub input: Input,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `verify`
+#[derive(Debug, Args)]
+pub struct Verify {
+    /// Container to check
+    pub input: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `unpack`
+#[derive(Debug, Args)]
+pub struct Unpack {
+    #[command(flatten)]
+    pub input: Input,
+    #[command(flatten)]
+    pub cameras: Cameras,
+    /// Folder to write frame_NNNNN.ply into
+    #[arg(short, long, value_name = "FOLDER")]
+    pub output: PathBuf,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+/// `recover`
+#[derive(Debug, Args)]
+pub struct Recover {
+    /// Container that was cut short
+    pub input: PathBuf,
+    /// Container to write
+    #[arg(short, long, value_name = "FILE.gseq")]
+    pub output: PathBuf,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+/// `demo`
+#[derive(Debug, Args)]
+pub struct Demo {
+    /// Keep the scene and the results in this folder [default: a temporary one]
+    #[arg(short, long, value_name = "FOLDER")]
+    pub output: Option<PathBuf>,
+    /// Gaussians of the scene
+    #[arg(long, value_name = "N", default_value_t = 6000, value_parser = clap::value_parser!(u32).range(100..=10_000_000))]
+    pub gaussians: u32,
+    /// Frames of the scene
+    #[arg(long, value_name = "T", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: u32,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub overwrite: bool,
+}
+
+/// `recipe`
+#[derive(Debug, Args)]
+pub struct RecipeVerb {
+    /// `default` or `paper`
+    #[arg(long, default_value = "default")]
+    pub preset: String,
+}
+
+/// `completions`
+#[derive(Debug, Args)]
+pub struct Completions {
+    /// Shell to complete for
+    #[arg(value_enum)]
+    pub shell: clap_complete::Shell,
+}
+
+fn parse_size(text: &str) -> Result<(u32, u32), String> {
+    let expected = || format!("expected WIDTHxHEIGHT such as 800x800, found {text:?}");
+    let (width, height) = text.split_once('x').ok_or_else(expected)?;
+    match (width.parse(), height.parse()) {
+        (Ok(width @ 1..=65_535), Ok(height @ 1..=65_535)) => Ok((width, height)),
+        _ => Err(expected()),
+    }
+}
+
+fn parse_box(text: &str) -> Result<[f64; 6], String> {
+    let numbers: Vec<f64> = text
+        .split(',')
+        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
+        .collect::<Result<_, _>>()?;
+    let corners: [f64; 6] =
+        numbers.try_into().map_err(|n: Vec<f64>| format!("expected six numbers, found {}", n.len()))?;
+    match (0..3).find(|&axis| !(corners[axis] <= corners[axis + 3])) {
+        Some(axis) => Err(format!("axis {axis}: {} is not below {}", corners[axis], corners[axis + 3])),
+        None => Ok(corners),
+    }
+}

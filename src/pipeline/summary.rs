@@ -1,0 +1,240 @@
+//! What a run did, for people and for programs: counts in and out of every stage, what was left out
+//! and why, memory and time. The only output whose bytes differ between runs.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::time::Instant;
+
+use serde::Serialize;
+
+/// One stage of a run.
+#[derive(Debug, Clone, Serialize)]
+pub struct Stage {
+    /// Its name: read, scan, score, select, merge, emit.
+    pub name: &'static str,
+    /// Gaussians that entered it.
+    pub gaussians_in: usize,
+    /// Gaussians that left it.
+    pub gaussians_out: usize,
+    /// Full reads of the frames it made.
+    pub full_reads: f64,
+    /// Wall-clock time.
+    pub seconds: f64,
+    /// Largest resident memory of the process up to the end of this stage, where the system tells.
+    pub peak_memory_bytes: Option<u64>,
+}
+
+/// Something the scene did not need.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct LeftOut {
+    /// What was not done.
+    pub what: &'static str,
+    /// Why not.
+    pub why: String,
+}
+
+/// The input, as the summary names it.
+#[derive(Debug, Clone, Serialize)]
+pub struct InputSummary {
+    /// Path as given.
+    pub path: String,
+    /// "4DGaussians model", "PLY sequence", ...
+    pub kind: &'static str,
+    /// Hash over the bytes read.
+    pub digest: String,
+    /// N.
+    pub gaussians: usize,
+    /// T.
+    pub frames: usize,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: usize,
+    /// Columns that differ between frames.
+    pub varying: Vec<&'static str>,
+    /// Bytes of the input file or, for a model, of its point cloud.
+    pub bytes: u64,
+}
+
+/// The cameras, as the summary names them.
+#[derive(Debug, Clone, Serialize)]
+pub struct CameraSummary {
+    /// File, or the recipe of a virtual rig.
+    pub origin: String,
+    /// Distinct cameras.
+    pub cameras: usize,
+    /// M, (time, view) pairs that were scored.
+    pub pairs: usize,
+}
+
+/// A term of the scores.
+#[derive(Debug, Clone, Serialize)]
+pub struct TermSummary {
+    /// C, E, D, kappa, V, Life, S_static or S_dynamic.
+    pub name: &'static str,
+    /// 1st percentile.
+    pub p1: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Whether the percentiles differ, so that the term grades rather than splits.
+    pub active: bool,
+}
+
+/// Counts of odd Gaussians.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct FlagSummary {
+    /// NaN or infinity in some frame.
+    pub non_finite: usize,
+    /// Zero quaternion in some frame.
+    pub zero_rotation: usize,
+    /// D set to 0 as rounding noise.
+    pub snapped_d: usize,
+    /// κ set to 0 as rounding noise.
+    pub snapped_kappa: usize,
+    /// Never alive.
+    pub never_alive: usize,
+    /// In no picture of the scored cameras.
+    pub never_in_view: usize,
+}
+
+/// What merging did.
+#[derive(Debug, Clone, Serialize)]
+pub struct MergeSummary {
+    /// Frame at which Gaussians were compared and merged.
+    pub reference_frame: usize,
+    /// Proxies in the output.
+    pub proxies: usize,
+    /// Gaussians that went into them.
+    pub members: usize,
+    /// Rule by which a proxy's opacity was made.
+    pub opacity: String,
+    /// One entry per pass.
+    pub passes: Vec<MergePassSummary>,
+    /// Furthest that a proxy strays from the weighted mean of its members' trajectories, scene units,
+    /// over frames sampled; none without a deformation field.
+    pub largest_deviation: Option<f64>,
+}
+
+/// What one merge pass did.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct MergePassSummary {
+    /// Nodes with more neighbours in reach than were looked at.
+    pub truncated: usize,
+    /// Pairs that passed the tests of space and colour.
+    pub candidates: usize,
+    /// Of those, pairs that passed the test of motion too.
+    pub passing: usize,
+    /// Gaussians that joined a leader.
+    pub joins: usize,
+    /// Parallel rounds of the greedy rule.
+    pub rounds: usize,
+    /// Whether the greedy rule was finished sequentially.
+    pub sequential: bool,
+}
+
+/// A run from input to output.
+#[derive(Debug, Clone, Serialize)]
+pub struct Summary {
+    /// Program and version.
+    pub tool: String,
+    /// What was read.
+    pub input: InputSummary,
+    /// From where it was looked at.
+    pub cameras: CameraSummary,
+    /// Gaussians in the output.
+    pub gaussians: usize,
+    /// Bytes of the output's point cloud or container; none for a dry run.
+    pub output_bytes: Option<u64>,
+    /// Everything in order.
+    pub stages: Vec<Stage>,
+    /// Percentiles of every term.
+    pub terms: Vec<TermSummary>,
+    /// Odd Gaussians.
+    pub flags: FlagSummary,
+    /// Stage 3, unless it was left out.
+    pub merge: Option<MergeSummary>,
+    /// What the scene did not need.
+    pub left_out: Vec<LeftOut>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+impl Summary {
+    /// A few lines for a person.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let input = &self.input;
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            out,
+            "{}: {}, {} Gaussians x {} frames, SH degree {}",
+            input.path, input.kind, input.gaussians, input.frames, input.sh_degree
+        );
+        let _ = writeln!(
+            out,
+            "cameras: {} ({} cameras, {} pictures)",
+            self.cameras.origin, self.cameras.cameras, self.cameras.pairs
+        );
+        for stage in &self.stages {
+            let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
+            let _ = writeln!(
+                out,
+                "  {:<7} {:>9} -> {:>9}  {:8.2} s{memory}",
+                stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds
+            );
+        }
+        for left in &self.left_out {
+            let _ = writeln!(out, "  left out: {} ({})", left.what, left.why);
+        }
+        for note in &self.notes {
+            let _ = writeln!(out, "  note: {note}");
+        }
+        let percent = 100.0 * self.gaussians as f64 / input.gaussians.max(1) as f64;
+        let _ = write!(out, "{} of {} Gaussians ({percent:.1}%)", self.gaussians, input.gaussians);
+        if let Some(bytes) = self.output_bytes {
+            let _ = write!(out, ", {bytes} of {} bytes ({:.1}%)", input.bytes, 100.0 * bytes as f64 / input.bytes.max(1) as f64);
+        }
+        out.push('\n');
+        out
+    }
+}
+
+/// Measures stages as they run.
+#[derive(Debug, Default)]
+pub struct Stages {
+    done: Vec<Stage>,
+}
+
+impl Stages {
+    /// Runs `work` as a stage; it returns its result and the number of Gaussians that left it.
+    pub fn run<T, E>(
+        &mut self,
+        name: &'static str,
+        gaussians_in: usize,
+        full_reads: f64,
+        work: impl FnOnce() -> Result<(T, usize), E>,
+    ) -> Result<T, E> {
+        let start = Instant::now();
+        let (value, gaussians_out) = work()?;
+        self.done.push(Stage {
+            name,
+            gaussians_in,
+            gaussians_out,
+            full_reads,
+            seconds: start.elapsed().as_secs_f64(),
+            peak_memory_bytes: peak_memory_bytes(),
+        });
+        Ok(value)
+    }
+
+    /// The stages so far.
+    pub fn finish(self) -> Vec<Stage> {
+        self.done
+    }
+}
+
+/// Largest resident memory of this process so far, mapped pages included (`VmHWM`); none where the
+/// system does not say.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
