@@ -1,9 +1,54 @@
-//! `gseq`: a chunked, memory-mapped container for sequences of Gaussians. See `SPEC.md`.
+//! `gseq`: a chunked, memory-mapped container for sequences of Gaussians.
+//!
+//! A container holds N Gaussians × T frames in *columns* of f32 (a name and a number of components
+//! per Gaussian), a time stamp per frame, and string attributes. It is cut into *tiles*, one per
+//! (column, Gaussian block, frame block); inside a tile the values lie as
+//! `[frame][component][gaussian]`, so that every (frame, component) plane is one contiguous slice.
+//! Every value comes back with the bits it went in with, NaN payloads and −0 included.
+//!
+//! ```
+//! # fn main() -> Result<(), gseq::Error> {
+//! # let folder = tempfile::tempdir().unwrap();
+//! # let path = folder.path().join("walk.gseq");
+//! use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileId, Writer, encode_tile};
+//!
+//! let layout = Layout {
+//!     gaussians: 2,
+//!     gaussian_block: 4096,
+//!     frame_block: 16,
+//!     columns: vec![ColumnSpec { name: "position".into(), width: 3 }],
+//!     attributes: Default::default(),
+//! };
+//! let mut writer = Writer::create(&path, layout)?;
+//! let frame_block = writer.append_times(&[0.0, 0.5])?;
+//! let at = TileId { column: 0, gaussian_block: 0, frame_block };
+//! let values = [0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.5, 1.5, 0.5, 1.5, 0.5, 1.5];
+//! writer.write_tile(at, &encode_tile(&values, 2, 3, 2, Compression::Zstd(1))?)?;
+//! writer.finish()?;
+//!
+//! let reader = Reader::open(&path)?;
+//! let mut buffer = TileBuffer::default();
+//! assert_eq!(reader.tile(at, &mut buffer)?.plane(1, 0), [0.5, 1.5]);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The bytes are specified in `SPEC.md`; [`recover`] saves what a killed writer left behind.
 
-/// What can be wrong with a container.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// Placeholder until the reader lands.
-    #[error("malformed container")]
-    Malformed,
-}
+mod codec;
+mod error;
+mod file;
+mod layout;
+mod reader;
+mod record;
+mod recover;
+mod verify;
+mod writer;
+
+pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
+pub use error::{Error, Result};
+pub use layout::{ColumnSpec, Layout, MAX_TILE_BYTES, TileId};
+pub use reader::{Reader, Tile, TileBuffer, TileInfo};
+pub use recover::{RecoverReport, recover};
+pub use verify::VerifyReport;
+pub use writer::Writer;

@@ -1,0 +1,395 @@
+//! Tiles to stored bytes and back: slices in, values out, no files.
+//!
+//! The filter replaces every value by the zigzagged difference between its bits, mapped to integers
+//! in numeric order, and what the one or two frames before predict; then it gathers the bytes of equal
+//! weight, and zstd takes the result. All arithmetic wraps, so every bit pattern survives.
+//!
+//! Measured on 60 consecutive frames of positions of three trained models, zstd level 1, against raw:
+//! no prediction 1.41–1.64×, XOR with the frame before 1.65–1.87, order 1 1.75–2.00, order 2 1.93–2.14,
+//! order 3 1.86–2.02. Without the zigzag order 2 gives 1.69–1.86; level 3 gains 1%; transposing to
+//! [component][gaussian][frame] 1%.
+
+use xxhash_rust::xxh3::xxh3_64;
+
+use crate::error::{Error, Result};
+use crate::layout::MAX_TILE_BYTES;
+
+/// How [`encode_tile`] stores values that are not better left raw.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Compression {
+    /// As they are: read in place from the map.
+    Raw,
+    /// Filtered and compressed by zstd at this level; a tile that does not shrink is stored raw.
+    Zstd(i32),
+}
+
+/// How the stored bytes of a tile are to be read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Encoding {
+    /// Little-endian f32.
+    Raw,
+    /// Predicted from `order` frames before, shuffled, zstd.
+    Filtered {
+        /// 0, 1 or 2 frames.
+        order: u8,
+    },
+}
+
+/// What a tile's stored values are like (of a constant tile: its one frame).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Stats {
+    /// Least finite value, zero as +0; +∞ if no value is finite.
+    pub min: f32,
+    /// Greatest finite value, zero as +0; −∞ if no value is finite.
+    pub max: f32,
+    /// Number of NaN and infinite values.
+    pub non_finite: u32,
+}
+
+/// A tile ready to be written.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EncodedTile {
+    pub(crate) frames: u32,
+    pub(crate) width: u32,
+    pub(crate) len: u32,
+    pub(crate) constant: bool,
+    pub(crate) encoding: Encoding,
+    pub(crate) stats: Stats,
+    pub(crate) checksum: u64,
+    pub(crate) bytes: Vec<u8>,
+}
+
+impl EncodedTile {
+    /// Bytes it takes in the file, without its 64-byte record header.
+    pub fn stored_bytes(&self) -> usize {
+        self.bytes.len()
+    }
+
+    /// Whether every frame has the same bits. Only one frame is stored then, and the tile may be
+    /// written to frame blocks of any length.
+    pub fn is_constant(&self) -> bool {
+        self.constant
+    }
+
+    /// Minimum, maximum and count of non-finite values.
+    pub fn stats(&self) -> Stats {
+        self.stats
+    }
+}
+
+/// Encodes `values`, laid out `[frames][width][len]`: `width` components of `len` Gaussians.
+///
+/// Pure and deterministic; call it from as many threads as you like. Needs about twice the size of
+/// `values` while it runs. A tile with the same bits in every frame keeps one; to encode a column that
+/// never changes, pass its one frame with `frames` 1 and write the result to every frame block.
+///
+/// Errors: `values` is not of this shape or empty, or larger than [`MAX_TILE_BYTES`]; zstd does not
+/// know the level.
+pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compression: Compression) -> Result<EncodedTile> {
+    let count = [frames, width, len].into_iter().try_fold(1u64, |product, n| product.checked_mul(n.into()));
+    if values.is_empty() || count != Some(values.len() as u64) || 4 * values.len() as u64 > MAX_TILE_BYTES {
+        return Err(Error::usage(format!(
+            "a tile of {frames} frames × {width} components × {len} Gaussians must have as many values, at least one \
+             and at most {}, not {}",
+            MAX_TILE_BYTES / 4,
+            values.len()
+        )));
+    }
+    let bits: &[u32] = bytemuck::cast_slice(values);
+    let plane = width as usize * len as usize;
+    let (first, rest) = bits.split_at(plane);
+    let constant = rest.chunks_exact(plane).all(|frame| frame == first);
+    let bits = if constant { first } else { bits };
+    let (encoding, bytes) = match compression {
+        Compression::Raw => (Encoding::Raw, raw_bytes(bits)),
+        Compression::Zstd(level) => {
+            if !zstd::compression_level_range().contains(&level) {
+                let range = zstd::compression_level_range();
+                return Err(Error::usage(format!(
+                    "zstd levels go from {} to {}, not {level}",
+                    range.start(),
+                    range.end()
+                )));
+            }
+            let order = best_order(bits, plane);
+            let shuffled = filter(bits, plane, order);
+            match zstd::bulk::compress(&shuffled, level) {
+                Ok(bytes) if bytes.len() < shuffled.len() => (Encoding::Filtered { order }, bytes),
+                Ok(_) => (Encoding::Raw, raw_bytes(bits)),
+                Err(error) => return Err(Error::usage(format!("zstd level {level} failed: {error}"))),
+            }
+        }
+    };
+    let checksum = xxh3_64(&bytes);
+    Ok(EncodedTile { frames, width, len, constant, encoding, stats: stats(bits), checksum, bytes })
+}
+
+/// Decodes `stored` into `out`, which is resized to `frames · plane` values. `shuffled` is scratch of
+/// the same size. The error says what was found instead of that many values.
+pub(crate) fn decode_tile(
+    stored: &[u8],
+    encoding: Encoding,
+    frames: usize,
+    plane: usize,
+    shuffled: &mut Vec<u8>,
+    out: &mut Vec<f32>,
+) -> std::result::Result<(), String> {
+    out.resize(frames * plane, 0.0);
+    let out: &mut [u32] = bytemuck::cast_slice_mut(out);
+    let expected = 4 * out.len();
+    match encoding {
+        Encoding::Raw if stored.len() != expected => Err(format!("{} bytes", stored.len())),
+        Encoding::Raw => {
+            for (value, bytes) in out.iter_mut().zip(stored.as_chunks().0) {
+                *value = u32::from_le_bytes(*bytes);
+            }
+            Ok(())
+        }
+        Encoding::Filtered { order } => {
+            shuffled.resize(expected, 0);
+            // The target has a fixed size: a frame that wants more is refused, whatever it claims.
+            match zstd::bulk::decompress_to_buffer(stored, shuffled.as_mut_slice()) {
+                Ok(len) if len == expected => {
+                    unfilter(shuffled, plane, order, out);
+                    Ok(())
+                }
+                Ok(len) => Err(format!("{len} bytes after decompression")),
+                Err(error) => Err(format!("a zstd frame that does not decompress to them ({error})")),
+            }
+        }
+    }
+}
+
+fn raw_bytes(bits: &[u32]) -> Vec<u8> {
+    bits.iter().flat_map(|bits| bits.to_le_bytes()).collect()
+}
+
+/// Bits of an f32 as an integer that grows with the value. A bijection on all bit patterns.
+fn ordered(bits: u32) -> u32 {
+    bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
+}
+
+/// The inverse of [`ordered`].
+fn unordered(rank: u32) -> u32 {
+    rank ^ (!((rank as i32) >> 31) as u32 | 0x8000_0000)
+}
+
+/// Small differences of either sign become small numbers, so that their high bytes are all zero.
+fn zigzag(difference: u32) -> u32 {
+    (difference << 1) ^ ((difference as i32) >> 31) as u32
+}
+
+/// The inverse of [`zigzag`].
+fn unzigzag(code: u32) -> u32 {
+    (code >> 1) ^ (code & 1).wrapping_neg()
+}
+
+/// What the frames before say a value will be: the last one, or the straight line through two.
+fn predict(order: u8, before: u32, before_that: u32) -> u32 {
+    match order {
+        1 => ordered(before),
+        _ => ordered(before).wrapping_mul(2).wrapping_sub(ordered(before_that)),
+    }
+}
+
+/// How many frames before `frame` predict it.
+fn order_at(order: u8, frame: usize) -> u8 {
+    order.min(frame.min(2) as u8)
+}
+
+/// The order with the shorter residuals. They are compared on every fourth value: all of them would
+/// cost as much as the filter, and tiles close enough to be judged wrongly gain nothing either way.
+fn best_order(bits: &[u32], plane: usize) -> u8 {
+    let frames = bits.len() / plane;
+    if frames < 3 {
+        return (frames - 1) as u8;
+    }
+    let cost = |order: u8| -> u64 {
+        let mut bits_needed = 0;
+        for frame in 2..frames {
+            let at = |back: usize| &bits[(frame - back) * plane..][..plane];
+            for i in (0..plane).step_by(4) {
+                let residual = ordered(at(0)[i]).wrapping_sub(predict(order, at(1)[i], at(2)[i]));
+                bits_needed += u64::from(32 - zigzag(residual).leading_zeros());
+            }
+        }
+        bits_needed
+    };
+    if cost(1) < cost(2) { 1 } else { 2 }
+}
+
+/// Residuals of every value, lowest bytes of all first.
+fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
+    let mut out = vec![0; 4 * bits.len()];
+    let (low, high) = out.split_at_mut(2 * bits.len());
+    let (b0, b1) = low.split_at_mut(bits.len());
+    let (b2, b3) = high.split_at_mut(bits.len());
+    let mut residuals = vec![0; plane];
+    for frame in 0..bits.len() / plane {
+        let at = |back: usize| &bits[(frame - back) * plane..][..plane];
+        match order_at(order, frame) {
+            0 => residuals.copy_from_slice(at(0)),
+            order => {
+                let (now, before, before_that) = (at(0), at(1), at(order.into()));
+                for (i, residual) in residuals.iter_mut().enumerate() {
+                    *residual = zigzag(ordered(now[i]).wrapping_sub(predict(order, before[i], before_that[i])));
+                }
+            }
+        }
+        for (weight, bytes) in [&mut *b0, &mut *b1, &mut *b2, &mut *b3].into_iter().enumerate() {
+            for (byte, residual) in bytes[frame * plane..][..plane].iter_mut().zip(&residuals) {
+                *byte = (residual >> (8 * weight)) as u8;
+            }
+        }
+    }
+    out
+}
+
+/// The inverse of [`filter`]; `shuffled` holds four bytes for each of `out`.
+fn unfilter(shuffled: &[u8], plane: usize, order: u8, out: &mut [u32]) {
+    let count = out.len();
+    for frame in 0..count / plane {
+        let (done, rest) = out.split_at_mut(frame * plane);
+        let now = &mut rest[..plane];
+        let bytes = |weight: usize| &shuffled[weight * count + frame * plane..][..plane];
+        let (b0, b1, b2, b3) = (bytes(0), bytes(1), bytes(2), bytes(3));
+        for (i, value) in now.iter_mut().enumerate() {
+            *value = u32::from_le_bytes([b0[i], b1[i], b2[i], b3[i]]);
+        }
+        let order = order_at(order, frame);
+        if order == 0 {
+            continue;
+        }
+        let before = &done[(frame - 1) * plane..][..plane];
+        let before_that = &done[(frame - usize::from(order)) * plane..][..plane];
+        for (i, value) in now.iter_mut().enumerate() {
+            *value = unordered(unzigzag(*value).wrapping_add(predict(order, before[i], before_that[i])));
+        }
+    }
+}
+
+/// [`Stats`] of values given as bits. Compared as ordered integers, which is associative: the
+/// compiler may take many at once, and the order of the values does not matter.
+pub(crate) fn stats(bits: &[u32]) -> Stats {
+    const EXPONENT: u32 = 0x7f80_0000;
+    let (mut min, mut max, mut non_finite) = (u32::MAX, 0, 0u32);
+    for &bits in bits {
+        let finite = bits & EXPONENT != EXPONENT;
+        let rank = ordered(bits);
+        min = min.min(if finite { rank } else { u32::MAX });
+        max = max.max(if finite { rank } else { 0 });
+        non_finite += u32::from(!finite);
+    }
+    if non_finite as usize == bits.len() {
+        return Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite };
+    }
+    // Adding +0 turns −0 into +0 and leaves everything else alone.
+    Stats { min: f32::from_bits(unordered(min)) + 0.0, max: f32::from_bits(unordered(max)) + 0.0, non_finite }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn bits() -> impl Strategy<Value = u32> {
+        prop_oneof![
+            any::<u32>(),
+            (-2.0f32..2.0).prop_map(f32::to_bits),
+            Just((-0.0f32).to_bits()),
+            Just(0xffc0_1234),
+            Just(0x7f80_0001),
+            Just(f32::INFINITY.to_bits()),
+        ]
+    }
+
+    fn decode(tile: &EncodedTile) -> Vec<u32> {
+        let (mut shuffled, mut out) = (Vec::new(), Vec::new());
+        let frames = if tile.constant { 1 } else { tile.frames as usize };
+        let plane = tile.width as usize * tile.len as usize;
+        decode_tile(&tile.bytes, tile.encoding, frames, plane, &mut shuffled, &mut out).unwrap();
+        let once: Vec<u32> = out.iter().map(|v| v.to_bits()).collect();
+        if tile.constant { once.repeat(tile.frames as usize) } else { once }
+    }
+
+    proptest! {
+        #[test]
+        fn maps_to_integers_are_bijections_in_numeric_order(a: u32, b: u32) {
+            prop_assert_eq!(unordered(ordered(a)), a);
+            prop_assert_eq!(unzigzag(zigzag(a)), a);
+            let (x, y) = (f32::from_bits(a), f32::from_bits(b));
+            if x < y { prop_assert!(ordered(a) < ordered(b), "{x} < {y}"); }
+        }
+
+        #[test]
+        fn every_bit_pattern_survives_every_filter(
+            (frames, plane, values) in (1usize..6, 1usize..9)
+                .prop_flat_map(|(t, p)| (Just(t), Just(p), prop::collection::vec(bits(), t * p))),
+        ) {
+            for order in 0..=2 {
+                let mut out = vec![0; values.len()];
+                unfilter(&filter(&values, plane, order), plane, order, &mut out);
+                prop_assert_eq!(&out, &values, "order {}, {} frames", order, frames);
+            }
+        }
+
+        #[test]
+        fn every_bit_pattern_survives_every_compression(
+            (frames, len, values) in (1u32..6, 1u32..40)
+                .prop_flat_map(|(t, n)| (Just(t), Just(n), prop::collection::vec(bits(), (t * n * 2) as usize))),
+            level in prop_oneof![Just(Compression::Raw), Just(Compression::Zstd(1)), Just(Compression::Zstd(-3))],
+        ) {
+            let floats: Vec<f32> = values.iter().map(|&b| f32::from_bits(b)).collect();
+            let tile = encode_tile(&floats, frames, 2, len, level).unwrap();
+            prop_assert_eq!(decode(&tile), values);
+        }
+    }
+
+    #[test]
+    fn a_straight_line_is_predicted_from_two_frames() {
+        let values: Vec<f32> =
+            (0..16 * 500).map(|i| 1.0 + (i / 500) as f32 * 0.0078125 + (i % 500) as f32 * 1e-4).collect();
+        let tile = encode_tile(&values, 16, 1, 500, Compression::Zstd(1)).unwrap();
+        assert_eq!(tile.encoding, Encoding::Filtered { order: 2 });
+        assert!(tile.stored_bytes() < 3 * 500, "{} bytes for 16 frames of 500", tile.stored_bytes());
+    }
+
+    #[test]
+    fn constant_tiles_store_one_frame_and_differ_by_a_single_sign_of_zero() {
+        let still = encode_tile(&[0.0, 2.0, 0.0, 2.0], 2, 1, 2, Compression::Raw).unwrap();
+        assert!(still.is_constant());
+        assert_eq!(still.stored_bytes(), 8);
+        let moved = encode_tile(&[0.0, 2.0, -0.0, 2.0], 2, 1, 2, Compression::Raw).unwrap();
+        assert!(!moved.is_constant());
+    }
+
+    #[test]
+    fn stats_cover_finite_values_only() {
+        let got = stats(&[f32::NAN, -3.5, f32::INFINITY, 7.0, f32::NEG_INFINITY].map(f32::to_bits));
+        assert_eq!(got, Stats { min: -3.5, max: 7.0, non_finite: 3 });
+        let none = stats(&[f32::NAN.to_bits()]);
+        assert_eq!(none, Stats { min: f32::INFINITY, max: f32::NEG_INFINITY, non_finite: 1 });
+        let zero = stats(&[(-0.0f32).to_bits()]);
+        assert_eq!((zero.min.to_bits(), zero.max.to_bits()), (0, 0));
+    }
+
+    #[test]
+    fn decompressed_size_must_be_exact() {
+        let (mut shuffled, mut out) = (Vec::new(), Vec::new());
+        for len in [0usize, 39, 41, 1 << 24] {
+            let bomb = zstd::bulk::compress(&vec![0; len], 1).unwrap();
+            let got = decode_tile(&bomb, Encoding::Filtered { order: 0 }, 1, 10, &mut shuffled, &mut out);
+            assert!(got.is_err(), "{len} bytes passed for 40");
+        }
+        assert!(shuffled.len() <= 40);
+    }
+
+    #[test]
+    fn wrong_shapes_and_levels_are_refused() {
+        for (frames, width, len) in [(0, 1, 0), (1, 1, 3), (u32::MAX, u32::MAX, u32::MAX)] {
+            assert!(encode_tile(&[1.0, 2.0], frames, width, len, Compression::Raw).is_err());
+        }
+        assert!(encode_tile(&[], 1, 1, 0, Compression::Raw).is_err());
+        assert!(encode_tile(&[1.0], 1, 1, 1, Compression::Zstd(99)).is_err());
+    }
+}

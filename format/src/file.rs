@@ -1,0 +1,75 @@
+//! The one place that maps a file: what a reader needs of it, and what is promised when it changes.
+//!
+//! Positioned reads ([`MappedFile::read_at`]) of a file that was cut short end in an error. Access in
+//! place ([`MappedFile::in_place`]) compares the file's length with the place first, so it ends in an
+//! error too, unless the file shrinks after that, while the slice is in use: then the system may end
+//! the process (SIGBUS). Writers of this crate never shrink or rewrite a container; they replace it by
+//! renaming, which leaves maps of the old one intact.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use memmap2::Mmap;
+
+use crate::error::{Error, Fault, Result};
+
+pub(crate) struct MappedFile {
+    path: PathBuf,
+    file: File,
+    map: Mmap,
+}
+
+impl MappedFile {
+    pub(crate) fn open(path: &Path) -> Result<Self> {
+        // Asked before opening: opening a pipe would wait for its writer.
+        let metadata = fs::metadata(path).map_err(Error::io("open", path))?;
+        if !metadata.is_file() {
+            return Err(Fault::new(0, "a regular file", "a folder, pipe or device").at(path));
+        }
+        let file = File::open(path).map_err(Error::io("open", path))?;
+        // SAFETY: a map is sound while nobody changes the file's bytes. Whoever holds the file keeps
+        // that promise; this crate's writers do, they only ever rename finished files into place.
+        // The map is private to this module, is reached only after a check of the file's current
+        // length, and no bit pattern of its bytes is invalid for the types read from it (u8, f32).
+        let map = unsafe { Mmap::map(&file) }.map_err(Error::io("map", path))?;
+        Ok(MappedFile { path: path.to_owned(), file, map })
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Length in bytes when it was opened.
+    pub(crate) fn len(&self) -> u64 {
+        self.map.len() as u64
+    }
+
+    /// Fills `out` from `offset`. Never touches the map on Unix, where a file may shrink under it;
+    /// elsewhere the system forbids that.
+    pub(crate) fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<()> {
+        #[cfg(unix)]
+        let read = std::os::unix::fs::FileExt::read_exact_at(&self.file, out, offset);
+        #[cfg(not(unix))]
+        let read =
+            self.in_place(offset, out.len() as u64).map(|bytes| out.copy_from_slice(bytes)).map_err(io::Error::other);
+        read.map_err(|error| match error.kind() {
+            io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),
+            _ => Error::io("read", &self.path)(error),
+        })
+    }
+
+    /// `len` bytes at `offset`, where they lie in the map.
+    pub(crate) fn in_place(&self, offset: u64, len: u64) -> Result<&[u8]> {
+        let now = self.file.metadata().map_err(Error::io("examine", &self.path))?.len();
+        match offset.checked_add(len) {
+            Some(end) if end <= now.min(self.len()) => Ok(&self.map[offset as usize..end as usize]),
+            _ => Err(self.too_short(offset, len)),
+        }
+    }
+
+    fn too_short(&self, offset: u64, len: u64) -> Error {
+        let now = self.file.metadata().map_or(0, |metadata| metadata.len());
+        Fault::new(offset, format!("{len} bytes"), format!("the end of the file at byte {now}")).at(&self.path)
+    }
+}

@@ -1,0 +1,315 @@
+//! The shape of a container: how many Gaussians, which columns, how they are cut into tiles, and the
+//! file header that says so (SPEC.md, "Header").
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
+
+use xxhash_rust::xxh3::xxh3_64;
+
+use crate::error::{Error, Fault, Result};
+
+/// First bytes of every container. A high bit, a line ending and a control byte, so that transfers
+/// which rewrite text are noticed at once.
+pub(crate) const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
+/// The one version of the format this crate reads and writes.
+pub(crate) const VERSION: u32 = 1;
+/// Bytes before the first column: magic, version, header length, the four sizes and two counts.
+pub(crate) const FIXED_HEADER: usize = 40;
+
+/// Largest decoded size of one tile, in bytes (256 MiB). A reader never allocates more for a tile.
+pub const MAX_TILE_BYTES: u64 = 1 << 28;
+/// Largest header; keeps a hostile length from being allocated.
+pub(crate) const MAX_HEADER_BYTES: usize = 1 << 22;
+const MAX_GAUSSIANS: u64 = 1 << 32;
+const MAX_FRAME_BLOCK: u32 = 1 << 24;
+const MAX_COLUMNS: usize = 256;
+const MAX_NAME_BYTES: usize = 64;
+const MAX_ATTRIBUTES: usize = 1024;
+const MAX_KEY_BYTES: usize = 256;
+const MAX_VALUE_BYTES: usize = 1 << 20;
+/// Most tiles of one frame block: bounds the index a writer holds at 1 GiB per frame block.
+const MAX_TILES_PER_FRAME_BLOCK: u64 = 1 << 24;
+
+/// One attribute of every Gaussian.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ColumnSpec {
+    /// `[a-z][a-z0-9_]*`, at most 64 bytes, unique in its container. SPEC.md lists well-known names.
+    pub name: String,
+    /// f32 components per Gaussian, at least 1.
+    pub width: u32,
+}
+
+/// The shape of a container; everything but the number of frames, which may not be known ahead.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Layout {
+    /// N, Gaussians in every frame; 0 to 2³².
+    pub gaussians: u64,
+    /// Gaussians per tile, at least 1; the last block holds what is left.
+    pub gaussian_block: u32,
+    /// Frames per tile, 1 to 2²⁴; the last block holds what is left.
+    pub frame_block: u32,
+    /// The columns, 1 to 256. A whole tile of the widest must fit [`MAX_TILE_BYTES`].
+    pub columns: Vec<ColumnSpec>,
+    /// Free text by key: at most 1024 keys of at most 256 bytes, values of at most 1 MiB, 4 MiB in all.
+    pub attributes: BTreeMap<String, String>,
+}
+
+/// Which tile: the position of a column in [`Layout::columns`], a block of Gaussians, a block of frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TileId {
+    /// Index into [`Layout::columns`].
+    pub column: u32,
+    /// Gaussians from `gaussian_block · Layout::gaussian_block`.
+    pub gaussian_block: u32,
+    /// Frames from `frame_block · Layout::frame_block`.
+    pub frame_block: u32,
+}
+
+impl Layout {
+    /// The column called `name`, as [`TileId::column`] counts them.
+    pub fn column(&self, name: &str) -> Option<u32> {
+        self.columns.iter().position(|column| column.name == name).map(|at| at as u32)
+    }
+
+    /// Number of Gaussian blocks; 0 without Gaussians.
+    pub fn gaussian_blocks(&self) -> u32 {
+        // Legal layouts have at most 2²⁴ tiles per frame block, so the cast keeps the value.
+        self.gaussians.div_ceil(u64::from(self.gaussian_block)) as u32
+    }
+
+    /// The Gaussians of a block; empty beyond the last.
+    pub fn gaussian_range(&self, block: u32) -> Range<u64> {
+        let start = u64::from(block) * u64::from(self.gaussian_block);
+        start.min(self.gaussians)..(start + u64::from(self.gaussian_block)).min(self.gaussians)
+    }
+
+    /// The frames of a block in a sequence of `frames` frames; empty beyond the last.
+    pub fn frame_range(&self, block: u32, frames: u64) -> Range<u64> {
+        let start = u64::from(block) * u64::from(self.frame_block);
+        start.min(frames)..(start + u64::from(self.frame_block)).min(frames)
+    }
+
+    /// Gaussians in a block.
+    pub(crate) fn block_len(&self, block: u32) -> u32 {
+        let range = self.gaussian_range(block);
+        (range.end - range.start) as u32
+    }
+
+    /// Tiles of one frame block.
+    pub(crate) fn tiles_per_frame_block(&self) -> u64 {
+        self.columns.len() as u64 * u64::from(self.gaussian_blocks())
+    }
+
+    /// Place of a tile in the index: by frame block, then Gaussian block, then column.
+    pub(crate) fn index_of(&self, id: TileId) -> Option<u64> {
+        if id.column as usize >= self.columns.len() || id.gaussian_block >= self.gaussian_blocks() {
+            return None;
+        }
+        let within = u64::from(id.gaussian_block) * self.columns.len() as u64 + u64::from(id.column);
+        Some(u64::from(id.frame_block) * self.tiles_per_frame_block() + within)
+    }
+
+    /// The tile at a place in the index; the inverse of [`Layout::index_of`].
+    pub(crate) fn tile_at(&self, index: u64) -> TileId {
+        let columns = self.columns.len() as u64;
+        TileId {
+            column: (index % columns) as u32,
+            gaussian_block: (index / columns % u64::from(self.gaussian_blocks())) as u32,
+            frame_block: (index / self.tiles_per_frame_block()) as u32,
+        }
+    }
+
+    /// Checks every limit; the message names the first one broken.
+    pub(crate) fn check(&self) -> std::result::Result<(), String> {
+        let within = |what: &str, value: u64, range: std::ops::RangeInclusive<u64>| {
+            if range.contains(&value) {
+                Ok(())
+            } else {
+                Err(format!("{what} {} to {}, not {value}", range.start(), range.end()))
+            }
+        };
+        within("gaussians", self.gaussians, 0..=MAX_GAUSSIANS)?;
+        within("gaussian_block", self.gaussian_block.into(), 1..=u32::MAX.into())?;
+        within("frame_block", self.frame_block.into(), 1..=MAX_FRAME_BLOCK.into())?;
+        within("number of columns", self.columns.len() as u64, 1..=MAX_COLUMNS as u64)?;
+        let mut names = BTreeSet::new();
+        for ColumnSpec { name, width } in &self.columns {
+            if !is_column_name(name) {
+                return Err(format!("column names of 1 to {MAX_NAME_BYTES} bytes [a-z][a-z0-9_]*, not {name:?}"));
+            }
+            if !names.insert(name) {
+                return Err(format!("distinct column names, not two called {name:?}"));
+            }
+            let frame_values = u64::from(self.gaussian_block) * u64::from(self.frame_block);
+            let most = MAX_TILE_BYTES / 4 / frame_values.max(1);
+            within(
+                &format!("width of column {name:?} (whole tiles hold {MAX_TILE_BYTES} bytes at most)"),
+                (*width).into(),
+                1..=most,
+            )?;
+        }
+        let blocks = self.gaussians.div_ceil(self.gaussian_block.into());
+        within("tiles per frame block", blocks * self.columns.len() as u64, 0..=MAX_TILES_PER_FRAME_BLOCK)?;
+        within("number of attributes", self.attributes.len() as u64, 0..=MAX_ATTRIBUTES as u64)?;
+        for (key, value) in &self.attributes {
+            within("bytes in an attribute key", key.len() as u64, 1..=MAX_KEY_BYTES as u64)?;
+            within("bytes in an attribute value", value.len() as u64, 0..=MAX_VALUE_BYTES as u64)?;
+        }
+        within("bytes in the header", self.header_len() as u64, 0..=MAX_HEADER_BYTES as u64)
+    }
+
+    fn header_len(&self) -> usize {
+        let columns: usize = self.columns.iter().map(|column| 6 + column.name.len()).sum();
+        let attributes: usize = self.attributes.iter().map(|(key, value)| 6 + key.len() + value.len()).sum();
+        FIXED_HEADER + columns + attributes + 8
+    }
+
+    /// The header of a file of this layout, without the zeros that pad it to 64 bytes.
+    pub(crate) fn to_header(&self) -> Result<Vec<u8>> {
+        self.check().map_err(|limit| Error::usage(format!("a container's layout must have {limit}")))?;
+        let mut out = Vec::with_capacity(self.header_len());
+        out.extend(MAGIC);
+        out.extend(VERSION.to_le_bytes());
+        out.extend((self.header_len() as u32).to_le_bytes());
+        out.extend(self.gaussians.to_le_bytes());
+        out.extend(self.gaussian_block.to_le_bytes());
+        out.extend(self.frame_block.to_le_bytes());
+        out.extend((self.columns.len() as u32).to_le_bytes());
+        out.extend((self.attributes.len() as u32).to_le_bytes());
+        for ColumnSpec { name, width } in &self.columns {
+            out.extend(width.to_le_bytes());
+            out.extend((name.len() as u16).to_le_bytes());
+            out.extend(name.as_bytes());
+        }
+        for (key, value) in &self.attributes {
+            out.extend((key.len() as u16).to_le_bytes());
+            out.extend((value.len() as u32).to_le_bytes());
+            out.extend(key.as_bytes());
+            out.extend(value.as_bytes());
+        }
+        let checksum = xxh3_64(&out);
+        out.extend(checksum.to_le_bytes());
+        Ok(out)
+    }
+
+    /// Length in bytes of the header that starts with `fixed`.
+    pub(crate) fn header_len_from(fixed: &[u8; FIXED_HEADER]) -> std::result::Result<usize, Fault> {
+        let mut fields = Fields { bytes: fixed, at: 0 };
+        let magic = fields.take(8)?;
+        if magic != MAGIC {
+            return Err(Fault::new(0, "the gseq magic 89 'GSEQ' 0d 0a 1a", format!("{:02x?}", magic)));
+        }
+        let version = fields.u32()?;
+        if version != VERSION {
+            let fault = Fault::new(8, format!("format version {VERSION}"), format!("version {version}"));
+            return Err(fault.hint("a newer release of this program may read it"));
+        }
+        let len = fields.u32()? as usize;
+        if !(FIXED_HEADER + 8..=MAX_HEADER_BYTES).contains(&len) {
+            return Err(Fault::new(
+                12,
+                format!("a header of {} to {MAX_HEADER_BYTES} bytes", FIXED_HEADER + 8),
+                format!("{len} bytes"),
+            ));
+        }
+        Ok(len)
+    }
+
+    /// Reads a whole header, checksum included.
+    pub(crate) fn from_header(bytes: &[u8]) -> std::result::Result<Layout, Fault> {
+        let body = bytes.len().saturating_sub(8);
+        let mut fields = Fields { bytes, at: body };
+        let stored = fields.u64()?;
+        let computed = xxh3_64(&bytes[..body]);
+        if stored != computed {
+            return Err(Fault::new(body as u64, format!("header checksum {computed:016x}"), format!("{stored:016x}")));
+        }
+        let mut fields = Fields { bytes: &bytes[..body], at: 16 };
+        let gaussians = fields.u64()?;
+        let gaussian_block = fields.u32()?;
+        let frame_block = fields.u32()?;
+        let column_count = fields.u32()? as usize;
+        let attribute_count = fields.u32()? as usize;
+        let mut columns = Vec::with_capacity(column_count.min(MAX_COLUMNS));
+        for _ in 0..column_count {
+            let width = fields.u32()?;
+            let len = fields.u16()?;
+            columns.push(ColumnSpec { name: fields.text(len.into())?, width });
+        }
+        let mut attributes = BTreeMap::new();
+        for _ in 0..attribute_count {
+            let start = fields.at;
+            let key_len = fields.u16()?;
+            let value_len = fields.u32()?;
+            let key = fields.text(key_len.into())?;
+            let value = fields.text(value_len as usize)?;
+            if attributes.last_key_value().is_some_and(|(last, _)| *last >= key) {
+                return Err(Fault::new(
+                    start as u64,
+                    "attributes in strictly increasing order of their keys",
+                    format!("{key:?}"),
+                ));
+            }
+            attributes.insert(key, value);
+        }
+        if fields.at != body {
+            return Err(Fault::new(
+                fields.at as u64,
+                "the header checksum",
+                format!("{} more bytes before it", body - fields.at),
+            ));
+        }
+        let layout = Layout { gaussians, gaussian_block, frame_block, columns, attributes };
+        layout.check().map_err(|limit| Fault::new(16, limit, "a header outside this limit"))?;
+        Ok(layout)
+    }
+}
+
+fn is_column_name(name: &str) -> bool {
+    name.len() <= MAX_NAME_BYTES
+        && name.starts_with(|c: char| c.is_ascii_lowercase())
+        && name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_')
+}
+
+/// Takes little-endian fields off a slice whose first byte is byte 0 of the file.
+struct Fields<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Fields<'a> {
+    fn take(&mut self, len: usize) -> std::result::Result<&'a [u8], Fault> {
+        let left = self.bytes.len() - self.at;
+        if len > left {
+            return Err(Fault::new(self.at as u64, format!("{len} bytes of header"), format!("{left} before its end")));
+        }
+        let taken = &self.bytes[self.at..self.at + len];
+        self.at += len;
+        Ok(taken)
+    }
+
+    fn array<const LEN: usize>(&mut self) -> std::result::Result<[u8; LEN], Fault> {
+        let mut out = [0; LEN];
+        out.copy_from_slice(self.take(LEN)?);
+        Ok(out)
+    }
+
+    fn u16(&mut self) -> std::result::Result<u16, Fault> {
+        self.array().map(u16::from_le_bytes)
+    }
+
+    fn u32(&mut self) -> std::result::Result<u32, Fault> {
+        self.array().map(u32::from_le_bytes)
+    }
+
+    fn u64(&mut self) -> std::result::Result<u64, Fault> {
+        self.array().map(u64::from_le_bytes)
+    }
+
+    fn text(&mut self, len: usize) -> std::result::Result<String, Fault> {
+        let start = self.at as u64;
+        let bytes = self.take(len)?;
+        let text = std::str::from_utf8(bytes).map_err(|error| Fault::new(start, "UTF-8 text", error))?;
+        Ok(text.to_owned())
+    }
+}

@@ -1,0 +1,373 @@
+//! Opens a finished container and hands out its tiles, from any number of threads.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use xxhash_rust::xxh3::xxh3_64;
+
+use crate::codec::{Encoding, Stats, decode_tile};
+use crate::error::{Fault, Result};
+use crate::file::MappedFile;
+use crate::layout::{FIXED_HEADER, Layout, TileId};
+use crate::record::{FooterRecord, RECORD, Record, TRAILER, TileRecord, align, digest, trailer_from_bytes};
+use crate::writer::check_times;
+
+/// A finished container. Memory: 64 bytes per tile and 8 per frame; tiles stay on disk.
+///
+/// What happens when the file changes underneath: see [`Reader::tile`].
+pub struct Reader {
+    pub(crate) file: MappedFile,
+    pub(crate) layout: Layout,
+    pub(crate) times: Vec<f64>,
+    pub(crate) tiles: Vec<TileRecord>,
+    pub(crate) footer_offset: u64,
+    /// Per tile whether its bytes in the map have matched their checksum.
+    verified: Vec<AtomicBool>,
+    digest: u64,
+}
+
+/// Room for a tile that has to be decoded; reuse it. Grows to three times the largest decoded tile.
+#[derive(Debug, Default)]
+pub struct TileBuffer {
+    stored: Vec<u8>,
+    shuffled: Vec<u8>,
+    values: Vec<f32>,
+}
+
+/// The values of one tile.
+#[derive(Debug, Clone, Copy)]
+pub struct Tile<'a> {
+    values: &'a [f32],
+    frames: usize,
+    width: usize,
+    len: usize,
+    constant: bool,
+}
+
+/// What the index says of a tile.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TileInfo {
+    /// How its bytes are to be read.
+    pub encoding: Encoding,
+    /// Whether one frame stands for all.
+    pub constant: bool,
+    /// Frames it covers.
+    pub frames: u32,
+    /// Where its stored bytes start. Constant tiles of other frame blocks may share them.
+    pub offset: u64,
+    /// Length of its stored bytes.
+    pub stored_bytes: u64,
+    /// xxh3-64 of its stored bytes.
+    pub checksum: u64,
+    /// Minimum, maximum, count of non-finite values.
+    pub stats: Stats,
+}
+
+impl<'a> Tile<'a> {
+    /// Component `component` of every Gaussian of the block at `frame`, both counted from the tile's first. A
+    /// constant tile gives the same plane for every frame.
+    ///
+    /// # Panics
+    /// If the tile has no such frame or component.
+    pub fn plane(&self, frame: usize, component: usize) -> &'a [f32] {
+        assert!(frame < self.frames && component < self.width, "no frame {frame}, component {component} in {self:?}");
+        let frame = if self.constant { 0 } else { frame };
+        &self.values[(frame * self.width + component) * self.len..][..self.len]
+    }
+
+    /// Everything that is stored, `[frame][component][gaussian]`; of a constant tile one frame.
+    pub fn values(&self) -> &'a [f32] {
+        self.values
+    }
+
+    /// Frames it covers, also if it is constant.
+    pub fn frames(&self) -> usize {
+        self.frames
+    }
+
+    /// Components per Gaussian.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Gaussians; never 0.
+    #[allow(clippy::len_without_is_empty)]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether one frame is stored for all.
+    pub fn is_constant(&self) -> bool {
+        self.constant
+    }
+}
+
+impl Reader {
+    /// Opens a container and checks its header, footer and index: every length and place lies within its limits, no
+    /// two tiles overlap. The tiles themselves are checked when they are read, or by [`Reader::verify`].
+    pub fn open(path: impl AsRef<Path>) -> Result<Reader> {
+        let file = MappedFile::open(path.as_ref())?;
+        Self::read(file)
+    }
+
+    fn read(file: MappedFile) -> Result<Reader> {
+        let fault = |fault: Fault| fault.at(file.path());
+        let (layout, header) = read_header(&file)?;
+        let first_record = align(header.len() as u64);
+
+        let least = first_record + RECORD + TRAILER;
+        if file.len() < least {
+            let short = Fault::new(file.len(), format!("a container of at least {least} bytes"), "the end of the file");
+            return Err(fault(short.hint("the file is cut short; nothing but its header is left")));
+        }
+        let mut trailer = [0; TRAILER as usize];
+        let trailer_offset = file.len() - TRAILER;
+        file.read_at(trailer_offset, &mut trailer)?;
+        let footer_offset = trailer_from_bytes(&trailer, trailer_offset).map_err(fault)?;
+        let room = first_record..trailer_offset - RECORD + 1;
+        if !room.contains(&footer_offset) || !footer_offset.is_multiple_of(RECORD) {
+            let expected =
+                format!("a footer within bytes {} to {}, at a multiple of {RECORD}", room.start, trailer_offset);
+            return Err(fault(Fault::new(trailer_offset, expected, footer_offset)));
+        }
+
+        let mut record = [0; RECORD as usize];
+        file.read_at(footer_offset, &mut record)?;
+        let footer = match Record::from_bytes(&record, footer_offset).map_err(fault)? {
+            Record::Footer(footer) => footer,
+            other => return Err(fault(Fault::new(footer_offset, "the footer", format!("{other:?}")))),
+        };
+        let start = footer_offset + RECORD;
+        check_footer(&footer, &layout, &header, footer_offset, trailer_offset - start).map_err(fault)?;
+        // As long as the file says, and the file is that long: no more memory than the file has bytes.
+        let mut payload = vec![0; (trailer_offset - start) as usize];
+        file.read_at(start, &mut payload)?;
+        let computed = xxh3_64(&payload);
+        if computed != footer.checksum {
+            let expected = format!("footer checksum {computed:016x}");
+            return Err(fault(Fault::new(footer_offset + 32, expected, format!("{:016x}", footer.checksum))));
+        }
+
+        let (times, index) = payload.split_at(8 * footer.frames as usize);
+        let times: Vec<f64> = times.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
+        check_times(None, &times)
+            .map_err(|(frame, found)| {
+                Fault::new(start + 8 * frame as u64, "finite, strictly increasing time stamps", found)
+            })
+            .map_err(fault)?;
+        let index_offset = start + 8 * footer.frames;
+        let tiles = parse_index(index, index_offset, &layout, footer.frames, first_record + RECORD..footer_offset)
+            .map_err(fault)?;
+        check_overlap(&tiles, index_offset).map_err(fault)?;
+
+        let digest = digest(&header, &times, &tiles);
+        let verified = tiles.iter().map(|_| AtomicBool::new(false)).collect();
+        Ok(Reader { file, layout, times, tiles, footer_offset, verified, digest })
+    }
+
+    /// The shape of the container.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Time stamp of every frame, strictly increasing.
+    pub fn times(&self) -> &[f64] {
+        &self.times
+    }
+
+    /// T, the number of frames.
+    pub fn frames(&self) -> usize {
+        self.times.len()
+    }
+
+    /// Number of frame blocks.
+    pub fn frame_blocks(&self) -> u32 {
+        self.times.len().div_ceil(self.layout.frame_block as usize) as u32
+    }
+
+    /// Identifies the content: a hash of header, time stamps and the checksums and statistics of every tile. The same
+    /// for the same content, layout and compression, in whatever order the tiles were written.
+    pub fn digest(&self) -> u64 {
+        self.digest
+    }
+
+    /// What the index says of a tile. Errors: there is no such tile.
+    pub fn tile_info(&self, at: TileId) -> Result<TileInfo> {
+        let tile = &self.tiles[self.index(at)?];
+        Ok(TileInfo {
+            encoding: tile.encoding,
+            constant: tile.constant,
+            frames: tile.frames,
+            offset: tile.offset,
+            stored_bytes: tile.stored_bytes.into(),
+            checksum: tile.checksum,
+            stats: tile.stats,
+        })
+    }
+
+    /// The values of a tile: in place from the map if it is stored raw, else decoded into `buffer`.
+    ///
+    /// The checksum is verified, for tiles in place once. If the file shrinks before this call, the call ends in an
+    /// error; if it shrinks while the slice of a raw tile is in use, the system may end the process, and a file
+    /// rewritten in place shows through. Use [`Reader::read_tile`] where others may do that to the file.
+    pub fn tile<'a>(&'a self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
+        let index = self.index(at)?;
+        let tile = &self.tiles[index];
+        if tile.encoding == Encoding::Raw && cfg!(target_endian = "little") {
+            let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
+            // Relaxed: the flag guards nothing but repeated work.
+            if !self.verified[index].load(Ordering::Relaxed) {
+                check_payload(tile, bytes).map_err(|fault| fault.at(self.file.path()))?;
+                self.verified[index].store(true, Ordering::Relaxed);
+            }
+            // Offsets are multiples of 64 and maps start at a page: the bytes are aligned.
+            if let Ok(values) = bytemuck::try_cast_slice(bytes) {
+                return Ok(self.shaped(tile, values));
+            }
+        }
+        self.read_record(tile, buffer)
+    }
+
+    /// The values of a tile, always copied into `buffer` by ordinary reads and verified: the map is not touched,
+    /// so that a file cut short at any moment ends in an error.
+    pub fn read_tile<'a>(&self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
+        self.read_record(&self.tiles[self.index(at)?], buffer)
+    }
+
+    fn index(&self, at: TileId) -> Result<usize> {
+        let index = self.layout.index_of(at).filter(|&index| index < self.tiles.len() as u64);
+        index.map(|index| index as usize).ok_or_else(|| {
+            let frames = self.frames();
+            crate::Error::usage(format!("{}: there is no {at:?} in {frames} frames", self.file.path().display()))
+        })
+    }
+
+    fn read_record<'a>(&self, tile: &TileRecord, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
+        read_tile(&self.file, &self.layout, tile, buffer)?;
+        Ok(self.shaped(tile, &buffer.values))
+    }
+
+    fn shaped<'a>(&self, tile: &TileRecord, values: &'a [f32]) -> Tile<'a> {
+        Tile {
+            values,
+            frames: tile.frames as usize,
+            width: self.layout.columns[tile.id.column as usize].width as usize,
+            len: self.layout.block_len(tile.id.gaussian_block) as usize,
+            constant: tile.constant,
+        }
+    }
+}
+
+impl TileBuffer {
+    /// The stored bytes of the tile that was read last.
+    pub(crate) fn stored(&self) -> &[u8] {
+        &self.stored
+    }
+}
+
+/// Reads, verifies and decodes the tile of a checked record.
+pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, buffer: &mut TileBuffer) -> Result<()> {
+    buffer.stored.resize(tile.stored_bytes as usize, 0);
+    file.read_at(tile.offset, &mut buffer.stored)?;
+    check_payload(tile, &buffer.stored).map_err(|fault| fault.at(file.path()))?;
+    let plane =
+        layout.columns[tile.id.column as usize].width as usize * layout.block_len(tile.id.gaussian_block) as usize;
+    let values = tile.values(layout);
+    decode_tile(&buffer.stored, tile.encoding, values / plane, plane, &mut buffer.shuffled, &mut buffer.values).map_err(
+        |found| Fault::new(tile.offset, format!("{} bytes of {:?}", 4 * values, tile.id), found).at(file.path()),
+    )
+}
+
+/// Reads and checks the header: the layout, and the header's bytes.
+pub(crate) fn read_header(file: &MappedFile) -> Result<(Layout, Vec<u8>)> {
+    let fault = |fault: Fault| fault.at(file.path());
+    let mut fixed = [0; FIXED_HEADER];
+    file.read_at(0, &mut fixed)?;
+    let len = Layout::header_len_from(&fixed).map_err(fault)?;
+    let mut header = vec![0; len];
+    file.read_at(0, &mut header)?;
+    Ok((Layout::from_header(&header).map_err(fault)?, header))
+}
+
+fn check_payload(tile: &TileRecord, bytes: &[u8]) -> std::result::Result<(), Fault> {
+    let computed = xxh3_64(bytes);
+    if computed == tile.checksum {
+        return Ok(());
+    }
+    Err(Fault::new(
+        tile.offset,
+        format!("{:?} with checksum {:016x}", tile.id, tile.checksum),
+        format!("{computed:016x}"),
+    ))
+}
+
+fn check_footer(
+    footer: &FooterRecord,
+    layout: &Layout,
+    header: &[u8],
+    offset: u64,
+    room: u64,
+) -> std::result::Result<(), Fault> {
+    let header_checksum = xxh3_64(header);
+    if footer.header_checksum != header_checksum {
+        let expected = format!("the footer of header {header_checksum:016x}");
+        return Err(Fault::new(offset + 24, expected, format!("{:016x}", footer.header_checksum)));
+    }
+    let blocks = footer.frames.div_ceil(layout.frame_block.into());
+    let tiles = blocks.checked_mul(layout.tiles_per_frame_block());
+    if blocks > 1 << 32 || tiles != Some(footer.tiles) {
+        let expected = format!("the tiles of {} frames", footer.frames);
+        return Err(Fault::new(offset + 16, expected, format!("{} tiles", footer.tiles)));
+    }
+    if footer.payload() != Some(room) {
+        let expected = format!("{} time stamps and {} index entries", footer.frames, footer.tiles);
+        return Err(Fault::new(offset + 8, expected, format!("{room} bytes before the trailer")));
+    }
+    Ok(())
+}
+
+fn parse_index(
+    index: &[u8],
+    offset: u64,
+    layout: &Layout,
+    frames: u64,
+    payloads: std::ops::Range<u64>,
+) -> std::result::Result<Vec<TileRecord>, Fault> {
+    let mut tiles = Vec::with_capacity(index.len() / RECORD as usize);
+    for (i, bytes) in index.as_chunks().0.iter().enumerate() {
+        let place = offset + RECORD * i as u64;
+        let id = layout.tile_at(i as u64);
+        let range = layout.frame_range(id.frame_block, frames);
+        match Record::from_bytes(bytes, place)? {
+            Record::Tile(tile) if tile.id == id && u64::from(tile.frames) == range.end - range.start => {
+                tile.check(layout, payloads.clone(), place)?;
+                tiles.push(tile);
+            }
+            other => {
+                let expected = format!("the index entry of {id:?}, frames {} to {}", range.start, range.end);
+                return Err(Fault::new(place, expected, format!("{other:?}")));
+            }
+        }
+    }
+    Ok(tiles)
+}
+
+/// No two tiles may use the same bytes of the file, but for constant ones that share all of them.
+fn check_overlap(tiles: &[TileRecord], index_offset: u64) -> std::result::Result<(), Fault> {
+    let mut order: Vec<usize> = (0..tiles.len()).collect();
+    order.sort_unstable_by_key(|&i| (tiles[i].offset, i));
+    for pair in order.windows(2) {
+        let (tile, next) = (&tiles[pair[0]], &tiles[pair[1]]);
+        let apart = next.offset - RECORD >= tile.offset + u64::from(tile.stored_bytes);
+        if !apart && !next.may_share(tile) {
+            let place = index_offset + RECORD * pair[1] as u64 + 24;
+            let expected = format!("{:?} stored apart from {:?}", next.id, tile.id);
+            return Err(Fault::new(
+                place,
+                expected,
+                format!("both at bytes {} to {}", next.offset, tile.offset + u64::from(tile.stored_bytes)),
+            ));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,250 @@
+//! The three kinds of record and the trailer (SPEC.md, "Records"). A record is a header of 64 bytes
+//! with its own checksum and, after it, a payload with another.
+
+use xxhash_rust::xxh3::{Xxh3, xxh3_64};
+
+use crate::codec::{Encoding, Stats};
+use crate::error::Fault;
+use crate::layout::{Layout, TileId};
+
+/// Length of a record header, and the alignment of records: their payloads are 64-byte aligned in
+/// the file and hence in its map.
+pub(crate) const RECORD: u64 = 64;
+/// Length of the trailer.
+pub(crate) const TRAILER: u64 = 32;
+const END_MAGIC: [u8; 8] = *b"\x1aGSEQEND";
+
+/// `offset` rounded up to where a record may start.
+pub(crate) fn align(offset: u64) -> u64 {
+    offset.next_multiple_of(RECORD)
+}
+
+/// One tile: the same 64 bytes stand before the payload and in the index.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct TileRecord {
+    pub(crate) id: TileId,
+    pub(crate) frames: u32,
+    pub(crate) encoding: Encoding,
+    pub(crate) constant: bool,
+    /// Where the payload starts. A constant tile may share the payload of an earlier one.
+    pub(crate) offset: u64,
+    pub(crate) stored_bytes: u32,
+    pub(crate) checksum: u64,
+    pub(crate) stats: Stats,
+}
+
+/// The time stamps of one frame block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct TimesRecord {
+    pub(crate) frame_block: u32,
+    pub(crate) frames: u32,
+    pub(crate) checksum: u64,
+}
+
+/// All time stamps and the index of all tiles.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct FooterRecord {
+    pub(crate) frames: u64,
+    pub(crate) tiles: u64,
+    pub(crate) checksum: u64,
+    /// Checksum of the header, so that a footer cannot serve another header.
+    pub(crate) header_checksum: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Record {
+    Tile(TileRecord),
+    Times(TimesRecord),
+    Footer(FooterRecord),
+}
+
+impl FooterRecord {
+    /// Length of the payload, unless it overflows: 8 bytes per frame, 64 per tile.
+    pub(crate) fn payload(&self) -> Option<u64> {
+        self.frames.checked_mul(8)?.checked_add(self.tiles.checked_mul(RECORD)?)
+    }
+}
+
+impl Record {
+    pub(crate) fn to_bytes(self) -> [u8; RECORD as usize] {
+        let mut out = [0; RECORD as usize];
+        match self {
+            Record::Tile(tile) => {
+                let (encoding, order) = match tile.encoding {
+                    Encoding::Raw => (0, 0),
+                    Encoding::Filtered { order } => (1, order),
+                };
+                out[..4].copy_from_slice(b"TILE");
+                out[4..8].copy_from_slice(&tile.id.column.to_le_bytes());
+                out[8..12].copy_from_slice(&tile.id.gaussian_block.to_le_bytes());
+                out[12..16].copy_from_slice(&tile.id.frame_block.to_le_bytes());
+                out[16..20].copy_from_slice(&[encoding, order, tile.constant.into(), 0]);
+                out[20..24].copy_from_slice(&tile.frames.to_le_bytes());
+                out[24..32].copy_from_slice(&tile.offset.to_le_bytes());
+                out[32..40].copy_from_slice(&tile.checksum.to_le_bytes());
+                out[40..44].copy_from_slice(&tile.stored_bytes.to_le_bytes());
+                out[44..48].copy_from_slice(&tile.stats.min.to_le_bytes());
+                out[48..52].copy_from_slice(&tile.stats.max.to_le_bytes());
+                out[52..56].copy_from_slice(&tile.stats.non_finite.to_le_bytes());
+            }
+            Record::Times(times) => {
+                out[..4].copy_from_slice(b"TIME");
+                out[12..16].copy_from_slice(&times.frame_block.to_le_bytes());
+                out[20..24].copy_from_slice(&times.frames.to_le_bytes());
+                out[32..40].copy_from_slice(&times.checksum.to_le_bytes());
+            }
+            Record::Footer(footer) => {
+                out[..4].copy_from_slice(b"FOOT");
+                out[8..16].copy_from_slice(&footer.frames.to_le_bytes());
+                out[16..24].copy_from_slice(&footer.tiles.to_le_bytes());
+                out[24..32].copy_from_slice(&footer.header_checksum.to_le_bytes());
+                out[32..40].copy_from_slice(&footer.checksum.to_le_bytes());
+            }
+        }
+        let checksum = xxh3_64(&out[..56]);
+        out[56..].copy_from_slice(&checksum.to_le_bytes());
+        out
+    }
+
+    /// Reads the record header at `offset`. Its own fields are legal afterwards; whether they fit
+    /// the layout is for the caller, see [`TileRecord::check`].
+    pub(crate) fn from_bytes(bytes: &[u8; RECORD as usize], offset: u64) -> Result<Record, Fault> {
+        let u32_at = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
+        let u64_at = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
+        let (stored, computed) = (u64_at(56), xxh3_64(&bytes[..56]));
+        if stored != computed {
+            return Err(Fault::new(offset + 56, format!("record checksum {computed:016x}"), format!("{stored:016x}")));
+        }
+        let record = match &bytes[..4] {
+            b"TILE" => {
+                let encoding = match (bytes[16], bytes[17]) {
+                    (0, 0) => Encoding::Raw,
+                    (1, order @ 0..=2) => Encoding::Filtered { order },
+                    other => {
+                        return Err(Fault::new(
+                            offset + 16,
+                            "encoding 0 order 0, or encoding 1 order 0 to 2",
+                            format!("{other:?}"),
+                        ));
+                    }
+                };
+                Record::Tile(TileRecord {
+                    id: TileId { column: u32_at(4), gaussian_block: u32_at(8), frame_block: u32_at(12) },
+                    encoding,
+                    constant: bytes[18] != 0,
+                    frames: u32_at(20),
+                    offset: u64_at(24),
+                    checksum: u64_at(32),
+                    stored_bytes: u32_at(40),
+                    stats: Stats {
+                        min: f32::from_bits(u32_at(44)),
+                        max: f32::from_bits(u32_at(48)),
+                        non_finite: u32_at(52),
+                    },
+                })
+            }
+            b"TIME" => Record::Times(TimesRecord { frame_block: u32_at(12), frames: u32_at(20), checksum: u64_at(32) }),
+            b"FOOT" => Record::Footer(FooterRecord {
+                frames: u64_at(8),
+                tiles: u64_at(16),
+                header_checksum: u64_at(24),
+                checksum: u64_at(32),
+            }),
+            other => return Err(Fault::new(offset, "a record TILE, TIME or FOOT", format!("{other:02x?}"))),
+        };
+        // Reserved bytes are zero and flags are 0 or 1: writing the record again must give the same bytes.
+        if record.to_bytes() != *bytes {
+            return Err(Fault::new(offset, "zero in every reserved byte and flags of 0 or 1", "something else"));
+        }
+        Ok(record)
+    }
+}
+
+impl TileRecord {
+    /// f32 values in the payload: one frame for a constant tile.
+    pub(crate) fn values(&self, layout: &Layout) -> usize {
+        let frames = if self.constant { 1 } else { self.frames as usize };
+        frames
+            * layout.columns[self.id.column as usize].width as usize
+            * layout.block_len(self.id.gaussian_block) as usize
+    }
+
+    /// Checks a record found at `place` against the layout: it is a tile of the container, of a
+    /// legal size, and its payload lies within `payloads`.
+    pub(crate) fn check(&self, layout: &Layout, payloads: std::ops::Range<u64>, place: u64) -> Result<(), Fault> {
+        if layout.index_of(self.id).is_none() {
+            return Err(Fault::new(
+                place + 4,
+                "a column and a Gaussian block of this container",
+                format!("{:?}", self.id),
+            ));
+        }
+        if !(1..=layout.frame_block).contains(&self.frames) {
+            return Err(Fault::new(place + 20, format!("1 to {} frames", layout.frame_block), self.frames));
+        }
+        let raw = 4 * self.values(layout) as u64;
+        let stored = u64::from(self.stored_bytes);
+        let legal = match self.encoding {
+            Encoding::Raw => stored == raw,
+            Encoding::Filtered { .. } => (1..raw).contains(&stored),
+        };
+        if !legal {
+            let expected = format!("{raw} stored bytes, or fewer if compressed");
+            return Err(Fault::new(place + 40, expected, format!("{stored} ({:?})", self.encoding)));
+        }
+        let inside =
+            self.offset >= payloads.start && self.offset.checked_add(stored).is_some_and(|end| end <= payloads.end);
+        if !inside || !self.offset.is_multiple_of(RECORD) {
+            let expected =
+                format!("a payload within bytes {} to {}, at a multiple of {RECORD}", payloads.start, payloads.end);
+            return Err(Fault::new(place + 24, expected, format!("{stored} bytes from {}", self.offset)));
+        }
+        Ok(())
+    }
+
+    /// Whether two tiles may name the same stored bytes: constant ones of the same Gaussians and column.
+    pub(crate) fn may_share(&self, other: &TileRecord) -> bool {
+        let shared = |tile: &TileRecord| TileRecord { id: TileId { frame_block: 0, ..tile.id }, frames: 0, ..*tile };
+        self.constant && shared(self).same_bits(&shared(other))
+    }
+
+    fn same_bits(&self, other: &TileRecord) -> bool {
+        Record::Tile(*self).to_bytes() == Record::Tile(*other).to_bytes()
+    }
+}
+
+/// The last bytes of a finished file: where the footer is, how long the file is.
+pub(crate) fn trailer_to_bytes(footer: u64) -> [u8; TRAILER as usize] {
+    let mut out = [0; TRAILER as usize];
+    out[..8].copy_from_slice(&footer.to_le_bytes());
+    let checksum = xxh3_64(&out[..16]);
+    out[16..24].copy_from_slice(&checksum.to_le_bytes());
+    out[24..].copy_from_slice(&END_MAGIC);
+    out
+}
+
+/// Reads the trailer at `offset`: the place of the footer.
+pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER as usize], offset: u64) -> Result<u64, Fault> {
+    let footer = u64::from_le_bytes(std::array::from_fn(|i| bytes[i]));
+    if trailer_to_bytes(footer) != *bytes {
+        let fault = Fault::new(
+            offset,
+            "the trailer of a finished container",
+            "something else: the file is cut short or damaged",
+        );
+        return Err(fault.hint("`recover` saves its complete frame blocks"));
+    }
+    Ok(footer)
+}
+
+/// What identifies a container's content: a hash of header, time stamps and every tile's record
+/// without the place it is stored at, so that the order of writing does not matter.
+pub(crate) fn digest(header: &[u8], times: &[f64], tiles: &[TileRecord]) -> u64 {
+    let mut hash = Xxh3::new();
+    hash.update(header);
+    times.iter().for_each(|time| hash.update(&time.to_le_bytes()));
+    for tile in tiles {
+        hash.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
+    }
+    hash.digest()
+}

@@ -1,0 +1,124 @@
+//! Checks every byte of a container, in the order they lie in the file.
+
+use crate::codec::stats;
+use crate::error::{Error, Fault, Result};
+use crate::reader::{Reader, TileBuffer};
+use crate::record::{RECORD, Record, TileRecord, align};
+use crate::recover::read_times;
+
+/// What [`Reader::verify`] went through.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct VerifyReport {
+    /// Frames of the sequence.
+    pub frames: u64,
+    /// Tiles that were decoded and compared with their statistics.
+    pub tiles: u64,
+    /// Bytes of payloads as stored; shared ones once.
+    pub stored_bytes: u64,
+    /// Bytes of values after decoding; constant tiles one frame.
+    pub decoded_bytes: u64,
+}
+
+impl Reader {
+    /// Reads the whole file and checks what opening it left unchecked: every record is where the index says and says
+    /// the same, every tile decodes to values with its checksum and statistics, all bytes between are zero. A file
+    /// that passes has no byte that could be changed unnoticed. Memory: one [`TileBuffer`], a flag per tile.
+    pub fn verify(&self) -> Result<VerifyReport> {
+        let fault = |fault: Fault| fault.at(self.file.path());
+        let mut report = VerifyReport { frames: self.times.len() as u64, tiles: 0, stored_bytes: 0, decoded_bytes: 0 };
+        let mut buffer = TileBuffer::default();
+        let mut met = vec![false; self.tiles.len()];
+        let mut blocks_met = 0;
+        let (_, header) = crate::reader::read_header(&self.file)?;
+        let mut position = self.padded(header.len() as u64)?;
+        while position < self.footer_offset {
+            let mut bytes = [0; RECORD as usize];
+            self.file.read_at(position, &mut bytes)?;
+            let payload = position + RECORD;
+            match Record::from_bytes(&bytes, position).map_err(fault)? {
+                Record::Tile(tile) => {
+                    let index = self.layout.index_of(tile.id).filter(|&index| index < self.tiles.len() as u64);
+                    let Some(index) = index.filter(|&i| self.indexed(i, &bytes) && !met[i as usize]) else {
+                        return Err(fault(Fault::new(
+                            position,
+                            "the tile the index describes, once",
+                            format!("{tile:?}"),
+                        )));
+                    };
+                    met[index as usize] = true;
+                    self.verify_tile(&tile, position, &mut buffer)?;
+                    report.tiles += 1;
+                    report.decoded_bytes += 4 * tile.values(&self.layout) as u64;
+                    let own = tile.offset == payload;
+                    if !own && tile.offset > position {
+                        return Err(fault(Fault::new(
+                            position + 24,
+                            "a payload that follows or was met before",
+                            tile.offset,
+                        )));
+                    }
+                    let stored = if own { u64::from(tile.stored_bytes) } else { 0 };
+                    report.stored_bytes += stored;
+                    position = self.padded(payload + stored)?;
+                }
+                Record::Times(times) => {
+                    let stamps = read_times(&self.file, &self.layout, &times, position)?;
+                    let range = self.layout.frame_range(times.frame_block, report.frames);
+                    let indexed = self.times.get(range.start as usize..range.end as usize).unwrap_or_default();
+                    let same = indexed.iter().map(|t| t.to_bits()).eq(stamps.iter().map(|t| t.to_bits()));
+                    if times.frame_block != blocks_met || !same {
+                        let expected = format!("the time stamps {indexed:?} of frame block {blocks_met}");
+                        return Err(fault(Fault::new(
+                            position,
+                            expected,
+                            format!("{stamps:?} of {}", times.frame_block),
+                        )));
+                    }
+                    blocks_met += 1;
+                    position = self.padded(payload + 8 * stamps.len() as u64)?;
+                }
+                Record::Footer(_) => {
+                    let expected = format!("the footer at byte {}", self.footer_offset);
+                    return Err(fault(Fault::new(position, expected, "another one")));
+                }
+            }
+        }
+        if blocks_met != self.frame_blocks() || report.tiles != self.tiles.len() as u64 {
+            let expected =
+                format!("{} time records and {} tiles before the footer", self.frame_blocks(), self.tiles.len());
+            return Err(fault(Fault::new(self.footer_offset, expected, format!("{blocks_met} and {}", report.tiles))));
+        }
+        Ok(report)
+    }
+
+    fn indexed(&self, index: u64, bytes: &[u8]) -> bool {
+        Record::Tile(self.tiles[index as usize]).to_bytes() == bytes
+    }
+
+    fn verify_tile(&self, tile: &TileRecord, position: u64, buffer: &mut TileBuffer) -> Result<()> {
+        let values = self.read_tile(tile.id, buffer)?.values();
+        let found = stats(bytemuck::cast_slice(values));
+        let bits = |min: f32, max: f32, count: u32| (min.to_bits(), max.to_bits(), count);
+        let stated = tile.stats;
+        if bits(found.min, found.max, found.non_finite) != bits(stated.min, stated.max, stated.non_finite) {
+            let fault = Fault::new(position + 44, format!("{found:?}, as the values are"), format!("{stated:?}"));
+            return Err(fault.at(self.file.path()));
+        }
+        Ok(())
+    }
+
+    /// Checks that zeros fill the file from `end` to the next multiple of 64, which is returned.
+    fn padded(&self, end: u64) -> Result<u64> {
+        let mut zeros = [0; RECORD as usize];
+        let zeros = &mut zeros[..(align(end) - end) as usize];
+        self.file.read_at(end, zeros)?;
+        match zeros.iter().position(|&byte| byte != 0) {
+            Some(at) => Err(self.padding_fault(end + at as u64, zeros[at])),
+            None => Ok(align(end)),
+        }
+    }
+
+    fn padding_fault(&self, offset: u64, byte: u8) -> Error {
+        Fault::new(offset, "a zero byte of padding", format!("{byte:#04x}")).at(self.file.path())
+    }
+}

@@ -1,0 +1,279 @@
+//! Writes a container under a temporary name and renames it when it is complete.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use xxhash_rust::xxh3::xxh3_64;
+
+use crate::codec::EncodedTile;
+use crate::error::{Error, Result};
+use crate::layout::{Layout, TileId};
+use crate::record::{FooterRecord, RECORD, Record, TileRecord, TimesRecord, align, digest, trailer_to_bytes};
+
+/// Writes a container: time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
+///
+/// Tiles may come in any order once the time stamps of their frame block are there. Writing all tiles of
+/// a block before the next lets [`crate::recover`] save most after a crash. The bytes of the file depend on that order;
+/// its digest and content do not.
+///
+/// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian
+/// block is not stored again: a column that never changes costs 64 bytes per further tile and its index entry.
+///
+/// Memory: 80 bytes per tile and 8 per frame for the index, and the largest constant tile.
+///
+/// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished
+/// writer removes it; a killed process leaves it behind, readable by [`crate::recover`].
+pub struct Writer {
+    path: PathBuf,
+    temporary: PathBuf,
+    file: File,
+    layout: Layout,
+    header: Vec<u8>,
+    /// Where the next record goes: a multiple of 64.
+    position: u64,
+    times: Vec<f64>,
+    tiles: Vec<Option<TileRecord>>,
+    written: u64,
+    /// Per column and Gaussian block the last constant tile that was written.
+    constants: Vec<Option<TileRecord>>,
+    stored: Vec<u8>,
+    finished: bool,
+}
+
+impl Writer {
+    /// Starts a container that will be called `path`. Errors: the layout breaks a limit, or the folder
+    /// does not take a new file.
+    pub fn create(path: impl AsRef<Path>, layout: Layout) -> Result<Writer> {
+        let path = path.as_ref();
+        let mut header = layout.to_header()?;
+        let (temporary, file) = create_beside(path)?;
+        let mut writer = Writer {
+            path: path.to_owned(),
+            temporary,
+            file,
+            constants: vec![None; layout.tiles_per_frame_block() as usize],
+            layout,
+            header: Vec::new(),
+            position: 0,
+            times: Vec::new(),
+            tiles: Vec::new(),
+            written: 0,
+            stored: Vec::new(),
+            finished: false,
+        };
+        writer.put(&[&header])?;
+        header.shrink_to_fit();
+        writer.header = header;
+        Ok(writer)
+    }
+
+    /// The shape the container was created with.
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// Adds the next frame block and returns its number. `times` holds the stamps of its frames, as many
+    /// as [`Layout::frame_block`]; fewer (but not none) end the sequence.
+    ///
+    /// Errors: a stamp is not finite or not above the one before; the sequence has ended.
+    pub fn append_times(&mut self, times: &[f64]) -> Result<u32> {
+        let most = self.layout.frame_block as usize;
+        let first = self.times.len();
+        if !first.is_multiple_of(most) {
+            return Err(Error::usage(format!(
+                "frame {first}: no frames can follow a frame block of fewer than {most}"
+            )));
+        }
+        if times.is_empty() || times.len() > most {
+            return Err(Error::usage(format!(
+                "frame {first}: a frame block has 1 to {most} frames, not {}",
+                times.len()
+            )));
+        }
+        let before = self.times.last().copied();
+        check_times(before, times).map_err(|(frame, found)| {
+            Error::usage(format!(
+                "frame {}: time stamps must be finite and strictly increasing, {found}",
+                first + frame
+            ))
+        })?;
+        let block =
+            u32::try_from(first / most).map_err(|_| Error::usage("a container has at most 2³² frame blocks"))?;
+        let payload: Vec<u8> = times.iter().flat_map(|time| time.to_le_bytes()).collect();
+        let record = TimesRecord { frame_block: block, frames: times.len() as u32, checksum: xxh3_64(&payload) };
+        self.put(&[&Record::Times(record).to_bytes(), &payload])?;
+        self.times.extend(times);
+        self.tiles.resize(self.tiles.len() + self.layout.tiles_per_frame_block() as usize, None);
+        Ok(block)
+    }
+
+    /// Writes one tile. Errors: there is no such tile, its time stamps have not been appended, it was written
+    /// already, or `tile` has another shape.
+    pub fn write_tile(&mut self, at: TileId, tile: &EncodedTile) -> Result<()> {
+        let frames = self.layout.frame_range(at.frame_block, self.times.len() as u64);
+        let Some(index) =
+            self.layout.index_of(at).map(|index| index as usize).filter(|&index| index < self.tiles.len())
+        else {
+            return Err(Error::usage(format!("there is no {at:?} after {} frames", self.times.len())));
+        };
+        if self.tiles[index].is_some() {
+            return Err(Error::usage(format!("{at:?} was written already")));
+        }
+        let frames = (frames.end - frames.start) as u32;
+        let width = self.layout.columns[at.column as usize].width;
+        let len = self.layout.block_len(at.gaussian_block);
+        let shape = |frames, width, len| format!("{frames} frames × {width} components × {len} Gaussians");
+        if (tile.width, tile.len) != (width, len) || (tile.frames != frames && !tile.constant) {
+            return Err(Error::usage(format!(
+                "{at:?} holds {}, not {}",
+                shape(frames, width, len),
+                shape(tile.frames, tile.width, tile.len)
+            )));
+        }
+        let mut record = TileRecord {
+            id: at,
+            frames,
+            encoding: tile.encoding,
+            constant: tile.constant,
+            offset: self.position + RECORD,
+            stored_bytes: tile.bytes.len() as u32,
+            checksum: tile.checksum,
+            stats: tile.stats,
+        };
+        let slot = index % self.constants.len();
+        match self.shared_payload(slot, &record, &tile.bytes)? {
+            Some(offset) => {
+                record.offset = offset;
+                self.put(&[&Record::Tile(record).to_bytes()])?;
+            }
+            None => self.put(&[&Record::Tile(record).to_bytes(), &tile.bytes])?,
+        }
+        if record.constant {
+            self.constants[slot] = Some(record);
+        }
+        self.tiles[index] = Some(record);
+        self.written += 1;
+        Ok(())
+    }
+
+    /// Writes the footer, syncs, renames the file to its final name (replacing what was there) and syncs the
+    /// folder. Returns the digest of the content, see [`crate::Reader::digest`].
+    ///
+    /// Errors: a tile is missing. Nothing appears under the final name then.
+    pub fn finish(mut self) -> Result<u64> {
+        if self.written != self.tiles.len() as u64 {
+            let missing = self.tiles.iter().position(Option::is_none).unwrap_or_default();
+            return Err(Error::usage(format!(
+                "{} of {} tiles are missing, the first is {:?}",
+                self.tiles.len() as u64 - self.written,
+                self.tiles.len(),
+                self.layout.tile_at(missing as u64)
+            )));
+        }
+        let tiles: Vec<TileRecord> = self.tiles.iter().flatten().copied().collect();
+        let mut payload = Vec::with_capacity(8 * self.times.len() + RECORD as usize * tiles.len());
+        payload.extend(self.times.iter().flat_map(|time| time.to_le_bytes()));
+        payload.extend(tiles.iter().flat_map(|&tile| Record::Tile(tile).to_bytes()));
+        let footer = FooterRecord {
+            frames: self.times.len() as u64,
+            tiles: tiles.len() as u64,
+            checksum: xxh3_64(&payload),
+            header_checksum: xxh3_64(&self.header),
+        };
+        let trailer = trailer_to_bytes(self.position);
+        // The payload is a multiple of 8 long; the trailer follows it without padding and ends the file.
+        self.put_exactly(&[&Record::Footer(footer).to_bytes(), &payload, &trailer])?;
+        self.file.sync_all().map_err(Error::io("sync", &self.temporary))?;
+        fs::rename(&self.temporary, &self.path).map_err(Error::io("rename", &self.temporary))?;
+        self.finished = true;
+        sync_folder(&self.path)?;
+        Ok(digest(&self.header, &self.times, &tiles))
+    }
+
+    /// Where the bytes of a constant tile already lie in the file, if they do. Equal checksums only
+    /// suggest it; the bytes are read back and compared.
+    fn shared_payload(&mut self, slot: usize, record: &TileRecord, bytes: &[u8]) -> Result<Option<u64>> {
+        let Some(earlier) = self.constants[slot] else { return Ok(None) };
+        if !record.may_share(&TileRecord { offset: record.offset, ..earlier }) {
+            return Ok(None);
+        }
+        self.stored.resize(bytes.len(), 0);
+        let read = self.file.seek(SeekFrom::Start(earlier.offset)).and_then(|_| self.file.read_exact(&mut self.stored));
+        read.map_err(Error::io("read back from", &self.temporary))?;
+        Ok((self.stored == bytes).then_some(earlier.offset))
+    }
+
+    /// Appends `parts` and the zeros that bring the next record to a multiple of 64. After an error the
+    /// position is as before, so that the call may be repeated.
+    fn put(&mut self, parts: &[&[u8]]) -> Result<()> {
+        let len: u64 = parts.iter().map(|part| part.len() as u64).sum();
+        let end = self.position + len;
+        let zeros = [0; RECORD as usize];
+        self.put_exactly(&[parts, &[&zeros[..(align(end) - end) as usize]]].concat())?;
+        self.position = align(end);
+        Ok(())
+    }
+
+    fn put_exactly(&mut self, parts: &[&[u8]]) -> Result<()> {
+        let written = self
+            .file
+            .seek(SeekFrom::Start(self.position))
+            .and_then(|_| parts.iter().try_for_each(|part| self.file.write_all(part)));
+        written.map_err(Error::io("write", &self.temporary))
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        if !self.finished {
+            // Nobody is left to tell of a failure, and the name says that the file is temporary.
+            let _ = fs::remove_file(&self.temporary);
+        }
+    }
+}
+
+/// Checks that `times` are finite and strictly increasing and above `before`; the error names the first that is not.
+pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Result<(), (usize, String)> {
+    let mut last = before;
+    for (frame, &time) in times.iter().enumerate() {
+        if !time.is_finite() {
+            return Err((frame, format!("not {time}")));
+        }
+        if let Some(last) = last.filter(|&last| last >= time) {
+            return Err((frame, format!("not {time} after {last}")));
+        }
+        last = Some(time);
+    }
+    Ok(())
+}
+
+/// A new file in the folder of `path`, hidden, named after it and this process, ending in `.tmp`.
+fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let Some(name) = path.file_name() else {
+        return Err(Error::usage(format!("{} names no file", path.display())));
+    };
+    loop {
+        let number = COUNTER.fetch_add(1, Ordering::Relaxed);
+        let mut hidden = std::ffi::OsString::from(".");
+        hidden.push(name);
+        hidden.push(format!(".{}-{number}.tmp", std::process::id()));
+        let temporary = path.with_file_name(hidden);
+        match OpenOptions::new().read(true).write(true).create_new(true).open(&temporary) {
+            // Left by a killed process that had the same number: take the next name.
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
+            opened => return opened.map_err(Error::io("create", &temporary)).map(|file| (temporary, file)),
+        }
+    }
+}
+
+/// Makes a rename last through a power failure. Elsewhere than on Unix folders cannot be synced.
+fn sync_folder(path: &Path) -> Result<()> {
+    if cfg!(unix) {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        File::open(folder).and_then(|folder| folder.sync_all()).map_err(Error::io("sync", folder))?;
+    }
+    Ok(())
+}
