@@ -1,5 +1,13 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
+mod gather;
 mod progress;
+mod scan;
 
+pub use gather::gather;
 pub use progress::Progress;
+pub use scan::{Scanned, scan};
+
+/// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.
+/// Results do not depend on it.
+pub const BLOCK: usize = 1024;

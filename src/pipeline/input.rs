@@ -1,0 +1,201 @@
+//! Opening whatever the user names: a model, frames, a container; and the cameras that look at it.
+
+use std::path::{Path, PathBuf};
+
+use crate::error::{Error, Result};
+use crate::ingest::cameras::{self, CameraOptions};
+use crate::ingest::container::Container;
+use crate::ingest::model_folder::ModelFolder;
+use crate::ingest::ply_sequence::PlySequence;
+use crate::model::{Columns, Rig, Schedule, Split};
+use crate::pass::FrameSource;
+use crate::pipeline::summary::InputSummary;
+use crate::stream::gather;
+
+/// What to read and from where to look.
+#[derive(Debug, Clone, Default)]
+pub struct InputOptions {
+    /// Model folder, folder of PLY files, .ply or .gseq.
+    pub path: PathBuf,
+    /// Training iteration of a model folder; none: the largest.
+    pub iteration: Option<u32>,
+    /// Frames of a model that is continuous in time; none: the cameras' times.
+    pub frames: Option<usize>,
+    /// Camera file or folder; none: searched for.
+    pub cameras: Option<PathBuf>,
+    /// Picture size where the cameras name none.
+    pub size: Option<(u32, u32)>,
+    /// Which pictures to score with; none: all.
+    pub split: Option<Split>,
+}
+
+/// An open input.
+pub enum Input {
+    /// A trained 4DGaussians model.
+    Model(ModelFolder),
+    /// PLY files, one per frame.
+    Frames(PlySequence),
+    /// A container.
+    Container(Container),
+}
+
+/// An input with the cameras that look at it.
+pub struct Scene {
+    /// Path as given.
+    pub path: PathBuf,
+    /// The input.
+    pub input: Input,
+    /// All cameras.
+    pub rig: Rig,
+    /// The cameras of the chosen split, frame by frame.
+    pub schedule: Schedule,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Opens an input and its cameras.
+pub fn open_scene(options: &InputOptions) -> Result<Scene> {
+    let path = &options.path;
+    let mut notes = Vec::new();
+    let mut input = Input::open(path, options.iteration)?;
+    let camera_options = CameraOptions { size: options.size, frames: options.frames, ..CameraOptions::default() };
+    let rig = match camera_path(options, &input) {
+        Some(found) => Some(cameras::load(&found, &camera_options)?),
+        None => None,
+    };
+    let times = rig.as_ref().map(Rig::times).unwrap_or_default();
+    if let Input::Model(model) = &mut input {
+        let times = match options.frames {
+            Some(frames) => (0..frames).map(|i| i as f64 / frames as f64).collect(),
+            None if !times.is_empty() => times.clone(),
+            None => {
+                notes.push(format!("the model names no frames: {DEFAULT_FRAMES} evenly spaced ones (--frames)"));
+                (0..DEFAULT_FRAMES).map(|i| i as f64 / DEFAULT_FRAMES as f64).collect()
+            }
+        };
+        model.set_times(times)?;
+    } else if options.frames.is_some() {
+        return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.display())));
+    }
+    if let Input::Frames(frames) = &mut input
+        && !times.is_empty()
+    {
+        let found = frames.info().times.len();
+        if times.len() != found {
+            return Err(Error::usage(format!(
+                "{}: {found} frames, but the cameras of {} have {} distinct times\n  give the cameras of this sequence",
+                path.display(),
+                rig.as_ref().map_or("", |rig| rig.origin.as_str()),
+                times.len()
+            )));
+        }
+        frames.set_times(times)?;
+    }
+    let rig = match rig {
+        Some(rig) => rig,
+        None => {
+            let rig = virtual_rig(input.source())?;
+            notes.push(format!("no cameras given or found: {}", rig.origin));
+            rig
+        }
+    };
+    let schedule = rig.schedule(&input.source().info().times, options.split)?;
+    if schedule.pairs() == 0 {
+        return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
+    }
+    Ok(Scene { path: path.clone(), input, rig, schedule, notes })
+}
+
+/// Frames of a model for which neither cameras nor the user name any.
+const DEFAULT_FRAMES: usize = 60;
+
+fn camera_path(options: &InputOptions, input: &Input) -> Option<PathBuf> {
+    options.cameras.clone().or_else(|| match input {
+        Input::Model(model) => cameras::find(model.source_path()?, &options.path),
+        _ => None,
+    })
+}
+
+/// A rig around the robust middle of the first frame.
+fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
+    let ids: Vec<u32> = (0..source.info().count as u32).collect();
+    let state = gather(source, &ids, 0, Columns::POSITION)?;
+    let bounds = crate::stats::RobustBox::of(&state.position);
+    Ok(cameras::virtual_rig(bounds.middle, bounds.extent()))
+}
+
+impl Input {
+    /// Opens a path by what it is.
+    pub fn open(path: &Path, iteration: Option<u32>) -> Result<Input> {
+        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+        let meta = std::fs::metadata(path).map_err(Error::io("open", path))?;
+        let input = if meta.is_dir() {
+            if path.join("cfg_args").exists() || path.join("point_cloud").is_dir() {
+                return Ok(Input::Model(ModelFolder::open(path, iteration)?));
+            }
+            Input::Frames(PlySequence::open(path)?)
+        } else if extension == "ply" {
+            Input::Frames(PlySequence::single(path)?)
+        } else if extension == "gseq" {
+            Input::Container(Container::open(path)?)
+        } else {
+            return Err(Error::input(path, "", "a 4DGaussians model folder, a folder of PLY files, a .ply or a .gseq", "another kind of file"));
+        };
+        match iteration {
+            Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.display()))),
+            None => Ok(input),
+        }
+    }
+
+    /// Its frames.
+    pub fn source(&self) -> &dyn FrameSource {
+        match self {
+            Input::Model(model) => model,
+            Input::Frames(frames) => frames,
+            Input::Container(container) => container,
+        }
+    }
+
+    /// What it is, for people.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Input::Model(_) => "4DGaussians model",
+            Input::Frames(_) => "PLY frames",
+            Input::Container(_) => "gseq container",
+        }
+    }
+
+    /// Hash over the bytes read.
+    pub fn digest(&self) -> Result<String> {
+        match self {
+            Input::Model(model) => model.digest(),
+            Input::Frames(frames) => frames.digest(),
+            Input::Container(container) => Ok(container.digest()),
+        }
+    }
+
+    /// What the summary says of it.
+    pub fn summary(&self, path: &Path) -> Result<InputSummary> {
+        let info = self.source().info();
+        Ok(InputSummary {
+            path: path.display().to_string(),
+            kind: self.kind(),
+            digest: self.digest()?,
+            gaussians: info.count,
+            frames: info.times.len(),
+            sh_degree: info.sh_degree,
+            varying: info.varying.iter().map(Columns::name).collect(),
+            bytes: self.bytes()?,
+        })
+    }
+
+    /// Bytes of the files that grow with the Gaussians.
+    fn bytes(&self) -> Result<u64> {
+        let paths: Vec<&Path> = match self {
+            Input::Model(model) => vec![model.ply_path()],
+            Input::Frames(frames) => frames.paths().collect(),
+            Input::Container(container) => vec![container.path()],
+        };
+        paths.iter().map(|path| Ok(std::fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
+    }
+}

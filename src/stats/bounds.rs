@@ -1,0 +1,69 @@
+//! The robust extent of a scene, the unit of relative lengths.
+
+use glam::DVec3;
+
+use crate::model::Column;
+
+/// Box between the 1st and 99th percentile of the positions, axis by axis: a few floaters do not
+/// stretch it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RobustBox {
+    /// 1st percentiles, scene units.
+    pub low: DVec3,
+    /// Medians.
+    pub middle: DVec3,
+    /// 99th percentiles.
+    pub high: DVec3,
+}
+
+impl RobustBox {
+    /// The box of `position` (`[3, N]`); percentiles are nearest ranks over finite values. Without
+    /// any, a point at the origin.
+    pub fn of(position: &Column) -> RobustBox {
+        let mut found = RobustBox { low: DVec3::ZERO, middle: DVec3::ZERO, high: DVec3::ZERO };
+        for axis in 0..3 {
+            let mut values: Vec<f32> = position.plane(axis).iter().copied().filter(|x| x.is_finite()).collect();
+            let mut percentile = |p: usize| -> f64 {
+                if values.is_empty() {
+                    return 0.0;
+                }
+                let rank = (values.len() * p).div_ceil(100).max(1) - 1;
+                (*values.select_nth_unstable_by(rank, f32::total_cmp).1).into()
+            };
+            found.low[axis] = percentile(1);
+            found.middle[axis] = percentile(50);
+            found.high[axis] = percentile(99);
+        }
+        found
+    }
+
+    /// The longest side; 1 for a scene without any, so that lengths can be divided by it.
+    pub fn extent(&self) -> f64 {
+        let longest = (self.high - self.low).max_element();
+        if longest > 0.0 { longest } else { 1.0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn floaters_and_nan_do_not_stretch_the_box() {
+        let mut position = Column::zeros(3, 1000);
+        for i in 0..1000 {
+            position.set_row(i, [i as f32, 2.0, -(i as f32)]);
+        }
+        position.set_row(0, [-1e9, f32::NAN, f32::INFINITY]);
+        let found = RobustBox::of(&position);
+        assert_eq!(found.low, DVec3::new(9.0, 2.0, -990.0));
+        assert_eq!(found.high.x, 989.0);
+        assert_eq!(found.extent(), 980.0);
+    }
+
+    #[test]
+    fn extent_of_nothing_is_one() {
+        assert_eq!(RobustBox::of(&Column::zeros(3, 0)).extent(), 1.0);
+        assert_eq!(RobustBox::of(&Column::zeros(3, 7)).extent(), 1.0);
+    }
+}
