@@ -1,1 +1,3 @@
 //! Sources: model folders, PLY files and sequences, containers, cameras.
+
+pub mod cameras;

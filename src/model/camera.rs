@@ -28,6 +28,28 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// A camera at `eye` with `target` in the middle of its picture, z up in it, pixels square.
+    ///
+    /// `angle` is the horizontal field of view in radians, `size` (width, height) in pixels. The two
+    /// points must differ and not lie above one another; else the rotation is NaN.
+    pub fn look_at(eye: DVec3, target: DVec3, angle: f64, (width, height): (u32, u32)) -> Camera {
+        let forward = (target - eye).normalize();
+        let right = forward.cross(DVec3::Z).normalize();
+        let down = forward.cross(right);
+        let rotation = DMat3::from_cols(right, down, forward).transpose();
+        let focal = 0.5 * f64::from(width) / (0.5 * angle).tan();
+        Camera {
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx: 0.5 * f64::from(width),
+            cy: 0.5 * f64::from(height),
+            rotation,
+            translation: -(rotation * eye),
+        }
+    }
+
     /// Position of the camera in the world.
     pub fn center(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
@@ -35,7 +57,7 @@ impl Camera {
 }
 
 /// The part of a data set a picture belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Split {
     /// Pictures the model was trained on; compression scores with these.
     Train,
@@ -65,54 +87,82 @@ pub struct Rig {
     pub cameras: Vec<Camera>,
     /// Every picture, in file order.
     pub shots: Vec<Shot>,
+    /// Linear RGB in [0, 1] behind the scene, if the cameras' file says.
+    pub background: Option<[f32; 3]>,
     /// Where they come from, for people: a path, or the recipe of a virtual rig.
     pub origin: String,
 }
 
+/// How far from a frame's time stamp a picture may be taken and still show that frame, in parts of
+/// the time span: files round their times, and a million frames are still told apart.
+const TIME_TOLERANCE: f64 = 1e-6;
+
 impl Rig {
     /// The distinct times of all pictures, increasing; empty when no picture has a time.
+    ///
+    /// Times within half the tolerance of [`Rig::schedule`] above another are that one: training and
+    /// held-out pictures of one moment may have been rounded differently.
     pub fn times(&self) -> Vec<f64> {
         let mut times: Vec<f64> = self.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
-        times.dedup();
+        let near = 0.5 * TIME_TOLERANCE * span(&times);
+        times.dedup_by(|later, kept| *later - *kept <= near);
         times
     }
 
     /// Which cameras see which frame, for the pictures of one split (`None`: all of them).
     ///
-    /// A picture belongs to the frame whose time stamp lies within 1e-6 of the time span of its own.
+    /// `frame_times` must increase. A picture belongs to the nearest frame, which must lie within
+    /// 1e-6 of the time span (of 1, if there is one frame); a picture without a time to every frame.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] when a picture was taken at no frame's time.
     pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<Schedule> {
         let mut frames = vec![Vec::new(); frame_times.len()];
-        let span = match frame_times {
-            [first, .., last] => last - first,
-            _ => 1.0,
-        };
+        let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };
         for shot in self.shots.iter().filter(|shot| split.is_none_or(|split| split == shot.split)) {
             match shot.time {
                 None => frames.iter_mut().for_each(|frame| frame.push((shot.view, shot.camera))),
                 Some(time) => {
-                    let after = frame_times.partition_point(|&t| t < time);
-                    let nearest = [after.wrapping_sub(1), after]
-                        .into_iter()
-                        .filter(|&i| i < frame_times.len() && (frame_times[i] - time).abs() <= 1e-6 * span)
-                        .min_by(|&a, &b| (frame_times[a] - time).abs().total_cmp(&(frame_times[b] - time).abs()));
-                    let Some(frame) = nearest else {
-                        return Err(Error::usage(format!(
-                            "{}: view {} was taken at time {time}, which is no frame of the sequence ({} frames from {:?} to {:?})\n  \
-                             give the cameras of this scene, or --frames to match their number",
-                            self.origin,
-                            shot.view,
-                            frame_times.len(),
-                            frame_times.first(),
-                            frame_times.last(),
-                        )));
-                    };
+                    let frame = nearest(frame_times, time)
+                        .filter(|&frame| (frame_times[frame] - time).abs() <= tolerance)
+                        .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))?;
                     frames[frame].push((shot.view, shot.camera));
                 }
             }
         }
         Ok(Schedule { cameras: self.cameras.clone(), frames })
     }
+
+    fn no_such_frame(&self, view: u32, time: f64, frame_times: &[f64]) -> Error {
+        let frames = match frame_times {
+            [] => "has none".to_owned(),
+            [only] => format!("has one, at time {only}"),
+            [first, .., last] => format!("has {}, from time {first} to {last}", frame_times.len()),
+        };
+        Error::usage(format!(
+            "{}: view {view} was taken at time {time}, which is no frame of the sequence: it {frames}\n  \
+             give the cameras of this scene, or --frames to match their number",
+            self.origin,
+        ))
+    }
+}
+
+/// Last minus first; 0 of fewer than two.
+fn span(times: &[f64]) -> f64 {
+    match times {
+        [first, .., last] => last - first,
+        _ => 0.0,
+    }
+}
+
+/// Index of the increasing `times` nearest to `time`, the earlier of two equally near.
+fn nearest(times: &[f64], time: f64) -> Option<usize> {
+    let after = times.partition_point(|&t| t < time);
+    [after.wrapping_sub(1), after]
+        .into_iter()
+        .filter(|&i| i < times.len())
+        .min_by(|&a, &b| (times[a] - time).abs().total_cmp(&(times[b] - time).abs()))
 }
 
 /// Which cameras see which frame.
@@ -128,5 +178,105 @@ impl Schedule {
     /// M, the number of (time, view) pairs.
     pub fn pairs(&self) -> usize {
         self.frames.iter().map(Vec::len).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rig(shots: &[(u32, Option<f64>, Split)]) -> Rig {
+        let camera = |view: u32| Camera::look_at(DVec3::new(f64::from(view), -5.0, 1.0), DVec3::ZERO, 1.0, (64, 48));
+        let views = shots.iter().map(|shot| shot.0).max().map_or(0, |last| last + 1);
+        let shot = |&(view, time, split)| Shot { view, camera: view, time, split, image: None };
+        Rig {
+            cameras: (0..views).map(camera).collect(),
+            shots: shots.iter().map(shot).collect(),
+            background: None,
+            origin: "test.json".into(),
+        }
+    }
+
+    #[test]
+    fn center_is_where_camera_coordinates_vanish() {
+        let camera = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), DVec3::new(-1.0, 0.5, 0.0), 0.9, (10, 10));
+        assert!((camera.center() - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-14);
+        assert!((camera.rotation * camera.center() + camera.translation).length() < 1e-14);
+    }
+
+    #[test]
+    fn target_is_in_the_middle_and_z_is_up() {
+        let target = DVec3::new(-1.0, 0.5, 0.0);
+        let camera = Camera::look_at(DVec3::new(1.0, 2.0, 3.0), target, 0.9, (40, 30));
+        let seen = camera.rotation * target + camera.translation;
+        assert!(seen.x.abs() < 1e-14 && seen.y.abs() < 1e-14 && seen.z > 0.0, "{seen}");
+        assert!((camera.rotation * DVec3::Z).y < 0.0);
+        assert!((camera.rotation.determinant() - 1.0).abs() < 1e-14);
+        let edge = (0.5 * f64::from(camera.width) / camera.fx).atan();
+        assert!((edge - 0.45).abs() < 1e-14);
+    }
+
+    #[test]
+    fn every_picture_of_a_synchronised_rig_lands_on_its_frame() {
+        let times = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
+        let shots: Vec<_> = times.iter().flat_map(|&t| (0..3).map(move |v| (v, Some(t), Split::Train))).collect();
+        let rig = rig(&shots);
+        assert_eq!(rig.times(), times);
+        let schedule = rig.schedule(&times, Some(Split::Train)).unwrap();
+        assert_eq!(schedule.pairs(), 12);
+        assert!(schedule.frames.iter().all(|frame| frame == &[(0, 0), (1, 1), (2, 2)]));
+    }
+
+    #[test]
+    fn monocular_capture_has_one_view_per_frame_and_its_gaps_stay() {
+        let rig = rig(&[(0, Some(0.0), Split::Train), (1, Some(0.5), Split::Test), (2, Some(1.0), Split::Train)]);
+        let times = rig.times();
+        assert_eq!(times, [0.0, 0.5, 1.0]);
+        assert_eq!(rig.schedule(&times, Some(Split::Train)).unwrap().frames, [vec![(0, 0)], vec![], vec![(2, 2)]]);
+        assert_eq!(rig.schedule(&times, Some(Split::Test)).unwrap().frames, [vec![], vec![(1, 1)], vec![]]);
+        assert_eq!(rig.schedule(&times, None).unwrap().pairs(), 3);
+    }
+
+    #[test]
+    fn picture_without_time_shows_every_frame() {
+        let rig = rig(&[(0, None, Split::Train), (1, None, Split::Test)]);
+        assert!(rig.times().is_empty());
+        assert_eq!(rig.schedule(&[0.0, 7.0], None).unwrap().frames, vec![vec![(0, 0), (1, 1)]; 2]);
+        assert_eq!(rig.schedule(&[], None).unwrap().frames.len(), 0);
+    }
+
+    #[test]
+    fn rounding_of_times_neither_splits_a_frame_nor_loses_a_picture() {
+        let exact: Vec<f64> = (0..60).map(|t| f64::from(t) / 59.0).collect();
+        let shots: Vec<_> = exact
+            .iter()
+            .flat_map(|&t| [(0, Some(t), Split::Train), (1, Some((t * 1e8).round() / 1e8), Split::Test)])
+            .collect();
+        let rig = rig(&shots);
+        let times = rig.times();
+        assert_eq!(times.len(), 60);
+        assert!(rig.schedule(&times, None).unwrap().frames.iter().all(|frame| frame.len() == 2));
+    }
+
+    #[test]
+    fn a_million_frames_are_told_apart() {
+        const T: usize = 1_000_000;
+        let shots: Vec<_> = (0..T).map(|t| (0, Some(t as f64 / (T - 1) as f64), Split::Train)).collect();
+        let rig = rig(&shots);
+        let times = rig.times();
+        assert_eq!(times.len(), T);
+        assert!(rig.schedule(&times, None).unwrap().frames.iter().all(|frame| frame.len() == 1));
+    }
+
+    #[test]
+    fn picture_of_no_frame_is_refused_by_name() {
+        let rig = rig(&[(0, Some(0.0), Split::Train), (3, Some(0.25), Split::Test)]);
+        let message = rig.schedule(&[0.0, 0.5, 1.0], None).unwrap_err().to_string();
+        for part in ["test.json", "view 3", "0.25", "has 3, from time 0 to 1", "--frames"] {
+            assert!(message.contains(part), "{part:?} is not in {message:?}");
+        }
+        assert!(rig.schedule(&[0.0, 0.5, 1.0], Some(Split::Train)).is_ok(), "the other split is not looked at");
+        assert!(rig.schedule(&[], None).unwrap_err().to_string().contains("has none"));
+        assert!(rig.schedule(&[5.0], None).unwrap_err().to_string().contains("has one, at time 5"));
     }
 }

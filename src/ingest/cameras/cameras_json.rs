@@ -1,0 +1,94 @@
+//! The two files called `cameras.json`.
+//!
+//! *This project's*, one entry per picture:
+//!
+//! ```json
+//! { "background": [1, 1, 1],
+//!   "frames": [ { "v": 0, "time": 0.0, "split": "train", "image": "train/t000_v00.png",
+//!                 "width": 288, "height": 288, "fx": 347.6, "fy": 347.6, "cx": 144, "cy": 144,
+//!                 "w2c": [[1,0,0,0],[0,1,0,0],[0,0,1,3],[0,0,0,1]] } ] }
+//! ```
+//!
+//! `w2c` is world to camera, row-major, OpenCV axes; focal lengths and the principal point are in
+//! pixels, the middle of the picture at `width / 2`. Optional: `background` (linear RGB in [0, 1]),
+//! `v` (view number, else by distinct camera), `time` (else every frame), `split` (`train` or `test`,
+//! else train), `image` (relative to the file). Other keys are ignored.
+//!
+//! *3DGS's*, one entry per camera, written beside a trained model: `width`, `height`, `fx`, `fy`,
+//! `position` (of the camera), `rotation` (camera to world, row-major, OpenCV axes), `img_name`. It
+//! has no times, so each camera sees every frame; it does not tell test from train, so all are train.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::assemble::{Picture, assemble, from_camera_to_world, view_in_name};
+use super::fields::{Fields, describe};
+use crate::error::{Error, Result};
+use crate::model::{Camera, Rig, Split};
+
+/// Reads this project's own file.
+pub(super) fn load_per_picture(file: &Path, document: &Value) -> Result<Rig> {
+    let shared = Fields::of(file, None, document)?;
+    let background = shared.optional_vector("background")?;
+    if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
+        return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
+    }
+    let mut pictures = Vec::new();
+    for (index, frame) in shared.list("frames")?.iter().enumerate() {
+        pictures.push(per_picture(file, Fields::of(file, Some(index), frame)?)?);
+    }
+    let background = background.map(|rgb| rgb.map(|c| c as f32));
+    assemble(vec![(file.to_owned(), pictures)], background, file.display().to_string())
+}
+
+fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
+    let (rotation, translation) = own.pose("w2c")?;
+    let split = match own.optional_text("split")? {
+        None | Some("train") => Split::Train,
+        Some("test") => Split::Test,
+        Some(_) => return Err(own.wrong("split", "\"train\" or \"test\"")),
+    };
+    let camera = Camera {
+        width: own.side("width")?,
+        height: own.side("height")?,
+        fx: own.number("fx")?,
+        fy: own.number("fy")?,
+        cx: own.number("cx")?,
+        cy: own.number("cy")?,
+        rotation,
+        translation,
+    };
+    Ok(Picture {
+        camera,
+        time: own.optional_number("time")?,
+        split,
+        image: own.optional_text("image")?.map(|name| file.with_file_name(name)),
+        view: own.optional_index("v")?,
+    })
+}
+
+/// Reads the file of a 3DGS model folder.
+pub(super) fn load_per_camera(file: &Path, document: &Value) -> Result<Rig> {
+    let Value::Array(list) = document else {
+        return Err(Error::input(file, "", "a list of cameras", describe(document)));
+    };
+    let mut pictures = Vec::new();
+    for (index, entry) in list.iter().enumerate() {
+        pictures.push(per_camera(file, Fields::of(file, Some(index), entry)?)?);
+    }
+    assemble(vec![(file.to_owned(), pictures)], None, file.display().to_string())
+}
+
+fn per_camera(file: &Path, own: Fields<'_>) -> Result<Picture> {
+    let size @ (width, height) = (own.side("width")?, own.side("height")?);
+    let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];
+    let name = own.optional_text("img_name")?;
+    Ok(Picture {
+        camera: from_camera_to_world(size, intrinsics, own.matrix3("rotation")?, own.vector("position")?.into()),
+        time: None,
+        split: Split::Train,
+        image: name.map(|name| file.with_file_name(name)),
+        view: name.and_then(view_in_name),
+    })
+}

@@ -1,0 +1,175 @@
+//! Cameras of a data set, from whichever file describes them, as a [`Rig`].
+//!
+//! | file | times | splits |
+//! |---|---|---|
+//! | `transforms_train.json` + `transforms_test.json`, `transforms.json` (NeRF, D-NeRF) | `time` | from the names |
+//! | `cameras.json` of this project ([`cameras_json`]) | `time` | `split` |
+//! | `cameras.json` of a 3DGS model folder ([`cameras_json`]) | none: every frame | all train |
+//! | `poses_bounds.npy` (LLFF, DyNeRF; [`llff`]) | i/n | camera 0 is test |
+//!
+//! Everything leaves in OpenCV axes, world to camera, in f64, rotations checked to be rotations.
+//! Memory: the parsed file; one small record per picture.
+
+mod assemble;
+mod cameras_json;
+mod fields;
+mod llff;
+mod transforms;
+mod virtual_rig;
+
+#[cfg(test)]
+mod tests;
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use crate::error::{Error, Result};
+use crate::model::Rig;
+
+pub use virtual_rig::{robust_bounds, virtual_rig};
+
+/// Largest camera file that is read. 10⁵ pictures take some 60 MB of JSON.
+const MAX_FILE_BYTES: u64 = 256 << 20;
+/// Largest picture side in pixels: beyond it the width times the height of one picture nears 2³².
+const MAX_SIDE_PX: u32 = 1 << 15;
+/// Most pictures of a rig.
+const MAX_PICTURES: usize = 1 << 24;
+
+/// What a folder is searched for, first match wins. `transforms*.json` come before `cameras.json`
+/// because a 3DGS `cameras.json` beside them has lost the times.
+const NAMES: [&str; 5] =
+    ["transforms_train.json", "transforms_test.json", "transforms.json", "cameras.json", "poses_bounds.npy"];
+
+/// Where COLMAP puts a reconstruction inside a data set.
+const COLMAP: [&str; 5] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin"];
+
+/// What the camera files may leave open.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct CameraOptions {
+    /// Picture (width, height) in pixels where the file names none and the picture is not there to
+    /// be asked. For `poses_bounds.npy`: instead of half the recorded size.
+    pub size: Option<(u32, u32)>,
+    /// Frames of a `poses_bounds.npy`, which does not count them: 300 if not given.
+    pub frames: Option<usize>,
+}
+
+/// Reads the cameras of `path`: a file, or a folder holding one, recognised by its name and content.
+///
+/// # Errors
+/// [`Error::Input`] naming the file and the picture ("frame 12" counts from 0 in file order) when a
+/// value is missing, not finite, out of range, when a rotation is none, or when one view is taken
+/// twice at the same time; [`Error::Usage`] when `options` are out of range.
+pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
+    check_options(options)?;
+    let Some(file) = locate(path) else {
+        // A path that cannot be looked at at all is the more useful thing to say.
+        path.metadata().map_err(Error::io("open", path))?;
+        return Err(Error::input(path, "", format!("a folder with one of {}", NAMES.join(", ")), "none of them"));
+    };
+    if is_colmap(&file) {
+        return Err(Error::input(&file, "", "cameras as JSON or poses_bounds.npy", "a COLMAP reconstruction")
+            .hint("COLMAP is not read: convert it to transforms.json, e.g. with colmap2nerf.py of instant-ngp"));
+    }
+    if file.extension().is_some_and(|extension| extension == "npy") {
+        return llff::load(&file, options);
+    }
+    let document = read_json(&file)?;
+    match kind(&document) {
+        Some(Kind::Transforms) => transforms::load(&file, document, options),
+        Some(Kind::PerPicture) => cameras_json::load_per_picture(&file, &document),
+        Some(Kind::PerCamera) => cameras_json::load_per_camera(&file, &document),
+        None => Err(Error::input(
+            &file,
+            "",
+            "a list of cameras, or an object with a non-empty list \"frames\" of objects with \
+             \"transform_matrix\" or \"w2c\"",
+            fields::describe(&document),
+        )),
+    }
+}
+
+/// Looks for the cameras a model was trained with: `source_path` is what its configuration says.
+///
+/// A relative path is tried from the working folder, then from each folder above the model's, the
+/// nearest first. `None` when nothing there holds cameras; never an error.
+pub fn find(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
+    if source_path.is_empty() {
+        return None;
+    }
+    let model_folder = std::path::absolute(model_folder).ok()?;
+    let beside = model_folder.ancestors().skip(1).map(|folder| folder.join(source_path));
+    std::iter::once(PathBuf::from(source_path)).chain(beside).find(|path| locate(path).is_some())
+}
+
+/// The camera file `path` stands for: itself, or the first known name inside the folder.
+fn locate(path: &Path) -> Option<PathBuf> {
+    if path.is_file() {
+        return Some(path.to_owned());
+    }
+    if is_colmap(path) && path.is_dir() {
+        return Some(path.to_owned());
+    }
+    let json_or_npy = NAMES.iter().map(|name| path.join(name)).find(|file| file.is_file());
+    json_or_npy.or_else(|| COLMAP.iter().map(|name| path.join(name)).find(|found| found.exists()))
+}
+
+fn is_colmap(path: &Path) -> bool {
+    COLMAP.iter().any(|name| path.ends_with(name))
+}
+
+enum Kind {
+    /// NeRF: camera to world, OpenGL axes.
+    Transforms,
+    /// This project's: one entry per picture.
+    PerPicture,
+    /// 3DGS: one entry per camera.
+    PerCamera,
+}
+
+fn kind(document: &Value) -> Option<Kind> {
+    if document.is_array() {
+        return Some(Kind::PerCamera);
+    }
+    let first = document.get("frames")?.get(0)?;
+    if first.get("w2c").is_some() {
+        Some(Kind::PerPicture)
+    } else if first.get("transform_matrix").is_some() {
+        Some(Kind::Transforms)
+    } else {
+        None
+    }
+}
+
+fn check_options(options: &CameraOptions) -> Result<()> {
+    let side = 1..=MAX_SIDE_PX;
+    if let Some((width, height)) = options.size.filter(|(w, h)| !side.contains(w) || !side.contains(h)) {
+        return Err(Error::usage(format!(
+            "picture size {width}x{height}: each side must be 1 to {MAX_SIDE_PX} pixels"
+        )));
+    }
+    if options.frames == Some(0) {
+        return Err(Error::usage("frames 0: there must be at least one"));
+    }
+    Ok(())
+}
+
+/// The bytes of a file no larger than the limit.
+fn read_limited(path: &Path) -> Result<Vec<u8>> {
+    let file = File::open(path).map_err(Error::io("open", path))?;
+    let mut bytes = Vec::new();
+    file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        return Err(Error::input(path, "", format!("a camera file of at most {MAX_FILE_BYTES} bytes"), "a larger one"));
+    }
+    Ok(bytes)
+}
+
+fn read_json(path: &Path) -> Result<Value> {
+    serde_json::from_slice(&read_limited(path)?).map_err(|error| {
+        Error::input(path, format!("line {}, column {}", error.line(), error.column()), "JSON", error.to_string())
+            .hint("NaN and Infinity are not JSON numbers: if a pose holds them, take the picture out of the file")
+    })
+}

@@ -1,0 +1,387 @@
+//! Cameras as real data sets write them, and what is said of those that are wrong.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+use serde_json::{Value, json};
+
+use super::{CameraOptions, find, load};
+use crate::model::{Camera, Rig, Split};
+
+fn shared_models() -> Vec<PathBuf> {
+    let data = std::env::var_os("SPLATSIEVE_DATA")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let models = ["deform2", "room2_big", "room2_dynerf"].map(|name| data.join(name));
+    models.into_iter().filter(|model| model.is_dir()).collect()
+}
+
+/// A folder with these files.
+fn folder(files: &[(&str, &Value)]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, content) in files {
+        fs::write(folder.path().join(name), content.to_string()).unwrap();
+    }
+    folder
+}
+
+fn load_json(name: &str, content: &Value) -> crate::error::Result<Rig> {
+    load(folder(&[(name, content)]).path(), &CameraOptions::default())
+}
+
+/// The message for a file of this name and content, which must contain every part.
+fn assert_refused(name: &str, content: &Value, parts: &[&str]) {
+    let message = load_json(name, content).unwrap_err().to_string();
+    for part in parts.iter().chain(&[name]) {
+        assert!(message.contains(part), "{part:?} is not in {message:?}");
+    }
+}
+
+/// OpenGL camera-to-world: at `eye`, looking along +y of the world, z up.
+fn along_y(eye: [f64; 3]) -> Value {
+    json!([[1, 0, 0, eye[0]], [0, 0, -1, eye[1]], [0, 1, 0, eye[2]], [0, 0, 0, 1]])
+}
+
+fn transforms(times: &[f64]) -> Value {
+    let frame = |(i, time): (usize, &f64)| {
+        json!({"file_path": format!("./train/r_{i:03}"), "time": time,
+               "transform_matrix": along_y([i as f64, -4.0, 1.0])})
+    };
+    let frames: Vec<Value> = times.iter().enumerate().map(frame).collect();
+    json!({"camera_angle_x": 1.0, "w": 80, "h": 60, "frames": frames})
+}
+
+fn per_picture(times: &[f64]) -> Value {
+    let frame = |time: &f64| {
+        json!({"v": 4, "time": time, "width": 80, "height": 60, "fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": 31.0,
+               "w2c": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]})
+    };
+    json!({"background": [1, 0.5, 0], "frames": times.iter().map(frame).collect::<Vec<_>>()})
+}
+
+/// A file as NumPy's format 1.0 has it.
+fn npy(dtype: &str, order: &str, shape: &str, rows: &[[f64; 17]]) -> Vec<u8> {
+    let header = format!("{{'descr': '{dtype}', 'fortran_order': {order}, 'shape': {shape}, }}");
+    let mut bytes = b"\x93NUMPY\x01\0\x76\0".to_vec();
+    bytes.extend(format!("{header:117}\n").bytes());
+    bytes.extend(rows.iter().flatten().flat_map(|x| x.to_le_bytes()));
+    bytes
+}
+
+fn write_npy(path: &Path, rows: &[[f64; 17]]) {
+    fs::write(path, npy("<f8", "False", &format!("({}, 17)", rows.len()), rows)).unwrap();
+}
+
+/// A row for a camera at `eye` looking along +y of the world, z up.
+fn llff_row(eye: [f64; 3], height: f64, width: f64, focal: f64) -> [f64; 17] {
+    let [x, y, z] = eye;
+    // Columns: down −z, right +x, backward −y, position, (height, width, focal).
+    [0.0, 1.0, 0.0, x, height, 0.0, 0.0, -1.0, y, width, -1.0, 0.0, 0.0, z, focal, 0.1, 9.0]
+}
+
+#[test]
+fn transforms_and_cameras_json_of_the_trained_models_give_the_same_cameras() {
+    let models = shared_models();
+    if models.is_empty() {
+        eprintln!("skipped: the shared models are not here");
+    }
+    for model in models {
+        let options = CameraOptions::default();
+        let transforms = load(&model, &options).unwrap();
+        let cameras = load(&model.join("cameras.json"), &options).unwrap();
+        for rig in [&transforms, &cameras] {
+            assert_eq!(rig.cameras.len(), 16, "{}", rig.origin);
+            let count = |split| rig.shots.iter().filter(|shot| shot.split == split).count();
+            assert_eq!((count(Split::Train), count(Split::Test)), (13 * 60, 3 * 60));
+            let times = rig.times();
+            assert_eq!(times.len(), 60);
+            let schedule = rig.schedule(&times, None).unwrap();
+            assert!(schedule.frames.iter().all(|frame| frame.len() == 16));
+        }
+        assert!(transforms.background.is_none() && cameras.background.is_some());
+        for shot in &cameras.shots {
+            let same = transforms.shots.iter().find(|s| s.view == shot.view && s.time == shot.time).unwrap();
+            assert_eq!(same.split, shot.split);
+            let (a, b) = (&transforms.cameras[same.camera as usize], &cameras.cameras[shot.camera as usize]);
+            let turned = (a.rotation - b.rotation).to_cols_array().into_iter().fold(0.0, |m: f64, x| m.max(x.abs()));
+            let moved = (a.center() - b.center()).length();
+            assert!(turned <= 1e-9 && moved <= 1e-9, "view {}: {turned:e} {moved:e}", shot.view);
+            assert_eq!((a.width, a.height, a.fx, a.fy), (b.width, b.height, b.fx, b.fy));
+            assert_eq!((a.cx, a.cy), (b.cx, b.cy));
+        }
+        let there = transforms.shots.iter().filter(|s| s.image.as_ref().is_some_and(|image| image.is_file())).count();
+        assert_eq!(there, fs::read_dir(model.join("test")).unwrap().count(), "every picture of test/ is found");
+    }
+}
+
+#[test]
+fn either_file_of_a_pair_or_their_folder_give_the_same_rig() {
+    let folder = folder(&[
+        ("transforms_train.json", &transforms(&[0.0, 0.5, 1.0])),
+        ("transforms_test.json", &transforms(&[0.25])),
+    ]);
+    let options = CameraOptions::default();
+    let whole = load(folder.path(), &options).unwrap();
+    assert_eq!(whole.shots.len(), 4);
+    assert_eq!(whole.shots.iter().map(|s| s.split == Split::Test).collect::<Vec<_>>(), [false, false, false, true]);
+    for name in ["transforms_train.json", "transforms_test.json"] {
+        assert_eq!(load(&folder.path().join(name), &options).unwrap(), whole);
+    }
+}
+
+#[test]
+fn opengl_pose_becomes_an_opencv_camera() {
+    let rig = load_json("transforms.json", &transforms(&[0.0, 1.0])).unwrap();
+    let focal = 40.0 / 0.5f64.tan();
+    let expected = Camera {
+        width: 80,
+        height: 60,
+        fx: focal,
+        fy: focal,
+        cx: 40.0,
+        cy: 30.0,
+        // Right is +x, down is −z, forward is +y.
+        rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::ZERO)
+            + DMat3::from_cols(DVec3::ZERO, DVec3::Y + DVec3::Z, DVec3::NEG_Y),
+        translation: DVec3::new(0.0, 1.0, 4.0),
+    };
+    assert_eq!(rig.cameras[0], expected);
+    assert_eq!(rig.cameras[1].center(), DVec3::new(1.0, -4.0, 1.0));
+}
+
+#[test]
+fn frame_keys_win_over_the_files_and_vertical_focal_length_stays_with_its_horizontal() {
+    let mut document = transforms(&[0.0, 1.0]);
+    document["fl_y"] = json!(50.0);
+    document["frames"][1]["fl_x"] = json!(90.0);
+    document["frames"][1]["cx"] = json!(41.5);
+    let rig = load_json("transforms.json", &document).unwrap();
+    assert_eq!((rig.cameras[0].fx, rig.cameras[0].fy), (40.0 / 0.5f64.tan(), 50.0));
+    assert_eq!((rig.cameras[1].fx, rig.cameras[1].fy, rig.cameras[1].cx), (90.0, 90.0, 41.5));
+}
+
+#[test]
+fn times_are_parts_of_the_largest_over_both_files() {
+    let folder =
+        folder(&[("transforms_train.json", &transforms(&[0.0, 2.0])), ("transforms_test.json", &transforms(&[4.0]))]);
+    assert_eq!(load(folder.path(), &CameraOptions::default()).unwrap().times(), [0.0, 0.5, 1.0]);
+    assert_eq!(load_json("transforms.json", &transforms(&[0.0])).unwrap().times(), [0.0]);
+}
+
+#[test]
+fn missing_size_comes_from_the_picture_then_the_option_else_is_asked_for() {
+    let mut document = transforms(&[0.0]);
+    document.as_object_mut().unwrap().remove("h");
+    assert_refused("transforms.json", &document, &["frame 0", "r_000", "--size"]);
+
+    let folder = folder(&[("transforms.json", &document)]);
+    let options = CameraOptions { size: Some((30, 20)), frames: None };
+    let rig = load(folder.path(), &options).unwrap();
+    assert_eq!((rig.cameras[0].width, rig.cameras[0].height, rig.cameras[0].cx), (30, 20, 15.0));
+    assert_eq!(rig.cameras[0].fx, 15.0 / 0.5f64.tan());
+
+    // The head of a PNG: signature, then IHDR with width and height.
+    let mut png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR".to_vec();
+    png.extend([0, 0, 1, 0, 0, 0, 0, 200, 8, 2, 0, 0, 0]);
+    fs::create_dir(folder.path().join("train")).unwrap();
+    fs::write(folder.path().join("train/r_000.png"), png).unwrap();
+    let rig = load(folder.path(), &options).unwrap();
+    assert_eq!((rig.cameras[0].width, rig.cameras[0].height), (256, 200));
+    assert_eq!(rig.shots[0].image, Some(folder.path().join("train/r_000.png")));
+}
+
+#[test]
+fn views_are_numbered_by_name_if_all_names_do_else_by_pose() {
+    let mut document = transforms(&[0.0, 1.0]);
+    for (i, name) in ["./train/t000_v07", "./train/t001_v03.png"].into_iter().enumerate() {
+        document["frames"][i]["file_path"] = json!(name);
+    }
+    let views = |document: &Value| -> Vec<u32> {
+        load_json("transforms.json", document).unwrap().shots.iter().map(|shot| shot.view).collect()
+    };
+    assert_eq!(views(&document), [7, 3]);
+    document["frames"][1]["file_path"] = json!("./train/cat_v03");
+    assert_eq!(views(&document), [0, 1]);
+    document["frames"][1]["transform_matrix"] = document["frames"][0]["transform_matrix"].clone();
+    assert_eq!(views(&document), [0, 0]);
+}
+
+#[test]
+fn own_cameras_json_says_everything_itself() {
+    let rig = load_json("cameras.json", &per_picture(&[0.0, 0.25])).unwrap();
+    assert_eq!(rig.background, Some([1.0, 0.5, 0.0]));
+    assert_eq!(rig.cameras.len(), 1);
+    let Camera { fx, fy, cx, cy, translation, .. } = rig.cameras[0];
+    assert_eq!((fx, fy, cx, cy, translation), (70.0, 71.0, 39.0, 31.0, DVec3::new(0.5, 0.0, 3.0)));
+    assert_eq!(rig.times(), [0.0, 0.25], "times are taken as they are");
+    assert!(rig.shots.iter().all(|shot| shot.view == 4 && shot.split == Split::Train));
+}
+
+#[test]
+fn cameras_of_a_3dgs_folder_see_every_frame_once() {
+    let entry = |id: u32, x: f64| {
+        json!({"id": id, "img_name": format!("{id:05}"), "width": 80, "height": 60, "fx": 70.0, "fy": 71.0,
+               "position": [x, 0.0, -3.0], "rotation": [[0, 0, 1], [1, 0, 0], [0, 1, 0]]})
+    };
+    let rig = load_json("cameras.json", &json!([entry(0, 1.0), entry(1, 2.0), entry(2, 1.0)])).unwrap();
+    assert_eq!((rig.cameras.len(), rig.shots.len()), (2, 2), "the third repeats the first");
+    assert_eq!(rig.cameras[0].center(), DVec3::new(1.0, 0.0, -3.0));
+    // Camera-to-world turns forward (z) to the world's x: so world x must come out forward.
+    assert_eq!(rig.cameras[0].rotation * DVec3::X, DVec3::Z);
+    assert_eq!(rig.schedule(&[0.0, 1.0, 2.0], None).unwrap().pairs(), 6);
+}
+
+#[test]
+fn dynerf_poses_are_used_at_half_size_with_camera_0_held_out() {
+    let folder = tempfile::tempdir().unwrap();
+    write_npy(
+        &folder.path().join("poses_bounds.npy"),
+        &[llff_row([0.0, -4.0, 1.0], 2028.0, 2704.0, 1400.0), llff_row([0.5, -4.0, 1.0], 2028.0, 2704.0, 1400.0)],
+    );
+    let rig = load(folder.path(), &CameraOptions { size: None, frames: Some(4) }).unwrap();
+    let camera = &rig.cameras[1];
+    assert_eq!((camera.width, camera.height, camera.fx, camera.fy), (1352, 1014, 700.0, 700.0));
+    assert_eq!((camera.cx, camera.cy, camera.center()), (676.0, 507.0, DVec3::new(0.5, -4.0, 1.0)));
+    assert_eq!(camera.rotation * DVec3::Y, DVec3::Z, "+y is forward");
+    assert_eq!(camera.rotation * DVec3::Z, DVec3::NEG_Y, "+z is up");
+    assert_eq!(rig.times(), [0.0, 0.25, 0.5, 0.75]);
+    assert_eq!(rig.schedule(&rig.times(), Some(Split::Test)).unwrap().frames, vec![vec![(0, 0)]; 4]);
+    let default = load(folder.path(), &CameraOptions { size: Some((676, 507)), frames: None }).unwrap();
+    assert_eq!((default.times().len(), default.cameras[0].fx), (300, 350.0));
+    assert!(default.origin.contains("300 frames"));
+}
+
+#[test]
+fn malformed_arrays_are_refused_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("poses_bounds.npy");
+    let refused = |parts: &[&str]| {
+        let message = load(folder.path(), &CameraOptions::default()).unwrap_err().to_string();
+        for part in parts {
+            assert!(message.contains(part), "{part:?} is not in {message:?}");
+        }
+    };
+    let good = llff_row([0.0; 3], 20.0, 30.0, 25.0);
+    for (column, value, parts) in [
+        (0, f64::NAN, ["row 1", "rotation"]),
+        (0, 0.5, ["row 1", "rotation"]),
+        (3, f64::INFINITY, ["row 1", "position"]),
+        (4, 20.5, ["row 1", "20.5"]),
+        (14, 0.0, ["row 1", "focal"]),
+    ] {
+        let mut bad = good;
+        bad[column] = value;
+        write_npy(&path, &[good, bad]);
+        refused(&parts);
+    }
+    for (dtype, order, shape, parts) in [
+        ("<i8", "False", "(2, 17)", ["float64 or float32", "i8"]),
+        ("<f8", "False", "(17, 2)", ["[V, 17]", "[17, 2]"]),
+        ("<f8", "False", "(34,)", ["[V, 17]", "[34]"]),
+        ("<f8", "False", "(0, 17)", ["V at least 1", "[0, 17]"]),
+        ("<f8", "False", "(9999999999, 17)", ["9999999999 rows", "bytes"]),
+        ("<f8", "False", "(9999999999, 9999999999)", ["NumPy array", "no readable shape"]),
+        ("<f8", "False", "(3, 17)", ["3 rows", "data"]),
+        ("<f8", "True", "(2, 17)", ["Fortran", "ascontiguousarray"]),
+        ("|O", "False", "(2, 17)", ["float64 or float32", "O"]),
+    ] {
+        fs::write(&path, npy(dtype, order, shape, &[good, good])).unwrap();
+        refused(&parts);
+    }
+    let whole = npy("<f8", "False", "(2, 17)", &[good, good]);
+    for length in 0..whole.len() {
+        fs::write(&path, &whole[..length]).unwrap();
+        refused(&["poses_bounds.npy"]);
+    }
+}
+
+#[test]
+fn what_is_wrong_with_a_picture_is_said_with_its_number() {
+    let mut cases: Vec<(&str, Value, Vec<&str>)> = vec![
+        ("time", json!("noon"), vec!["frame 1", "\"time\"", "noon"]),
+        ("time", Value::Null, vec!["frame 1", "a time for every picture"]),
+        ("time", json!(0.0), vec![]),
+        ("fl_x", json!(0.0), vec!["frame 1", "focal", "0"]),
+        ("fl_x", json!(-3), vec!["frame 1", "focal", "-3"]),
+        ("w", json!(80.5), vec!["frame 1", "\"w\"", "80.5"]),
+        ("w", json!(1e9), vec!["frame 1", "\"w\"", "32768"]),
+        ("transform_matrix", json!([[1, 0], [0, 1]]), vec!["frame 1", "transform_matrix"]),
+        ("transform_matrix", Value::Null, vec!["frame 1", "transform_matrix"]),
+        ("file_path", json!(12), vec!["frame 1", "file_path", "12"]),
+    ];
+    let mut matrix = |r: usize, c: usize, value: f64, parts: &[&'static str]| {
+        let mut pose = along_y([1.0, -4.0, 1.0]);
+        pose[r][c] = json!(value);
+        cases.push(("transform_matrix", pose, [&["frame 1"], parts].concat()));
+    };
+    matrix(0, 0, 1.01, &["a rotation", "2.010e-2"]);
+    matrix(0, 0, -1.0, &["reflection"]);
+    matrix(3, 0, 2.0, &["0 0 0 1", "transposed"]);
+    for (key, value, parts) in cases {
+        let mut document = transforms(&[0.0, 1.0]);
+        document["frames"][1][key] = value;
+        if parts.is_empty() {
+            load_json("transforms.json", &document).expect("another view at the same time is a synchronised rig");
+        } else {
+            assert_refused("transforms.json", &document, &parts);
+        }
+    }
+    assert_refused("cameras.json", &per_picture(&[0.0, 0.5, 0.5]), &["frame 2", "view 4", "0.5", "frame 1"]);
+    assert_refused("cameras.json", &per_picture(&[0.0, -0.0]), &["frame 1", "as in frame 0"]);
+    let mut document = per_picture(&[0.0]);
+    document["frames"][0]["split"] = json!("validation");
+    assert_refused("cameras.json", &document, &["frame 0", "split", "validation"]);
+}
+
+#[test]
+fn what_holds_no_cameras_is_said_to() {
+    assert_refused("transforms.json", &json!({"frames": []}), &["non-empty list"]);
+    assert_refused("cameras.json", &json!([]), &["at least one picture"]);
+    assert_refused("cameras.json", &json!([3]), &["frame 0", "an object"]);
+    assert_refused("cameras.json", &json!("text"), &["text"]);
+
+    let folder = tempfile::tempdir().unwrap();
+    let message = |path: &Path| load(path, &CameraOptions::default()).unwrap_err().to_string();
+    assert!(message(folder.path()).contains("transforms_train.json"));
+    assert!(message(&folder.path().join("nowhere")).contains("cannot open"));
+    let json = folder.path().join("transforms.json");
+    fs::write(&json, "{\"frames\": [{\"time\": NaN}]}").unwrap();
+    let text = message(folder.path());
+    assert!(text.contains("line 1, column") && text.contains("NaN"), "{text}");
+    fs::write(&json, [0xff, 0xfe, 0]).unwrap();
+    assert!(message(&json).contains("JSON"));
+    fs::remove_file(&json).unwrap();
+    fs::create_dir_all(folder.path().join("sparse/0")).unwrap();
+    assert!(message(folder.path()).contains("COLMAP"));
+    assert!(message(&folder.path().join("sparse/0")).contains("COLMAP"));
+}
+
+#[test]
+fn options_out_of_range_are_misuse() {
+    for options in [
+        CameraOptions { size: Some((0, 10)), frames: None },
+        CameraOptions { size: Some((10, 1 << 20)), frames: None },
+        CameraOptions { size: None, frames: Some(0) },
+    ] {
+        let error = load(Path::new("anything"), &options).unwrap_err();
+        assert!(matches!(error, crate::error::Error::Usage(_)), "{error}");
+    }
+}
+
+#[test]
+fn source_path_is_found_from_any_folder_above_the_model() {
+    let root = tempfile::tempdir().unwrap();
+    let model = root.path().join("output/deep/model");
+    fs::create_dir_all(&model).unwrap();
+    assert_eq!(find("data/scene", &model), None);
+    fs::create_dir_all(root.path().join("data/scene")).unwrap();
+    assert_eq!(find("data/scene", &model), None, "a folder without cameras is not it");
+    fs::write(root.path().join("data/scene/transforms.json"), "{}").unwrap();
+    assert_eq!(find("data/scene", &model), Some(root.path().join("data/scene")));
+    fs::create_dir_all(root.path().join("output/data/scene")).unwrap();
+    fs::write(root.path().join("output/data/scene/cameras.json"), "{}").unwrap();
+    assert_eq!(find("data/scene", &model), Some(root.path().join("output/data/scene")), "the nearest wins");
+    let absolute = root.path().join("data/scene");
+    assert_eq!(find(absolute.to_str().unwrap(), &model), Some(absolute));
+    assert_eq!(find("", &model), None);
+}

@@ -1,0 +1,143 @@
+//! `transforms*.json` of NeRF and D-NeRF: one camera-to-world pose per picture, in OpenGL axes.
+//!
+//! Keys, of a frame or of the file (the frame's win): `fl_x fl_y cx cy w h`, or `camera_angle_x`
+//! (and `camera_angle_y`), the field of view in radians. Pixels are square and the principal point is
+//! the middle unless said otherwise. A frame has `file_path`, `transform_matrix` and, if the scene
+//! moves, `time`.
+//!
+//! Times are divided by the largest of all files read, as the D-NeRF loaders do that the models were
+//! trained with (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames
+//! 0 … T−1 and files that reach 1 give the same times.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+use serde_json::Value;
+
+use super::assemble::{Listing, Picture, assemble, from_camera_to_world, view_in_name};
+use super::fields::Fields;
+use super::{CameraOptions, read_json};
+use crate::error::Result;
+use crate::model::{Rig, Split};
+
+/// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
+const FLIP: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+
+/// Reads `file`, parsed as `document`, and the other one of a train/test pair beside it.
+pub(super) fn load(file: &Path, document: Value, options: &CameraOptions) -> Result<Rig> {
+    let split = split_of(file);
+    let mut listings = vec![(split, listing(file, &document, split, options)?)];
+    if let Some(partner) = partner(file).filter(|partner| partner.is_file()) {
+        let split = split_of(&partner);
+        listings.push((split, listing(&partner, &read_json(&partner)?, split, options)?));
+    }
+    listings.sort_by_key(|(split, _)| *split == Split::Test);
+    let mut listings: Vec<Listing> = listings.into_iter().map(|(_, listing)| listing).collect();
+
+    let pictures = || listings.iter().flat_map(|(_, pictures)| pictures);
+    let latest = pictures().filter_map(|picture| picture.time).fold(0.0, f64::max);
+    if latest > 0.0 {
+        for picture in listings.iter_mut().flat_map(|(_, pictures)| pictures) {
+            picture.time = picture.time.map(|time| time / latest);
+        }
+    }
+    let names: Vec<String> = listings.iter().map(|(path, _)| path.display().to_string()).collect();
+    assemble(listings, None, names.join(" and "))
+}
+
+fn split_of(file: &Path) -> Split {
+    let name = file.file_name().unwrap_or_default().to_string_lossy();
+    if name.contains("test") || name.contains("val") { Split::Test } else { Split::Train }
+}
+
+fn partner(file: &Path) -> Option<PathBuf> {
+    let other = match file.file_name()?.to_str()? {
+        "transforms_train.json" => "transforms_test.json",
+        "transforms_test.json" => "transforms_train.json",
+        _ => return None,
+    };
+    Some(file.with_file_name(other))
+}
+
+fn listing(file: &Path, document: &Value, split: Split, options: &CameraOptions) -> Result<Listing> {
+    let shared = Fields::of(file, None, document)?;
+    let mut pictures = Vec::new();
+    for (index, frame) in shared.list("frames")?.iter().enumerate() {
+        pictures.push(picture(file, shared, Fields::of(file, Some(index), frame)?, split, options)?);
+    }
+    Ok((file.to_owned(), pictures))
+}
+
+fn picture(file: &Path, shared: Fields<'_>, own: Fields<'_>, split: Split, options: &CameraOptions) -> Result<Picture> {
+    let name = own.optional_text("file_path")?;
+    let image = name.map(|name| resolve(file, name));
+    let size = size(shared, own, image.as_deref(), options)?;
+    let intrinsics = intrinsics(shared, own, size)?;
+    let (rotation, center) = own.pose("transform_matrix")?;
+    Ok(Picture {
+        camera: from_camera_to_world(size, intrinsics, rotation * FLIP, center),
+        time: own.optional_number("time")?,
+        split,
+        image,
+        view: name.and_then(view_in_name),
+    })
+}
+
+/// Picture size in pixels: the file's, else the picture's own, else the option's.
+fn size(shared: Fields<'_>, own: Fields<'_>, image: Option<&Path>, options: &CameraOptions) -> Result<(u32, u32)> {
+    let side =
+        |key| own.optional_side(key).and_then(|side| side.map_or_else(|| shared.optional_side(key), |s| Ok(Some(s))));
+    if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
+        return Ok((width, height));
+    }
+    // A picture that is missing or unreadable is no error: the size may be given instead.
+    let measured = image.and_then(|image| imagesize::size(image).ok());
+    let measured = measured.and_then(|size| Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?)));
+    measured.or(options.size).ok_or_else(|| {
+        let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.display()));
+        own.wrong("w", format!("the picture size as w and h{tried}"))
+            .hint("give --size WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
+    })
+}
+
+/// fx, fy, cx, cy in pixels.
+fn intrinsics(shared: Fields<'_>, own: Fields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
+    let (width, height) = (f64::from(width), f64::from(height));
+    let focal = |fields: Fields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
+        if let Some(focal) = fields.optional_number(pixels)? {
+            return Ok(Some(focal));
+        }
+        Ok(fields.optional_number(angle)?.map(|angle| 0.5 * side / (0.5 * angle).tan()))
+    };
+    let mut fx = None;
+    let mut fy = None;
+    for fields in [own, shared] {
+        if fx.is_none() {
+            fx = focal(fields, "fl_x", "camera_angle_x", width)?;
+            // A vertical focal length of the file must not be paired with a horizontal one of the frame.
+            fy = focal(fields, "fl_y", "camera_angle_y", height)?;
+        }
+    }
+    let fx = fx.ok_or_else(|| shared.wrong("camera_angle_x", "camera_angle_x or fl_x, here or in every frame"))?;
+    let middle = |key, middle| -> Result<f64> {
+        Ok(own.optional_number(key)?.or(shared.optional_number(key)?).unwrap_or(middle))
+    };
+    Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
+}
+
+/// The picture a file names, relative to it. D-NeRF leaves the extension out.
+fn resolve(file: &Path, name: &str) -> PathBuf {
+    let named = file.parent().unwrap_or(Path::new("")).join(name.strip_prefix("./").unwrap_or(name));
+    let with = |extension: &str| {
+        let mut path = named.clone().into_os_string();
+        path.push(extension);
+        PathBuf::from(path)
+    };
+    let stated =
+        named.extension().is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|known| e.eq_ignore_ascii_case(known)));
+    if stated {
+        return named;
+    }
+    let candidates = [named.clone(), with(".png"), with(".jpg"), with(".jpeg")];
+    candidates.into_iter().find(|path| path.is_file()).unwrap_or_else(|| with(".png"))
+}

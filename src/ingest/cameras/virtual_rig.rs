@@ -1,0 +1,130 @@
+//! A stated rig for scenes that come without cameras.
+
+use glam::DVec3;
+
+use crate::model::{Camera, Column, Rig, Shot, Split};
+
+/// Cameras of the rig: as many scoring views as the figures of METHOD section 6 were taken with.
+const CAMERAS: u32 = 12;
+/// Distance from the centre in extents. At 60° the picture then spans 2.3 extents, so that a scene of
+/// equal sides is seen whole from every corner.
+const DISTANCE: f64 = 2.0;
+const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
+const SIDE_PX: u32 = 512;
+
+/// Cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, looking at it, every one at
+/// every frame, all for training; see [`robust_bounds`] for the two numbers.
+///
+/// Camera k of n looks from latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z is up in the
+/// pictures. An extent that is zero or not finite counts as 1, a centre that is not finite as 0.
+pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
+    let center = if center.is_finite() { center } else { DVec3::ZERO };
+    let extent = if extent.is_finite() && extent > 0.0 { extent } else { 1.0 };
+    let radius = DISTANCE * extent;
+    let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let cameras = (0..CAMERAS).map(|k| {
+        let z = 1.0 - f64::from(2 * k + 1) / f64::from(CAMERAS);
+        let (sin, cos) = (golden_angle * f64::from(k)).sin_cos();
+        let outward = DVec3::new(cos, sin, 0.0) * (1.0 - z * z).sqrt() + DVec3::Z * z;
+        Camera::look_at(center + radius * outward, center, FIELD_OF_VIEW_DEGREES.to_radians(), (SIDE_PX, SIDE_PX))
+    });
+    let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
+    Rig {
+        cameras: cameras.collect(),
+        shots: (0..CAMERAS).map(shot).collect(),
+        background: None,
+        origin: format!(
+            "virtual rig: {CAMERAS} cameras on a Fibonacci sphere of radius {radius:.6} around ({:.6}, {:.6}, {:.6}), \
+             {FIELD_OF_VIEW_DEGREES}° field of view, {SIDE_PX}×{SIDE_PX} pixels, every frame",
+            center.x, center.y, center.z
+        ),
+    }
+}
+
+/// Centre and extent of `[3, N]` positions, untroubled by floaters: the median of each axis, and the
+/// largest P99 − P1 of the three (nearest rank, METHOD section 2), in scene units.
+///
+/// NaN and infinities do not count; `None` when an axis has no finite value. Takes 4 N bytes.
+pub fn robust_bounds(position: &Column) -> Option<(DVec3, f64)> {
+    let mut center = DVec3::ZERO;
+    let mut extent: f64 = 0.0;
+    let mut values = Vec::with_capacity(position.len());
+    for axis in 0..3 {
+        values.clear();
+        values.extend(position.plane(axis).iter().filter(|x| x.is_finite()));
+        if values.is_empty() {
+            return None;
+        }
+        center[axis] = percentile(&mut values, 50);
+        extent = extent.max(percentile(&mut values, 99) - percentile(&mut values, 1));
+    }
+    Some((center, extent))
+}
+
+/// Nearest rank: the ⌈p/100·n⌉-th smallest.
+fn percentile(values: &mut [f32], percent: usize) -> f64 {
+    let rank = (values.len() * percent).div_ceil(100).max(1);
+    f64::from(*values.select_nth_unstable_by(rank - 1, f32::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn virtual_cameras_see_the_centre_in_the_middle_of_the_picture() {
+        let center = DVec3::new(3.0, -2.0, 7.0);
+        let rig = virtual_rig(center, 1.5);
+        assert_eq!(rig.cameras.len(), 12);
+        for camera in &rig.cameras {
+            let seen = camera.rotation * center + camera.translation;
+            assert!((seen - DVec3::new(0.0, 0.0, 3.0)).length() < 1e-12, "{seen}");
+            assert!((camera.rotation.determinant() - 1.0).abs() < 1e-12);
+            let up = camera.rotation * (center + 0.1 * DVec3::Z) + camera.translation;
+            assert!(up.y < 0.0, "z is up in the picture, y is down: {up}");
+            assert!((camera.fx - 256.0 / 30f64.to_radians().tan()).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn virtual_cameras_surround_the_scene() {
+        let rig = virtual_rig(DVec3::ZERO, 1.0);
+        let mean: DVec3 = rig.cameras.iter().map(Camera::center).sum::<DVec3>() / 12.0;
+        assert!(mean.length() < 0.3, "{mean}");
+        let closest =
+            rig.cameras.iter().enumerate().flat_map(|(i, a)| {
+                rig.cameras[..i].iter().map(move |b| a.center().angle_between(b.center()).to_degrees())
+            });
+        assert!(closest.fold(f64::MAX, f64::min) > 40.0);
+    }
+
+    #[test]
+    fn a_scene_without_extent_still_has_cameras() {
+        for extent in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            let rig = virtual_rig(DVec3::NAN, extent);
+            assert!(rig.cameras.iter().all(|camera| (camera.center().length() - 2.0).abs() < 1e-12));
+        }
+    }
+
+    #[test]
+    fn bounds_ignore_floaters_and_what_is_not_finite() {
+        let mut position = Column::zeros(3, 1002);
+        for i in 0..1000 {
+            position.set_row(i, [i as f32, 2.0 * i as f32, -1.0]);
+        }
+        position.set_row(1000, [1e9, f32::INFINITY, -1.0]);
+        position.set_row(1001, [f32::NAN, -1e9, -1.0]);
+        let (center, extent) = robust_bounds(&position).unwrap();
+        // 1001 finite values on each axis: ranks 501, 991 and 11.
+        assert_eq!(center, DVec3::new(500.0, 998.0, -1.0));
+        assert_eq!(extent, 2.0 * (989.0 - 9.0));
+    }
+
+    #[test]
+    fn no_finite_position_means_no_bounds() {
+        assert_eq!(robust_bounds(&Column::zeros(3, 0)), None);
+        let mut one = Column::zeros(3, 1);
+        one.set_row(0, [0.0, f32::NAN, 0.0]);
+        assert_eq!(robust_bounds(&one), None);
+    }
+}
