@@ -1,0 +1,64 @@
+//! Life span and opacity variance: both follow from the time-dependent opacity alone.
+
+use std::mem::size_of;
+
+/// Running life span and opacity moments of a block.
+///
+/// V = s₂/n − (s₁/n)² with s₁, s₂ the sums of α − α₁ and (α − α₁)² over life, α₁ the opacity of the
+/// first life frame. The shift makes a constant opacity give exactly 0 and keeps full precision for
+/// a nearly constant one, where the unshifted moments cancel.
+pub(super) struct Life {
+    first: Vec<f64>,
+    sum: Vec<f64>,
+    sum_of_squares: Vec<f64>,
+    frames: Vec<u32>,
+}
+
+impl Life {
+    pub(super) const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<f64>() + size_of::<u32>();
+
+    pub(super) fn new(len: usize) -> Self {
+        Life { first: vec![0.0; len], sum: vec![0.0; len], sum_of_squares: vec![0.0; len], frames: vec![0; len] }
+    }
+
+    /// Adds a frame of opacities in [0, 1]; says how many Gaussians are alive in it.
+    pub(super) fn frame(&mut self, opacity: &[f64], alpha_min: f64) -> u32 {
+        let mut alive = 0;
+        for (i, &alpha) in opacity.iter().enumerate() {
+            if alpha >= alpha_min {
+                if self.frames[i] == 0 {
+                    self.first[i] = alpha;
+                }
+                let shifted = alpha - self.first[i];
+                self.sum[i] += shifted;
+                self.sum_of_squares[i] += shifted * shifted;
+                self.frames[i] += 1;
+                alive += 1;
+            }
+        }
+        alive
+    }
+
+    /// Life frames of every Gaussian so far.
+    pub(super) fn frames(&self) -> &[u32] {
+        &self.frames
+    }
+
+    /// V of every Gaussian; 0 for one that never lived.
+    pub(super) fn variance(&self) -> Vec<f64> {
+        (0..self.frames.len())
+            .map(|i| {
+                let n = f64::from(self.frames[i].max(1));
+                let mean = self.sum[i] / n;
+                // Rounding can leave a hair below zero.
+                (self.sum_of_squares[i] / n - mean * mean).max(0.0)
+            })
+            .collect()
+    }
+
+    #[cfg(test)]
+    pub(super) fn resident_bytes(&self) -> usize {
+        let Life { first, sum, sum_of_squares, frames } = self;
+        size_of_val(&first[..]) + size_of_val(&sum[..]) + size_of_val(&sum_of_squares[..]) + size_of_val(&frames[..])
+    }
+}

@@ -1,0 +1,141 @@
+//! What a scan must know before its first frame.
+
+use crate::error::{Error, Result};
+use crate::model::Schedule;
+use crate::recipe::{Motion, Scan};
+
+/// Deviation of a time step from the mean step, as a fraction of it, up to which frames count as
+/// even. Stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5; real gaps are far larger.
+const EVEN_TOLERANCE: f64 = 1e-2;
+
+/// Largest contribution of one (frame, view) pair in fixed point: [`super::projection`] rounds by
+/// adding 2⁵², so a contribution must stay below it; one bit is kept in reserve.
+const CONTRIBUTION_BITS: i32 = 51;
+
+/// Bits of the sum over all pairs; one bit of the u64 is kept in reserve.
+const SUM_BITS: i32 = 63;
+
+/// Everything the scan of any block needs: one plan serves all blocks of a sequence.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScanPlan {
+    pub(super) alpha_min: f64,
+    pub(super) motion: Motion,
+    /// Step into frame t in units of the mean step; empty when frames are even.
+    pub(super) steps: Vec<f64>,
+    pub(super) frames: usize,
+    pub(super) pairs: u32,
+    pub(super) coverage_exponent: i32,
+}
+
+impl ScanPlan {
+    /// The scan of frames at `times` (strictly increasing) seen by the cameras of `schedule`.
+    ///
+    /// Motion is measured per mean step: under [`Motion::Runs`] a step that lasts h mean steps is
+    /// divided by h, so that even frames give the plain formula exactly. [`Motion::Literal`] knows
+    /// no time stamps.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for time stamps that do not increase, a schedule of another number of
+    /// frames, or more than 2³² (frame, view) pairs.
+    pub fn new(scan: &Scan, times: &[f64], schedule: &Schedule) -> Result<Self> {
+        if let Some(t) =
+            (1..times.len()).find(|&t| times[t - 1].partial_cmp(&times[t]) != Some(std::cmp::Ordering::Less))
+        {
+            return Err(Error::usage(format!(
+                "time stamps must increase: frame {} has {}, frame {t} has {}",
+                t - 1,
+                times[t - 1],
+                times[t]
+            )));
+        }
+        if schedule.frames.len() != times.len() {
+            return Err(Error::usage(format!(
+                "the cameras are scheduled for {} frames, the sequence has {}",
+                schedule.frames.len(),
+                times.len()
+            )));
+        }
+        let pairs = u32::try_from(schedule.pairs())
+            .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pairs())))?;
+        let image_px = schedule.cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
+        Ok(ScanPlan {
+            alpha_min: scan.alpha_min,
+            motion: scan.motion,
+            steps: if scan.motion == Motion::Runs { uneven_steps(times) } else { Vec::new() },
+            frames: times.len(),
+            pairs,
+            coverage_exponent: coverage_exponent(image_px, pairs),
+        })
+    }
+
+    /// T, the number of frames.
+    pub fn frames(&self) -> usize {
+        self.frames
+    }
+
+    /// M, the number of (frame, view) pairs.
+    pub fn pairs(&self) -> u32 {
+        self.pairs
+    }
+
+    /// Resolution of C in pixels: contributions are summed as multiples of it, so that their sum is
+    /// the same in any order.
+    pub fn coverage_resolution_px(&self) -> f64 {
+        2f64.powi(-self.coverage_exponent)
+    }
+
+    /// Duration of the step into frame `t` in mean steps.
+    pub(super) fn step(&self, t: usize) -> f64 {
+        self.steps.get(t).copied().unwrap_or(1.0)
+    }
+}
+
+/// Steps in units of their mean (entry 0 unused), or nothing when all are one.
+fn uneven_steps(times: &[f64]) -> Vec<f64> {
+    let [first, .., last] = times else { return Vec::new() };
+    let mean = (last - first) / (times.len() - 1) as f64;
+    let steps: Vec<f64> = std::iter::once(1.0).chain(times.windows(2).map(|pair| (pair[1] - pair[0]) / mean)).collect();
+    if steps.iter().all(|step| (step - 1.0).abs() <= EVEN_TOLERANCE) { Vec::new() } else { steps }
+}
+
+/// Largest e for which one contribution of `image_px` and a sum of `pairs` of them, times 2ᵉ, fit.
+fn coverage_exponent(image_px: f64, pairs: u32) -> i32 {
+    let image_bits = image_px.log2().ceil() as i32;
+    let pair_bits = f64::from(pairs.max(1)).log2().ceil() as i32;
+    (CONTRIBUTION_BITS - image_bits).min(SUM_BITS - image_bits - pair_bits)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::Recipe;
+
+    fn plan(times: &[f64]) -> Result<ScanPlan> {
+        let schedule = Schedule { cameras: vec![], frames: vec![vec![]; times.len()] };
+        ScanPlan::new(&Recipe::preset("default").unwrap().scan, times, &schedule)
+    }
+
+    #[test]
+    fn stamps_rounded_to_f32_count_as_even() {
+        let times: Vec<f64> = (0..100_000).map(|i| f64::from(i as f32 / 1e5)).collect();
+        assert!(plan(&times).unwrap().steps.is_empty());
+        assert_eq!(plan(&[0.0, 1.0, 3.0]).unwrap().steps, [1.0, 2.0 / 3.0, 4.0 / 3.0]);
+    }
+
+    #[test]
+    fn stamps_that_do_not_increase_are_named() {
+        for bad in [[0.0, 1.0, 1.0], [0.0, 1.0, 0.5], [0.0, 1.0, f64::NAN]] {
+            let message = plan(&bad).unwrap_err().to_string();
+            assert!(message.contains("frame 1") && message.contains("frame 2"), "{message}");
+        }
+    }
+
+    #[test]
+    fn coverage_cannot_wrap_whatever_the_pictures_and_their_number() {
+        for (image_px, pairs) in [(1.0, 0), (82_944.0, 780), (8192.0 * 8192.0, u32::MAX), (1.8e19, 3)] {
+            let unit = 2f64.powi(coverage_exponent(image_px, pairs));
+            assert!(image_px * unit <= 2f64.powi(CONTRIBUTION_BITS));
+            assert!(image_px * unit * f64::from(pairs) <= 2f64.powi(SUM_BITS));
+        }
+    }
+}

@@ -1,0 +1,141 @@
+//! One block of Gaussians through all frames: accumulators in, rows of statistics out.
+
+use std::mem::size_of;
+
+use super::life::Life;
+use super::motion::Motion;
+use super::plan::ScanPlan;
+use super::projection::{Footprints, Scale, Sums, project};
+use super::state::State;
+use crate::model::{Camera, Columns, Flags, Gaussians, Rows};
+
+/// Resident bytes of a [`BlockScan`] per Gaussian, whatever the number of frames.
+pub const BYTES_PER_GAUSSIAN: usize = State::BYTES_PER_GAUSSIAN
+    + Life::BYTES_PER_GAUSSIAN
+    + Motion::BYTES_PER_GAUSSIAN
+    + size_of::<u64>()
+    + size_of::<u32>();
+
+/// Gaussians projected at a time: about 108 bytes each, so that every view of a frame but the first
+/// finds them in the first-level cache.
+const CHUNK: usize = 256;
+
+/// Columns a scan needs whatever the model; SH may be left out.
+const NEEDED: Columns = Columns::ALL.without(Columns::SH);
+
+/// The running statistics of consecutive Gaussians.
+pub struct BlockScan<'a> {
+    plan: &'a ScanPlan,
+    first_id: usize,
+    next_frame: usize,
+    state: State,
+    life: Life,
+    motion: Motion,
+    coverage: Vec<u64>,
+    touched: Vec<u32>,
+    alive_per_frame: Vec<u32>,
+}
+
+/// What a block gave.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BlockStatistics {
+    /// Id of the block's first Gaussian.
+    pub first_id: usize,
+    /// One row per Gaussian. `e` is 0 until [`super::fill_anisotropy`]; D and κ include rounding noise until
+    /// [`super::snap`]. A Gaussian with [`Flags::NON_FINITE`] has zeros throughout.
+    pub rows: Rows,
+    /// Living Gaussians of the block in each of the T frames; those with NaN somewhere included.
+    pub alive_per_frame: Vec<u32>,
+    /// Largest finite |coordinate| of a position in the block, scene units.
+    pub largest_coordinate: f32,
+}
+
+impl<'a> BlockScan<'a> {
+    /// An empty scan of the Gaussians `first_id .. first_id + len`.
+    pub fn new(len: usize, first_id: usize, plan: &'a ScanPlan) -> Self {
+        BlockScan {
+            plan,
+            first_id,
+            next_frame: 0,
+            state: State::new(len),
+            life: Life::new(len),
+            motion: Motion::new(len, plan.motion),
+            coverage: vec![0; len],
+            touched: vec![0; len],
+            alive_per_frame: Vec::with_capacity(plan.frames),
+        }
+    }
+
+    /// Adds frame `t` with the cameras that see it. `changed` names the columns that may differ from
+    /// the previous frame; in frame 0 all but SH count as changed. SH is only searched for NaN, and
+    /// only where `changed` names it.
+    ///
+    /// # Panics
+    /// If frames do not come in order, or a column is not as long as the block.
+    pub fn frame(&mut self, t: usize, gaussians: &Gaussians, cameras: &[&Camera], changed: Columns) {
+        assert_eq!(t, self.next_frame, "frames are scanned in order");
+        self.next_frame += 1;
+        let changed = if t == 0 { changed | NEEDED } else { changed };
+        self.state.update(gaussians, changed);
+
+        let alpha_min = self.plan.alpha_min;
+        self.alive_per_frame.push(self.life.frame(&self.state.opacity, alpha_min));
+        let (step, step_before) = (self.plan.step(t), self.plan.step(t.saturating_sub(1)));
+        self.motion.frame(&gaussians.position, &self.state.opacity, alpha_min, step, step_before);
+        self.project(gaussians, cameras);
+    }
+
+    fn project(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
+        let scale = Scale { exponent: self.plan.coverage_exponent, alpha_min: self.plan.alpha_min };
+        let len = self.coverage.len();
+        for start in (0..len).step_by(CHUNK) {
+            let range = start..len.min(start + CHUNK);
+            let from = Footprints {
+                position: std::array::from_fn(|axis| &gaussians.position.plane(axis)[range.clone()]),
+                axes: std::array::from_fn(|plane| &self.state.axes[plane][range.clone()]),
+                opacity: &self.state.opacity[range.clone()],
+            };
+            let mut sums = Sums { coverage: &mut self.coverage[range.clone()], touched: &mut self.touched[range] };
+            for camera in cameras {
+                project(camera, &from, scale, &mut sums);
+            }
+        }
+    }
+
+    /// The statistics, once every frame was added.
+    ///
+    /// # Panics
+    /// If frames are missing.
+    pub fn finish(self) -> BlockStatistics {
+        assert_eq!(self.next_frame, self.plan.frames, "every frame is scanned");
+        let pairs = f64::from(self.plan.pairs.max(1));
+        let resolution = self.plan.coverage_resolution_px();
+        let life = self.life.frames();
+        let mut rows = Rows {
+            d: self.motion.magnitude(life),
+            kappa: self.motion.curvature(life),
+            v: self.life.variance(),
+            life: life.to_vec(),
+            c: self.coverage.iter().map(|&sum| sum as f64 * resolution / pairs).collect(),
+            e: vec![0.0; life.len()],
+            vis: self.touched.iter().map(|&count| f64::from(count) / pairs).collect(),
+            flags: self.state.flags,
+        };
+        clear_non_finite(&mut rows);
+        BlockStatistics {
+            first_id: self.first_id,
+            rows,
+            alive_per_frame: self.alive_per_frame,
+            largest_coordinate: self.state.largest_coordinate,
+        }
+    }
+}
+
+fn clear_non_finite(rows: &mut Rows) {
+    for (i, _) in rows.flags.iter().enumerate().filter(|(_, flags)| flags.has(Flags::NON_FINITE)) {
+        for values in [&mut rows.d, &mut rows.kappa, &mut rows.v, &mut rows.c, &mut rows.vis] {
+            values[i] = 0.0;
+        }
+        rows.life[i] = 0;
+    }
+}

@@ -1,0 +1,101 @@
+//! What a frame's stored columns mean: opacities and scaled axes in f64, kept between frames so that
+//! only columns that changed are decoded again.
+
+use std::mem::size_of;
+
+use crate::model::{Column, Columns, Flags, Gaussians};
+
+/// Largest ln(scale) that is taken at its word: e¹⁰⁰ scene units overflows nothing downstream and
+/// already covers every picture whole.
+const MAX_LOG_SCALE: f64 = 100.0;
+
+/// Decoded state of a block at the current frame.
+pub(super) struct State {
+    /// Opacity in [0, 1].
+    pub(super) opacity: Vec<f64>,
+    /// R·S, plane 3·row + axis.
+    pub(super) axes: [Vec<f64>; 9],
+    pub(super) flags: Vec<Flags>,
+    /// Largest finite |coordinate| so far.
+    pub(super) largest_coordinate: f32,
+}
+
+impl State {
+    pub(super) const BYTES_PER_GAUSSIAN: usize = 10 * size_of::<f64>() + size_of::<Flags>();
+
+    pub(super) fn new(len: usize) -> Self {
+        State {
+            opacity: vec![0.0; len],
+            axes: std::array::from_fn(|_| vec![0.0; len]),
+            flags: vec![Flags::default(); len],
+            largest_coordinate: 0.0,
+        }
+    }
+
+    /// Takes over the columns `changed`, and flags what is odd in them.
+    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns) {
+        for column in changed.iter() {
+            self.flag_non_finite(gaussians.column(column));
+        }
+        if changed.contains(Columns::POSITION) {
+            let finite = gaussians.position.planes().iter().filter(|x| x.is_finite());
+            self.largest_coordinate = finite.fold(self.largest_coordinate, |largest, x| largest.max(x.abs()));
+        }
+        if changed.contains(Columns::OPACITY) {
+            for (opacity, &logit) in self.opacity.iter_mut().zip(gaussians.opacity_logit.plane(0)) {
+                *opacity = sigmoid(f64::from(logit));
+            }
+        }
+        if !(changed & (Columns::ROTATION | Columns::LOG_SCALE)).is_empty() {
+            self.update_axes(gaussians);
+        }
+    }
+
+    fn flag_non_finite(&mut self, column: &Column) {
+        for c in 0..column.width() {
+            for (flags, x) in self.flags.iter_mut().zip(column.plane(c)) {
+                flags.0 |= u8::from(!x.is_finite()) * Flags::NON_FINITE;
+            }
+        }
+    }
+
+    fn update_axes(&mut self, gaussians: &Gaussians) {
+        for i in 0..self.flags.len() {
+            let mut quaternion = gaussians.rotation.row::<4>(i).map(f64::from);
+            if quaternion == [0.0; 4] {
+                quaternion = [1.0, 0.0, 0.0, 0.0];
+                self.flags[i].0 |= Flags::ZERO_ROTATION;
+            }
+            let rotation = rotation_matrix(quaternion);
+            let scale = gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).min(MAX_LOG_SCALE).exp());
+            for row in 0..3 {
+                for axis in 0..3 {
+                    self.axes[3 * row + axis][i] = rotation[row][axis] * scale[axis];
+                }
+            }
+        }
+    }
+
+    #[cfg(test)]
+    pub(super) fn resident_bytes(&self) -> usize {
+        let State { opacity, axes, flags, largest_coordinate: _ } = self;
+        size_of_val(&opacity[..])
+            + axes.iter().map(|plane| size_of_val(&plane[..])).sum::<usize>()
+            + size_of_val(&flags[..])
+    }
+}
+
+fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+/// Rows of the rotation of a wxyz quaternion of any length but zero. Dividing the quadratic form by
+/// the squared length needs no square root; f64 holds the square of any f32, subnormals included.
+fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
+    let s = 2.0 / (w * w + x * x + y * y + z * z);
+    [
+        [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+        [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
+        [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
+    ]
+}
