@@ -50,7 +50,7 @@ pub trait FrameSource: Send + Sync {
 }
 
 /// Reads one block of Gaussians at any frame.
-pub trait BlockReader {
+pub trait BlockReader: Send {
     /// Writes the columns `want` of the block at `frame` into `out`, which is resized to the block.
     /// Columns outside `want` are left alone.
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()>;

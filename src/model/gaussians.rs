@@ -65,6 +65,12 @@ impl Column {
         std::array::from_fn(|c| self.data[c * self.len + i])
     }
 
+    /// The Gaussians `rows`, in that order.
+    pub fn pick(&self, rows: &[u32]) -> Column {
+        let data = (0..self.width).flat_map(|c| rows.iter().map(move |&i| self.plane(c)[i as usize])).collect();
+        Column { width: self.width, len: rows.len(), data }
+    }
+
     /// Writes the first `W` components of Gaussian `i`.
     pub fn set_row<const W: usize>(&mut self, i: usize, row: [f32; W]) {
         for (c, value) in row.into_iter().enumerate() {
@@ -117,6 +123,17 @@ impl Gaussians {
     pub fn resize(&mut self, len: usize) {
         for column in Columns::ALL.iter() {
             self.column_mut(column).resize(len);
+        }
+    }
+
+    /// The Gaussians `rows`, in that order.
+    pub fn pick(&self, rows: &[u32]) -> Gaussians {
+        Gaussians {
+            position: self.position.pick(rows),
+            rotation: self.rotation.pick(rows),
+            log_scale: self.log_scale.pick(rows),
+            opacity_logit: self.opacity_logit.pick(rows),
+            sh: self.sh.pick(rows),
         }
     }
 

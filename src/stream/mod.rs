@@ -1,10 +1,12 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
 mod gather;
+mod motion;
 mod progress;
 mod scan;
 
 pub use gather::gather;
+pub use motion::measure_motion;
 pub use progress::Progress;
 pub use scan::{Scanned, scan};
 

@@ -1,0 +1,170 @@
+//! The main job: scan, score, select, merge, emit.
+
+use std::path::PathBuf;
+
+use super::input::{InputOptions, Scene, open_scene};
+use super::merging::{Sieved, sieve};
+use super::output::{OutputKind, check_output, write_result};
+use super::overrides::parse_ids;
+use super::scored::{Scored, UserOverrides, score_scene};
+use super::summary::{CameraSummary, LeftOut, Stages, Summary};
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+
+/// Which of pruning and merging to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Only {
+    /// Prune, then merge.
+    #[default]
+    Both,
+    /// The paper's "pruned".
+    Prune,
+    /// The paper's "merged".
+    Merge,
+}
+
+/// How many Gaussians the output is to have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Target {
+    /// This many.
+    Count(u64),
+    /// This fraction of the input, in (0, 1], rounded to the nearest and at least one.
+    Ratio(f64),
+}
+
+/// Everything a compression is asked for.
+#[derive(Debug, Clone)]
+pub struct CompressOptions {
+    /// What to read.
+    pub input: InputOptions,
+    /// Where to write.
+    pub output: PathBuf,
+    /// What to write; none: by the output's name.
+    pub kind: Option<OutputKind>,
+    /// All hyper-parameters.
+    pub recipe: Recipe,
+    /// Which stages to run.
+    pub only: Only,
+    /// Exact size of the output, if asked for.
+    pub target: Option<Target>,
+    /// Ids to keep: a list or a file.
+    pub keep_ids: Option<String>,
+    /// Ids to drop: a list or a file.
+    pub drop_ids: Option<String>,
+    /// Box whose Gaussians are kept.
+    pub keep_box: Option<[f64; 6]>,
+    /// Write nothing.
+    pub dry_run: bool,
+    /// Replace an earlier output.
+    pub overwrite: bool,
+}
+
+/// Writes a smaller model and says what was done.
+///
+/// # Errors
+/// Whatever is wrong with input, cameras, recipe or output. Nothing is left behind then.
+pub fn compress(options: &CompressOptions) -> Result<Summary> {
+    options.recipe.validate().map_err(Error::usage)?;
+    let mut stages = Stages::default();
+    let scene = stages.run("read", 0, 0.0, || {
+        let scene = open_scene(&options.input)?;
+        let count = scene.input.source().info().count;
+        Ok::<_, Error>((scene, count))
+    })?;
+    compress_scene(&scene, options, stages)
+}
+
+/// [`compress`] of a scene that is open already.
+pub fn compress_scene(scene: &Scene, options: &CompressOptions, mut stages: Stages) -> Result<Summary> {
+    let recipe = &options.recipe;
+    let info = scene.input.source().info();
+    let kind = OutputKind::of(&options.output, options.kind, &scene.input)?;
+    check_output(&options.output, kind, scene, options.overwrite)?;
+    let target = options.target.map(|target| target.count(info.count)).transpose()?;
+    let user = UserOverrides {
+        keep: options.keep_ids.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, info.count))?,
+        drop: options.drop_ids.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, info.count))?,
+        keep_box: options.keep_box,
+    };
+    let input = scene.input.summary(&scene.path)?;
+    let scored = score_scene(scene, recipe, &user, &mut stages)?;
+    let sieved = sieve(scene, &scored, recipe, options.only, target, &mut stages)?;
+
+    let mut left_out = scored.left_out(scene);
+    left_out.extend(stages_left_out(options, recipe));
+    let mut notes = scene.notes.clone();
+    notes.extend(selection_notes(&scored));
+    let mut summary = Summary {
+        tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        input,
+        cameras: CameraSummary {
+            origin: scene.rig.origin.clone(),
+            cameras: scene.schedule.cameras.len(),
+            pairs: scene.schedule.pairs(),
+        },
+        gaussians: sieved.kept.len(),
+        output_bytes: None,
+        selection: scored.selection.counts.into(),
+        terms: scored.terms(),
+        flags: scored.flags(),
+        merge: sieved.summary.clone(),
+        left_out,
+        notes,
+        stages: Vec::new(),
+    };
+    if options.dry_run {
+        summary.notes.push("dry run: nothing was written".to_owned());
+        summary.stages = stages.finish();
+        return Ok(summary);
+    }
+    write_result(scene, &scored, &sieved, recipe, kind, options, summary, stages)
+}
+
+impl Target {
+    /// The number of Gaussians it means for an input of `count`.
+    pub fn count(self, count: usize) -> Result<usize> {
+        let wanted = match self {
+            Target::Count(wanted) => wanted,
+            Target::Ratio(ratio) if ratio > 0.0 && ratio <= 1.0 => ((ratio * count as f64).round() as u64).max(1),
+            Target::Ratio(ratio) => {
+                return Err(Error::usage(format!("--target-ratio: expected a number above 0 and at most 1, found {ratio}")));
+            }
+        };
+        match usize::try_from(wanted) {
+            Ok(wanted @ 1..) if wanted <= count => Ok(wanted),
+            // The empty scene has one size only.
+            _ if count == 0 => Ok(0),
+            _ => Err(Error::usage(format!("--target-count: expected 1 to {count}, the Gaussians of the input, found {wanted}"))),
+        }
+    }
+}
+
+fn stages_left_out(options: &CompressOptions, recipe: &Recipe) -> Vec<LeftOut> {
+    let mut out = Vec::new();
+    if options.only == Only::Merge {
+        out.push(LeftOut { what: "pruning", why: "--merge-only".to_owned() });
+    }
+    if options.only == Only::Prune {
+        out.push(LeftOut { what: "merging, and its pass over the frames", why: "--prune-only".to_owned() });
+    } else if recipe.merge.passes.is_empty() {
+        out.push(LeftOut { what: "merging, and its pass over the frames", why: "the recipe has no merge pass".to_owned() });
+    }
+    out
+}
+
+fn selection_notes(scored: &Scored) -> Vec<String> {
+    let flags = scored.flags();
+    let mut notes = Vec::new();
+    for (count, what) in [
+        (flags.non_finite, "with NaN or infinity"),
+        (flags.zero_rotation, "with a zero quaternion (taken as the identity)"),
+        (flags.snapped_d, "whose motion D is rounding noise (set to 0)"),
+        (flags.snapped_kappa, "whose curvature kappa is rounding noise (set to 0)"),
+        (flags.never_alive, "never alive"),
+    ] {
+        if count > 0 {
+            notes.push(format!("{count} Gaussians {what}"));
+        }
+    }
+    notes
+}
