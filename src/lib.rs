@@ -7,12 +7,13 @@
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
 //! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`] | pure mathematics: slices in, values out |
-//! | L3 | [`ingest`], [`stream`], [`emit`] | files, threads, terminals |
+//! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
 
 //! | L5 | [`cli`] | arguments and exit codes |
 
 pub mod cli;
 pub mod deform;
+pub mod demo;
 pub mod emit;
 pub mod error;
 pub mod ingest;

@@ -3,9 +3,9 @@
 //! | file | times | splits |
 //! |---|---|---|
 //! | `transforms_train.json` + `transforms_test.json`, `transforms.json` (NeRF, D-NeRF) | `time` | from the names |
-//! | `cameras.json` of this project ([`cameras_json`]) | `time` | `split` |
-//! | `cameras.json` of a 3DGS model folder ([`cameras_json`]) | none: every frame | all train |
-//! | `poses_bounds.npy` (LLFF, DyNeRF; [`llff`]) | i/n | camera 0 is test |
+//! | `cameras.json` of this project (`cameras_json.rs`) | `time` | `split` |
+//! | `cameras.json` of a 3DGS model folder (`cameras_json.rs`) | none: every frame | all train |
+//! | `poses_bounds.npy` (LLFF, DyNeRF; `llff.rs`) | i/n | camera 0 is test |
 //!
 //! Everything leaves in OpenCV axes, world to camera, in f64, rotations checked to be rotations.
 //! Memory: the parsed file; one small record per picture.

@@ -141,12 +141,18 @@ fn opengl_pose_becomes_an_opencv_camera() {
         cx: 40.0,
         cy: 30.0,
         // Right is +x, down is −z, forward is +y.
-        rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::ZERO)
-            + DMat3::from_cols(DVec3::ZERO, DVec3::Y + DVec3::Z, DVec3::NEG_Y),
+        rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y).transpose(),
         translation: DVec3::new(0.0, 1.0, 4.0),
     };
     assert_eq!(rig.cameras[0], expected);
     assert_eq!(rig.cameras[1].center(), DVec3::new(1.0, -4.0, 1.0));
+
+    // Looking along +x: a pose with which the order of the axis flip and the rotation shows.
+    let mut document = transforms(&[0.0]);
+    document["frames"][0]["transform_matrix"] = json!([[0, 0, -1, 7], [-1, 0, 0, 8], [0, 1, 0, 9], [0, 0, 0, 1]]);
+    let camera = load_json("transforms.json", &document).unwrap().cameras[0].clone();
+    assert_eq!(camera.rotation, DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X).transpose());
+    assert_eq!(camera.center(), DVec3::new(7.0, 8.0, 9.0));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //! Keys, of a frame or of the file (the frame's win): `fl_x fl_y cx cy w h`, or `camera_angle_x`
 //! (and `camera_angle_y`), the field of view in radians. Pixels are square and the principal point is
 //! the middle unless said otherwise. A frame has `file_path`, `transform_matrix` and, if the scene
-//! moves, `time`.
+//! moves, `time`. Lens distortion (`k1` …) is ignored: pictures are taken to be undistorted.
 //!
 //! Times are divided by the largest of all files read, as the D-NeRF loaders do that the models were
 //! trained with (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames

@@ -1,0 +1,356 @@
+//! The families of the demo scene: where each Gaussian is at rest, and how it moves.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+use std::ops::Range;
+
+use glam::{DQuat, DVec2, DVec3};
+use xxhash_rust::xxh3::xxh3_64_with_seed;
+
+use crate::model::SH_C0;
+
+/// A kind of thing in the demo scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Family {
+    /// Floor and three walls with a chequered texture. Still; inside a tile all of one colour, so
+    /// neighbours can merge.
+    Wall,
+    /// Near-duplicates of wall Gaussians: a tenth of a size beside one, a little smaller, of the same
+    /// colour. Still; the first to merge.
+    Double,
+    /// Opaque Gaussians behind the back wall that no camera sees. Still; the first to prune by
+    /// visibility, and not by opacity or size.
+    Buried,
+    /// Tiny faint Gaussians all over the room. Still; the first to prune by coverage.
+    Dust,
+    /// An egg that circles and spins as one body: strong motion that is rigid, so merging within it
+    /// keeps the motion.
+    Egg,
+    /// A cloth, held at its left edge and waving at the right: neighbours move differently.
+    Cloth,
+    /// A cloud whose opacity goes from full to nothing or the reverse. Still: only the variance of the
+    /// opacity and the life span tell it from a wall.
+    Fading,
+    /// Sparks that fly and are seen for an eighth of the sequence each, at their own time: disjoint
+    /// lives, no motion while dead.
+    Spark,
+    /// Hanging wires of needles, 25 times longer than thick. Still; small in area and yet seen.
+    Wire,
+}
+
+impl Family {
+    /// Every family, in the order of their Gaussians.
+    pub const ALL: [Family; 9] = [
+        Family::Wall,
+        Family::Double,
+        Family::Buried,
+        Family::Dust,
+        Family::Egg,
+        Family::Cloth,
+        Family::Fading,
+        Family::Spark,
+        Family::Wire,
+    ];
+
+    /// Parts of a thousand Gaussians.
+    const fn share(self) -> usize {
+        match self {
+            Family::Wall => 400,
+            Family::Double => 150,
+            Family::Egg => 100,
+            Family::Buried | Family::Dust | Family::Cloth => 80,
+            Family::Fading | Family::Wire => 40,
+            Family::Spark => 30,
+        }
+    }
+}
+
+/// A Gaussian's constants and its law of motion.
+#[derive(Debug, Clone)]
+pub(super) struct Part {
+    position: DVec3,
+    rotation: DQuat,
+    opacity_logit: f64,
+    motion: Motion,
+    pub(super) log_scale: [f32; 3],
+    pub(super) sh: [f32; 12],
+}
+
+/// What varies, at one time.
+pub(super) struct Moved {
+    pub(super) position: DVec3,
+    pub(super) rotation: DQuat,
+    pub(super) opacity_logit: f64,
+}
+
+/// How a Gaussian moves; times run from 0 to 1.
+#[derive(Debug, Clone)]
+enum Motion {
+    Still,
+    /// `position` and `rotation` are those in the egg's own frame.
+    Egg,
+    /// Displaced along y by a wave, `along` from 0 (held) to 1 (free).
+    Wave {
+        along: f64,
+    },
+    /// The logit changes at this rate per unit of time.
+    Fade {
+        rate: f64,
+    },
+    /// Seen within `half_life` of `peak`, flying at `velocity` meanwhile.
+    Spark {
+        peak: f64,
+        half_life: f64,
+        velocity: DVec3,
+    },
+}
+
+/// The cloth's size along x, and how far its free edge swings.
+const CLOTH_WIDTH: f64 = 1.2;
+const SWING: f64 = 0.18;
+/// Waves along the cloth, and waves that pass in the sequence.
+const WAVES: f64 = 1.5;
+const PASSES: f64 = 2.0;
+/// Logit at which a spark or a fading Gaussian is as good as gone; 0.01, the usual threshold of life,
+/// is −4.6.
+const GONE: f64 = -6.0;
+/// Logit of the sparks at their peak.
+const BRIGHT: f64 = 3.0;
+/// The sparks' half lives. With 1/16 they span an eighth of the sequence.
+const HALF_LIFE: f64 = 1.0 / 16.0;
+const GRAVITY: f64 = 12.0;
+
+impl Part {
+    /// The Gaussian at `time`.
+    pub(super) fn at(&self, time: f64) -> Moved {
+        let Part { mut position, mut rotation, mut opacity_logit, .. } = *self;
+        match self.motion {
+            Motion::Still => {}
+            Motion::Egg => {
+                let (sin, cos) = (0.75 * TAU * time).sin_cos();
+                let spin = DQuat::from_axis_angle(DVec3::new(1.0, 1.0, 3.0).normalize(), TAU * time);
+                position = DVec3::new(0.6 * cos, 0.2 + 0.4 * sin, 0.7) + spin * position;
+                rotation = spin * rotation;
+            }
+            Motion::Wave { along } => {
+                let (sin, cos) = (TAU * (WAVES * along - PASSES * time)).sin_cos();
+                position.y += SWING * along * sin;
+                let slope = SWING * (sin + along * TAU * WAVES * cos) / CLOTH_WIDTH;
+                rotation = DQuat::from_rotation_z(slope.atan()) * rotation;
+            }
+            Motion::Fade { rate } => opacity_logit += rate * time,
+            Motion::Spark { peak, half_life, velocity } => {
+                let away = (time - peak) / half_life;
+                opacity_logit = BRIGHT + (GONE - BRIGHT) * (away * away).min(1.5);
+                let flown = (time - (peak - half_life)).clamp(0.0, 2.0 * half_life);
+                position += velocity * flown - DVec3::Z * (0.5 * GRAVITY * flown * flown);
+            }
+        }
+        Moved { position, rotation, opacity_logit }
+    }
+}
+
+/// Which Gaussian belongs to which family.
+#[derive(Debug, Clone)]
+pub(super) struct Layout {
+    /// Where each family starts, and where the last ends.
+    starts: [usize; Family::ALL.len() + 1],
+}
+
+impl Layout {
+    pub(super) fn new(count: usize) -> Layout {
+        let mut starts = [0; Family::ALL.len() + 1];
+        let mut share = 0;
+        for (start, family) in starts[1..].iter_mut().zip(Family::ALL) {
+            share += family.share();
+            *start = (count as u128 * share as u128 / 1000) as usize;
+        }
+        Layout { starts }
+    }
+
+    pub(super) fn members(&self, family: Family) -> Range<usize> {
+        let at = family as usize;
+        self.starts[at]..self.starts[at + 1]
+    }
+
+    /// Gaussian `id`, less than the count.
+    pub(super) fn part(&self, id: usize) -> Part {
+        let family = Family::ALL[self.starts.partition_point(|&start| start <= id) - 1];
+        let members = self.members(family);
+        let dice = Dice(id as u64);
+        let (k, n) = (id - members.start, members.len());
+        match family {
+            Family::Wall => wall(k, n, dice),
+            Family::Double => self.double(k, n, dice),
+            Family::Buried => buried(dice),
+            Family::Dust => dust(dice),
+            Family::Egg => egg(k, n, dice),
+            Family::Cloth => cloth(k, n, dice),
+            Family::Fading => fading(dice),
+            Family::Spark => spark(dice),
+            Family::Wire => wire(k, n, dice),
+        }
+    }
+
+    fn double(&self, k: usize, n: usize, dice: Dice) -> Part {
+        let walls = self.members(Family::Wall);
+        // A scene of two Gaussians has a double and no wall.
+        let original = (k as u128 * walls.len() as u128 / n as u128) as usize;
+        let mut part = wall(original, walls.len().max(1), Dice((walls.start + original) as u64));
+        let size = f64::from(part.log_scale[0]).exp();
+        part.position += part.rotation * DVec3::new(dice.signed(0), dice.signed(1), 0.0) * (0.1 * size);
+        part.log_scale = part.log_scale.map(|x| x - 0.1);
+        part.opacity_logit -= 1.0;
+        part
+    }
+}
+
+/// Numbers that belong to one Gaussian: hashed from its id, so that no order of drawing matters.
+#[derive(Clone, Copy)]
+struct Dice(u64);
+
+impl Dice {
+    /// Number `channel`, from 0 to 1.
+    fn unit(self, channel: u64) -> f64 {
+        const BITS: u32 = f64::MANTISSA_DIGITS;
+        (xxh3_64_with_seed(&self.0.to_le_bytes(), channel) >> (64 - BITS)) as f64 / (1u64 << BITS) as f64
+    }
+
+    /// Number `channel`, from −1 to 1.
+    fn signed(self, channel: u64) -> f64 {
+        2.0 * self.unit(channel) - 1.0
+    }
+
+    /// Number `channel`, from `low` to `high`.
+    fn between(self, channel: u64, low: f64, high: f64) -> f64 {
+        low + (high - low) * self.unit(channel)
+    }
+}
+
+/// Channels of [`Dice`] that several families use: the families' own start at 0.
+const TINT: u64 = 100;
+const SHEEN: u64 = 200;
+
+fn still(position: DVec3, rotation: DQuat, scale: [f64; 3], opacity_logit: f64, sh: [f32; 12]) -> Part {
+    let log_scale = scale.map(|s| s.ln() as f32);
+    Part { position, rotation, opacity_logit, motion: Motion::Still, log_scale, sh }
+}
+
+/// Coefficients for a colour in [0, 1], with a tint of its own and a slight change with direction.
+fn color(rgb: [f64; 3], dice: Dice) -> [f32; 12] {
+    std::array::from_fn(|at| match at {
+        0..3 => ((rgb[at] + 0.02 * dice.signed(TINT) - 0.5) / SH_C0) as f32,
+        _ => (0.04 * dice.signed(SHEEN + at as u64)) as f32,
+    })
+}
+
+/// Point `k` of a sequence that fills the unit square evenly however many are taken (R2: Roberts,
+/// "The unreasonable effectiveness of quasirandom sequences", 2018).
+fn spread(k: usize) -> DVec2 {
+    const PLASTIC: f64 = 1.324_717_957_244_746;
+    let k = k as f64;
+    DVec2::new((0.5 + k / PLASTIC).fract(), (0.5 + k / (PLASTIC * PLASTIC)).fract())
+}
+
+/// Rotates the thin axis z to ∓y.
+fn facing_y() -> DQuat {
+    DQuat::from_rotation_x(FRAC_PI_2)
+}
+
+fn wall(k: usize, n: usize, dice: Dice) -> Part {
+    /// Height of the walls and width of the room.
+    const HIGH: f64 = 2.5;
+    const WIDE: f64 = 4.0;
+    const WALL: f64 = HIGH * WIDE;
+    const FLOOR: f64 = WIDE * WIDE;
+    const ALL: f64 = FLOOR + 3.0 * WALL;
+
+    let at = (k as f64 + 0.5) / n as f64 * ALL;
+    let DVec2 { x: u, y: v } = spread(k);
+    let (across, up, side) = (WIDE * (u - 0.5), HIGH * v, 0.5 * WIDE);
+    let facing_x = DQuat::from_rotation_y(FRAC_PI_2);
+    let (position, facing, hue) = if at < FLOOR {
+        (DVec3::new(across, WIDE * (v - 0.5), 0.0), DQuat::IDENTITY, [0.55, 0.45, 0.35])
+    } else if at < FLOOR + WALL {
+        (DVec3::new(across, side, up), facing_y(), [0.45, 0.55, 0.65])
+    } else if at < FLOOR + 2.0 * WALL {
+        (DVec3::new(-side, across, up), facing_x, [0.65, 0.4, 0.4])
+    } else {
+        (DVec3::new(side, across, up), facing_x, [0.4, 0.6, 0.45])
+    };
+    let tile = (position / 0.5).floor();
+    let dark = (tile.x + tile.y + tile.z).rem_euclid(2.0) == 0.0;
+    let size = 0.6 * (ALL / n as f64).sqrt();
+    let scale = [size * dice.between(0, 0.9, 1.4), size * dice.between(1, 0.7, 0.9), 0.1 * size];
+    let rotation = facing * DQuat::from_rotation_z(dice.between(2, 0.0, TAU));
+    still(
+        position,
+        rotation,
+        scale,
+        dice.between(3, 3.0, 5.0),
+        color(hue.map(|c| if dark { 0.6 * c } else { c }), dice),
+    )
+}
+
+fn buried(dice: Dice) -> Part {
+    let position = DVec3::new(1.8 * dice.signed(0), dice.between(1, 2.3, 2.8), dice.between(2, 0.2, 2.2));
+    let size = dice.between(3, 0.03, 0.06);
+    still(position, facing_y(), [size, size, 0.5 * size], 3.0, color([0.9, 0.1, 0.9], dice))
+}
+
+fn dust(dice: Dice) -> Part {
+    let position = DVec3::new(1.9 * dice.signed(0), 1.9 * dice.signed(1), dice.between(2, 0.1, 2.4));
+    let size = dice.between(3, 0.002, 0.004);
+    still(position, DQuat::IDENTITY, [size; 3], dice.between(4, -4.0, -1.0), color([0.7; 3], dice))
+}
+
+fn egg(k: usize, n: usize, dice: Dice) -> Part {
+    let axes = DVec3::new(0.3, 0.3, 0.42);
+    let DVec2 { x: turn, y: height } = spread(k);
+    let z = 2.0 * height - 1.0;
+    let (sin, cos) = (TAU * turn).sin_cos();
+    let ball = DVec3::new(cos, sin, 0.0) * (1.0 - z * z).max(0.0).sqrt() + DVec3::Z * z;
+    let size = 0.7 * (1.5 / n as f64).sqrt();
+    let band = if (4.0 * turn).floor() % 2.0 == 0.0 { [0.95, 0.75, 0.2] } else { [0.2, 0.35, 0.8] };
+    let rotation = DQuat::from_rotation_arc(DVec3::Z, (ball / axes).normalize());
+    let scale = [size, size, 0.2 * size];
+    Part { motion: Motion::Egg, ..still(ball * axes, rotation, scale, 4.0, color(band, dice)) }
+}
+
+fn cloth(k: usize, n: usize, dice: Dice) -> Part {
+    const HIGH: f64 = 1.1;
+    let DVec2 { x: along, y: up } = spread(k);
+    let position = DVec3::new(-1.6 + CLOTH_WIDTH * along, 1.0, 0.7 + HIGH * up);
+    let size = 0.7 * (CLOTH_WIDTH * HIGH / n as f64).sqrt();
+    let stripe = if (6.0 * up).floor() % 2.0 == 0.0 { [0.85, 0.85, 0.8] } else { [0.75, 0.15, 0.15] };
+    let scale = [size, size, 0.1 * size];
+    Part { motion: Motion::Wave { along }, ..still(position, facing_y(), scale, 4.0, color(stripe, dice)) }
+}
+
+fn fading(dice: Dice) -> Part {
+    let position = DVec3::new(1.1, 0.8, 1.0) + 0.4 * DVec3::new(dice.signed(0), dice.signed(1), dice.signed(2));
+    let size = dice.between(3, 0.03, 0.06);
+    let (start, end) = if dice.unit(4) < 0.5 { (BRIGHT, GONE) } else { (GONE, BRIGHT) };
+    let cloud = still(position, DQuat::IDENTITY, [size; 3], start, color([0.8, 0.8, 0.9], dice));
+    Part { motion: Motion::Fade { rate: end - start }, ..cloud }
+}
+
+fn spark(dice: Dice) -> Part {
+    let position = DVec3::new(0.9, -0.5, 0.1);
+    let velocity = DVec3::new(2.0 * dice.signed(0), 2.0 * dice.signed(1), dice.between(2, 3.0, 5.0));
+    // The peak lies where the whole life fits into the sequence.
+    let motion = Motion::Spark { peak: dice.between(3, HALF_LIFE, 1.0 - HALF_LIFE), half_life: HALF_LIFE, velocity };
+    Part { motion, ..still(position, DQuat::IDENTITY, [0.02; 3], BRIGHT, color([1.0, 0.8, 0.3], dice)) }
+}
+
+fn wire(k: usize, n: usize, dice: Dice) -> Part {
+    const WIRES: usize = 4;
+    const SPAN: f64 = 3.8;
+    let (which, at) = (k % WIRES, k / WIRES);
+    let along = (at as f64 + 0.5) / n.div_ceil(WIRES) as f64;
+    let sag = 0.3 + 0.15 * which as f64;
+    let position = DVec3::new(SPAN * (along - 0.5), -1.2 + 0.7 * which as f64, 2.3 - sag * 4.0 * along * (1.0 - along));
+    let tangent = DVec3::new(SPAN, 0.0, -sag * 4.0 * (1.0 - 2.0 * along)).normalize();
+    let length = 0.6 * SPAN / n.div_ceil(WIRES) as f64;
+    let scale = [length, length / 25.0, length / 25.0];
+    still(position, DQuat::from_rotation_arc(DVec3::X, tangent), scale, 4.0, color([0.15, 0.15, 0.2], dice))
+}
