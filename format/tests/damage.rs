@@ -141,7 +141,9 @@ fn hostile_index_entries_with_valid_checksums_are_refused() {
         let bytes = bytes.to_vec();
         Box::new(move |entry| entry[at..at + bytes.len()].copy_from_slice(&bytes))
     };
-    let cases: [(&str, Change); 13] = [
+    let cases: [(&str, Change); 15] = [
+        ("a reserved byte in use", put(19, &[1])),
+        ("an odd offset", put(24, &(first + 4).to_le_bytes())),
         ("another column", put(4, &1u32.to_le_bytes())),
         ("a column that is not there", put(4, &u32::MAX.to_le_bytes())),
         ("another frame block", put(12, &0u32.to_le_bytes())),
@@ -159,6 +161,11 @@ fn hostile_index_entries_with_valid_checksums_are_refused() {
     for (name, change) in cases {
         fs::write(&path, forge(&good, 2, change)).unwrap();
         assert!(check(&scene, &path, good.len() as u64).is_err(), "{name} passed");
+        let unread = Reader::open(&path).is_err();
+        assert_eq!(unread, name != "wrong statistics", "{name}: only statistics wait for verification");
+        // Whatever it makes of the record, what it saves is a container.
+        recover(&path, folder.path().join("saved")).unwrap();
+        Reader::open(folder.path().join("saved")).unwrap();
     }
 }
 

@@ -7,6 +7,7 @@ use std::fs;
 use gseq::{Compression, Encoding, Error, Layout, Reader, TileBuffer, TileId, Writer, encode_tile};
 use proptest::prelude::*;
 use scene::{Scene, layout};
+use xxhash_rust::xxh3::xxh3_64;
 
 const AT: TileId = TileId { column: 0, gaussian_block: 0, frame_block: 0 };
 
@@ -44,6 +45,17 @@ fn digest_ignores_the_order_of_writing_and_bytes_follow_it() {
     let mut other = Scene::new(layout(30, 8, 3, &[3, 2, 1]), 7, 5);
     other.bits[2][11] ^= 1;
     assert_ne!(other.write(&b, Compression::Zstd(1), |_| ()), first, "a changed bit must change the digest");
+}
+
+/// The hash was recorded when version 1 was made (raw tiles: zstd has no part in it). If it changes, so does the version.
+#[test]
+fn the_bytes_of_version_1_stay_as_they_are() {
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    Scene::new(layout(30, 8, 3, &[3, 2, 1]), 7, 5).write(&path, Compression::Raw, |_| ());
+    let bytes = fs::read(&path).unwrap();
+    assert_eq!(bytes[..12], *b"\x89GSEQ\r\n\x1a\x01\0\0\0");
+    assert_eq!((bytes.len(), xxh3_64(&bytes)), (9752, 2_483_963_558_680_014_291));
 }
 
 #[test]
