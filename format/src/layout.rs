@@ -72,6 +72,9 @@ impl Layout {
     }
 
     /// Number of Gaussian blocks; 0 without Gaussians.
+    ///
+    /// # Panics
+    /// If `gaussian_block` is 0, which no container has.
     pub fn gaussian_blocks(&self) -> u32 {
         // Legal layouts have at most 2²⁴ tiles per frame block, so the cast keeps the value.
         self.gaussians.div_ceil(u64::from(self.gaussian_block)) as u32

@@ -11,6 +11,7 @@ use crate::file::MappedFile;
 use crate::layout::Layout;
 use crate::reader::{TileBuffer, read_header, read_tile};
 use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
+use crate::verify::check_stats;
 use crate::writer::{Writer, check_times};
 
 /// What [`recover`] found and saved.
@@ -148,6 +149,7 @@ impl Found {
         let own = tile.offset == position + RECORD;
         if own {
             read_tile(file, layout, tile, buffer).ok()?;
+            check_stats(tile, position, buffer.values()).ok()?;
             if tile.constant {
                 self.constants.insert(tile.offset, *tile);
             }

@@ -2,8 +2,8 @@
 
 use std::collections::HashSet;
 
-use crate::codec::stats;
-use crate::error::{Error, Fault, Result};
+use crate::codec::{Stats, stats};
+use crate::error::{Fault, Result};
 use crate::reader::{Reader, TileBuffer};
 use crate::record::{RECORD, Record, TileRecord, align};
 use crate::recover::read_times;
@@ -53,7 +53,8 @@ impl Reader {
                     report.tiles += 1;
                     let mut stored = 0;
                     if tile.offset == payload {
-                        self.verify_tile(&tile, position, &mut buffer)?;
+                        let values = self.read_tile(tile.id, &mut buffer)?.values();
+                        check_stats(&tile, position, values).map_err(fault)?;
                         stored = u64::from(tile.stored_bytes);
                         report.stored_bytes += stored;
                         report.decoded_bytes += 4 * tile.values(&self.layout) as u64;
@@ -99,30 +100,26 @@ impl Reader {
         Record::Tile(self.tiles[index as usize]).to_bytes() == bytes
     }
 
-    fn verify_tile(&self, tile: &TileRecord, position: u64, buffer: &mut TileBuffer) -> Result<()> {
-        let values = self.read_tile(tile.id, buffer)?.values();
-        let found = stats(bytemuck::cast_slice(values));
-        let bits = |min: f32, max: f32, count: u32| (min.to_bits(), max.to_bits(), count);
-        let stated = tile.stats;
-        if bits(found.min, found.max, found.non_finite) != bits(stated.min, stated.max, stated.non_finite) {
-            let fault = Fault::new(position + 44, format!("{found:?}, as the values are"), format!("{stated:?}"));
-            return Err(fault.at(self.file.path()));
-        }
-        Ok(())
-    }
-
     /// Checks that zeros fill the file from `end` to the next multiple of 64, which is returned.
     fn padded(&self, end: u64) -> Result<u64> {
         let mut zeros = [0; RECORD as usize];
         let zeros = &mut zeros[..(align(end) - end) as usize];
         self.file.read_at(end, zeros)?;
-        match zeros.iter().position(|&byte| byte != 0) {
-            Some(at) => Err(self.padding_fault(end + at as u64, zeros[at])),
-            None => Ok(align(end)),
+        if let Some(at) = zeros.iter().position(|&byte| byte != 0) {
+            let fault = Fault::new(end + at as u64, "a zero byte of padding", format!("{:#04x}", zeros[at]));
+            return Err(fault.at(self.file.path()));
         }
+        Ok(align(end))
     }
+}
 
-    fn padding_fault(&self, offset: u64, byte: u8) -> Error {
-        Fault::new(offset, "a zero byte of padding", format!("{byte:#04x}")).at(self.file.path())
+/// Checks the statistics of the record at `position` against the values of its tile.
+pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> std::result::Result<(), Fault> {
+    let found = stats(bytemuck::cast_slice(values));
+    // As bits: a forged NaN must not compare as equal to nothing, nor −0 to the +0 it has to be.
+    let bits = |stats: Stats| (stats.min.to_bits(), stats.max.to_bits(), stats.non_finite);
+    if bits(found) != bits(tile.stats) {
+        return Err(Fault::new(position + 44, format!("{found:?}, as the values are"), format!("{:?}", tile.stats)));
     }
+    Ok(())
 }

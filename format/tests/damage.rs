@@ -5,7 +5,7 @@ mod scene;
 use std::fs;
 use std::path::Path;
 
-use gseq::{Compression, Error, Reader, TileBuffer, TileId, recover};
+use gseq::{Compression, Error, Reader, TileBuffer, TileId, Writer, recover};
 use scene::{Scene, layout};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -106,6 +106,20 @@ fn recover_of_a_flipped_bit_saves_what_comes_before_it() {
     assert_eq!(fs::read(&saved).unwrap(), good, "recovering a whole file copies it");
 }
 
+#[test]
+fn what_a_killed_writer_leaves_behind_is_recovered() {
+    let folder = scene::folder();
+    let scene = small_scene();
+    let mut writer = Writer::create(folder.path().join("a"), scene.layout.clone()).unwrap();
+    scene.fill(&mut writer, Compression::Zstd(1), |_| ());
+    std::mem::forget(writer);
+    let left = fs::read_dir(folder.path()).unwrap().next().unwrap().unwrap().path();
+    assert!(Reader::open(&left).err().unwrap().to_string().contains("`recover` saves"));
+    let saved = folder.path().join("saved");
+    assert_eq!(recover(&left, &saved).unwrap().frames, 5);
+    scene.compare(&Reader::open(&saved).unwrap(), 5).unwrap();
+}
+
 /// A hostile writer: changes bytes of an index entry and of its record, then makes every checksum agree again.
 fn forge(good: &[u8], tile: usize, change: impl Fn(&mut [u8])) -> Vec<u8> {
     let mut bad = good.to_vec();
@@ -165,7 +179,7 @@ fn hostile_index_entries_with_valid_checksums_are_refused() {
         assert_eq!(unread, name != "wrong statistics", "{name}: only statistics wait for verification");
         // Whatever it makes of the record, what it saves is a container.
         recover(&path, folder.path().join("saved")).unwrap();
-        Reader::open(folder.path().join("saved")).unwrap();
+        Reader::open(folder.path().join("saved")).unwrap().verify().unwrap();
     }
 }
 

@@ -87,6 +87,22 @@ fn one_encoded_frame_serves_frame_blocks_of_any_length() {
 }
 
 #[test]
+fn threads_share_a_reader() {
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    let scene = Scene::new(layout(40, 8, 2, &[3, 1, 1]), 6, 5);
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        scene.write(&path, compression, |_| ());
+        let reader = Reader::open(&path).unwrap();
+        std::thread::scope(|threads| {
+            for _ in 0..4 {
+                threads.spawn(|| scene.compare(&reader, 6).unwrap());
+            }
+        });
+    }
+}
+
+#[test]
 fn raw_tiles_lie_aligned_in_the_file_and_are_used_in_place() {
     let folder = scene::folder();
     let path = folder.path().join("a");
