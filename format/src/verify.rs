@@ -5,7 +5,7 @@ use std::collections::HashSet;
 use crate::codec::{Stats, stats};
 use crate::error::{Fault, Result};
 use crate::reader::{Reader, TileBuffer};
-use crate::record::{RECORD, Record, TileRecord, align};
+use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
 use crate::recover::read_times;
 
 /// What [`Reader::verify`] went through.
@@ -67,20 +67,9 @@ impl Reader {
                     position = self.padded(payload + stored)?;
                 }
                 Record::Times(times) => {
-                    let stamps = read_times(&self.file, &self.layout, &times, position)?;
-                    let range = self.layout.frame_range(times.frame_block, report.frames);
-                    let indexed = self.times.get(range.start as usize..range.end as usize).unwrap_or_default();
-                    let same = indexed.iter().map(|t| t.to_bits()).eq(stamps.iter().map(|t| t.to_bits()));
-                    if times.frame_block != blocks_met || !same {
-                        let expected = format!("the time stamps {indexed:?} of frame block {blocks_met}");
-                        return Err(fault(Fault::new(
-                            position,
-                            expected,
-                            format!("{stamps:?} of {}", times.frame_block),
-                        )));
-                    }
+                    self.check_times(&times, blocks_met, position)?;
                     blocks_met += 1;
-                    position = self.padded(payload + 8 * stamps.len() as u64)?;
+                    position = self.padded(payload + 8 * u64::from(times.frames))?;
                 }
                 Record::Footer(_) => {
                     let expected = format!("the footer at byte {}", self.footer_offset);
@@ -94,6 +83,20 @@ impl Reader {
             return Err(fault(Fault::new(self.footer_offset, expected, format!("{blocks_met} and {}", report.tiles))));
         }
         Ok(report)
+    }
+
+    /// Checks that the record at `position` holds the time stamps of frame block `block`, as the footer has them.
+    fn check_times(&self, record: &TimesRecord, block: u32, position: u64) -> Result<()> {
+        let stamps = read_times(&self.file, &self.layout, record, position)?;
+        let range = self.layout.frame_range(block, self.times.len() as u64);
+        let indexed = self.times.get(range.start as usize..range.end as usize).unwrap_or_default();
+        let same = indexed.iter().map(|t| t.to_bits()).eq(stamps.iter().map(|t| t.to_bits()));
+        if record.frame_block != block || !same {
+            let expected = format!("the time stamps of frame block {block}, as in the footer");
+            let found = format!("{} others of frame block {}", stamps.len(), record.frame_block);
+            return Err(Fault::new(position, expected, found).at(self.file.path()));
+        }
+        Ok(())
     }
 
     fn indexed(&self, index: u64, bytes: &[u8]) -> bool {
