@@ -72,6 +72,9 @@ impl Layout {
     }
 
     /// Number of Gaussian blocks; 0 without Gaussians.
+    ///
+    /// # Panics
+    /// If `gaussian_block` is 0, which no container has.
     pub fn gaussian_blocks(&self) -> u32 {
         // Legal layouts have at most 2²⁴ tiles per frame block, so the cast keeps the value.
         self.gaussians.div_ceil(u64::from(self.gaussian_block)) as u32
@@ -311,5 +314,60 @@ impl<'a> Fields<'a> {
         let bytes = self.take(len)?;
         let text = std::str::from_utf8(bytes).map_err(|error| Fault::new(start, "UTF-8 text", error))?;
         Ok(text.to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn layout() -> Layout {
+        Layout {
+            gaussians: 100,
+            gaussian_block: 32,
+            frame_block: 4,
+            columns: vec![
+                ColumnSpec { name: "position".into(), width: 3 },
+                ColumnSpec { name: "sh".into(), width: 48 },
+            ],
+            attributes: BTreeMap::from([("a".into(), "1".into()), ("b".into(), String::new())]),
+        }
+    }
+
+    #[test]
+    fn headers_come_back_as_they_were_written() {
+        let header = layout().to_header().unwrap();
+        assert_eq!(header.len(), layout().header_len());
+        assert_eq!(Layout::from_header(&header).unwrap(), layout());
+    }
+
+    #[test]
+    fn places_in_the_index_and_tiles_correspond() {
+        let layout = layout();
+        let ids: Vec<TileId> = (0..40).map(|index| layout.tile_at(index)).collect();
+        assert!(ids.iter().enumerate().all(|(index, &id)| layout.index_of(id) == Some(index as u64)));
+        assert_eq!(ids[9], TileId { column: 1, gaussian_block: 0, frame_block: 1 });
+        assert_eq!(layout.gaussian_range(3), 96..100);
+        assert_eq!(layout.gaussian_range(4), 100..100);
+    }
+
+    proptest! {
+        #[test]
+        fn hostile_headers_with_valid_checksums_are_legal_or_refused(
+            at in 16usize..120, bytes in prop::collection::vec(any::<u8>(), 1..12), cut in 0usize..60,
+        ) {
+            let mut header = layout().to_header().unwrap();
+            header.truncate(header.len() - 8);
+            for (i, byte) in bytes.into_iter().enumerate() {
+                if let Some(place) = header.get_mut(at + i) { *place = byte; }
+            }
+            header.truncate(header.len() - cut);
+            let checksum = xxh3_64(&header);
+            header.extend(checksum.to_le_bytes());
+            if let Ok(layout) = Layout::from_header(&header) {
+                prop_assert!(layout.check().is_ok());
+            }
+        }
     }
 }

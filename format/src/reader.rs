@@ -12,7 +12,8 @@ use crate::layout::{FIXED_HEADER, Layout, TileId};
 use crate::record::{FooterRecord, RECORD, Record, TRAILER, TileRecord, align, digest, trailer_from_bytes};
 use crate::writer::check_times;
 
-/// A finished container. Memory: 64 bytes per tile and 8 per frame; tiles stay on disk.
+/// A finished container. Memory: 64 bytes per tile and 8 per frame, three times that while opening; the values
+/// stay on disk.
 ///
 /// What happens when the file changes underneath: see [`Reader::tile`].
 pub struct Reader {
@@ -259,6 +260,11 @@ impl Reader {
 }
 
 impl TileBuffer {
+    /// The values of the tile that was read last.
+    pub(crate) fn values(&self) -> &[f32] {
+        &self.values
+    }
+
     /// The stored bytes of the tile that was read last.
     pub(crate) fn stored(&self) -> &[u8] {
         &self.stored
@@ -315,7 +321,7 @@ fn check_footer(
     }
     let blocks = footer.frames.div_ceil(layout.frame_block.into());
     let tiles = blocks.checked_mul(layout.tiles_per_frame_block());
-    if blocks > 1 << 32 || tiles != Some(footer.tiles) {
+    if blocks > u32::MAX.into() || tiles != Some(footer.tiles) {
         let expected = format!("the tiles of {} frames", footer.frames);
         return Err(Fault::new(offset + 16, expected, format!("{} tiles", footer.tiles)));
     }

@@ -11,6 +11,7 @@ use crate::file::MappedFile;
 use crate::layout::Layout;
 use crate::reader::{TileBuffer, read_header, read_tile};
 use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
+use crate::verify::check_stats;
 use crate::writer::{Writer, check_times};
 
 /// What [`recover`] found and saved.
@@ -92,13 +93,15 @@ fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
 struct Found {
     times: HashMap<u32, Vec<f64>>,
     tiles: HashMap<u64, TileRecord>,
+    /// Constant tiles that have their own payload, by its place.
+    constants: HashMap<u64, TileRecord>,
     skipped: u64,
 }
 
 /// Goes from record to record. Where one is damaged, tries every multiple of 64 after it: a record knows
 /// its place, so bytes inside a payload are not taken for one.
 fn scan(file: &MappedFile, layout: &Layout, start: u64) -> Result<Found> {
-    let mut found = Found { times: HashMap::new(), tiles: HashMap::new(), skipped: 0 };
+    let mut found = Found { times: HashMap::new(), tiles: HashMap::new(), constants: HashMap::new(), skipped: 0 };
     let mut buffer = TileBuffer::default();
     let mut position = start;
     while position + RECORD <= file.len() {
@@ -106,12 +109,7 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64) -> Result<Found> {
         file.read_at(position, &mut bytes)?;
         let payload = position + RECORD;
         let len = match Record::from_bytes(&bytes, position) {
-            Ok(Record::Tile(tile)) => intact_tile(file, layout, &tile, position, start, &mut buffer).map(|len| {
-                if let Some(index) = layout.index_of(tile.id) {
-                    found.tiles.entry(index).or_insert(tile);
-                }
-                len
-            }),
+            Ok(Record::Tile(tile)) => found.take_tile(file, layout, &tile, position, start, &mut buffer),
             Ok(Record::Times(times)) => read_times(file, layout, &times, position).ok().map(|stamps| {
                 let len = 8 * stamps.len() as u64;
                 found.times.entry(times.frame_block).or_insert(stamps);
@@ -135,22 +133,34 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64) -> Result<Found> {
     Ok(found)
 }
 
-/// Length of what follows the record of an intact tile at `position`: its payload, or nothing if it shares one.
-fn intact_tile(
-    file: &MappedFile,
-    layout: &Layout,
-    tile: &TileRecord,
-    position: u64,
-    start: u64,
-    buffer: &mut TileBuffer,
-) -> Option<u64> {
-    tile.check(layout, start + RECORD..file.len(), position).ok()?;
-    let own = tile.offset == position + RECORD;
-    if !own && (!tile.constant || tile.offset > position) {
-        return None;
+impl Found {
+    /// Takes the tile of the record at `position` if it is intact. Gives the length of what follows the record: its payload,
+    /// or nothing if it shares one.
+    fn take_tile(
+        &mut self,
+        file: &MappedFile,
+        layout: &Layout,
+        tile: &TileRecord,
+        position: u64,
+        start: u64,
+        buffer: &mut TileBuffer,
+    ) -> Option<u64> {
+        tile.check(layout, start + RECORD..file.len(), position).ok()?;
+        let own = tile.offset == position + RECORD;
+        if own {
+            read_tile(file, layout, tile, buffer).ok()?;
+            check_stats(tile, position, buffer.values()).ok()?;
+            if tile.constant {
+                self.constants.insert(tile.offset, *tile);
+            }
+        } else {
+            // Decoded when its owner was met: a file of nothing but records that share one large payload
+            // costs no more than its length.
+            self.constants.get(&tile.offset).filter(|owner| tile.may_share(owner))?;
+        }
+        self.tiles.entry(layout.index_of(tile.id)?).or_insert(*tile);
+        Some(if own { tile.stored_bytes.into() } else { 0 })
     }
-    read_tile(file, layout, tile, buffer).ok()?;
-    Some(if own { tile.stored_bytes.into() } else { 0 })
 }
 
 /// The time stamps of the record at `position`, checked against its checksum and the layout.

@@ -21,7 +21,8 @@ use crate::record::{FooterRecord, RECORD, Record, TileRecord, TimesRecord, align
 /// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian
 /// block is not stored again: a column that never changes costs 64 bytes per further tile and its index entry.
 ///
-/// Memory: 80 bytes per tile and 8 per frame for the index, and the largest constant tile.
+/// Memory: 64 bytes per tile and 8 per frame for the index, three times that in [`Writer::finish`]; 64 bytes per
+/// column and Gaussian block; the stored bytes of the largest constant tile.
 ///
 /// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished
 /// writer removes it; a killed process leaves it behind, readable by [`crate::recover`].
@@ -99,8 +100,8 @@ impl Writer {
                 first + frame
             ))
         })?;
-        let block =
-            u32::try_from(first / most).map_err(|_| Error::usage("a container has at most 2³² frame blocks"))?;
+        let block = u32::try_from(first / most).ok().filter(|&block| block < u32::MAX);
+        let block = block.ok_or_else(|| Error::usage("a container has fewer than 2³² frame blocks"))?;
         let payload: Vec<u8> = times.iter().flat_map(|time| time.to_le_bytes()).collect();
         let record = TimesRecord { frame_block: block, frames: times.len() as u32, checksum: xxh3_64(&payload) };
         self.put(&[&Record::Times(record).to_bytes(), &payload])?;

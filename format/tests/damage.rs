@@ -1,0 +1,215 @@
+//! Damaged files end in an error that names a byte, never in a panic, never in wrong data.
+
+mod scene;
+
+use std::fs;
+use std::path::Path;
+
+use gseq::{Compression, Error, Reader, TileBuffer, TileId, Writer, recover};
+use scene::{Scene, layout};
+use xxhash_rust::xxh3::xxh3_64;
+
+/// Opens, verifies and reads everything; any error must name a place inside the file, or its end.
+fn check(scene: &Scene, path: &Path, len: u64) -> Result<(), Error> {
+    let checked = Reader::open(path).and_then(|reader| {
+        let verified = reader.verify();
+        scene.compare(&reader, scene.times.len())?;
+        verified.map(drop)
+    });
+    if let Err(error) = &checked {
+        assert!(matches!(error, Error::Malformed { offset, .. } if *offset <= len), "{error}");
+    }
+    checked
+}
+
+fn small_scene() -> Scene {
+    Scene::new(layout(3, 2, 2, &[2, 1, 1]), 5, 11)
+}
+
+#[test]
+fn a_flipped_bit_anywhere_is_an_error_and_never_wrong_data() {
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    let scene = small_scene();
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        scene.write(&path, compression, |_| ());
+        let good = fs::read(&path).unwrap();
+        check(&scene, &path, good.len() as u64).unwrap();
+        for at in 0..good.len() {
+            let mut bad = good.clone();
+            bad[at] ^= 1 << (at % 8);
+            fs::write(&path, &bad).unwrap();
+            assert!(check(&scene, &path, good.len() as u64).is_err(), "{compression:?}, byte {at}: the flip passed");
+        }
+    }
+}
+
+#[test]
+fn a_file_cut_anywhere_is_an_error_and_recover_saves_its_complete_frame_blocks() {
+    let folder = scene::folder();
+    let [path, saved] = ["a", "saved"].map(|name| folder.path().join(name));
+    let scene = small_scene();
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        scene.write(&path, compression, |_| ());
+        let good = fs::read(&path).unwrap();
+        let per_block = scene.tiles().len() / 3;
+        // Where the last tile of each frame block ends; shared payloads end with their record, which precedes the own
+        // payload of the block's last tile here.
+        let reader = Reader::open(&path).unwrap();
+        let ends: Vec<u64> = (0..3)
+            .map(|block| {
+                let last = reader.tile_info(scene.tiles()[(block + 1) * per_block - 1]).unwrap();
+                last.offset + last.stored_bytes
+            })
+            .collect();
+        let header = good.len() - 32 - 64 - 8 * 5 - 64 * scene.tiles().len();
+        assert!(ends[2] <= header as u64);
+        let mut most = 0;
+        for len in (0..good.len()).rev() {
+            fs::write(&path, &good[..len]).unwrap();
+            assert!(check(&scene, &path, len as u64).is_err(), "{len} of {} bytes passed", good.len());
+            match recover(&path, &saved) {
+                Err(error) => assert!(matches!(error, Error::Malformed { .. }) && len < 200, "{len}: {error}"),
+                Ok(report) => {
+                    let blocks = ends.iter().filter(|&&end| end <= len as u64).count();
+                    assert_eq!(report.frames, [0, 2, 4, 5][blocks], "{compression:?}, {len} bytes: {report:?}");
+                    let reader = Reader::open(&saved).unwrap();
+                    reader.verify().unwrap();
+                    scene.compare(&reader, report.frames as usize).unwrap();
+                    most = most.max(report.frames);
+                }
+            }
+        }
+        assert_eq!(most, 5);
+    }
+}
+
+#[test]
+fn recover_of_a_flipped_bit_saves_what_comes_before_it() {
+    let folder = scene::folder();
+    let [path, saved] = ["a", "saved"].map(|name| folder.path().join(name));
+    let scene = small_scene();
+    scene.write(&path, Compression::Zstd(1), |_| ());
+    let good = fs::read(&path).unwrap();
+    for at in (192..good.len()).step_by(3) {
+        let mut bad = good.clone();
+        bad[at] ^= 0x10;
+        fs::write(&path, &bad).unwrap();
+        let report = recover(&path, &saved).unwrap();
+        let reader = Reader::open(&saved).unwrap();
+        reader.verify().unwrap();
+        scene.compare(&reader, report.frames as usize).unwrap();
+    }
+    fs::write(&path, &good).unwrap();
+    let report = recover(&path, &saved).unwrap();
+    assert_eq!((report.frames, report.tiles_saved, report.bytes_skipped), (5, scene.tiles().len() as u64, 0));
+    assert_eq!(fs::read(&saved).unwrap(), good, "recovering a whole file copies it");
+}
+
+#[test]
+fn what_a_killed_writer_leaves_behind_is_recovered() {
+    let folder = scene::folder();
+    let scene = small_scene();
+    let mut writer = Writer::create(folder.path().join("a"), scene.layout.clone()).unwrap();
+    scene.fill(&mut writer, Compression::Zstd(1), |_| ());
+    std::mem::forget(writer);
+    let left = fs::read_dir(folder.path()).unwrap().next().unwrap().unwrap().path();
+    assert!(Reader::open(&left).err().unwrap().to_string().contains("`recover` saves"));
+    let saved = folder.path().join("saved");
+    assert_eq!(recover(&left, &saved).unwrap().frames, 5);
+    scene.compare(&Reader::open(&saved).unwrap(), 5).unwrap();
+}
+
+/// A hostile writer: changes bytes of an index entry and of its record, then makes every checksum agree again.
+fn forge(good: &[u8], tile: usize, change: impl Fn(&mut [u8])) -> Vec<u8> {
+    let mut bad = good.to_vec();
+    let u64_at = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
+    let footer = u64_at(good, good.len() - 32) as usize;
+    let index = footer + 64 + 8 * u64_at(good, footer + 8) as usize;
+    let entry = index + 64 * tile;
+    let record = u64_at(good, entry + 24) as usize - 64;
+    for at in [entry, record] {
+        change(&mut bad[at..at + 56]);
+        let sum = xxh3_64(&bad[at..at + 56]);
+        bad[at + 56..at + 64].copy_from_slice(&sum.to_le_bytes());
+    }
+    let sum = xxh3_64(&bad[footer + 64..good.len() - 32]);
+    bad[footer + 32..footer + 40].copy_from_slice(&sum.to_le_bytes());
+    let sum = xxh3_64(&bad[footer..footer + 56]);
+    bad[footer + 56..footer + 64].copy_from_slice(&sum.to_le_bytes());
+    bad
+}
+
+#[test]
+fn hostile_index_entries_with_valid_checksums_are_refused() {
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    let scene = Scene::new(layout(9, 9, 2, &[3, 1]), 4, 11);
+    scene.write(&path, Compression::Raw, |_| ());
+    let good = fs::read(&path).unwrap();
+    let first = Reader::open(&path).unwrap().tile_info(scene.tiles()[0]).unwrap().offset;
+    fs::write(&path, forge(&good, 2, |_| ())).unwrap();
+    check(&scene, &path, good.len() as u64).unwrap();
+    type Change = Box<dyn Fn(&mut [u8])>;
+    let put = |at: usize, bytes: &[u8]| -> Change {
+        let bytes = bytes.to_vec();
+        Box::new(move |entry| entry[at..at + bytes.len()].copy_from_slice(&bytes))
+    };
+    let cases: [(&str, Change); 15] = [
+        ("a reserved byte in use", put(19, &[1])),
+        ("an odd offset", put(24, &(first + 4).to_le_bytes())),
+        ("another column", put(4, &1u32.to_le_bytes())),
+        ("a column that is not there", put(4, &u32::MAX.to_le_bytes())),
+        ("another frame block", put(12, &0u32.to_le_bytes())),
+        ("an unknown encoding", put(16, &[7, 0])),
+        ("an order of 3", put(16, &[1, 3])),
+        ("bytes that are no zstd frame", put(16, &[1, 1])),
+        ("a constant flag of 2", put(18, &[2])),
+        ("no frames", put(20, &0u32.to_le_bytes())),
+        ("an offset beyond the file", put(24, &(1u64 << 40).to_le_bytes())),
+        ("an offset that overflows", put(24, &(u64::MAX - 63).to_le_bytes())),
+        ("the payload of another tile", put(24, &first.to_le_bytes())),
+        ("an absurd length", put(40, &u32::MAX.to_le_bytes())),
+        ("wrong statistics", put(44, &9e9f32.to_le_bytes())),
+    ];
+    for (name, change) in cases {
+        fs::write(&path, forge(&good, 2, change)).unwrap();
+        assert!(check(&scene, &path, good.len() as u64).is_err(), "{name} passed");
+        let unread = Reader::open(&path).is_err();
+        assert_eq!(unread, name != "wrong statistics", "{name}: only statistics wait for verification");
+        // Whatever it makes of the record, what it saves is a container.
+        recover(&path, folder.path().join("saved")).unwrap();
+        Reader::open(folder.path().join("saved")).unwrap().verify().unwrap();
+    }
+}
+
+#[test]
+fn a_file_that_shrinks_under_the_map_ends_in_an_error() {
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        let scene = Scene::new(layout(5000, 5000, 2, &[3]), 4, 5);
+        scene.write(&path, compression, |_| ());
+        let reader = Reader::open(&path).unwrap();
+        let at = TileId { column: 0, gaussian_block: 0, frame_block: 1 };
+        let mut buffer = TileBuffer::default();
+        reader.tile(at, &mut buffer).unwrap();
+        fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(4096).unwrap();
+        for found in [reader.tile(at, &mut buffer).map(drop), reader.verify().map(drop)] {
+            assert!(matches!(found, Err(Error::Malformed { .. })), "{found:?}");
+        }
+    }
+}
+
+#[test]
+fn folders_and_empty_and_foreign_files_are_named_for_what_they_are() {
+    let folder = scene::folder();
+    assert!(Reader::open(folder.path()).err().unwrap().to_string().contains("folder"));
+    let path = folder.path().join("a");
+    assert!(matches!(Reader::open(&path), Err(Error::Io { action: "open", .. })));
+    fs::write(&path, "").unwrap();
+    assert!(matches!(Reader::open(&path), Err(Error::Malformed { offset: 0, .. })));
+    fs::write(&path, "ply\nformat binary_little_endian 1.0\nelement vertex 0\n").unwrap();
+    let error = Reader::open(&path).err().unwrap().to_string();
+    assert!(error.contains("byte 0: expected the gseq magic"), "{error}");
+}

@@ -1,0 +1,135 @@
+//! A sequence held in memory as plain bits: what a container must give back.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileId, Writer, encode_tile};
+
+/// A temporary folder, in memory where the system has one: thousands of files are synced in these tests,
+/// which costs milliseconds each on a disk.
+pub(crate) fn folder() -> tempfile::TempDir {
+    let memory = Path::new("/dev/shm");
+    if memory.is_dir() { tempfile::tempdir_in(memory).unwrap() } else { tempfile::tempdir().unwrap() }
+}
+
+pub(crate) struct Scene {
+    pub(crate) layout: Layout,
+    pub(crate) times: Vec<f64>,
+    /// Per column `[frame][component][gaussian]`.
+    pub(crate) bits: Vec<Vec<u32>>,
+}
+
+pub(crate) fn layout(gaussians: u64, gaussian_block: u32, frame_block: u32, widths: &[u32]) -> Layout {
+    let columns =
+        widths.iter().enumerate().map(|(i, &width)| ColumnSpec { name: format!("column_{i}"), width }).collect();
+    let attributes = BTreeMap::from([("origin".into(), "a test".into()), ("unit".into(), "Ångström".into())]);
+    Layout { gaussians, gaussian_block, frame_block, columns, attributes }
+}
+
+impl Scene {
+    /// Column 0 moves, column 1 is constant in time, the others hold any bits, NaN and −0 among them.
+    pub(crate) fn new(layout: Layout, frames: usize, seed: u64) -> Scene {
+        let mut state = seed;
+        let mut random = move || {
+            // SplitMix64 (Steele, Lea, Flood 2014).
+            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+            (z ^ (z >> 31)) as u32
+        };
+        let n = layout.gaussians as usize;
+        let bits = layout.columns.iter().enumerate().map(|(column, spec)| {
+            let plane = n * spec.width as usize;
+            match column {
+                0 => (0..frames * plane)
+                    .map(|i| ((i % plane.max(1)) as f32 + (i / plane.max(1)) as f32 * 0.01).to_bits())
+                    .collect(),
+                1 => (0..plane).map(|_| random()).collect::<Vec<_>>().repeat(frames),
+                _ => (0..frames * plane)
+                    .map(|_| match random() % 4 {
+                        0 => 0x8000_0000,
+                        1 => 0x7fc0_0000 | random() >> 10,
+                        _ => random(),
+                    })
+                    .collect(),
+            }
+        });
+        Scene { bits: bits.collect(), times: (0..frames).map(|t| t as f64 * 0.5 - 1.0).collect(), layout }
+    }
+
+    pub(crate) fn tiles(&self) -> Vec<TileId> {
+        let blocks = self.times.len().div_ceil(self.layout.frame_block as usize) as u32;
+        let mut ids = Vec::new();
+        for frame_block in 0..blocks {
+            for gaussian_block in 0..self.layout.gaussian_blocks() {
+                for column in 0..self.layout.columns.len() as u32 {
+                    ids.push(TileId { column, gaussian_block, frame_block });
+                }
+            }
+        }
+        ids
+    }
+
+    pub(crate) fn tile(&self, id: TileId) -> (Vec<u32>, u32, u32, u32) {
+        let width = self.layout.columns[id.column as usize].width as usize;
+        let n = self.layout.gaussians as usize;
+        let gaussians = self.layout.gaussian_range(id.gaussian_block);
+        let frames = self.layout.frame_range(id.frame_block, self.times.len() as u64);
+        let mut out = Vec::new();
+        for frame in frames.clone() {
+            for component in 0..width {
+                let plane = (frame as usize * width + component) * n;
+                out.extend(
+                    &self.bits[id.column as usize][plane + gaussians.start as usize..plane + gaussians.end as usize],
+                );
+            }
+        }
+        (out, (frames.end - frames.start) as u32, width as u32, (gaussians.end - gaussians.start) as u32)
+    }
+
+    /// Writes time stamps block by block, each followed by its tiles in the order that `shuffle` gives them.
+    pub(crate) fn write(&self, path: &Path, compression: Compression, shuffle: impl Fn(&mut Vec<TileId>)) -> u64 {
+        let mut writer = Writer::create(path, self.layout.clone()).unwrap();
+        self.fill(&mut writer, compression, shuffle);
+        writer.finish().unwrap()
+    }
+
+    pub(crate) fn fill(&self, writer: &mut Writer, compression: Compression, shuffle: impl Fn(&mut Vec<TileId>)) {
+        let mut ids = self.tiles();
+        shuffle(&mut ids);
+        let mut blocks = self.times.chunks(self.layout.frame_block as usize);
+        let mut appended = 0;
+        if self.layout.gaussians == 0 {
+            for times in blocks.by_ref() {
+                writer.append_times(times).unwrap();
+            }
+        }
+        for id in ids {
+            while appended <= id.frame_block {
+                assert_eq!(writer.append_times(blocks.next().unwrap()).unwrap(), appended);
+                appended += 1;
+            }
+            let (bits, frames, width, len) = self.tile(id);
+            let values: Vec<f32> = bits.into_iter().map(f32::from_bits).collect();
+            writer.write_tile(id, &encode_tile(&values, frames, width, len, compression).unwrap()).unwrap();
+        }
+    }
+
+    /// Compares the first `frames` frames through both ways of reading; an error of the reader is passed on.
+    pub(crate) fn compare(&self, reader: &Reader, frames: usize) -> gseq::Result<()> {
+        assert_eq!(*reader.layout(), self.layout);
+        assert_eq!(reader.times(), &self.times[..frames]);
+        let mut buffer = TileBuffer::default();
+        for id in self.tiles().into_iter().filter(|id| id.frame_block < reader.frame_blocks()) {
+            let (bits, frames, width, len) = self.tile(id);
+            for in_place in [true, false] {
+                let tile = if in_place { reader.tile(id, &mut buffer)? } else { reader.read_tile(id, &mut buffer)? };
+                assert_eq!((tile.frames(), tile.width(), tile.len()), (frames as usize, width as usize, len as usize));
+                let planes = (0..tile.frames()).flat_map(|f| (0..tile.width()).map(move |c| (f, c)));
+                let got: Vec<u32> = planes.flat_map(|(f, c)| tile.plane(f, c)).map(|v| v.to_bits()).collect();
+                assert!(got == bits, "{id:?}, in place {in_place}: wrong data");
+            }
+        }
+        Ok(())
+    }
+}
