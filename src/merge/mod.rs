@@ -1,1 +1,3 @@
 //! Motion-consistent merging by moment matching (METHOD section 5).
+
+pub mod moments;
