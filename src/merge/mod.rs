@@ -55,7 +55,7 @@ pub struct Merged {
     pub groups: Groups,
     /// One state per group at the reference frame; groups of one are unchanged to the byte.
     pub states: Gaussians,
-    /// What each pass did.
+    /// What each pass did; passes after the limit was met are not made.
     pub passes: Vec<PassCounts>,
 }
 
@@ -112,6 +112,9 @@ pub fn run<E>(
     let mut states = survivors.states.clone();
     let (mut passes, mut left) = (Vec::new(), limit);
     for pass in &recipe.passes {
+        if left == Some(0) {
+            break;
+        }
         let sizes: Vec<f64> = (0..groups.len())
             .map(|group| groups.members(group).iter().map(|&row| survivors.coverage[row as usize]).sum())
             .collect();
