@@ -1,0 +1,229 @@
+//! Tests 1 and 2: whether two Gaussians look alike at the reference frame.
+//!
+//! In: two rows of Gaussians. Out: yes or no. Memory: none. A NaN fails every test.
+
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::model::{Gaussians, SH_C0};
+use crate::recipe;
+
+/// ε in the denominator of the cosine of base colours, as in the paper (section 3.5.1).
+const COSINE_EPSILON: f64 = 1e-8;
+/// Share of the trace added to the diagonal of the averaged covariance, so that coplanar pancakes
+/// have a finite distance.
+const REGULARIZATION: f64 = 1e-6;
+/// Below this fraction of its middle scale the smallest scale counts as flat: how flat is a matter
+/// of training noise, and no picture shows it.
+const FLAT: f64 = 0.1;
+
+/// Tests 1 and 2 of one merge pass.
+#[derive(Debug, Clone, Copy)]
+pub struct Gates {
+    d0: f64,
+    rho: f64,
+    max_log_scale_ratio: f64,
+    max_color_difference: f64,
+}
+
+impl Gates {
+    /// The thresholds of `pass` and of `merge`.
+    pub fn new(merge: &recipe::Merge, pass: &recipe::MergePass) -> Self {
+        Gates {
+            d0: pass.d0,
+            rho: pass.rho,
+            max_log_scale_ratio: merge.max_scale_ratio.ln(),
+            max_color_difference: merge.max_color_difference,
+        }
+    }
+
+    /// Whether `a` and `b` pass both tests; symmetric. The cheap tests come first.
+    pub fn pass(&self, a: &Look, b: &Look) -> bool {
+        (a.color - b.color).length() <= self.max_color_difference
+            && cosine(a.dc, b.dc) > self.rho
+            && alike_in_size(a.log_scale, b.log_scale, self.max_log_scale_ratio)
+            && mahalanobis(a.position - b.position, &((a.covariance() + b.covariance()) * 0.5)) < self.d0
+    }
+}
+
+/// What the tests read of a Gaussian.
+#[derive(Debug, Clone, Copy)]
+pub struct Look {
+    position: DVec3,
+    rotation: DQuat,
+    /// Descending, the smallest no flatter than [`FLAT`] for the comparison of sizes.
+    log_scale: [f64; 3],
+    scales: DVec3,
+    dc: DVec3,
+    color: DVec3,
+}
+
+impl Look {
+    /// Row `i` of `states`.
+    pub fn new(states: &Gaussians, i: usize) -> Self {
+        let log_scale = states.log_scale.row::<3>(i).map(f64::from);
+        let mut sorted = log_scale;
+        sorted.sort_by(|a, b| b.total_cmp(a));
+        // Only a finite scale is lifted: minus infinity is no thickness and must fail.
+        if sorted[2].is_finite() {
+            sorted[2] = sorted[2].max(sorted[1] + FLAT.ln());
+        }
+        let dc = DVec3::from(states.sh.row::<3>(i).map(f64::from));
+        Look {
+            position: DVec3::from(states.position.row::<3>(i).map(f64::from)),
+            rotation: unit_rotation(states.rotation.row(i)),
+            log_scale: sorted,
+            scales: DVec3::from(log_scale.map(f64::exp)),
+            dc,
+            color: (DVec3::splat(0.5) + SH_C0 * dc).max(DVec3::ZERO),
+        }
+    }
+
+    fn covariance(&self) -> DMat3 {
+        let axes = DMat3::from_quat(self.rotation);
+        axes * DMat3::from_diagonal(self.scales * self.scales) * axes.transpose()
+    }
+}
+
+/// The unit quaternion of a stored wxyz row; the identity where it is zero or not finite.
+pub(super) fn unit_rotation([w, x, y, z]: [f32; 4]) -> DQuat {
+    let rotation = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
+    let length = rotation.length();
+    if length > 0.0 && length.is_finite() { rotation / length } else { DQuat::IDENTITY }
+}
+
+/// Whether corresponding scales (largest and largest, middle and middle, smallest and smallest)
+/// differ by at most a factor exp(`max_log_ratio`). A giant beside detail fails whatever its shape.
+/// Equal infinities differ by NaN and fail.
+fn alike_in_size(a: [f64; 3], b: [f64; 3], max_log_ratio: f64) -> bool {
+    (0..3).all(|c| (a[c] - b[c]).abs() <= max_log_ratio)
+}
+
+/// (a·b)/(‖a‖‖b‖ + ε), in [−1, 1]; 1 for equal vectors of any length, so that duplicates of exactly
+/// medium grey, whose coefficients are zero, are alike.
+fn cosine(a: DVec3, b: DVec3) -> f64 {
+    if a == b { 1.0 } else { a.dot(b) / (a.length() * b.length() + COSINE_EPSILON) }
+}
+
+/// √(Δᵀ (Σ + 1e-6 tr Σ)⁻¹ Δ) for a positive semidefinite Σ, by Cholesky in f64 of Σ over its trace,
+/// so that neither 1e-12 nor 1e6 squared leaves the range. Σ = 0: 0 for Δ = 0, else infinite.
+fn mahalanobis(delta: DVec3, sigma: &DMat3) -> f64 {
+    let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
+    if trace == 0.0 {
+        return if delta == DVec3::ZERO { 0.0 } else { f64::INFINITY };
+    }
+    let unit = *sigma * trace.recip();
+    let [a, b, c] = [unit.x_axis.x, unit.y_axis.y, unit.z_axis.z].map(|diagonal| diagonal + REGULARIZATION);
+    // Lower factor L, then L y = Δ: the distance is ‖y‖.
+    let l00 = a.sqrt();
+    let (l10, l20) = (unit.x_axis.y / l00, unit.x_axis.z / l00);
+    let l11 = (b - l10 * l10).sqrt();
+    let l21 = (unit.y_axis.z - l20 * l10) / l11;
+    let l22 = (c - l20 * l20 - l21 * l21).sqrt();
+    let y0 = delta.x / l00;
+    let y1 = (delta.y - l10 * y0) / l11;
+    let y2 = (delta.z - l20 * y0 - l21 * y1) / l22;
+    DVec3::new(y0, y1, y2).length() / trace.sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::recipe::Recipe;
+
+    fn default_gates() -> Gates {
+        let merge = Recipe::preset("default").unwrap().merge;
+        Gates::new(&merge, &merge.passes[0])
+    }
+
+    fn two(edit: impl Fn(&mut Gaussians)) -> [Look; 2] {
+        let mut states = Gaussians::zeros(2, 0);
+        for i in 0..2 {
+            states.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+            states.sh.set_row(i, [0.4, 0.2, -0.3]);
+        }
+        edit(&mut states);
+        [0, 1].map(|i| Look::new(&states, i))
+    }
+
+    fn passes(edit: impl Fn(&mut Gaussians)) -> bool {
+        let [a, b] = two(edit);
+        assert_eq!(default_gates().pass(&a, &b), default_gates().pass(&b, &a));
+        default_gates().pass(&a, &b)
+    }
+
+    #[test]
+    fn black_beside_grey_of_the_same_direction_is_not_merged() {
+        let edit = |states: &mut Gaussians| {
+            states.sh.set_row(0, [-1.7; 3]);
+            states.sh.set_row(1, [-0.2; 3]);
+        };
+        let [black, grey] = two(edit);
+        assert!(cosine(black.dc, grey.dc) > 0.99);
+        assert!(!passes(edit));
+        // Below black there is only black: the renderer clamps.
+        assert!(passes(|states| {
+            states.sh.set_row(0, [-1.8; 3]);
+            states.sh.set_row(1, [-9.0; 3]);
+        }));
+    }
+
+    #[test]
+    fn duplicates_of_any_colour_scale_and_rotation_pass() {
+        assert!(passes(|_| {}));
+        assert!(passes(|states| (0..2).for_each(|i| states.sh.set_row(i, [0.0; 3]))));
+        assert!(passes(|states| (0..2).for_each(|i| states.rotation.set_row(i, [0.0; 4]))));
+        for log_scale in [1e-12f32.ln(), 1e6f32.ln(), -400.0, 300.0] {
+            assert!(passes(|states| (0..2).for_each(|i| states.log_scale.set_row(i, [log_scale; 3]))), "{log_scale}");
+        }
+    }
+
+    #[test]
+    fn a_giant_does_not_swallow_detail() {
+        assert!(!passes(|states| states.log_scale.set_row(0, [6.0; 3])));
+        assert!(!passes(|states| states.log_scale.set_row(0, [2.0, 0.0, 0.0])));
+        assert!(!passes(|states| states.log_scale.set_row(0, [0.0, -2.0, -2.0])));
+        assert!(!passes(|states| states.log_scale.set_row(0, [0.0, 0.0, -8.0])), "a ball beside a pancake");
+    }
+
+    #[test]
+    fn pancakes_of_different_thickness_are_alike() {
+        assert!(passes(|states| {
+            states.log_scale.set_row(0, [0.0, -20.0, 0.1]);
+            states.log_scale.set_row(1, [0.0, -8.0, 0.0]);
+        }));
+    }
+
+    #[test]
+    fn nothing_that_is_not_finite_passes() {
+        let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
+        for value in bad {
+            assert!(!passes(|states| states.position.set_row(0, [value, 0.0, 0.0])), "position {value}");
+            assert!(!passes(|states| states.sh.set_row(0, [value, 0.0, 0.0])), "colour {value}");
+            assert!(
+                !passes(|states| (0..2).for_each(|i| states.log_scale.set_row(i, [0.0, value, 0.0]))),
+                "scale {value}"
+            );
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn mahalanobis_equals_the_inverse_covariance(
+            delta in prop::array::uniform3(-1.0..1.0f64),
+            axes in prop::array::uniform9(-1.0..1.0f64),
+            log10_size in -24.0..24.0f64,
+        ) {
+            let factor = DMat3::from_cols_array(&axes);
+            let sigma = factor * factor.transpose() * 10f64.powf(log10_size);
+            let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
+            let regular = sigma + DMat3::from_diagonal(DVec3::splat(REGULARIZATION * trace));
+            let delta = DVec3::from(delta);
+            // The inverse by cofactors loses about cond(Σ) ≤ 1e6 ulp; normalised, as determinants overflow.
+            let expected = (delta.dot((regular * trace.recip()).inverse() * delta) / trace).sqrt();
+            let got = mahalanobis(delta, &sigma);
+            prop_assert!((got / expected - 1.0).abs() < 1e-8, "got {got:e}, expected {expected:e}");
+        }
+    }
+}

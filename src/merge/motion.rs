@@ -1,0 +1,359 @@
+//! Test 3: whether two Gaussians move alike over their common life, measured as frames stream by.
+//!
+//! In: pairs, then the positions and liveness of every node frame by frame. Out: a [`PairMeasure`]
+//! for each pair, independent of any threshold. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`]
+//! per node; nothing grows with the number of frames. A pair is summed by one thread in frame
+//! order, so threads do not change the sums.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::model::Column;
+use crate::recipe::{self, Motion, Trajectory};
+
+/// Memory of one pair while frames stream by.
+pub const PAIR_BYTES: usize = size_of::<Pair>();
+/// Memory of one node while frames stream by.
+pub const NODE_BYTES: usize = size_of::<Track>();
+
+/// How two Gaussians move beside each other. Velocities are steps x(t) − x(t−1) between consecutive
+/// frames, whatever their distance in time: the noise floor they are held against is one of steps.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PairMeasure {
+    /// Mean cosine of velocities; a step with a velocity of zero counts as 0. The mean is over all
+    /// frames of the common life (`Motion::Literal`) or over the steps inside it (`Motion::Runs`).
+    pub cosine: f64,
+    /// Σ a·b over the steps, squared scene units.
+    pub dot: f64,
+    /// Σ ‖a‖² + ‖b‖² over the steps, squared scene units.
+    pub squares: f64,
+    /// n, the number of steps.
+    pub steps: u32,
+    /// |life ∩ life'| in frames.
+    pub common: u32,
+    /// |life ∪ life'| in frames.
+    pub union: u32,
+    /// Largest ‖(x_i − x_j)(t) − (x_i − x_j)(t₀)‖ over the common life, scene units; t₀ is the
+    /// reference frame, whose offset is the one a proxy is built from.
+    pub drift: f64,
+}
+
+impl PairMeasure {
+    /// A = (2Σ a·b + 2nσ²)/(Σ‖a‖² + Σ‖b‖² + 2nσ²), in [−1, 1]: 1 for two static Gaussians, the
+    /// cosine for equally fast ones, small for v beside 10 v. Nothing moved and σ = 0, or no step: 1.
+    ///
+    /// `noise` is σ in scene units per step.
+    pub fn alignment(&self, noise: f64) -> f64 {
+        let floor = 2.0 * f64::from(self.steps) * noise * noise;
+        let whole = self.squares + floor;
+        if whole == 0.0 { 1.0 } else { (2.0 * self.dot + floor) / whole }
+    }
+
+    /// The fraction of the union of both lives in which only one lives; 1 if neither ever does.
+    pub fn dead_time(&self) -> f64 {
+        if self.union == 0 { 1.0 } else { f64::from(self.union - self.common) / f64::from(self.union) }
+    }
+}
+
+/// The thresholds of test 3, lengths in scene units.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionGate {
+    trajectory: Trajectory,
+    tau: f64,
+    noise: f64,
+    max_drift: f64,
+    max_dead_time: f64,
+}
+
+impl MotionGate {
+    /// The thresholds of `pass` and of `merge`; `unit` is the length of one unit of the recipe.
+    pub fn new(merge: &recipe::Merge, pass: &recipe::MergePass, unit: f64) -> Self {
+        // An unlimited drift stays unlimited in a scene of no extent.
+        let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
+        MotionGate {
+            trajectory: merge.trajectory,
+            tau: pass.tau_m,
+            noise: merge.motion_noise * unit,
+            max_drift,
+            max_dead_time: merge.max_dead_time,
+        }
+    }
+
+    /// Whether the pair moves alike: lives that never meet do not.
+    pub fn passes(&self, pair: &PairMeasure) -> bool {
+        let alike = match self.trajectory {
+            Trajectory::Cosine => pair.cosine,
+            Trajectory::Alignment => pair.alignment(self.noise),
+        };
+        pair.common > 0 && alike > self.tau && pair.drift <= self.max_drift && pair.dead_time() <= self.max_dead_time
+    }
+}
+
+/// A node between two frames.
+#[derive(Debug, Clone, Copy)]
+struct Track {
+    reference: [f32; 3],
+    now: [f32; 3],
+    before: [f32; 3],
+    alive: bool,
+    alive_before: bool,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Pair {
+    nodes: (u32, u32),
+    cosines: f64,
+    dot: f64,
+    squares: f64,
+    steps: u32,
+    common: u32,
+    union: u32,
+    drift_squared: f64,
+}
+
+/// Measures pairs of nodes over frames that arrive in order.
+#[derive(Debug)]
+pub struct PairMotion {
+    motion: Motion,
+    frames: usize,
+    tracks: Vec<Track>,
+    pairs: Vec<Pair>,
+}
+
+impl PairMotion {
+    /// Starts measuring `pairs` of nodes whose positions at the reference frame are `reference`
+    /// `[3, N]`. `motion` says which steps count: `Literal` those that end in the common life,
+    /// `Runs` those that begin there too.
+    pub fn new(pairs: &[(u32, u32)], reference: &Column, motion: Motion) -> Self {
+        let track = |i| {
+            let reference = reference.row(i);
+            Track { reference, now: reference, before: reference, alive: false, alive_before: false }
+        };
+        let fresh = Pair {
+            nodes: (0, 0),
+            cosines: 0.0,
+            dot: 0.0,
+            squares: 0.0,
+            steps: 0,
+            common: 0,
+            union: 0,
+            drift_squared: 0.0,
+        };
+        PairMotion {
+            motion,
+            frames: 0,
+            tracks: (0..reference.len()).map(track).collect(),
+            pairs: pairs.iter().map(|&nodes| Pair { nodes, ..fresh }).collect(),
+        }
+    }
+
+    /// Takes the next frame: positions `[3, N]` and whether each of the N nodes is alive.
+    pub fn frame(&mut self, position: &Column, alive: &[bool]) {
+        self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
+            (track.before, track.alive_before) = (track.now, track.alive);
+            (track.now, track.alive) = (position.row(i), alive[i]);
+        });
+        let steps_end_here = self.frames > 0;
+        let (tracks, motion) = (&self.tracks, self.motion);
+        self.pairs.par_iter_mut().with_min_len(1024).for_each(|pair| {
+            let [a, b] = [pair.nodes.0, pair.nodes.1].map(|node| &tracks[node as usize]);
+            pair.union += u32::from(a.alive || b.alive);
+            if !(a.alive && b.alive) {
+                return;
+            }
+            pair.common += 1;
+            pair.drift(a, b);
+            if steps_end_here && (motion == Motion::Literal || (a.alive_before && b.alive_before)) {
+                pair.step(a.velocity(), b.velocity());
+            }
+        });
+        self.frames += 1;
+    }
+
+    /// What the frames so far say of each pair, in the order given.
+    pub fn finish(self) -> Vec<PairMeasure> {
+        let motion = self.motion;
+        let measure = |pair: Pair| {
+            let terms = match motion {
+                Motion::Literal => pair.common,
+                Motion::Runs => pair.steps,
+            };
+            PairMeasure {
+                cosine: if terms == 0 { 0.0 } else { pair.cosines / f64::from(terms) },
+                dot: pair.dot,
+                squares: pair.squares,
+                steps: pair.steps,
+                common: pair.common,
+                union: pair.union,
+                drift: pair.drift_squared.sqrt(),
+            }
+        };
+        self.pairs.into_iter().map(measure).collect()
+    }
+}
+
+impl Track {
+    fn velocity(&self) -> DVec3 {
+        wide(self.now) - wide(self.before)
+    }
+}
+
+impl Pair {
+    fn step(&mut self, a: DVec3, b: DVec3) {
+        let dot = a.dot(b);
+        let speeds = a.length() * b.length();
+        self.cosines += if speeds > 0.0 { dot / speeds } else { 0.0 };
+        self.dot += dot;
+        self.squares += a.length_squared() + b.length_squared();
+        self.steps += 1;
+    }
+
+    fn drift(&mut self, a: &Track, b: &Track) {
+        let change = (wide(a.now) - wide(b.now)) - (wide(a.reference) - wide(b.reference));
+        let squared = change.length_squared();
+        // A NaN must not be forgotten: it counts as an endless drift.
+        self.drift_squared = self.drift_squared.max(if squared.is_nan() { f64::INFINITY } else { squared });
+    }
+}
+
+fn wide(v: [f32; 3]) -> DVec3 {
+    DVec3::from(v.map(f64::from))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::recipe::Recipe;
+
+    type Path = Vec<(f32, bool)>;
+
+    /// Measures the pair (0, 1) of nodes that move along x; reference frame 0.
+    fn measure(a: &Path, b: &Path, motion: Motion) -> PairMeasure {
+        let column = |t: usize| {
+            let mut column = Column::zeros(3, 2);
+            column.plane_mut(0).copy_from_slice(&[a[t].0, b[t].0]);
+            column
+        };
+        let mut pairs = PairMotion::new(&[(0, 1)], &column(0), motion);
+        for t in 0..a.len() {
+            pairs.frame(&column(t), &[a[t].1, b[t].1]);
+        }
+        pairs.finish()[0]
+    }
+
+    fn path(x: impl Fn(usize) -> f32) -> Path {
+        (0..20).map(|t| (x(t), true)).collect()
+    }
+
+    /// Verdict of the default recipe in a scene of extent `extent`.
+    fn merges(a: &Path, b: &Path, extent: f64) -> bool {
+        let merge = Recipe::preset("default").unwrap().merge;
+        MotionGate::new(&merge, &merge.passes[0], extent).passes(&measure(a, b, Motion::Runs))
+    }
+
+    fn merges_in_paper(a: &Path, b: &Path) -> bool {
+        let merge = Recipe::preset("paper").unwrap().merge;
+        MotionGate::new(&merge, &merge.passes[0], 1.0).passes(&measure(a, b, Motion::Literal))
+    }
+
+    #[test]
+    fn static_gaussians_move_alike_though_not_to_the_letter_of_the_paper() {
+        let still = path(|_| 3.0);
+        assert!(merges(&still, &path(|_| 3.1), 1.0));
+        assert!(merges(&still, &path(|_| 3.1), 0.0), "a scene of no extent");
+        assert!(!merges_in_paper(&still, &still));
+        let one_frame = vec![(1.0, true)];
+        assert!(merges(&one_frame, &one_frame, 1.0));
+    }
+
+    #[test]
+    fn opposite_velocities_and_v_beside_10_v_are_not_merged() {
+        let slow = path(|t| 0.01 * t as f32);
+        assert!(!merges(&slow, &path(|t| -0.01 * t as f32), 1.0));
+        assert!(!merges(&slow, &path(|t| 0.1 * t as f32), 1.0));
+        let opposite = measure(&slow, &path(|t| -0.01 * t as f32), Motion::Runs);
+        assert!((opposite.alignment(0.0) + 1.0).abs() < 1e-12);
+        let tenfold = measure(&slow, &path(|t| 0.1 * t as f32), Motion::Runs);
+        assert!((tenfold.alignment(0.0) - 20.0 / 101.0).abs() < 1e-6);
+        assert!(merges_in_paper(&slow, &path(|t| 0.1 * t as f32)), "the cosine is blind to speed");
+        assert!(!merges_in_paper(&slow, &path(|t| -0.01 * t as f32)));
+        assert!(merges(&slow, &path(|t| 5.0 + 0.01 * t as f32), 1.0));
+    }
+
+    #[test]
+    fn a_teleport_while_alive_never_merges_and_one_while_dead_does() {
+        let still = path(|_| 0.0);
+        let jump = path(|t| if t < 10 { 0.0 } else { 50.0 });
+        assert!(!merges(&still, &jump, 1.0) && !merges_in_paper(&still, &jump));
+        // Away in frame 10, dead there: nothing was seen to move.
+        let mut hidden = path(|t| if t == 10 { 50.0 } else { 0.0 });
+        hidden[10].1 = false;
+        assert!(merges(&still, &hidden, 1.0));
+        assert_eq!(measure(&still, &hidden, Motion::Runs).squares, 0.0);
+        assert!(measure(&still, &hidden, Motion::Literal).squares > 0.0, "the literal rule counts the step back");
+    }
+
+    #[test]
+    fn disjoint_lives_are_not_merged() {
+        let first: Path = (0..20).map(|t| (0.0, t < 10)).collect();
+        let last: Path = (0..20).map(|t| (0.0, t >= 10)).collect();
+        assert!(!merges(&first, &last, 1.0));
+        let mut merge = Recipe::preset("default").unwrap().merge;
+        merge.max_dead_time = f64::INFINITY;
+        merge.max_drift = f64::INFINITY;
+        let gate = MotionGate::new(&merge, &merge.passes[0], 1.0);
+        assert!(!gate.passes(&measure(&first, &last, Motion::Runs)));
+        let never: Path = vec![(0.0, false); 20];
+        assert!(!gate.passes(&measure(&never, &never, Motion::Runs)));
+    }
+
+    #[test]
+    fn dead_time_is_the_share_of_the_union_in_which_one_lives_alone() {
+        let long: Path = (0..20).map(|t| (0.0, t < 16)).collect();
+        let short: Path = (0..20).map(|t| (0.0, (4..16).contains(&t))).collect();
+        let pair = measure(&long, &short, Motion::Runs);
+        assert_eq!((pair.common, pair.union, pair.steps, pair.dead_time()), (12, 16, 11, 0.25));
+        assert!(!merges(&long, &short, 1.0), "a quarter dead is more than a tenth");
+    }
+
+    #[test]
+    fn a_step_to_nowhere_is_never_forgotten() {
+        for lost in [f32::NAN, f32::INFINITY] {
+            let wild = path(|t| if t == 7 { lost } else { 0.0 });
+            assert!(!merges(&wild, &wild, 1.0), "{lost}");
+            assert!(!merges_in_paper(&wild, &path(|t| t as f32)), "{lost}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn streaming_sums_equal_the_definitions(
+            frames in prop::collection::vec((-1.0..1.0f32, any::<bool>(), -1.0..1.0f32, any::<bool>()), 1..30),
+        ) {
+            let a: Path = frames.iter().map(|f| (f.0, f.1)).collect();
+            let b: Path = frames.iter().map(|f| (f.2, f.3)).collect();
+            let both = |t: usize| a[t].1 && b[t].1;
+            let common: Vec<usize> = (0..a.len()).filter(|&t| both(t)).collect();
+            for motion in [Motion::Literal, Motion::Runs] {
+                let got = measure(&a, &b, motion);
+                let ends: Vec<usize> =
+                    common.iter().copied().filter(|&t| t > 0 && (motion == Motion::Literal || both(t - 1))).collect();
+                let v = |p: &Path, t: usize| f64::from(p[t].0) - f64::from(p[t - 1].0);
+                let signs: f64 = ends.iter().map(|&t| if v(&a, t) * v(&b, t) == 0.0 { 0.0 } else { (v(&a, t) * v(&b, t)).signum() }).sum();
+                let terms = if motion == Motion::Literal { common.len() } else { ends.len() };
+                let cosine = if terms == 0 { 0.0 } else { signs / terms as f64 };
+                let dot: f64 = ends.iter().map(|&t| v(&a, t) * v(&b, t)).sum();
+                let squares: f64 = ends.iter().map(|&t| v(&a, t).powi(2) + v(&b, t).powi(2)).sum();
+                let offset = |t: usize| f64::from(a[t].0) - f64::from(b[t].0);
+                let drift = common.iter().map(|&t| (offset(t) - offset(0)).abs()).fold(0.0, f64::max);
+                prop_assert!((got.cosine - cosine).abs() < 1e-12, "cosine {} for {cosine}", got.cosine);
+                prop_assert!((got.dot - dot).abs() < 1e-12 && (got.squares - squares).abs() < 1e-12);
+                prop_assert!((got.drift - drift).abs() < 1e-12, "drift {} for {drift}", got.drift);
+                prop_assert_eq!((got.steps as usize, got.common as usize), (ends.len(), common.len()));
+                prop_assert_eq!(got.union as usize, (0..a.len()).filter(|&t| a[t].1 || b[t].1).count());
+            }
+        }
+    }
+}

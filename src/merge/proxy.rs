@@ -1,0 +1,368 @@
+//! The proxy: the one Gaussian that stands for a cluster.
+//!
+//! In: states of all members at the reference frame and their weights. Out: a state in the stored
+//! encoding, one row per group. Memory: 1 KiB per group for at most [`BATCH`] groups at a time,
+//! beside the output.
+
+use glam::{DQuat, DVec3};
+use rayon::prelude::*;
+
+use super::Groups;
+use super::gates::unit_rotation;
+use super::moments::{Ellipsoid, Part, align_axes, moments};
+use crate::model::{Columns, Gaussians};
+use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
+
+/// Groups merged between two writes into the output planes.
+const BATCH: usize = 4096;
+/// Opacities of proxies stay within [this, 1 − this], where the logit is finite in f32.
+const OPACITY_MARGIN: f64 = 1.0 / (1u32 << 24) as f64;
+/// Exponent of Thomsen's surface formula (Knud Thomsen, 2004; see Michon, "Surface area of an
+/// ellipsoid").
+const THOMSEN: f64 = 1.6075;
+
+/// State of a proxy at the reference frame, in the encoding of [`Gaussians`] but in f64.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProxyState {
+    /// Scene units.
+    pub position: DVec3,
+    /// wxyz, unit; axes named as the leader's, sign nearest to the leader's quaternion.
+    pub rotation: [f64; 4],
+    /// Natural log of scene units, finite.
+    pub log_scale: [f64; 3],
+    /// Finite.
+    pub opacity_logit: f64,
+    /// Laid out as a row of [`Gaussians::sh`].
+    pub sh: Vec<f64>,
+}
+
+/// What makes a member weigh, for every row of the states.
+#[derive(Debug, Clone, Copy)]
+pub struct Importance<'a> {
+    /// C.
+    pub coverage: &'a [f64],
+    /// Vis.
+    pub visibility: &'a [f64],
+}
+
+/// Weights of the rows `members`, w ∝ C·Vis, summing to 1. Where that sum is not positive and finite
+/// w ∝ opacity × area, and where that fails too all weigh the same.
+pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
+    let seen = |&i: &u32| importance.coverage[i as usize] * importance.visibility[i as usize];
+    let covered = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
+    let share = |weights: Vec<f64>| {
+        let total: f64 = weights.iter().sum();
+        let sound = total.is_normal() && weights.iter().all(|&w| w >= 0.0);
+        sound.then(|| weights.into_iter().map(|w| w / total).collect())
+    };
+    share(members.iter().map(seen).collect())
+        .or_else(|| share(members.iter().map(covered).collect()))
+        .unwrap_or_else(|| vec![1.0 / members.len() as f64; members.len()])
+}
+
+/// The proxy of `members` — rows of `states` with weights that sum to 1, `leader` among them.
+///
+/// Mean and covariance are the mixture's; with [`Placement::Leader`] the proxy sits at the leader and
+/// takes the second moments about it. Base colour is the weighted average, higher bands that or the
+/// heaviest member's (ties to the first). Opacity: [`ProxyOpacity`], an area being the mean over all
+/// directions of the ellipsoid's shadow. Exact duplicates give the leader's own position, axes,
+/// scales and colour. A zero quaternion is the identity.
+pub fn merge_state(members: &[(u32, f64)], states: &Gaussians, leader: u32, merge: &recipe::Merge) -> ProxyState {
+    // All in the leader's frame: coordinates far from the origin cancel once, and Jacobi starts from
+    // the leader's axes, so it turns them only as far as the other members ask.
+    let origin = position(states, leader);
+    let frame = unit_rotation(states.rotation.row(leader as usize));
+    let part = |&(i, weight): &(u32, f64)| {
+        let rotation = unit_rotation(states.rotation.row(i as usize));
+        let relative = if rotation == frame { DQuat::IDENTITY } else { (frame.inverse() * rotation).normalize() };
+        Part {
+            weight,
+            position: frame.inverse() * (position(states, i) - origin),
+            rotation: relative,
+            scales: scales(states, i),
+        }
+    };
+    let parts: Vec<Part> = members.iter().map(part).collect();
+    let about = match merge.placement {
+        Placement::Mean => None,
+        Placement::Leader => Some(DVec3::ZERO),
+    };
+    let local = align_axes(&moments(&parts, about), DQuat::IDENTITY);
+    ProxyState {
+        position: origin + frame * local.mean,
+        rotation: nearest_sign(frame * local.rotation, frame),
+        // A scale that underflowed is still a finite one.
+        log_scale: local.scales.to_array().map(|scale| scale.max(f64::MIN_POSITIVE).ln()),
+        opacity_logit: logit(merged_opacity(members, states, &local, merge.opacity)),
+        sh: merged_sh(members, states, leader, merge.sh_high),
+    }
+}
+
+/// One row per group: the proxy of its members, or the very bytes of a Gaussian that is alone.
+pub fn merge_groups(
+    groups: &Groups,
+    importance: &Importance<'_>,
+    states: &Gaussians,
+    merge: &recipe::Merge,
+) -> Gaussians {
+    let mut out = Gaussians::default();
+    for column in Columns::ALL.iter() {
+        *out.column_mut(column) = crate::model::Column::zeros(states.column(column).width(), groups.len());
+    }
+    for (c, column) in Columns::ALL.iter().map(|column| (states.column(column), column)) {
+        for plane in 0..c.width() {
+            let from = c.plane(plane);
+            let to = out.column_mut(column).plane_mut(plane);
+            to.par_iter_mut().zip(groups.leaders()).for_each(|(to, &leader)| *to = from[leader as usize]);
+        }
+    }
+    let clusters: Vec<usize> = (0..groups.len()).filter(|&group| groups.members(group).len() > 1).collect();
+    for batch in clusters.chunks(BATCH) {
+        let proxies: Vec<ProxyState> = batch
+            .par_iter()
+            .map(|&group| {
+                let rows = groups.members(group);
+                let weights = weights(rows, importance, states);
+                let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
+                merge_state(&members, states, groups.leaders()[group], merge)
+            })
+            .collect();
+        for (&group, proxy) in batch.iter().zip(&proxies) {
+            out.position.set_row(group, proxy.position.to_array().map(|x| x as f32));
+            out.rotation.set_row(group, proxy.rotation.map(|x| x as f32));
+            out.log_scale.set_row(group, proxy.log_scale.map(|x| x as f32));
+            out.opacity_logit.set_row(group, [proxy.opacity_logit as f32]);
+            for (plane, &value) in proxy.sh.iter().enumerate() {
+                out.sh.plane_mut(plane)[group] = value as f32;
+            }
+        }
+    }
+    out
+}
+
+fn position(states: &Gaussians, i: u32) -> DVec3 {
+    DVec3::from(states.position.row::<3>(i as usize).map(f64::from))
+}
+
+fn scales(states: &Gaussians, i: u32) -> DVec3 {
+    DVec3::from(states.log_scale.row::<3>(i as usize).map(|log_scale| f64::from(log_scale).exp()))
+}
+
+fn opacity(states: &Gaussians, i: u32) -> f64 {
+    let [logit] = states.opacity_logit.row(i as usize);
+    1.0 / (1.0 + (-f64::from(logit)).exp())
+}
+
+fn logit(opacity: f64) -> f64 {
+    (opacity / (1.0 - opacity)).ln()
+}
+
+/// wxyz of a unit quaternion, in the sign nearest to `reference`.
+fn nearest_sign(rotation: DQuat, reference: DQuat) -> [f64; 4] {
+    let rotation = rotation.normalize();
+    let q = if rotation.dot(reference) < 0.0 { -rotation } else { rotation };
+    [q.w, q.x, q.y, q.z]
+}
+
+/// Mean area of the shadow of an ellipsoid with these half axes over all directions: a quarter of
+/// its surface (Cauchy), by Thomsen's formula, within 1.1%. The plain mean of the three cross
+/// sections would call a pancake that thickens to 0.3 of its width 60% larger; it is 18% larger.
+fn mean_area(scales: DVec3) -> f64 {
+    let largest = scales.max_element();
+    if largest <= 0.0 {
+        return 0.0;
+    }
+    let s = scales / largest;
+    let mean = [s.x * s.y, s.y * s.z, s.z * s.x].map(|section| section.powf(THOMSEN)).iter().sum::<f64>() / 3.0;
+    std::f64::consts::PI * mean.powf(1.0 / THOMSEN) * largest * largest
+}
+
+/// Opacity of the proxy by `rule`, clamped so that its logit is finite.
+fn merged_opacity(members: &[(u32, f64)], states: &Gaussians, proxy: &Ellipsoid, rule: ProxyOpacity) -> f64 {
+    let sum = || members.iter().map(|&(i, _)| opacity(states, i)).sum::<f64>();
+    let opacity = match rule {
+        ProxyOpacity::Sum => sum(),
+        ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - opacity(states, i)).product::<f64>(),
+        ProxyOpacity::Area => {
+            let covered: f64 = members.iter().map(|&(i, _)| opacity(states, i) * mean_area(scales(states, i))).sum();
+            let area = mean_area(proxy.scales);
+            // Scales that underflowed have no area to conserve.
+            if area.is_normal() { covered / area } else { sum() }
+        }
+    };
+    opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
+}
+
+fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ShHigh) -> Vec<f64> {
+    let heaviest = members
+        .iter()
+        .fold((leader, f64::NEG_INFINITY), |best, &(i, weight)| if weight > best.1 { (i, weight) } else { best })
+        .0;
+    let average = |plane: &[f32]| {
+        // Differences from the leader: equal colours stay equal to the last bit.
+        let base = f64::from(plane[leader as usize]);
+        base + members.iter().map(|&(i, weight)| weight * (f64::from(plane[i as usize]) - base)).sum::<f64>()
+    };
+    let coefficient = |(k, plane): (usize, &[f32])| match high {
+        ShHigh::Heaviest if k >= 3 => f64::from(plane[heaviest as usize]),
+        _ => average(plane),
+    };
+    (0..states.sh.width()).map(|k| (k, states.sh.plane(k))).map(coefficient).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::recipe::{Merge, Recipe};
+
+    fn recipe(placement: Placement, opacity: ProxyOpacity) -> Merge {
+        Merge { placement, opacity, ..Recipe::preset("default").unwrap().merge }
+    }
+
+    /// `n` copies of a Gaussian of degree 1.
+    fn copies(n: usize, log_scale: [f32; 3], rotation: [f32; 4]) -> Gaussians {
+        let mut states = Gaussians::zeros(n, 1);
+        for i in 0..n {
+            states.position.set_row(i, [1000.25, -7.125, 0.1]);
+            states.rotation.set_row(i, rotation);
+            states.log_scale.set_row(i, log_scale);
+            states.sh.set_row::<12>(i, std::array::from_fn(|k| 0.1 * k as f32 - 0.37));
+        }
+        states
+    }
+
+    fn alike(n: u32) -> Vec<(u32, f64)> {
+        (0..n).map(|i| (i, 1.0 / f64::from(n))).collect()
+    }
+
+    #[test]
+    fn duplicates_merge_to_the_same_gaussian_with_opacity_by_the_rule() {
+        // (opacity of each, how many, rule, expected)
+        for (rule, expected) in
+            [(ProxyOpacity::Sum, 0.6), (ProxyOpacity::Union, 1.0 - 0.8f64.powi(3)), (ProxyOpacity::Area, 0.6)]
+        {
+            for placement in [Placement::Mean, Placement::Leader] {
+                for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
+                    let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
+                    states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
+                    let got = merge_state(&alike(3), &states, 1, &recipe(placement, rule));
+                    assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(1));
+                    assert_eq!(got.log_scale.map(|x| x as f32), scale);
+                    assert_eq!(got.sh.iter().map(|&x| x as f32).collect::<Vec<_>>(), states.sh.row::<12>(1));
+                    let unit = unit_rotation(states.rotation.row(1));
+                    let same =
+                        DQuat::from_xyzw(got.rotation[1], got.rotation[2], got.rotation[3], got.rotation[0]).dot(unit);
+                    assert!((same - 1.0).abs() < 1e-14, "rotation {:?} for {unit:?}", got.rotation);
+                    let opacity = 1.0 / (1.0 + (-got.opacity_logit).exp());
+                    assert!((opacity - expected).abs() < 1e-6, "{rule:?}: got {opacity}, expected {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn opacities_0_and_1_and_beyond_give_finite_logits() {
+        for rule in [ProxyOpacity::Sum, ProxyOpacity::Union, ProxyOpacity::Area] {
+            for logit in [f32::MIN, -200.0, 0.0, 200.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
+                let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
+                states.opacity_logit.plane_mut(0).fill(logit);
+                let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, rule)).opacity_logit;
+                assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
+            }
+        }
+    }
+
+    #[test]
+    fn needle_of_1_to_1e12_and_scales_1e_12_and_1e6_survive_merging_with_their_duplicate() {
+        let needle = [1e6f32.ln(), 1.0f32.ln(), 1e-6f32.ln()];
+        for scale in
+            [needle, [1e-12f32.ln(); 3], [1e6f32.ln(); 3], [1e6f32.ln(), 1e-12f32.ln(), 1e-12f32.ln()], [-800.0; 3]]
+        {
+            let states = copies(2, scale, [0.9, -1.3, 0.2, 0.4]);
+            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area));
+            for (got, expected) in got.log_scale.iter().zip(scale.map(|x| f64::from(x).max(f64::MIN_POSITIVE.ln()))) {
+                assert!((got - expected).abs() < 1e-12, "got {got}, expected {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_zero_quaternion_is_the_identity() {
+        let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
+        let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum));
+        assert_eq!(got.rotation, [1.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn the_leader_keeps_its_place_names_of_axes_and_sign() {
+        // The second axis is the longest: canonical order would rename it.
+        let mut states = copies(2, [-3.0, -1.0, -5.0], [-0.9, 0.2, 0.1, 0.3]);
+        states.position.set_row(1, [1000.3, -7.1, 0.12]);
+        let got = merge_state(&[(0, 0.3), (1, 0.7)], &states, 0, &recipe(Placement::Leader, ProxyOpacity::Area));
+        assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(0));
+        let leader = unit_rotation(states.rotation.row(0));
+        let rotation = DQuat::from_xyzw(got.rotation[1], got.rotation[2], got.rotation[3], got.rotation[0]);
+        assert!(rotation.dot(leader) > 0.8, "{rotation:?} for {leader:?}");
+        assert!(got.log_scale[1] > got.log_scale[0] && got.log_scale[0] > got.log_scale[2]);
+        let mean = merge_state(&[(0, 0.3), (1, 0.7)], &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area));
+        assert!((mean.position.x - (1000.25 * 0.3 + f64::from(1000.3f32) * 0.7)).abs() < 1e-9);
+        assert!(mean.log_scale[1] < got.log_scale[1], "moments about the leader exceed those about the mean");
+    }
+
+    #[test]
+    fn higher_bands_average_or_follow_the_heaviest() {
+        let mut states = copies(2, [0.0; 3], [1.0, 0.0, 0.0, 0.0]);
+        states.sh.set_row(0, [1.0f32; 12]);
+        states.sh.set_row(1, [0.0f32; 12]);
+        let members = [(0, 0.25), (1, 0.75)];
+        let average = merged_sh(&members, &states, 0, ShHigh::Average);
+        assert_eq!(average, vec![0.25; 12]);
+        let heaviest = merged_sh(&members, &states, 0, ShHigh::Heaviest);
+        assert_eq!((&heaviest[..3], &heaviest[3..]), (&[0.25; 3][..], &[0.0; 9][..]));
+    }
+
+    #[test]
+    fn a_cluster_nobody_sees_weighs_by_opacity_and_area_then_evenly() {
+        let mut states = copies(3, [0.0; 3], [1.0, 0.0, 0.0, 0.0]);
+        states.log_scale.set_row(2, [2f32.sqrt().ln(); 3]);
+        let by = |coverage: &[f64], states: &Gaussians| {
+            weights(&[0, 1, 2], &Importance { coverage, visibility: &[1.0, 0.5, 0.0] }, states)
+        };
+        assert_eq!(by(&[1.0, 6.0, 9.0], &states), [0.25, 0.75, 0.0]);
+        for unusable in [[0.0, 0.0, 9.0], [f64::NAN, 1.0, 1.0], [f64::INFINITY, 1.0, 1.0]] {
+            for (got, expected) in by(&unusable, &states).iter().zip([0.25, 0.25, 0.5]) {
+                assert!((got - expected).abs() < 1e-7, "{unusable:?}: {got}, expected {expected}");
+            }
+        }
+        states.opacity_logit.plane_mut(0).fill(f32::NEG_INFINITY);
+        assert_eq!(by(&[0.0; 3], &states), [1.0 / 3.0; 3]);
+    }
+
+    #[test]
+    fn mean_area_is_a_quarter_of_the_surface() {
+        let pi = std::f64::consts::PI;
+        assert!((mean_area(DVec3::ONE) - pi).abs() < 1e-12);
+        // A flat disc has two faces of πr²; Thomsen's formula is 1% off there.
+        assert!((mean_area(DVec3::new(1.0, 1.0, 0.0)) / (pi / 2.0) - 1.0).abs() < 0.011);
+        assert!((mean_area(DVec3::splat(1e6)) / (pi * 1e12) - 1.0).abs() < 1e-12);
+        assert_eq!(mean_area(DVec3::ZERO), 0.0);
+    }
+
+    proptest! {
+        #[test]
+        fn opacity_times_area_is_conserved_below_saturation(
+            spread in prop::array::uniform3(-0.1..0.1f32),
+            logits in prop::array::uniform2(-9.0..-2.0f32),
+        ) {
+            let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
+            states.position.set_row(1, [1000.25 + spread[0], -7.125 + spread[1], 0.1 + spread[2]]);
+            states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
+            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area));
+            let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
+            let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
+            prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");
+        }
+    }
+}

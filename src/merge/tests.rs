@@ -1,0 +1,280 @@
+//! Claims about whole passes.
+
+use std::convert::Infallible;
+use std::time::Instant;
+
+use glam::{DQuat, DVec3};
+use xxhash_rust::xxh3::xxh3_64_with_seed;
+
+use super::motion::PairMotion;
+use super::*;
+use crate::model::Column;
+use crate::recipe::{Merge, Motion, Recipe};
+
+/// A number in [0, 1) for Gaussian `i`, another for every `salt`.
+fn uniform(i: usize, salt: u64) -> f64 {
+    (xxh3_64_with_seed(&(i as u64).to_le_bytes(), salt) >> 11) as f64 / (1u64 << 53) as f64
+}
+
+/// Survivors that own what they point to.
+struct Scene {
+    states: Gaussians,
+    coverage: Vec<f64>,
+    visibility: Vec<f64>,
+    hash: Vec<u64>,
+    mergeable: Vec<bool>,
+    extent: f64,
+}
+
+impl Scene {
+    /// `n` similar Gaussians, strewn evenly over the unit cube.
+    fn strewn(n: usize) -> Self {
+        let mut states = Gaussians::zeros(n, 1);
+        let size = 0.7 * (n.max(1) as f64).powf(-1.0 / 3.0);
+        for i in 0..n {
+            let value = |salt: u64| uniform(i, salt) as f32;
+            states.position.set_row(i, [value(0), value(1), value(2)]);
+            states.rotation.set_row(i, [value(3) - 0.5, value(4) - 0.5, value(5) - 0.5, 0.6]);
+            states.log_scale.set_row(i, [6, 7, 8].map(|salt| size.ln() as f32 + 0.8 * (value(salt) - 0.5)));
+            states.opacity_logit.set_row(i, [4.0 * value(9) - 2.0]);
+            states.sh.set_row::<12>(i, std::array::from_fn(|k| 0.5 + 0.1 * value(10 + k as u64)));
+        }
+        Scene {
+            states,
+            coverage: (0..n).map(|i| uniform(i, 30)).collect(),
+            visibility: (0..n).map(|i| uniform(i, 31)).collect(),
+            hash: (0..n as u64).map(|i| xxh3_64_with_seed(&i.to_le_bytes(), 32)).collect(),
+            mergeable: vec![true; n],
+            extent: 1.0,
+        }
+    }
+
+    /// The default recipe with a reach of about two Gaussians here.
+    fn recipe(&self) -> Merge {
+        let mut merge = Recipe::preset("default").unwrap().merge;
+        merge.passes[0].epsilon = 1.2 * (self.states.len() as f64).powf(-1.0 / 3.0);
+        merge.passes[0].d0 = 2.0;
+        merge
+    }
+
+    fn merge(&self, recipe: &Merge, limit: Option<usize>) -> Merged {
+        self.merge_moving(recipe, limit, &[self.states.position.clone()])
+    }
+
+    /// Merges with everything alive and at `frames`, the first of which is the reference.
+    fn merge_moving(&self, recipe: &Merge, limit: Option<usize>, frames: &[Column]) -> Merged {
+        let Scene { states, coverage, visibility, hash, mergeable, extent } = self;
+        let survivors = Survivors { states, coverage, visibility, hash, mergeable, extent: *extent };
+        let measure = |pairs: &[(u32, u32)]| {
+            let mut motion = PairMotion::new(pairs, &frames[0], Motion::Runs);
+            frames.iter().for_each(|frame| motion.frame(frame, &vec![true; states.len()]));
+            Ok::<_, Infallible>(motion.finish())
+        };
+        match run(&survivors, recipe, limit, measure) {
+            Ok(merged) => merged,
+            Err(never) => match never {},
+        }
+    }
+
+    /// The scene with every position and Gaussian turned, scaled and shifted.
+    fn moved(mut self, turn: DQuat, scale: f64, shift: DVec3) -> Self {
+        for i in 0..self.states.len() {
+            let position = DVec3::from(self.states.position.row::<3>(i).map(f64::from));
+            self.states.position.set_row(i, (turn * position * scale + shift).to_array().map(|x| x as f32));
+            let q = turn * gates::unit_rotation(self.states.rotation.row(i));
+            self.states.rotation.set_row(i, [q.w, q.x, q.y, q.z].map(|x| x as f32));
+            let log_scale = self.states.log_scale.row::<3>(i).map(|s| s + scale.ln() as f32);
+            self.states.log_scale.set_row(i, log_scale);
+        }
+        self.extent *= scale;
+        self
+    }
+}
+
+fn joins(merged: &Merged) -> usize {
+    merged.passes.iter().map(|pass| pass.joins).sum()
+}
+
+#[test]
+fn static_neighbours_merge_and_movers_apart_do_not() {
+    let scene = Scene::strewn(2000);
+    let still = scene.merge(&scene.recipe(), None);
+    assert!(joins(&still) > 300, "{:?}", still.passes);
+    assert_eq!(still.groups.len(), 2000 - joins(&still));
+    assert_eq!(still.states.len(), still.groups.len());
+    // Every other Gaussian flies up, the rest down.
+    let mut later = scene.states.position.clone();
+    for (i, y) in later.plane_mut(1).iter_mut().enumerate() {
+        *y += if i % 2 == 0 { 0.5 } else { -0.5 };
+    }
+    let flying = scene.merge_moving(&scene.recipe(), None, &[scene.states.position.clone(), later]);
+    assert!(joins(&flying) > 100);
+    for group in 0..flying.groups.len() {
+        let parity: Vec<u32> = flying.groups.members(group).iter().map(|row| row % 2).collect();
+        assert!(parity.windows(2).all(|w| w[0] == w[1]), "group {group} flies both ways");
+    }
+}
+
+#[test]
+fn scene_translated_rotated_and_scaled_merges_alike() {
+    let scene = Scene::strewn(1500);
+    let expected = scene.merge(&scene.recipe(), None).groups;
+    let turn = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
+    for (turn, scale, shift) in [
+        (DQuat::IDENTITY, 1.0, DVec3::new(8.0, -4.0, 2.0)),
+        (turn, 1.0, DVec3::ZERO),
+        (DQuat::IDENTITY, 1024.0, DVec3::ZERO),
+        (turn, 1e-3, DVec3::new(0.002, 0.0, -0.001)),
+    ] {
+        let moved = Scene::strewn(1500).moved(turn, scale, shift);
+        assert_eq!(
+            moved.merge(&scene.recipe(), None).groups,
+            expected,
+            "turn {turn:?}, scale {scale}, shift {shift:?}"
+        );
+    }
+}
+
+#[test]
+fn exact_duplicates_merge_to_one() {
+    let mut scene = Scene::strewn(60);
+    for column in Columns::ALL.iter() {
+        for c in 0..scene.states.column(column).width() {
+            let plane = scene.states.column_mut(column).plane_mut(c);
+            (0..60).for_each(|i| plane[i] = plane[i % 20]);
+        }
+    }
+    // A reach of zero: nothing but duplicates.
+    let mut recipe = scene.recipe();
+    recipe.passes[0].epsilon = 0.0;
+    let merged = scene.merge(&recipe, None);
+    assert_eq!(merged.groups.len(), 20);
+    for group in 0..20 {
+        let members = merged.groups.members(group);
+        assert_eq!(members.iter().map(|row| row % 20).collect::<Vec<_>>(), [members[0] % 20; 3]);
+        let leader = merged.groups.leaders()[group] as usize;
+        assert_eq!(merged.states.position.row::<3>(group), scene.states.position.row(leader));
+        assert_eq!(merged.states.log_scale.row::<3>(group), scene.states.log_scale.row(leader));
+        assert_eq!(merged.states.sh.row::<12>(group), scene.states.sh.row(leader));
+    }
+}
+
+#[test]
+fn one_giant_background_gaussian_swallows_nothing_and_stays_as_it_is() {
+    let mut scene = Scene::strewn(500);
+    scene.states.position.set_row(7, [0.5; 3]);
+    scene.states.log_scale.set_row(7, [100f32.ln(); 3]);
+    scene.coverage[7] = 1e9;
+    let merged = scene.merge(&scene.recipe(), None);
+    let group = merged.groups.group_of()[7] as usize;
+    assert_eq!(merged.groups.members(group), [7]);
+    assert_eq!(merged.states.log_scale.row::<3>(group), scene.states.log_scale.row(7));
+}
+
+#[test]
+fn what_is_not_finite_or_not_mergeable_stays_alone_to_the_byte() {
+    let mut scene = Scene::strewn(400);
+    scene.mergeable[11] = false;
+    scene.states.opacity_logit.set_row(12, [f32::NAN]);
+    scene.states.sh.plane_mut(11)[13] = f32::INFINITY;
+    let merged = scene.merge(&scene.recipe(), None);
+    assert!(joins(&merged) > 50);
+    for row in [11, 12, 13] {
+        let group = merged.groups.group_of()[row] as usize;
+        assert_eq!(merged.groups.members(group), [row as u32]);
+        for column in Columns::ALL.iter() {
+            let (before, after) = (scene.states.column(column), merged.states.column(column));
+            for c in 0..before.width() {
+                assert_eq!(before.plane(c)[row].to_bits(), after.plane(c)[group].to_bits());
+            }
+        }
+    }
+}
+
+#[test]
+fn thread_count_changes_no_byte() {
+    let scene = Scene::strewn(5000);
+    let recipe = scene.recipe();
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let merged = pool.install(|| scene.merge(&recipe, None));
+        (merged.groups, merged.states, merged.passes)
+    };
+    let one = with(1);
+    assert!(one == with(2) && one == with(16));
+}
+
+#[test]
+fn order_of_rows_changes_no_cluster() {
+    let n = 1500;
+    let (scene, mut turned) = (Scene::strewn(n), Scene::strewn(n));
+    let new_row = |row: usize| (row * 7 + 3) % n;
+    for row in 0..n {
+        for column in Columns::ALL.iter() {
+            for c in 0..scene.states.column(column).width() {
+                turned.states.column_mut(column).plane_mut(c)[new_row(row)] = scene.states.column(column).plane(c)[row];
+            }
+        }
+        turned.coverage[new_row(row)] = scene.coverage[row];
+        turned.visibility[new_row(row)] = scene.visibility[row];
+        turned.hash[new_row(row)] = scene.hash[row];
+    }
+    let leaders = |groups: &Groups, place: &dyn Fn(usize) -> usize| -> Vec<u32> {
+        (0..n).map(|row| groups.leaders()[groups.group_of()[place(row)] as usize]).collect()
+    };
+    let straight = leaders(&scene.merge(&scene.recipe(), None).groups, &|row| row);
+    let shuffled = leaders(&turned.merge(&scene.recipe(), None).groups, &new_row);
+    assert_eq!(straight.iter().map(|&row| new_row(row as usize) as u32).collect::<Vec<_>>(), shuffled);
+}
+
+#[test]
+fn the_limit_counts_joins_over_all_passes_exactly() {
+    let scene = Scene::strewn(2000);
+    let mut recipe = scene.recipe();
+    recipe.passes.push(recipe::MergePass { epsilon: 1.5 * recipe.passes[0].epsilon, ..recipe.passes[0] });
+    let all = scene.merge(&recipe, None);
+    let (first, both) = (all.passes[0].joins, joins(&all));
+    assert!(both > first, "the second pass joins nothing: {:?}", all.passes);
+    for limit in [0, 1, first, first + 1, both, both + 5] {
+        let merged = scene.merge(&recipe, Some(limit));
+        assert_eq!(merged.groups.len(), 2000 - limit.min(both), "limit {limit}");
+    }
+}
+
+#[test]
+fn a_proxy_of_two_passes_is_made_from_its_original_members() {
+    let scene = Scene::strewn(2000);
+    let mut recipe = scene.recipe();
+    recipe.passes.push(recipe::MergePass { epsilon: 2.0 * recipe.passes[0].epsilon, d0: 3.0, ..recipe.passes[0] });
+    let merged = scene.merge(&recipe, None);
+    let importance = Importance { coverage: &scene.coverage, visibility: &scene.visibility };
+    let direct = proxy::merge_groups(&merged.groups, &importance, &scene.states, &recipe);
+    assert!(direct == merged.states);
+}
+
+#[test]
+fn no_survivors_and_one_survivor_pass_through() {
+    for n in [0, 1] {
+        let scene = Scene::strewn(n);
+        let merged = scene.merge(&Recipe::preset("default").unwrap().merge, None);
+        assert_eq!((merged.groups.len(), merged.states == scene.states), (n, true));
+    }
+}
+
+#[test]
+#[ignore = "a measurement: run with --release --nocapture"]
+fn time_of_candidates_for_200_000_gaussians() {
+    let scene = Scene::strewn(200_000);
+    let recipe = scene.recipe();
+    for max_neighbors in [8, 32] {
+        let recipe = Merge { max_neighbors, ..recipe.clone() };
+        let start = Instant::now();
+        let rank = greedy::ranks(&scene.coverage, &scene.hash);
+        let found = candidates(&scene.states, rank, &scene.mergeable, &recipe, &recipe.passes[0], 1.0);
+        let seconds = start.elapsed().as_secs_f64();
+        eprintln!("K = {max_neighbors}: {} pairs, {} lists cut, {seconds:.3} s", found.pairs.len(), found.truncated);
+        let start = Instant::now();
+        let merged = scene.merge(&recipe, None);
+        eprintln!("whole pass, one frame: {:?}, {:.3} s", merged.passes, start.elapsed().as_secs_f64());
+    }
+}
