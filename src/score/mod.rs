@@ -1,1 +1,225 @@
 //! Robust normalisation and scores (METHOD sections 2 and 3).
+//!
+//! In: rows of statistics. Out: S, its static and dynamic parts, and these normalised. Memory: six
+//! f64 per Gaussian at most, and one sketch at a time. Source: "Temporally-Aware Pruning for Compact
+//! 4D Gaussian Splatting Models", section 3.2.
+
+mod norm;
+pub mod sketch;
+
+pub use norm::Norm;
+pub use sketch::FloatSketch;
+
+use crate::model::{Flags, Rows};
+use crate::recipe;
+
+/// Scores of N Gaussians; every array has N entries, all finite.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scores {
+    /// S_static = norm(C) + λ·norm(E).
+    pub static_score: Vec<f64>,
+    /// S_dynamic = norm(D) + μ·norm(κ) + η·norm(V) + ξ·norm(Life).
+    pub dynamic_score: Vec<f64>,
+    /// S = w_s·S_static + w_d·S_dynamic.
+    pub score: Vec<f64>,
+    /// norm(S_static), for stage 2.
+    pub static_norm: Vec<f64>,
+    /// norm(S_dynamic), for stage 2.
+    pub dynamic_norm: Vec<f64>,
+    /// What every term was normalised by, in the order C, E, D, kappa, V, Life, S_static, S_dynamic;
+    /// terms of weight 0 were not computed and are missing.
+    pub terms: Vec<Term>,
+}
+
+/// How a term was normalised.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Term {
+    /// C, E, D, kappa, V, Life, S_static or S_dynamic.
+    pub name: &'static str,
+    /// Its percentiles.
+    pub norm: Norm,
+}
+
+/// Scores of `rows` from a sequence of `frames` frames.
+///
+/// Rows with [`Flags::NON_FINITE`] count in no percentile and score 0 throughout. `rows.e` is used
+/// only when λ > 0. No rows give empty scores.
+pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
+    let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.has(Flags::NON_FINITE)).collect();
+    let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
+    let motion_weight = |i: usize| if recipe.weigh_motion_by_life { life(i) } else { 1.0 };
+
+    let mut sum = Summation { counts: &counts, recipe, terms: Vec::new() };
+    let mut static_score = vec![0.0; rows.len()];
+    sum.add(&mut static_score, "C", 1.0, |i| rows.c[i]);
+    sum.add(&mut static_score, "E", recipe.lambda, |i| rows.e[i]);
+    let mut dynamic_score = vec![0.0; rows.len()];
+    sum.add(&mut dynamic_score, "D", 1.0, |i| rows.d[i] * motion_weight(i));
+    sum.add(&mut dynamic_score, "kappa", recipe.mu, |i| rows.kappa[i] * motion_weight(i));
+    sum.add(&mut dynamic_score, "V", recipe.eta, |i| rows.v[i]);
+    sum.add(&mut dynamic_score, "Life", recipe.xi, life);
+
+    let score =
+        static_score.iter().zip(&dynamic_score).map(|(s, d)| recipe.w_static * s + recipe.w_dynamic * d).collect();
+    let mut static_norm = vec![0.0; rows.len()];
+    sum.add(&mut static_norm, "S_static", 1.0, |i| static_score[i]);
+    let mut dynamic_norm = vec![0.0; rows.len()];
+    sum.add(&mut dynamic_norm, "S_dynamic", 1.0, |i| dynamic_score[i]);
+    let terms = sum.terms;
+    Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
+}
+
+/// Adds up normalised terms.
+struct Summation<'a> {
+    counts: &'a [bool],
+    recipe: &'a recipe::Score,
+    terms: Vec<Term>,
+}
+
+impl Summation<'_> {
+    /// total += weight · norm(value), over the rows that count; nothing when the weight is 0.
+    fn add(&mut self, total: &mut [f64], name: &'static str, weight: f64, value: impl Fn(usize) -> f64) {
+        if weight == 0.0 {
+            return;
+        }
+        let counted = || (0..total.len()).filter(|&i| self.counts[i]);
+        let norm = Norm::of(|| counted().map(&value), self.recipe);
+        for (i, total) in total.iter_mut().enumerate() {
+            if self.counts[i] {
+                *total += weight * norm.apply(value(i));
+            }
+        }
+        self.terms.push(Term { name, norm });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::Recipe;
+
+    fn rows(n: usize) -> Rows {
+        let ramp = |scale: f64| (0..n).map(|i| scale * i as f64).collect::<Vec<f64>>();
+        Rows {
+            d: ramp(0.1),
+            kappa: ramp(0.01),
+            v: ramp(1e-3),
+            life: (0..n as u32).collect(),
+            c: ramp(3.0),
+            e: ramp(2.0),
+            vis: ramp(0.0),
+            flags: vec![Flags::default(); n],
+        }
+    }
+
+    fn preset(name: &str) -> recipe::Score {
+        recipe::Score { exact_percentiles: true, ..Recipe::preset(name).unwrap().score }
+    }
+
+    #[test]
+    fn paper_scores_equal_the_formulas_written_out() {
+        let rows = rows(1000);
+        let recipe =
+            recipe::Score { lambda: 0.3, mu: 0.7, eta: 0.9, xi: 0.2, w_static: 1.5, w_dynamic: 2.5, ..preset("paper") };
+        let scores = score(&rows, 2000, &recipe);
+        // Every statistic is a ramp 0..999: nearest rank puts P1 at 9 and P99 at 989 steps.
+        let norm = |i: usize, scale: f64| (i as f64 - 9.0) * scale / (980.0 * scale + 1e-8);
+        for i in [0, 9, 500, 989, 999] {
+            let static_score = norm(i, 3.0) + 0.3 * norm(i, 2.0);
+            let dynamic_score = norm(i, 0.1) + 0.7 * norm(i, 0.01) + 0.9 * norm(i, 1e-3) + 0.2 * norm(i, 1.0 / 2000.0);
+            let expected = 1.5 * static_score + 2.5 * dynamic_score;
+            assert!((scores.score[i] - expected).abs() < 1e-12, "{i}: got {}, expected {expected}", scores.score[i]);
+            assert!((scores.static_norm[i] - norm(i, 1.0)).abs() < 1e-7);
+        }
+        let names: Vec<&str> = scores.terms.iter().map(|term| term.name).collect();
+        assert_eq!(names, ["C", "E", "D", "kappa", "V", "Life", "S_static", "S_dynamic"]);
+    }
+
+    #[test]
+    fn terms_of_weight_zero_are_left_out() {
+        let mut rows = rows(100);
+        rows.e = vec![f64::NAN; 100];
+        let scores = score(&rows, 100, &preset("default"));
+        assert!(scores.terms.iter().all(|term| term.name != "E" && term.name != "Life"));
+        assert!(scores.score.iter().all(|s| s.is_finite()));
+    }
+
+    #[test]
+    fn flagged_rows_leave_percentiles_untouched() {
+        let clean = rows(500);
+        let mut odd = rows(500);
+        let zeros = Rows {
+            d: vec![0.0; 200],
+            kappa: vec![0.0; 200],
+            v: vec![0.0; 200],
+            life: vec![0; 200],
+            c: vec![0.0; 200],
+            e: vec![0.0; 200],
+            vis: vec![0.0; 200],
+            flags: vec![Flags(Flags::NON_FINITE); 200],
+        };
+        odd.append(&mut zeros.clone());
+        for name in ["paper", "default"] {
+            let (expected, got) = (score(&clean, 9, &preset(name)), score(&odd, 9, &preset(name)));
+            assert_eq!(got.terms, expected.terms);
+            assert_eq!(got.score[..500], expected.score);
+            assert!(got.score[500..].iter().all(|&s| s == 0.0));
+        }
+    }
+
+    #[test]
+    fn static_scene_has_no_dynamic_score_and_says_so() {
+        let mut rows = rows(300);
+        for values in [&mut rows.d, &mut rows.kappa, &mut rows.v] {
+            values.fill(0.0);
+        }
+        for name in ["paper", "default"] {
+            let scores = score(&rows, 300, &preset(name));
+            assert!(scores.dynamic_score.iter().chain(&scores.dynamic_norm).all(|&s| s == 0.0));
+            let inactive: Vec<_> = scores.terms.iter().filter(|t| !t.norm.is_active()).map(|t| t.name).collect();
+            assert_eq!(inactive, ["D", "kappa", "V", "S_dynamic"]);
+        }
+    }
+
+    #[test]
+    fn movers_around_one_percent_all_reach_the_top() {
+        for movers in [9, 10, 11] {
+            let mut rows = rows(1000);
+            rows.d = (0..1000).map(|i| if i < movers { 5.0 } else { 0.0 }).collect();
+            (rows.kappa, rows.v) = (vec![0.0; 1000], vec![0.0; 1000]);
+            let scores = score(&rows, 10, &preset("default"));
+            for (i, &norm) in scores.dynamic_norm.iter().enumerate() {
+                assert_eq!(norm, f64::from(u8::from(i < movers)), "{movers} movers, Gaussian {i}");
+            }
+        }
+    }
+
+    #[test]
+    fn sketched_percentiles_move_no_score_by_more_than_their_bound() {
+        let rows = rows(10_000);
+        let recipe = preset("default");
+        let exact = score(&rows, 10_000, &recipe);
+        let sketched = score(&rows, 10_000, &recipe::Score { exact_percentiles: false, ..recipe });
+        for (got, expected) in sketched.static_score.iter().zip(&exact.static_score) {
+            assert!((got - expected).abs() <= 0.005, "got {got}, expected {expected}");
+        }
+    }
+
+    #[test]
+    fn no_rows_and_one_row_are_scored() {
+        let none = score(&Rows::default(), 0, &preset("default"));
+        assert!(none.score.is_empty());
+        let one = score(&rows(1), 1, &preset("paper"));
+        assert_eq!(one.score, [0.0]);
+    }
+
+    #[test]
+    fn motion_can_be_weighed_by_life() {
+        let mut rows = rows(200);
+        rows.life = vec![50; 200];
+        let plain = score(&rows, 100, &preset("paper"));
+        let weighed = score(&rows, 100, &recipe::Score { weigh_motion_by_life: true, ..preset("paper") });
+        let d = |scores: &Scores| scores.terms.iter().find(|t| t.name == "D").unwrap().norm.p99;
+        assert_eq!(d(&weighed), 0.5 * d(&plain));
+    }
+}

@@ -1,0 +1,158 @@
+//! Claims about the selection, against its definition written out.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::recipe::Recipe;
+
+/// Scores in which S is the sum of the normalised parts.
+fn scores(parts: &[(f64, f64)]) -> Scores {
+    let (static_norm, dynamic_norm): (Vec<f64>, Vec<f64>) = parts.iter().copied().unzip();
+    let score = parts.iter().map(|(s, d)| s + d).collect();
+    Scores {
+        static_score: static_norm.clone(),
+        dynamic_score: dynamic_norm.clone(),
+        score,
+        static_norm,
+        dynamic_norm,
+        terms: Vec::new(),
+    }
+}
+
+fn rule(low_priority: LowPriority, keep_fraction: f64, tau_static: f64, tau_dynamic: f64) -> Select {
+    Select { keep_fraction, tau_static, tau_dynamic, low_priority }
+}
+
+fn free(scores: &Scores, recipe: &Select) -> Selection {
+    select(scores, recipe, &Overrides::default()).unwrap()
+}
+
+/// The kept set by the definition: full sort, then the OR rule.
+fn kept_by_definition(scores: &Scores, recipe: &Select) -> Vec<bool> {
+    let n = scores.score.len();
+    let mut order: Vec<usize> = (0..n).collect();
+    order.sort_by(|&a, &b| {
+        scores.score[b].partial_cmp(&scores.score[a]).unwrap().then(hash_id(a as u64).cmp(&hash_id(b as u64)))
+    });
+    let candidates = &order[..(recipe.keep_fraction * n as f64 + 0.5).floor() as usize];
+    (0..n)
+        .map(|i| {
+            let passes = scores.static_norm[i] >= recipe.tau_static || scores.dynamic_norm[i] >= recipe.tau_dynamic;
+            passes && (recipe.low_priority == LowPriority::Rescue || candidates.contains(&i))
+        })
+        .collect()
+}
+
+/// Coarse values, so that ties are frequent; −0 and unclipped values included.
+fn any_part() -> impl Strategy<Value = f64> {
+    prop_oneof![(-2i32..12).prop_map(|x| f64::from(x) / 8.0), Just(-0.0), Just(0.05), Just(0.05f64.next_down())]
+}
+
+fn any_rule() -> impl Strategy<Value = Select> {
+    let tau = || prop_oneof![Just(0.0), Just(0.05), Just(0.5), Just(1.25)];
+    let fraction = prop_oneof![Just(0.0), Just(1.0), 0.0..=1.0f64];
+    (any::<bool>(), fraction, tau(), tau()).prop_map(|(rescue, fraction, tau_static, tau_dynamic)| {
+        rule(if rescue { LowPriority::Rescue } else { LowPriority::Drop }, fraction, tau_static, tau_dynamic)
+    })
+}
+
+proptest! {
+    #[test]
+    fn kept_set_is_that_of_the_definition_and_a_prefix_of_the_ranking(
+        parts in prop::collection::vec((any_part(), any_part()), 0..80),
+        recipe in any_rule(),
+    ) {
+        let scores = scores(&parts);
+        let selection = free(&scores, &recipe);
+        prop_assert_eq!(&selection.keep, &kept_by_definition(&scores, &recipe));
+        let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
+        prop_assert_eq!(selection.ranking.take(selection.counts.kept), kept);
+        prop_assert_eq!(selection.ranking.take(usize::MAX), (0..parts.len() as u32).collect::<Vec<_>>());
+        let counts = selection.counts;
+        prop_assert_eq!(counts.kept, counts.candidates - counts.pruned_by_stage_2 + counts.rescued);
+        prop_assert_eq!(counts.total, counts.kept + counts.pruned_by_stage_1 + counts.pruned_by_stage_2);
+    }
+
+    #[test]
+    fn overrides_lead_the_ranking_or_leave_it(
+        parts in prop::collection::vec((any_part(), any_part()), 1..60),
+        fates in prop::collection::vec(0u8..6, 60),
+        recipe in any_rule(),
+    ) {
+        let scores = scores(&parts);
+        let with = |fate| (0..parts.len() as u32).filter(|&i| fates[i as usize] == fate).collect::<Vec<u32>>();
+        let overrides = Overrides { keep_ids: with(0), drop_ids: with(1) };
+        let selection = select(&scores, &recipe, &overrides).unwrap();
+        for (i, &natural) in free(&scores, &recipe).keep.iter().enumerate() {
+            let expected = match fates[i] { 0 => true, 1 => false, _ => natural };
+            prop_assert_eq!(selection.keep[i], expected, "Gaussian {}", i);
+        }
+        prop_assert_eq!(selection.ranking.take(overrides.keep_ids.len()), overrides.keep_ids.clone());
+        prop_assert_eq!(selection.ranking.order().len(), parts.len() - overrides.drop_ids.len());
+        let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
+        prop_assert_eq!(selection.ranking.take(selection.counts.kept), kept);
+    }
+}
+
+#[test]
+fn presets_follow_their_low_priority() {
+    let parts: Vec<(f64, f64)> = (0..1000).map(|i| (f64::from(i) / 1000.0, 0.0)).collect();
+    let scores = scores(&parts);
+    let paper = free(&scores, &Recipe::preset("paper").unwrap().select);
+    assert_eq!((paper.counts.candidates, paper.counts.rescued, paper.counts.kept), (800, 0, 800));
+    let default = free(&scores, &Recipe::preset("default").unwrap().select);
+    assert_eq!((default.counts.candidates, default.counts.rescued, default.counts.kept), (800, 150, 950));
+}
+
+#[test]
+fn identical_gaussians_are_cut_to_the_exact_count_by_hashed_id() {
+    let scores = scores(&vec![(0.5, 0.5); 1001]);
+    let selection = free(&scores, &rule(LowPriority::Drop, 0.3, 0.05, 0.05));
+    assert_eq!(selection.counts.kept, 300);
+    let mut by_hash: Vec<u32> = (0..1001).collect();
+    by_hash.sort_by_key(|&id| hash_id(id.into()));
+    assert_eq!(selection.ranking.order(), by_hash);
+    let first_half = selection.keep[..500].iter().filter(|&&keep| keep).count();
+    assert!((110..190).contains(&first_half), "ties must not favour a place in the file: {first_half} of 300");
+}
+
+#[test]
+fn nothing_stays_without_candidates_but_targets_are_still_met_in_order_of_score() {
+    let parts: Vec<(f64, f64)> = (0..50).map(|i| (f64::from(i), 0.0)).collect();
+    let selection = free(&scores(&parts), &rule(LowPriority::Drop, 0.0, 0.05, 0.05));
+    assert_eq!(selection.counts.kept, 0);
+    assert_eq!(selection.ranking.take(3), [47, 48, 49]);
+}
+
+#[test]
+fn conflicting_and_unknown_ids_are_refused_by_name() {
+    let scores = scores(&[(0.0, 0.0); 4]);
+    let recipe = rule(LowPriority::Rescue, 0.5, 0.05, 0.05);
+    for (overrides, id) in [
+        (Overrides { keep_ids: vec![1, 2], drop_ids: vec![2] }, "2"),
+        (Overrides { keep_ids: vec![7], drop_ids: vec![] }, "7"),
+    ] {
+        let message = select(&scores, &recipe, &overrides).unwrap_err().to_string();
+        assert!(message.contains(id), "{message}");
+    }
+}
+
+#[test]
+fn no_gaussians_give_an_empty_selection() {
+    let selection = free(&scores(&[]), &Recipe::preset("default").unwrap().select);
+    assert!(selection.keep.is_empty() && selection.ranking.order().is_empty());
+}
+
+#[test]
+fn selection_ignores_thread_count() {
+    let parts: Vec<(f64, f64)> =
+        (0..20_000u64).map(|i| ((hash_id(i) % 50) as f64 / 50.0, (hash_id(i + 7) % 9) as f64 / 9.0)).collect();
+    let scores = scores(&parts);
+    let recipe = rule(LowPriority::Drop, 0.6, 0.3, 0.5);
+    let on = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| free(&scores, &recipe))
+    };
+    let one = on(1);
+    assert!(one == on(2) && one == on(7));
+}
