@@ -1,3 +1,15 @@
 //! Sources: model folders, PLY files and sequences, containers, cameras.
 
 pub mod cameras;
+mod cfg_args;
+pub mod container;
+mod map;
+mod model_folder;
+pub mod ply;
+pub mod ply_sequence;
+mod pth;
+mod python_literal;
+
+pub use cfg_args::ModelConfig;
+pub use model_folder::{ModelFolder, ModelPaths};
+pub use pth::read_state_dict;

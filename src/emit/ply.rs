@@ -1,0 +1,163 @@
+//! Gaussians to PLY files.
+//!
+//! In: Gaussians, or an open PLY and the rows to keep of it. Out: a file at the path given. Memory: one
+//! row. Writers that go through [`super::atomic`] pass its temporary path.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use crate::error::{Error, Result};
+use crate::ingest::ply::{Encoding, Plane, Ply, Property, Scalar};
+use crate::model::{Columns, Gaussians, sh_coefficients};
+
+/// One row of a smaller PLY.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OutRow {
+    /// The Gaussian of the template whose row is copied: itself, or the leader of its cluster.
+    pub source: u32,
+    /// The proxy whose columns replace those of the row, if any.
+    pub proxy: Option<u32>,
+}
+
+/// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):
+/// only the count changes. A row without a proxy is the template's, byte for byte. A row with one is the
+/// template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of its
+/// property (integers: nearest, saturated); normals and further properties stay the leader's. A
+/// template without `scale_2` has no place for a proxy's third scale: order axes largest first.
+///
+/// Further elements and bytes after the last one are copied. A text template becomes little-endian
+/// binary; otherwise all rows in order without proxies give the template's own bytes.
+///
+/// # Errors
+/// A source or proxy that does not exist; proxies of another SH degree; a template cut short since
+/// it was opened; a failed write.
+pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, path: &Path) -> Result<()> {
+    check_rows(template, rows, proxies)?;
+    template.check_unshrunk()?;
+    create(path, |out| {
+        out.write_all(&template.header().text_for(rows.len()))?;
+        out.write_all(template.lead())?;
+        let mut changed = Vec::new();
+        for row in rows {
+            let source = template.row(row.source as usize);
+            match row.proxy {
+                None => out.write_all(source)?,
+                Some(proxy) => {
+                    changed.clear();
+                    changed.extend_from_slice(source);
+                    replace(&mut changed, template, proxies, proxy as usize);
+                    out.write_all(&changed)?;
+                }
+            }
+        }
+        out.write_all(template.tail())
+    })
+}
+
+/// Writes `gaussians` in the INRIA layout: binary little-endian f32, zero normals, `comments` as
+/// comment lines (line breaks in them become spaces). An f32 keeps its bits.
+///
+/// # Errors
+/// A failed write; an SH width that belongs to no degree from 0 to 3.
+pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
+    let width = gaussians.sh.width();
+    if !(0..=3).any(|degree| 3 * sh_coefficients(degree) == width) {
+        return Err(Error::usage(format!("{width} SH planes belong to no degree from 0 to 3")));
+    }
+    let rest = width - 3;
+    let mut planes: Vec<&[f32]> = Vec::new();
+    let zeros = vec![0.0; gaussians.len()];
+    planes.extend((0..3).map(|c| gaussians.position.plane(c)));
+    planes.extend([zeros.as_slice(); 3]);
+    planes.extend((0..3).map(|c| gaussians.sh.plane(c)));
+    // The file holds all of red, then green, then blue; a plane is 3 · coefficient + channel.
+    planes.extend((0..3).flat_map(|channel| (1..=rest / 3).map(move |k| gaussians.sh.plane(3 * k + channel))));
+    planes.push(gaussians.opacity_logit.plane(0));
+    planes.extend((0..3).map(|c| gaussians.log_scale.plane(c)));
+    planes.extend((0..4).map(|c| gaussians.rotation.plane(c)));
+    create(path, |out| {
+        out.write_all(inria_header(gaussians.len(), rest, comments).as_bytes())?;
+        for i in 0..gaussians.len() {
+            for plane in &planes {
+                out.write_all(&plane[i].to_le_bytes())?;
+            }
+        }
+        Ok(())
+    })
+}
+
+fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
+    let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
+    for comment in comments {
+        header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
+    }
+    header += &format!("element vertex {count}\n");
+    let names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(str::to_owned).into_iter();
+    let names = names.chain((0..rest).map(|k| format!("f_rest_{k}")));
+    let last = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+    for name in names.chain(last.map(str::to_owned)) {
+        header += &format!("property float {name}\n");
+    }
+    header + "end_header\n"
+}
+
+/// Creates the file at `path` and lets `fill` write it.
+fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
+    let mut out = BufWriter::with_capacity(1 << 18, File::create(path).map_err(Error::io("create", path))?);
+    fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
+}
+
+fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians) -> Result<()> {
+    let planes = template.layout().planes(Columns::SH).len();
+    if !proxies.is_empty() && proxies.sh.width() != planes {
+        let width = proxies.sh.width();
+        return Err(Error::usage(format!(
+            "proxies have {width} SH planes, {} has {planes}",
+            template.path().display()
+        )));
+    }
+    for row in rows {
+        if row.source as usize >= template.count() {
+            let (path, count) = (template.path().display(), template.count());
+            return Err(Error::usage(format!("{path}: Gaussian {} is to be kept, of {count} from 0", row.source)));
+        }
+        if let Some(proxy) = row.proxy.filter(|&proxy| proxy as usize >= proxies.len()) {
+            return Err(Error::usage(format!("proxy {proxy} is to be written, of {} counted from 0", proxies.len())));
+        }
+    }
+    Ok(())
+}
+
+/// Replaces what a proxy changes in the bytes of its leader's row.
+fn replace(row: &mut [u8], template: &Ply, proxies: &Gaussians, proxy: usize) {
+    let big_endian = template.header().encoding == Encoding::BigEndian;
+    for column in Columns::ALL.iter() {
+        for (c, plane) in template.layout().planes(column).iter().enumerate() {
+            if let Plane::Property(property) = plane {
+                put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);
+            }
+        }
+    }
+}
+
+fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
+    let rounded = value.round();
+    let mut bytes = [0; 8];
+    let used = &mut bytes[..property.scalar.bytes()];
+    // `as` saturates and turns NaN into 0.
+    match property.scalar {
+        Scalar::F32 => used.copy_from_slice(&value.to_le_bytes()),
+        Scalar::F64 => used.copy_from_slice(&f64::from(value).to_le_bytes()),
+        Scalar::I8 => used.copy_from_slice(&(rounded as i8).to_le_bytes()),
+        Scalar::U8 => used.copy_from_slice(&(rounded as u8).to_le_bytes()),
+        Scalar::I16 => used.copy_from_slice(&(rounded as i16).to_le_bytes()),
+        Scalar::U16 => used.copy_from_slice(&(rounded as u16).to_le_bytes()),
+        Scalar::I32 => used.copy_from_slice(&(rounded as i32).to_le_bytes()),
+        Scalar::U32 => used.copy_from_slice(&(rounded as u32).to_le_bytes()),
+    }
+    if big_endian {
+        used.reverse();
+    }
+    row[property.offset..property.offset + used.len()].copy_from_slice(used);
+}

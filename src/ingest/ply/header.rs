@@ -1,0 +1,235 @@
+//! The header of a PLY file: encoding, elements, properties, comments.
+//!
+//! In: the bytes of a file. Out: [`Header`]. Source: G. Turk, "The PLY Polygon File Format", 1994.
+
+use std::path::Path;
+
+use crate::error::{Error, Result};
+
+/// How the body stores numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Encoding {
+    /// Text, one row per line.
+    Ascii,
+    /// Little-endian binary.
+    LittleEndian,
+    /// Big-endian binary.
+    BigEndian,
+}
+
+/// Type of a property.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the names say it")]
+pub enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    /// The type a header spells `name`, in the old or the sized spelling.
+    fn parse(name: &str) -> Option<Scalar> {
+        Some(match name {
+            "char" | "int8" => Scalar::I8,
+            "uchar" | "uint8" => Scalar::U8,
+            "short" | "int16" => Scalar::I16,
+            "ushort" | "uint16" => Scalar::U16,
+            "int" | "int32" => Scalar::I32,
+            "uint" | "uint32" => Scalar::U32,
+            "float" | "float32" => Scalar::F32,
+            "double" | "float64" => Scalar::F64,
+            _ => return None,
+        })
+    }
+
+    /// Bytes of one value in a binary body.
+    pub fn bytes(self) -> usize {
+        match self {
+            Scalar::I8 | Scalar::U8 => 1,
+            Scalar::I16 | Scalar::U16 => 2,
+            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
+            Scalar::F64 => 8,
+        }
+    }
+}
+
+/// One column of an element.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Property {
+    /// Its name.
+    pub name: String,
+    /// Its type.
+    pub scalar: Scalar,
+    /// Its place in a binary row, bytes.
+    pub offset: usize,
+}
+
+/// A table of the file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Element {
+    pub(crate) name: String,
+    pub(crate) count: u64,
+    pub(crate) properties: Vec<Property>,
+    /// Bytes of a binary row.
+    pub(crate) stride: usize,
+}
+
+/// A parsed header. All elements have rows of fixed size.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Header {
+    pub(crate) encoding: Encoding,
+    pub(crate) elements: Vec<Element>,
+    /// Texts of the `comment` lines, in order.
+    pub(crate) comments: Vec<String>,
+    /// The header itself, through the line end of `end_header`.
+    pub(crate) text: Vec<u8>,
+    /// Its number of lines.
+    pub(crate) lines: usize,
+}
+
+impl Header {
+    /// Parses the header at the start of `bytes`, the content of `path`. Lines may end in LF or CRLF.
+    ///
+    /// # Errors
+    /// Not a PLY; a header without `end_header`; a line, type or count that is none; a list property
+    /// (its rows have no fixed size); a name used twice. Each names the line.
+    pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<Header> {
+        let mut encoding = None;
+        let mut elements: Vec<Element> = Vec::new();
+        let mut comments = Vec::new();
+        let mut end = 0;
+        for (index, raw) in bytes.split_inclusive(|&b| b == b'\n').enumerate() {
+            end += raw.len();
+            let place = || format!("header line {}", index + 1);
+            let text = String::from_utf8_lossy(excerpt(raw));
+            if index == 0 {
+                if raw.trim_ascii() != b"ply" {
+                    return Err(Error::input(path, "first line", "\"ply\"", found(raw)).hint("this is not a PLY file"));
+                }
+                continue;
+            }
+            if !raw.ends_with(b"\n") {
+                break;
+            }
+            let words: Vec<&str> = text.split_ascii_whitespace().collect();
+            match words[..] {
+                [] | ["obj_info", ..] => {}
+                ["comment", ..] => {
+                    let all = raw.trim_ascii();
+                    let comment = all.strip_prefix(b"comment").unwrap_or(all).trim_ascii_start();
+                    comments.push(String::from_utf8_lossy(comment).into_owned());
+                }
+                ["format", name, "1.0"] => {
+                    encoding = Some(match name {
+                        "ascii" => Encoding::Ascii,
+                        "binary_little_endian" => Encoding::LittleEndian,
+                        "binary_big_endian" => Encoding::BigEndian,
+                        _ => {
+                            let expected = "ascii, binary_little_endian or binary_big_endian";
+                            return Err(Error::input(path, place(), expected, format!("{name:?}")));
+                        }
+                    });
+                }
+                ["element", name, count] => {
+                    if elements.iter().any(|element| element.name == name) {
+                        return Err(Error::input(
+                            path,
+                            place(),
+                            "elements of different names",
+                            format!("{name:?} twice"),
+                        ));
+                    }
+                    let count =
+                        count.parse().map_err(|_| Error::input(path, place(), "a row count", format!("{count:?}")))?;
+                    elements.push(Element { name: name.to_owned(), count, properties: Vec::new(), stride: 0 });
+                }
+                ["property", "list", .., name] => {
+                    let element = elements.last().map_or("no element", |element| &element.name);
+                    let found = format!("list property {name:?} in element {element:?}");
+                    return Err(Error::input(path, place(), "properties of one number", found)
+                        .hint("lists do not occur in Gaussian models; export the points alone"));
+                }
+                ["property", kind, name] => {
+                    let Some(scalar) = Scalar::parse(kind) else {
+                        return Err(Error::input(
+                            path,
+                            place(),
+                            "a number type of PLY, such as float",
+                            format!("{kind:?}"),
+                        ));
+                    };
+                    let Some(element) = elements.last_mut() else {
+                        return Err(Error::input(path, place(), "an element before its properties", found(raw)));
+                    };
+                    if element.properties.iter().any(|property| property.name == name) {
+                        let expected = format!("each property of element {:?} once", element.name);
+                        return Err(Error::input(path, place(), expected, format!("{name:?} twice")));
+                    }
+                    element.properties.push(Property { name: name.to_owned(), scalar, offset: element.stride });
+                    element.stride += scalar.bytes();
+                }
+                ["end_header"] => {
+                    let Some(encoding) = encoding else {
+                        return Err(Error::input(path, place(), "a format line before it", "none"));
+                    };
+                    return Ok(Header { encoding, elements, comments, text: bytes[..end].to_vec(), lines: index + 1 });
+                }
+                _ => {
+                    let expected = "a format, comment, element, property or end_header line";
+                    return Err(Error::input(path, place(), expected, found(raw)));
+                }
+            }
+        }
+        let what = format!("the file ends after {} bytes without one", bytes.len());
+        Err(Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again"))
+    }
+
+    /// The header text for `count` vertices: the same lines, but for the count and, where the body
+    /// was text, for the format, which becomes little-endian binary.
+    pub(crate) fn text_for(&self, count: usize) -> Vec<u8> {
+        let mut out = Vec::with_capacity(self.text.len() + 16);
+        for line in self.text.split_inclusive(|&b| b == b'\n') {
+            let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+            let line_end: &[u8] = if line.ends_with(b"\r\n") { b"\r\n" } else { b"\n" };
+            let changed = match (words.next(), words.next()) {
+                (Some(b"format"), _) if self.encoding == Encoding::Ascii => {
+                    Some("format binary_little_endian 1.0".to_owned())
+                }
+                (Some(b"element"), Some(b"vertex")) if self.vertex().is_some_and(|v| v.count != count as u64) => {
+                    Some(format!("element vertex {count}"))
+                }
+                _ => None,
+            };
+            match changed {
+                Some(text) => out.extend([text.as_bytes(), line_end].concat()),
+                None => out.extend(line),
+            }
+        }
+        out
+    }
+
+    /// The element that holds the Gaussians.
+    pub(crate) fn vertex(&self) -> Option<&Element> {
+        self.elements.iter().find(|element| element.name == "vertex")
+    }
+}
+
+/// Enough of a line to hold any keyword with its arguments: binary data may lack line ends.
+fn excerpt(line: &[u8]) -> &[u8] {
+    &line[..line.len().min(1024)]
+}
+
+/// A line as messages quote it.
+fn found(line: &[u8]) -> String {
+    let line = line.trim_ascii();
+    match line.len() {
+        0 => "nothing".to_owned(),
+        1..=60 => format!("{:?}", String::from_utf8_lossy(line)),
+        _ => format!("{:?}…", String::from_utf8_lossy(&line[..60])),
+    }
+}

@@ -1,0 +1,87 @@
+//! Where a PLY row holds each plane of a Gaussian.
+//!
+//! In: the properties of element `vertex`. Out: [`Layout`].
+
+use std::path::Path;
+
+use super::header::{Element, Property};
+use crate::error::{Error, Result};
+use crate::model::{Columns, sh_coefficients};
+
+/// Natural log of the thickness given to a surfel (2DGS, no `scale_2`), relative to its smaller
+/// axis: a thousandth. Relative, so that results do not depend on the scene's unit; thin enough to
+/// vanish under the rasteriser's 0.3 px² dilation, thick enough to stay an f32 covariance.
+pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
+
+/// The source of one plane.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Plane {
+    /// A property of the row.
+    Property(Property),
+    /// The missing third scale of a surfel: min(scale_0, scale_1) + [`THIN_LOG_SCALE`].
+    Thin,
+}
+
+/// The planes of every column, in the order of [`Gaussians`](crate::model::Gaussians).
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Layout {
+    pub(crate) sh_degree: usize,
+    planes: [Vec<Plane>; 5],
+}
+
+impl Layout {
+    /// Finds the planes among the properties of `vertex`; any others are ignored.
+    ///
+    /// # Errors
+    /// A missing property, or a number of `f_rest` that belongs to no degree.
+    pub(super) fn of(path: &Path, vertex: &Element) -> Result<Layout> {
+        let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
+        let need = |name: &str| match find(name) {
+            Some(property) => Ok(Plane::Property(property.clone())),
+            None => Err(missing(path, vertex, name)),
+        };
+        let need_all = |names: &[&str]| names.iter().map(|name| need(name)).collect::<Result<Vec<Plane>>>();
+
+        let position = need_all(&["x", "y", "z"])?;
+        let mut sh = need_all(&["f_dc_0", "f_dc_1", "f_dc_2"])?;
+        let opacity = need_all(&["opacity"])?;
+        let mut log_scale = need_all(&["scale_0", "scale_1"])?;
+        log_scale.push(find("scale_2").map_or(Plane::Thin, |property| Plane::Property(property.clone())));
+        let rotation = need_all(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
+
+        let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
+        let Some(sh_degree) = (0..=3).find(|&degree| 3 * (sh_coefficients(degree) - 1) == rest) else {
+            let expected = "0, 9, 24 or 45 properties f_rest_* (degree 0 to 3)";
+            return Err(Error::input(path, "element vertex", expected, rest.to_string()));
+        };
+        // The file holds all of red, then green, then blue; a plane is 3 · coefficient + channel.
+        let per_channel = rest / 3;
+        for coefficient in 0..per_channel {
+            for channel in 0..3 {
+                sh.push(need(&format!("f_rest_{}", channel * per_channel + coefficient))?);
+            }
+        }
+        Ok(Layout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
+    }
+
+    /// The planes of a single column.
+    pub(crate) fn planes(&self, column: Columns) -> &[Plane] {
+        let index = Columns::ALL.iter().take_while(|&one| one != column).count();
+        &self.planes[index]
+    }
+}
+
+fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
+    let has = |name: &str| vertex.properties.iter().any(|property| property.name == name);
+    let names: Vec<&str> = vertex.properties.iter().map(|property| property.name.as_str()).take(80).collect();
+    let hint = if has("packed_position") {
+        "this is a compressed PLY; convert it to the plain layout first"
+    } else if has("trbf_center") {
+        "this is a SpacetimeGaussians model, which is not a plain cloud of Gaussians"
+    } else if has("red") || has("face") {
+        "this looks like a point cloud or a mesh, not a trained Gaussian model"
+    } else {
+        "a Gaussian model has x y z f_dc_0..2 opacity scale_0..2 rot_0..3"
+    };
+    Error::input(path, "element vertex", format!("property {name:?}"), format!("only {}", names.join(" "))).hint(hint)
+}

@@ -1,0 +1,264 @@
+//! Gaussians from a PLY file in the INRIA layout and its dialects.
+//!
+//! In: a path. Out: planes of f32 for any list of Gaussians, and the rows as they lie in the file for
+//! writers that keep them. Memory: a map of the file; text bodies are held as binary rows.
+//! Source: 3D Gaussian Splatting (Kerbl et al., 2023), `save_ply` of its public code.
+//!
+//! Accepted: binary of either byte order and text; any number type per property; properties in any
+//! order, further ones, no normals; comments; LF or CRLF; further elements before or after `vertex`;
+//! no `scale_2` (2DGS, see [`THIN_LOG_SCALE`]); bytes after the last element. NaN is no error here.
+
+mod ascii;
+mod header;
+mod layout;
+#[cfg(test)]
+mod tests;
+
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+pub(crate) use header::Header;
+pub use header::{Encoding, Property, Scalar};
+pub use layout::THIN_LOG_SCALE;
+pub(crate) use layout::{Layout, Plane};
+
+use super::map::FileMap;
+use crate::error::{Error, Result};
+use crate::model::{Column, Columns, Gaussians};
+use crate::pass::Ids;
+
+/// Rows handled together, so that all planes of them are taken from cache: 32 KiB at degree 3.
+const BLOCK_ROWS: usize = 128;
+
+/// An open PLY file of Gaussians.
+#[derive(Debug)]
+pub struct Ply {
+    path: PathBuf,
+    header: Header,
+    layout: Layout,
+    stride: usize,
+    properties: Vec<Property>,
+    body: Body,
+    /// Where the rows of `vertex` lie in the body.
+    rows: Range<usize>,
+    count: usize,
+}
+
+/// The tables of a file after its header.
+#[derive(Debug)]
+enum Body {
+    /// The whole file; the tables start after the header.
+    Mapped { map: FileMap, start: usize },
+    /// The tables of a text file as little-endian rows.
+    Parsed(Vec<u8>),
+}
+
+impl Body {
+    fn bytes(&self) -> &[u8] {
+        match self {
+            Body::Mapped { map, start } => &map[*start..],
+            Body::Parsed(bytes) => bytes,
+        }
+    }
+}
+
+impl Ply {
+    /// Opens the file at `path` and checks its header against its size.
+    ///
+    /// # Errors
+    /// Not a PLY; a malformed header; a missing property; a list property; a number of `f_rest_*` that
+    /// belongs to no SH degree; more than `u32::MAX` Gaussians; fewer bytes than the header declares; in
+    /// a text file, a row that cannot be read.
+    pub fn open(path: &Path) -> Result<Ply> {
+        let map = FileMap::open(path)?;
+        let header = Header::parse(path, &map)?;
+        let Some(vertex) = header.vertex() else {
+            return Err(Error::input(path, "header", "an element \"vertex\"", "none"));
+        };
+        let (stride, properties) = (vertex.stride, vertex.properties.clone());
+        let layout = Layout::of(path, vertex)?;
+        let count = u32::try_from(vertex.count)
+            .map_err(|_| Error::input(path, "element vertex", "at most 4294967295 rows", vertex.count.to_string()))?;
+        let start = header.text.len();
+        let body = match header.encoding {
+            Encoding::Ascii => Body::Parsed(ascii::to_binary(path, &header, &map[start..])?),
+            Encoding::LittleEndian | Encoding::BigEndian => Body::Mapped { map, start },
+        };
+        let rows = vertex_rows(path, &header, body.bytes().len())?;
+        Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, count: count as usize })
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// N, the number of Gaussians.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub fn sh_degree(&self) -> usize {
+        self.layout.sh_degree
+    }
+
+    /// Texts of the `comment` lines, in order.
+    pub fn comments(&self) -> &[String] {
+        &self.header.comments
+    }
+
+    /// The properties of a Gaussian's row, in file order.
+    pub fn properties(&self) -> &[Property] {
+        &self.properties
+    }
+
+    /// Writes the columns `want` of the Gaussians `range` into `out`, as [`Ply::gather`] does.
+    pub fn gaussians(&self, range: Range<usize>, want: Columns, out: &mut Gaussians) -> Result<()> {
+        self.gather(&Ids::Range(range), want, out)
+    }
+
+    /// Writes the columns `want` of the Gaussians `ids`, in that order, into `out`, which is resized to
+    /// them. An f32 keeps its bits; other number types become the nearest f32.
+    ///
+    /// # Errors
+    /// An id beyond the last Gaussian; a file cut short since it was opened.
+    pub fn gather(&self, ids: &Ids<'_>, want: Columns, out: &mut Gaussians) -> Result<()> {
+        self.check_unshrunk()?;
+        check_ids(&self.path, ids, self.count)?;
+        out.resize(ids.len());
+        for column in want.iter() {
+            let width = self.layout.planes(column).len();
+            if out.column(column).width() != width {
+                *out.column_mut(column) = Column::zeros(width, ids.len());
+            }
+        }
+        let rows = &self.body.bytes()[self.rows.clone()];
+        let big_endian = self.header.encoding == Encoding::BigEndian;
+        let mut starts = Vec::with_capacity(BLOCK_ROWS);
+        let mut ids_left = ids.iter();
+        for first in (0..ids.len()).step_by(BLOCK_ROWS) {
+            starts.clear();
+            starts.extend(ids_left.by_ref().take(BLOCK_ROWS).map(|id| id * self.stride));
+            for column in want.iter() {
+                for (c, plane) in self.layout.planes(column).iter().enumerate() {
+                    if let Plane::Property(property) = plane {
+                        let out = &mut out.column_mut(column).plane_mut(c)[first..first + starts.len()];
+                        read_plane(rows, &starts, property, big_endian, out);
+                    }
+                }
+            }
+        }
+        if want.contains(Columns::LOG_SCALE) && self.layout.planes(Columns::LOG_SCALE).contains(&Plane::Thin) {
+            for i in 0..ids.len() {
+                let [a, b, _] = out.log_scale.row::<3>(i);
+                out.log_scale.set_row(i, [a, b, a.min(b) + THIN_LOG_SCALE]);
+            }
+        }
+        Ok(())
+    }
+
+    /// The header, for writers.
+    pub(crate) fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// Where a row holds what, for writers.
+    pub(crate) fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The bytes of Gaussian `i` in a binary body.
+    pub(crate) fn row(&self, i: usize) -> &[u8] {
+        &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
+    }
+
+    /// What a binary body holds before the rows of `vertex`.
+    pub(crate) fn lead(&self) -> &[u8] {
+        &self.body.bytes()[..self.rows.start]
+    }
+
+    /// What a binary body holds after the rows of `vertex`.
+    pub(crate) fn tail(&self) -> &[u8] {
+        &self.body.bytes()[self.rows.end..]
+    }
+
+    /// Confirms that a mapped file still has its bytes.
+    pub(crate) fn check_unshrunk(&self) -> Result<()> {
+        match &self.body {
+            Body::Mapped { map, .. } => map.check(),
+            Body::Parsed(_) => Ok(()),
+        }
+    }
+}
+
+/// Confirms that every id is below `count`.
+pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> {
+    let beyond = match ids {
+        Ids::Range(range) => (range.end > count && !range.is_empty()).then(|| range.end - 1),
+        Ids::List(list) => list.iter().map(|&id| id as usize).find(|&id| id >= count),
+    };
+    match beyond {
+        None => Ok(()),
+        Some(id) => {
+            Err(Error::usage(format!("{}: Gaussian {id} was asked for, of {count} counted from 0", path.display())))
+        }
+    }
+}
+
+/// Where the rows of `vertex` lie in a binary body of `available` bytes.
+fn vertex_rows(path: &Path, header: &Header, available: usize) -> Result<Range<usize>> {
+    let mut end = 0u64;
+    let mut rows = 0..0;
+    for element in &header.elements {
+        let start = end;
+        let size = element.count.checked_mul(element.stride as u64);
+        let Some(next) = size.and_then(|size| start.checked_add(size)).filter(|&next| next <= available as u64) else {
+            let place = format!("element {}", element.name);
+            let size = size.map_or("far too many".to_owned(), |size| size.to_string());
+            let expected = format!("{} rows × {} bytes = {size} bytes", element.count, element.stride);
+            return Err(Error::input(path, place, expected, format!("{} bytes", available as u64 - start))
+                .hint("the file is cut short; copy or export it again"));
+        };
+        end = next;
+        if element.name == "vertex" {
+            // Both fit usize: they are at most `available`.
+            rows = start as usize..next as usize;
+        }
+    }
+    Ok(rows)
+}
+
+/// Reads one property of the rows that start at `starts`.
+fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big_endian: bool, out: &mut [f32]) {
+    let at = property.offset;
+    match (property.scalar, big_endian) {
+        (Scalar::F32, false) => fill(rows, starts, at, out, f32::from_le_bytes),
+        (Scalar::F32, true) => fill(rows, starts, at, out, f32::from_be_bytes),
+        (Scalar::F64, false) => fill(rows, starts, at, out, |b| f64::from_le_bytes(b) as f32),
+        (Scalar::F64, true) => fill(rows, starts, at, out, |b| f64::from_be_bytes(b) as f32),
+        (Scalar::I8, _) => fill(rows, starts, at, out, |b| i8::from_le_bytes(b).into()),
+        (Scalar::U8, _) => fill(rows, starts, at, out, |b| u8::from_le_bytes(b).into()),
+        (Scalar::I16, false) => fill(rows, starts, at, out, |b| i16::from_le_bytes(b).into()),
+        (Scalar::I16, true) => fill(rows, starts, at, out, |b| i16::from_be_bytes(b).into()),
+        (Scalar::U16, false) => fill(rows, starts, at, out, |b| u16::from_le_bytes(b).into()),
+        (Scalar::U16, true) => fill(rows, starts, at, out, |b| u16::from_be_bytes(b).into()),
+        (Scalar::I32, false) => fill(rows, starts, at, out, |b| i32::from_le_bytes(b) as f32),
+        (Scalar::I32, true) => fill(rows, starts, at, out, |b| i32::from_be_bytes(b) as f32),
+        (Scalar::U32, false) => fill(rows, starts, at, out, |b| u32::from_le_bytes(b) as f32),
+        (Scalar::U32, true) => fill(rows, starts, at, out, |b| u32::from_be_bytes(b) as f32),
+    }
+}
+
+fn fill<const W: usize>(
+    rows: &[u8],
+    starts: &[usize],
+    offset: usize,
+    out: &mut [f32],
+    convert: impl Fn([u8; W]) -> f32,
+) {
+    for (out, start) in out.iter_mut().zip(starts) {
+        let at = start + offset;
+        *out = convert(std::array::from_fn(|b| rows[at + b]));
+    }
+}
