@@ -1,1 +1,14 @@
 //! The deformation field of a 4DGaussians model: HexPlane features and MLP heads, evaluated in blocks.
+
+mod deltas;
+mod field;
+mod linear;
+#[cfg(test)]
+mod oracle;
+mod planes;
+mod tensors;
+mod voxel;
+
+pub use deltas::Deltas;
+pub use field::{Field, FieldConfig, Prepared, Scratch};
+pub use tensors::{Tensor, Tensors};

@@ -1,0 +1,336 @@
+//! The deformation field: features, trunk, heads, and how their deltas change raw parameters.
+//!
+//! Data in: tensors of a state dict, canonical positions, a time. Data out: deltas and masks per
+//! Gaussian. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared Gaussian, and about
+//! 4·ROWS·(features + trunk + heads) bytes of scratch per reader.
+//! Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
+//! behaviour of its public renderer.
+
+use std::path::Path;
+
+use crate::error::{Error, Result};
+use crate::model::{Column, Columns, Gaussians};
+
+use super::deltas::Deltas;
+use super::linear::{Linear, Stride, add_bias, multiply};
+use super::planes::{Planes, PreparedPlanes};
+use super::tensors::{Lookup, Tensors};
+use super::voxel::VoxelMask;
+
+/// Rows evaluated at a time: the activations of a block stay in the second-level cache.
+const ROWS: usize = 256;
+
+/// What of a model's hyper-parameters decides the evaluation and cannot be told from tensor shapes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FieldConfig {
+    /// Columns whose heads are on (`no_dx`, `no_ds`, `no_dr`, `no_do`, `no_dshs` are off).
+    pub active: Columns,
+    /// A head of the hidden features gives the mask; takes precedence over `empty_voxel`.
+    pub static_mlp: bool,
+    /// A voxel grid gives the mask.
+    pub empty_voxel: bool,
+    /// Above 1: features become `[f, sin(p·f), cos(p·f)]` with p this number.
+    pub grid_pe: i64,
+    /// The trunk reads `[x, y, z, t]` instead of plane features.
+    pub no_grid: bool,
+    /// The rotation delta multiplies the quaternion instead of being added.
+    pub apply_rotation: bool,
+}
+
+#[derive(Debug, Clone)]
+enum Mask {
+    None,
+    /// The last head, of the hidden features: varies with time.
+    Head,
+    /// Constant in time.
+    Voxel(VoxelMask),
+}
+
+/// One head: ReLU, then a slice of the fused hidden layer, ReLU, output layer.
+#[derive(Debug, Clone)]
+struct Head {
+    /// The column it deforms; none for the mask of `static_mlp`.
+    column: Option<Columns>,
+    output: Linear,
+}
+
+/// A 4DGaussians deformation field. Evaluates any block of Gaussians at any time; the result of a
+/// Gaussian has the same bits whatever block it is evaluated in.
+#[derive(Debug, Clone)]
+pub struct Field {
+    config: FieldConfig,
+    /// None when the trunk reads positions.
+    planes: Option<Planes>,
+    trunk: Vec<Linear>,
+    /// First layers of all heads side by side: `[width, width·heads]`.
+    hidden: Option<Linear>,
+    heads: Vec<Head>,
+    mask: Mask,
+}
+
+/// What does not depend on time for one block of Gaussians.
+#[derive(Debug, Clone)]
+pub struct Prepared {
+    rows: usize,
+    input: PreparedInput,
+    /// Mask of `empty_voxel`.
+    voxel: Option<Vec<f32>>,
+}
+
+#[derive(Debug, Clone)]
+enum PreparedInput {
+    Planes(PreparedPlanes),
+    Position(Column),
+}
+
+/// Reusable activations of one reader.
+#[derive(Debug, Clone, Default)]
+pub struct Scratch {
+    features: Vec<f32>,
+    trunk: [Vec<f32>; 2],
+    hidden: Vec<f32>,
+}
+
+/// Name of a column's head in the state dict and its flag in `cfg_args`.
+fn head_name(column: Columns) -> (&'static str, &'static str) {
+    match column {
+        Columns::POSITION => ("pos_deform", "no_dx=False"),
+        Columns::LOG_SCALE => ("scales_deform", "no_ds=False"),
+        Columns::ROTATION => ("rotations_deform", "no_dr=False"),
+        Columns::OPACITY => ("opacity_deform", "no_do=False"),
+        _ => ("shs_deform", "no_dshs=False"),
+    }
+}
+
+impl Field {
+    /// Builds the field from the state dict read from `path`, for a cloud of `sh_degree`.
+    ///
+    /// Depth, widths, levels and resolutions follow from the tensors' shapes. Tensors the evaluation
+    /// does not use (`timenet.*`, `*_poc`, heads that are off) are ignored.
+    ///
+    /// # Errors
+    /// A tensor that is missing, of the wrong shape, or not finite; the error names it.
+    pub fn new(tensors: &Tensors, config: FieldConfig, sh_degree: usize, path: &Path) -> Result<Self> {
+        let lookup = Lookup { tensors, path };
+        let planes = if config.no_grid { None } else { Some(Planes::load(lookup)?) };
+        let inputs = match &planes {
+            None => 4,
+            Some(planes) if config.grid_pe > 1 => 3 * planes.width(),
+            Some(planes) => planes.width(),
+        };
+        let layer = |i: usize| format!("deformation_net.feature_out.{}", 2 * i);
+        let mut trunk = vec![Linear::load(lookup, &layer(0), inputs, None, "the features it reads")?];
+        let width = trunk[0].outputs;
+        while lookup.has(&format!("{}.weight", layer(trunk.len()))) {
+            trunk.push(Linear::load(lookup, &layer(trunk.len()), width, Some(width), "the width of the network")?);
+        }
+
+        let shape = Gaussians::zeros(0, sh_degree);
+        let mut wanted: Vec<_> = config
+            .active
+            .iter()
+            .map(|column| (Some(column), head_name(column), shape.column(column).width()))
+            .collect();
+        let mask = if config.static_mlp {
+            wanted.push((None, ("static_mlp", "static_mlp=True"), 1));
+            Mask::Head
+        } else if config.empty_voxel {
+            Mask::Voxel(VoxelMask::load(lookup, planes.as_ref().map(Planes::corners))?)
+        } else {
+            Mask::None
+        };
+        let mut first = Vec::new();
+        let mut heads = Vec::new();
+        for (column, (name, why), outputs) in wanted {
+            let name = format!("deformation_net.{name}");
+            first.push(Linear::load(lookup, &format!("{name}.1"), width, Some(width), why)?);
+            let output = Linear::load(lookup, &format!("{name}.3"), width, Some(outputs), why)?;
+            heads.push(Head { column, output });
+        }
+        Ok(Field { config, planes, trunk, hidden: Linear::fuse(&first), heads, mask })
+    }
+
+    /// Columns that change with time.
+    pub fn active(&self) -> Columns {
+        self.config.active
+    }
+
+    /// The hyper-parameters the field was built with.
+    pub fn config(&self) -> &FieldConfig {
+        &self.config
+    }
+
+    /// Bytes one Gaussian takes in [`Prepared`].
+    pub fn bytes_per_gaussian(&self) -> usize {
+        let input = self.planes.as_ref().map_or(12, Planes::bytes_per_gaussian);
+        input + if matches!(self.mask, Mask::Voxel(_)) { 4 } else { 0 }
+    }
+
+    /// Computes what does not depend on time for Gaussians at canonical `position` `[N, 3]`.
+    pub fn prepare(&self, position: &Column) -> Prepared {
+        Prepared {
+            rows: position.len(),
+            input: match &self.planes {
+                Some(planes) => PreparedInput::Planes(planes.prepare(position)),
+                None => PreparedInput::Position(position.clone()),
+            },
+            voxel: match &self.mask {
+                Mask::Voxel(voxel) => Some(voxel.sample(position)),
+                _ => None,
+            },
+        }
+    }
+
+    /// Deltas and masks at `time` of the prepared block, for the active columns among `want`; other
+    /// columns of `out` are left alone. `time` is used as it is, clamped to [−1, 1] by the planes.
+    ///
+    /// # Errors
+    /// A time that is not finite, or `out` of another SH degree than the field was built for.
+    pub fn deltas(
+        &self,
+        prepared: &Prepared,
+        time: f64,
+        want: Columns,
+        scratch: &mut Scratch,
+        out: &mut Deltas,
+    ) -> Result<()> {
+        if !time.is_finite() {
+            return Err(Error::usage(format!("a deformation field has no state at time {time}")));
+        }
+        let want = want & self.config.active;
+        if let Some(head) = self.heads.iter().find(|head| {
+            head.column.is_some_and(|c| want.contains(c) && out.delta.column(c).width() != head.output.outputs)
+        }) {
+            let name = head.column.map_or("mask", Columns::name);
+            return Err(Error::usage(format!("the field deforms {} values of {name}", head.output.outputs)));
+        }
+        out.begin(prepared.rows, want, self.config.apply_rotation);
+        let masked = !want.without(Columns::ROTATION).is_empty();
+        match (&self.mask, &prepared.voxel) {
+            (Mask::None, _) => out.mask = None,
+            (Mask::Head, _) => out.mask = masked.then(|| vec![0.0; prepared.rows]),
+            (Mask::Voxel(_), voxel) => out.mask = voxel.clone(),
+        }
+        if want.is_empty() {
+            return Ok(());
+        }
+        let time = time as f32;
+        let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
+        for start in (0..prepared.rows).step_by(ROWS) {
+            let rows = ROWS.min(prepared.rows - start);
+            let input = match (&self.planes, &prepared.input) {
+                (Some(planes), PreparedInput::Planes(block)) => {
+                    scratch.features.resize(rows * planes.width(), 0.0);
+                    planes.features(block, &lines, start, &mut scratch.features);
+                    if self.config.grid_pe > 1 {
+                        scratch.features =
+                            with_frequencies(&scratch.features, planes.width(), self.config.grid_pe as f32);
+                    }
+                    &scratch.features
+                }
+                (_, PreparedInput::Position(position)) => {
+                    scratch.features.clear();
+                    for i in start..start + rows {
+                        let [x, y, z] = position.row(i);
+                        scratch.features.extend([x, y, z, time]);
+                    }
+                    &scratch.features
+                }
+                (None, PreparedInput::Planes(_)) => {
+                    return Err(Error::usage("a block prepared by another field was given"));
+                }
+            };
+            run_trunk(&self.trunk, input, rows, &mut scratch.trunk);
+            self.run_heads(&scratch.trunk[0], rows, start, want, masked, &mut scratch.hidden, out);
+        }
+        Ok(())
+    }
+
+    /// Both layers of the wanted heads for one sub-block; `width` activations per row in `trunk`.
+    #[expect(clippy::too_many_arguments, reason = "one call site; the arguments are the sub-block")]
+    fn run_heads(
+        &self,
+        trunk: &[f32],
+        rows: usize,
+        start: usize,
+        want: Columns,
+        masked: bool,
+        hidden: &mut Vec<f32>,
+        out: &mut Deltas,
+    ) {
+        let Some(layer) = &self.hidden else { return };
+        let width = layer.inputs;
+        let all = layer.outputs;
+        let wanted = |head: &Head| head.column.map_or(masked, |column| want.contains(column));
+        hidden.resize(rows * all, 0.0);
+        // Wanted heads that lie side by side share one multiplication.
+        let mut first = 0;
+        for run in self.heads.chunk_by(|a, b| wanted(a) == wanted(b)) {
+            let (from, to) = (first * width, (first + run.len()) * width);
+            first += run.len();
+            if wanted(&run[0]) {
+                multiply(
+                    [rows, width, to - from],
+                    (trunk, Stride { row: width, col: 1 }),
+                    (&layer.weight[from..], Stride { row: all, col: 1 }),
+                    (&mut hidden[from..], Stride { row: all, col: 1 }),
+                );
+                for row in hidden.chunks_exact_mut(all) {
+                    add_bias(&mut row[from..to], &layer.bias[from..to], true);
+                }
+            }
+        }
+        for (h, head) in self.heads.iter().enumerate().filter(|(_, head)| wanted(head)) {
+            let (planes, len) = match (head.column, &mut out.mask) {
+                (Some(column), _) => {
+                    let column = out.delta.column_mut(column);
+                    let len = column.len();
+                    (column.planes_mut(), len)
+                }
+                (None, Some(mask)) => {
+                    let len = mask.len();
+                    (mask.as_mut_slice(), len)
+                }
+                (None, None) => continue,
+            };
+            let outputs = head.output.outputs;
+            multiply(
+                [rows, width, outputs],
+                (&hidden[h * width..], Stride { row: all, col: 1 }),
+                (&head.output.weight, Stride { row: outputs, col: 1 }),
+                (&mut planes[start..], Stride { row: 1, col: len }),
+            );
+            for (plane, bias) in planes.chunks_exact_mut(len).zip(&head.output.bias) {
+                plane[start..start + rows].iter_mut().for_each(|x| *x += bias);
+            }
+        }
+    }
+}
+
+/// Runs the trunk on `rows` rows of `input`; leaves its ReLU-ed output, as every head wants it, in
+/// `buffers[0]`.
+fn run_trunk(layers: &[Linear], input: &[f32], rows: usize, buffers: &mut [Vec<f32>; 2]) {
+    for (i, layer) in layers.iter().enumerate() {
+        buffers.swap(0, 1);
+        let [out, previous] = buffers;
+        out.resize(rows * layer.outputs, 0.0);
+        multiply(
+            [rows, layer.inputs, layer.outputs],
+            (if i == 0 { input } else { previous }, Stride { row: layer.inputs, col: 1 }),
+            (&layer.weight, Stride { row: layer.outputs, col: 1 }),
+            (out, Stride { row: layer.outputs, col: 1 }),
+        );
+        add_bias(out, &layer.bias, true);
+    }
+}
+
+/// `[f, sin(p·f), cos(p·f)]` for every row of `width` features.
+fn with_frequencies(features: &[f32], width: usize, p: f32) -> Vec<f32> {
+    let mut out = Vec::with_capacity(3 * features.len());
+    for row in features.chunks_exact(width) {
+        out.extend_from_slice(row);
+        out.extend(row.iter().map(|f| (p * f).sin()));
+        out.extend(row.iter().map(|f| (p * f).cos()));
+    }
+    out
+}

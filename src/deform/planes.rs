@@ -1,0 +1,213 @@
+//! HexPlane features: six bilinear samples per level, multiplied elementwise.
+//!
+//! Data in: canonical positions `[N, 3]`, a time. Data out: features `[N, Σ channels]`.
+//! Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian.
+//! Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting", 2024, section 4.2.
+//!
+//! The three spatial samples do not depend on time: their product is prepared once per block. All
+//! Gaussians share the time of a frame, so each time plane is first interpolated along time into a
+//! line; a Gaussian then interpolates between two of its points.
+
+use crate::error::Result;
+use crate::model::Column;
+
+use super::tensors::Lookup;
+
+const X: usize = 0;
+const Y: usize = 1;
+const Z: usize = 2;
+/// Axis pairs of the planes without time, as (place in the state dict, a, b).
+const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
+/// Places in the state dict of the planes (x,t), (y,t), (z,t).
+const TEMPORAL: [usize; 3] = [2, 4, 5];
+
+/// A plane over axes (a, b), `[size_b, size_a, channels]`: one sample is contiguous.
+#[derive(Debug, Clone)]
+struct Plane {
+    size_a: usize,
+    size_b: usize,
+    texels: Vec<f32>,
+}
+
+#[derive(Debug, Clone)]
+struct Level {
+    channels: usize,
+    spatial: [Plane; 3],
+    temporal: [Plane; 3],
+}
+
+/// The planes of all levels and the box they cover.
+#[derive(Debug, Clone)]
+pub(super) struct Planes {
+    /// Corner mapped to −1, by axis; the model stores the MAX corner here.
+    origin: [f32; 3],
+    /// 2 / (other corner − origin).
+    factor: [f32; 3],
+    levels: Vec<Level>,
+}
+
+/// Where a coordinate falls between texels `low` and `high`; `fraction` is the weight of `high`.
+#[derive(Debug, Clone, Copy)]
+struct Tap {
+    low: u32,
+    high: u32,
+    fraction: f32,
+}
+
+/// What of the features of a block does not depend on time.
+#[derive(Debug, Clone)]
+pub(super) struct PreparedPlanes {
+    /// Product of the spatial samples, `[rows, width]`.
+    product: Vec<f32>,
+    /// Where x, y, z fall on the time lines of each level, `[rows, levels, 3]`.
+    taps: Vec<Tap>,
+}
+
+impl Plane {
+    fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
+        let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
+        let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];
+        let texel_count = size_b * size_a;
+        let mut texels = vec![0.0; tensor.data.len()];
+        for (c, plane) in tensor.data.chunks_exact(texel_count).enumerate() {
+            for (texel, &value) in texels.chunks_exact_mut(channels).zip(plane) {
+                texel[c] = value;
+            }
+        }
+        Ok((Plane { size_a, size_b, texels }, channels))
+    }
+
+    fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
+        let start = (b as usize * self.size_a + a as usize) * channels;
+        &self.texels[start..start + channels]
+    }
+
+    /// Bilinear sample at taps `a`, `b`; one value per channel into `out`.
+    fn sample(&self, a: Tap, b: Tap, out: &mut [f32]) {
+        let channels = out.len();
+        let corner = |ia, ib| self.texel(ia, ib, channels);
+        let [ll, hl] = [corner(a.low, b.low), corner(a.high, b.low)];
+        let [lh, hh] = [corner(a.low, b.high), corner(a.high, b.high)];
+        let weights = [
+            (1.0 - a.fraction) * (1.0 - b.fraction),
+            a.fraction * (1.0 - b.fraction),
+            (1.0 - a.fraction) * b.fraction,
+            a.fraction * b.fraction,
+        ];
+        for c in 0..out.len() {
+            out[c] = ll[c] * weights[0] + hl[c] * weights[1] + lh[c] * weights[2] + hh[c] * weights[3];
+        }
+    }
+}
+
+/// The tap of normalised coordinate `u` on `size` texels: align_corners, border padding.
+/// A NaN coordinate gives a NaN fraction, hence NaN features.
+fn tap(u: f32, size: usize) -> Tap {
+    let last = (size - 1) as f32;
+    let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
+    let low = x.floor();
+    Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
+}
+
+/// Interpolates `a` to `b` by `fraction` and multiplies `out` by it.
+fn multiply_mix(out: &mut [f32], a: &[f32], b: &[f32], fraction: f32) {
+    let rest = 1.0 - fraction;
+    for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
+        *out *= a * rest + b * fraction;
+    }
+}
+
+impl Planes {
+    /// Reads `deformation_net.grid.*`.
+    pub(super) fn load(lookup: Lookup<'_>) -> Result<Self> {
+        const AABB: &str = "deformation_net.grid.aabb";
+        let aabb = &lookup.get_shaped(AABB, &[Some(2), Some(3)], "the two corners of the field's box")?.data;
+        let origin = [aabb[0], aabb[1], aabb[2]];
+        let factor = std::array::from_fn(|axis| 2.0 / (aabb[3 + axis] - aabb[axis]));
+        if factor.iter().any(|f: &f32| !f.is_finite()) {
+            return Err(lookup.mismatch(AABB, "two corners that differ along every axis", format!("{aabb:?}")));
+        }
+        let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
+        let mut levels = Vec::new();
+        while levels.is_empty() || lookup.has(&name(levels.len(), 0)) {
+            let level = levels.len();
+            let (xy, channels) = Plane::load(lookup, &name(level, SPATIAL[0].0), None)?;
+            let load = |plane| Plane::load(lookup, &name(level, plane), Some(channels)).map(|(plane, _)| plane);
+            levels.push(Level {
+                channels,
+                spatial: [xy, load(SPATIAL[1].0)?, load(SPATIAL[2].0)?],
+                temporal: [load(TEMPORAL[0])?, load(TEMPORAL[1])?, load(TEMPORAL[2])?],
+            });
+        }
+        Ok(Planes { origin, factor, levels })
+    }
+
+    /// Features per Gaussian: the channels of all levels.
+    pub(super) fn width(&self) -> usize {
+        self.levels.iter().map(|level| level.channels).sum()
+    }
+
+    /// Bytes one Gaussian takes in [`PreparedPlanes`].
+    pub(super) fn bytes_per_gaussian(&self) -> usize {
+        4 * self.width() + 3 * self.levels.len() * size_of::<Tap>()
+    }
+
+    /// The box, as (corner mapped to −1, corner mapped to +1).
+    pub(super) fn corners(&self) -> ([f32; 3], [f32; 3]) {
+        (self.origin, std::array::from_fn(|axis| self.origin[axis] + 2.0 / self.factor[axis]))
+    }
+
+    pub(super) fn prepare(&self, position: &Column) -> PreparedPlanes {
+        let rows = position.len();
+        let width = self.width();
+        let mut prepared =
+            PreparedPlanes { product: vec![1.0; rows * width], taps: Vec::with_capacity(rows * 3 * self.levels.len()) };
+        let mut sample = vec![0.0; width];
+        for (i, row) in prepared.product.chunks_exact_mut(width).enumerate() {
+            let p: [f32; 3] = position.row(i);
+            let u: [f32; 3] = std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0);
+            let mut rest = row;
+            for level in &self.levels {
+                let out;
+                (out, rest) = rest.split_at_mut(level.channels);
+                for (plane, &(_, a, b)) in level.spatial.iter().zip(&SPATIAL) {
+                    let sample = &mut sample[..level.channels];
+                    plane.sample(tap(u[a], plane.size_a), tap(u[b], plane.size_b), sample);
+                    out.iter_mut().zip(&*sample).for_each(|(out, sample)| *out *= sample);
+                }
+                prepared.taps.extend(level.temporal.iter().zip(u).map(|(plane, u)| tap(u, plane.size_a)));
+            }
+        }
+        prepared
+    }
+
+    /// The time planes of every level interpolated at `time`: for each level and axis `[size_a, channels]`.
+    pub(super) fn lines(&self, time: f32) -> Vec<[Vec<f32>; 3]> {
+        let line = |level: &Level, plane: &Plane| {
+            let Tap { low, high, fraction } = tap(time, plane.size_b);
+            let row =
+                |b: u32| &plane.texels[b as usize * plane.size_a * level.channels..][..plane.size_a * level.channels];
+            row(low).iter().zip(row(high)).map(|(a, b)| a * (1.0 - fraction) + b * fraction).collect::<Vec<f32>>()
+        };
+        self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
+    }
+
+    /// Writes the features of rows `start..` of the prepared block into `out` `[rows, width]`.
+    pub(super) fn features(&self, prepared: &PreparedPlanes, lines: &[[Vec<f32>; 3]], start: usize, out: &mut [f32]) {
+        let width = self.width();
+        out.copy_from_slice(&prepared.product[start * width..][..out.len()]);
+        let taps = &prepared.taps[start * 3 * self.levels.len()..];
+        for (row, taps) in out.chunks_exact_mut(width).zip(taps.chunks_exact(3 * self.levels.len())) {
+            let mut rest = row;
+            for ((level, lines), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
+                let n = level.channels;
+                let out;
+                (out, rest) = rest.split_at_mut(n);
+                for (line, tap) in lines.iter().zip(taps) {
+                    let (a, b) = (tap.low as usize * n, tap.high as usize * n);
+                    multiply_mix(out, &line[a..a + n], &line[b..b + n], tap.fraction);
+                }
+            }
+        }
+    }
+}

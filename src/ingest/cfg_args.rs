@@ -1,0 +1,200 @@
+//! `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`, parsed and never evaluated.
+
+use std::fs;
+use std::path::Path;
+
+use crate::deform::FieldConfig;
+use crate::error::{Error, Result};
+use crate::model::Columns;
+
+use super::python_literal::{Literal, parse_call};
+
+/// Larger than any namespace an argument parser prints.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// The hyper-parameters of a model, with the defaults of the original where `cfg_args` lacks a key.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelConfig {
+    /// Largest degree of the spherical harmonics; default 3.
+    pub sh_degree: i64,
+    /// Folder of the data set the model was trained on.
+    pub source_path: Option<String>,
+    /// Background is white rather than black; default false.
+    pub white_background: bool,
+    /// Width of the network; default 64. The tensors' shapes outrank it.
+    pub net_width: i64,
+    /// Layers of the trunk; default 1, and 0 behaves as 1. The tensors' shapes outrank it.
+    pub defor_depth: i64,
+    /// Spatial resolution of each level as a multiple; default `[1, 2, 4, 8]`. The tensors' shapes outrank it.
+    pub multires: Vec<i64>,
+    /// Resolution of the planes along x, y, z, t at level multiple 1; default `[64, 64, 64, 25]`.
+    /// The tensors' shapes outrank it.
+    pub resolution: Vec<i64>,
+    /// Channels of a plane; default 32. The tensors' shapes outrank it.
+    pub channels: i64,
+    /// Half size of the field's initial box; default 1.6. The stored box outranks it.
+    pub bounds: f64,
+    /// No position head.
+    pub no_dx: bool,
+    /// No scale head.
+    pub no_ds: bool,
+    /// No rotation head.
+    pub no_dr: bool,
+    /// No opacity head; default true.
+    pub no_do: bool,
+    /// No spherical-harmonics head; default true.
+    pub no_dshs: bool,
+    /// The network reads positions instead of planes.
+    pub no_grid: bool,
+    /// A head masks the raw parameters.
+    pub static_mlp: bool,
+    /// A voxel grid masks the raw parameters.
+    pub empty_voxel: bool,
+    /// Frequency of the features' sine and cosine; default 0, none.
+    pub grid_pe: i64,
+    /// The rotation delta multiplies.
+    pub apply_rotation: bool,
+}
+
+impl ModelConfig {
+    /// Reads the `cfg_args` file at `path`.
+    pub fn read(path: &Path) -> Result<Self> {
+        let bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
+        if bytes > MAX_BYTES {
+            return Err(Error::input(path, "", format!("at most {MAX_BYTES} bytes"), format!("{bytes} bytes")));
+        }
+        let bytes = fs::read(path).map_err(Error::io("read", path))?;
+        let text = std::str::from_utf8(&bytes).map_err(|error| {
+            Error::input(path, format!("byte {}", error.valid_up_to()), "UTF-8 text", "a byte that is not")
+        })?;
+        Self::parse(text, path)
+    }
+
+    /// Parses the text of `cfg_args`; `path` is for error messages.
+    ///
+    /// Keys this program does not need may hold anything, written in any syntax that keeps its
+    /// brackets and quotes balanced.
+    pub fn parse(text: &str, path: &Path) -> Result<Self> {
+        let keys = parse_call(text, "Namespace").map_err(|error| error.in_file(path, text))?;
+        let get = |name: &'static str| {
+            // Python would refuse a repeated keyword; of a hand-edited file take the last one.
+            keys.iter()
+                .rev()
+                .find(|(key, _)| key == name)
+                .map_or(Key { name, value: &Literal::None, path }, |found| Key { name, value: &found.1, path })
+        };
+        let planes = get("kplanes_config");
+        let config = ModelConfig {
+            sh_degree: get("sh_degree").int(3)?,
+            source_path: get("source_path").string()?,
+            white_background: get("white_background").bool(false)?,
+            net_width: get("net_width").int(64)?,
+            defor_depth: get("defor_depth").int(1)?,
+            multires: get("multires").ints(&[1, 2, 4, 8])?,
+            resolution: planes.entry("resolution")?.ints(&[64, 64, 64, 25])?,
+            channels: planes.entry("output_coordinate_dim")?.int(32)?,
+            bounds: get("bounds").float(1.6)?,
+            no_dx: get("no_dx").bool(false)?,
+            no_ds: get("no_ds").bool(false)?,
+            no_dr: get("no_dr").bool(false)?,
+            no_do: get("no_do").bool(true)?,
+            no_dshs: get("no_dshs").bool(true)?,
+            no_grid: get("no_grid").bool(false)?,
+            static_mlp: get("static_mlp").bool(false)?,
+            empty_voxel: get("empty_voxel").bool(false)?,
+            grid_pe: get("grid_pe").int(0)?,
+            apply_rotation: get("apply_rotation").bool(false)?,
+        };
+        Ok(config)
+    }
+
+    /// What decides the evaluation of the deformation field.
+    pub fn field(&self) -> FieldConfig {
+        let off = [
+            (self.no_dx, Columns::POSITION),
+            (self.no_ds, Columns::LOG_SCALE),
+            (self.no_dr, Columns::ROTATION),
+            (self.no_do, Columns::OPACITY),
+            (self.no_dshs, Columns::SH),
+        ];
+        FieldConfig {
+            active: off.iter().filter(|(off, _)| !off).fold(Columns::NONE, |set, &(_, column)| set | column),
+            static_mlp: self.static_mlp,
+            empty_voxel: self.empty_voxel,
+            grid_pe: self.grid_pe,
+            no_grid: self.no_grid,
+            apply_rotation: self.apply_rotation,
+        }
+    }
+}
+
+/// One key and its value; `None` stands for a missing key too, and takes the default.
+#[derive(Clone, Copy)]
+struct Key<'a> {
+    name: &'static str,
+    value: &'a Literal,
+    path: &'a Path,
+}
+
+impl<'a> Key<'a> {
+    fn wrong(&self, expected: &str) -> Error {
+        Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
+    }
+
+    fn bool(&self, default: bool) -> Result<bool> {
+        match self.value {
+            Literal::None => Ok(default),
+            Literal::Bool(value) => Ok(*value),
+            Literal::Int(value @ (0 | 1)) => Ok(*value == 1),
+            _ => Err(self.wrong("True or False")),
+        }
+    }
+
+    /// Python's `True` is the integer 1; `grid_pe=False` is written by some forks.
+    fn int(&self, default: i64) -> Result<i64> {
+        match self.value {
+            Literal::None => Ok(default),
+            Literal::Int(value) => Ok(*value),
+            Literal::Bool(value) => Ok(i64::from(*value)),
+            _ => Err(self.wrong("an integer")),
+        }
+    }
+
+    fn float(&self, default: f64) -> Result<f64> {
+        match self.value {
+            Literal::None => Ok(default),
+            Literal::Float(value) => Ok(*value),
+            Literal::Int(value) => Ok(*value as f64),
+            _ => Err(self.wrong("a number")),
+        }
+    }
+
+    fn string(&self) -> Result<Option<String>> {
+        match self.value {
+            Literal::None => Ok(None),
+            Literal::Str(value) => Ok(Some(value.clone())),
+            _ => Err(self.wrong("a string")),
+        }
+    }
+
+    fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
+        match self.value {
+            Literal::None => Ok(default.to_vec()),
+            Literal::Sequence(items) => items.iter().map(|value| Key { value, ..*self }.int(0)).collect::<Result<_>>(),
+            _ => Err(self.wrong("a list of integers")),
+        }
+    }
+
+    /// The value of `name` in this dictionary.
+    fn entry(&self, name: &'static str) -> Result<Key<'a>> {
+        let value = match self.value {
+            Literal::None => &Literal::None,
+            Literal::Dict(entries) => entries
+                .iter()
+                .find(|(key, _)| matches!(key, Literal::Str(key) if key == name))
+                .map_or(&Literal::None, |(_, value)| value),
+            _ => return Err(self.wrong("a dictionary")),
+        };
+        Ok(Key { name, value, path: self.path })
+    }
+}

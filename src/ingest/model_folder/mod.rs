@@ -1,0 +1,232 @@
+//! A 4DGaussians model folder as a sequence of frames.
+//!
+//! Data in: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, time stamps.
+//! Data out: states of any Gaussians at any frame. Memory: the canonical cloud (44 + 12·(d+1)² bytes
+//! per Gaussian), the field's tensors, and per open reader the canonical rows again plus
+//! [`Field::bytes_per_gaussian`].
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use xxhash_rust::xxh3::Xxh3;
+
+use crate::deform::{Deltas, Field, Prepared, Scratch};
+use crate::error::{Error, Result};
+use crate::model::{Column, Columns, Gaussians, SequenceInfo};
+use crate::pass::{BlockReader, FrameSource, Ids};
+
+use super::cfg_args::ModelConfig;
+use super::pth::read_state_dict;
+
+/// The files of a model folder.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ModelPaths {
+    /// The model folder.
+    pub root: PathBuf,
+    /// K of `iteration_K`.
+    pub iteration: u32,
+    /// `<root>/cfg_args`.
+    pub cfg_args: PathBuf,
+    /// The canonical cloud.
+    pub point_cloud: PathBuf,
+    /// The deformation field's state dict.
+    pub deformation: PathBuf,
+    /// `deformation_table.pth`, if there is one.
+    pub deformation_table: Option<PathBuf>,
+    /// `deformation_accum.pth`, if there is one.
+    pub deformation_accum: Option<PathBuf>,
+}
+
+impl ModelPaths {
+    /// Finds the files of the model at `root`: of `iteration`, or of the largest one.
+    ///
+    /// # Errors
+    /// A folder or file that is missing; optional files may be.
+    pub fn locate(root: &Path, iteration: Option<u32>) -> Result<Self> {
+        let clouds = root.join("point_cloud");
+        let entries = fs::read_dir(&clouds).map_err(Error::io("open", &clouds))?;
+        let mut found = Vec::new();
+        for entry in entries {
+            let name = entry.map_err(Error::io("list", &clouds))?.file_name();
+            let number = name.to_str().and_then(|name| name.strip_prefix("iteration_"));
+            found.extend(number.and_then(|number| number.parse::<u32>().ok()));
+        }
+        found.sort_unstable();
+        let available = || {
+            let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();
+            if names.is_empty() { "none".to_owned() } else { names.join(", ") }
+        };
+        let iteration = match iteration {
+            Some(k) if found.contains(&k) => k,
+            Some(k) => return Err(Error::input(&clouds, "", format!("a folder iteration_{k}"), available())),
+            None => {
+                *found.last().ok_or_else(|| Error::input(&clouds, "", "a folder iteration_<number>", available()))?
+            }
+        };
+        let folder = clouds.join(format!("iteration_{iteration}"));
+        let optional = |name: &str| Some(folder.join(name)).filter(|path| path.exists());
+        let paths = ModelPaths {
+            root: root.to_owned(),
+            iteration,
+            cfg_args: root.join("cfg_args"),
+            point_cloud: folder.join("point_cloud.ply"),
+            deformation: folder.join("deformation.pth"),
+            deformation_table: optional("deformation_table.pth"),
+            deformation_accum: optional("deformation_accum.pth"),
+        };
+        for path in paths.required() {
+            if !path.is_file() {
+                return Err(Error::input(path, "", "a file of the model folder", "none")
+                    .hint("a 4DGaussians model folder holds cfg_args and point_cloud/iteration_K/{point_cloud.ply, deformation.pth}"));
+            }
+        }
+        Ok(paths)
+    }
+
+    /// The files a model cannot do without, in the order the digest reads them.
+    fn required(&self) -> [&Path; 3] {
+        [&self.point_cloud, &self.deformation, &self.cfg_args]
+    }
+
+    /// xxh3-128 over the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
+    pub fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        let mut buffer = vec![0; 1 << 18];
+        for path in self.required() {
+            let mut file = File::open(path).map_err(Error::io("open", path))?;
+            loop {
+                match file.read(&mut buffer).map_err(Error::io("read", path))? {
+                    0 => break,
+                    n => hash.update(&buffer[..n]),
+                }
+            }
+        }
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+}
+
+/// A trained 4DGaussians model: a canonical cloud and the field that deforms it.
+///
+/// The model is continuous in time; [`ModelFolder::with_times`] says which instants are its frames.
+#[derive(Debug, Clone)]
+pub struct ModelFolder {
+    paths: ModelPaths,
+    config: ModelConfig,
+    canonical: Arc<Gaussians>,
+    field: Arc<Field>,
+    info: SequenceInfo,
+}
+
+impl ModelFolder {
+    /// Reads configuration and field of the model at `paths`; `canonical` is its point cloud, of
+    /// `sh_degree`. The sequence has no frames yet.
+    pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize) -> Result<Self> {
+        let config = ModelConfig::read(&paths.cfg_args)?;
+        let tensors = read_state_dict(&paths.deformation)?;
+        let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
+        let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
+        Ok(ModelFolder { paths, config, canonical: Arc::new(canonical), field: Arc::new(field), info })
+    }
+
+    /// The same model with frames at `times`.
+    ///
+    /// # Errors
+    /// Times that are not finite or not strictly increasing; the error names the frames.
+    pub fn with_times(mut self, times: Vec<f64>) -> Result<Self> {
+        if let Some(frame) = times.iter().position(|time| !time.is_finite()) {
+            return Err(Error::usage(format!("frame {frame} has time {}", times[frame])));
+        }
+        if let Some(frame) = times.windows(2).position(|pair| pair[0] >= pair[1]) {
+            return Err(Error::usage(format!(
+                "times must increase: frame {frame} is at {}, frame {} at {}",
+                times[frame],
+                frame + 1,
+                times[frame + 1]
+            )));
+        }
+        self.info.times = times;
+        Ok(self)
+    }
+
+    /// The model's files.
+    pub fn paths(&self) -> &ModelPaths {
+        &self.paths
+    }
+
+    /// The model's hyper-parameters.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// The raw parameters of every Gaussian, before any deformation.
+    pub fn canonical(&self) -> &Gaussians {
+        &self.canonical
+    }
+
+    /// The deformation field.
+    pub fn field(&self) -> &Field {
+        &self.field
+    }
+
+    /// What the field would change at `time` about Gaussians at canonical `position` `[N, 3]`, which
+    /// need not be Gaussians of this model. [`Deltas::solve`] turns a wanted state into raw parameters.
+    pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
+        let prepared = self.field.prepare(position);
+        let mut deltas = Deltas::new(self.info.sh_degree);
+        self.field.deltas(&prepared, time, Columns::ALL, &mut Scratch::default(), &mut deltas)?;
+        Ok(deltas)
+    }
+}
+
+impl FrameSource for ModelFolder {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let count = self.info.count;
+        if let Some(id) = ids.iter().find(|&id| id >= count) {
+            return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
+        }
+        let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
+        for column in Columns::ALL.iter() {
+            let (from, to) = (self.canonical.column(column), raw.column_mut(column));
+            for c in 0..from.width() {
+                let plane = from.plane(c);
+                to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(to, id)| *to = plane[id]);
+            }
+        }
+        Ok(Box::new(FieldReader {
+            model: self,
+            prepared: self.field.prepare(&raw.position),
+            raw,
+            scratch: Scratch::default(),
+            deltas: Deltas::new(self.info.sh_degree),
+        }))
+    }
+}
+
+struct FieldReader<'a> {
+    model: &'a ModelFolder,
+    raw: Gaussians,
+    prepared: Prepared,
+    scratch: Scratch,
+    deltas: Deltas,
+}
+
+impl BlockReader for FieldReader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let times = &self.model.info.times;
+        let Some(&time) = times.get(frame) else {
+            return Err(Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len())));
+        };
+        self.model.field.deltas(&self.prepared, time, want, &mut self.scratch, &mut self.deltas)?;
+        self.deltas.apply(&self.raw, want, out);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,136 @@
+use std::collections::BTreeMap;
+
+use super::*;
+
+/// The shared models, or None with a note when this machine has none.
+fn shared_model(name: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os("SPLATSIEVE_DATA")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from)
+        .join(name);
+    if folder.is_dir() {
+        return Some(folder);
+    }
+    eprintln!("skipped: {} is not here", folder.display());
+    None
+}
+
+/// Reads an INRIA PLY of float properties in the canonical order, degree 3: enough for these models.
+fn read_cloud(path: &Path) -> Gaussians {
+    let bytes = fs::read(path).unwrap();
+    let mark = b"end_header\n";
+    let body = bytes.windows(mark.len()).position(|w| w == mark).unwrap() + mark.len();
+    let values: Vec<f32> = bytes[body..].as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect();
+    let rows: Vec<&[f32]> = values.chunks_exact(62).collect();
+    let mut cloud = Gaussians::zeros(rows.len(), 3);
+    for (i, row) in rows.iter().enumerate() {
+        cloud.position.set_row(i, [row[0], row[1], row[2]]);
+        for channel in 0..3 {
+            cloud.sh.plane_mut(channel)[i] = row[6 + channel];
+            for k in 1..16 {
+                cloud.sh.plane_mut(3 * k + channel)[i] = row[9 + channel * 15 + k - 1];
+            }
+        }
+        cloud.opacity_logit.set_row(i, [row[54]]);
+        cloud.log_scale.set_row(i, [row[55], row[56], row[57]]);
+        cloud.rotation.set_row(i, [row[58], row[59], row[60], row[61]]);
+    }
+    cloud
+}
+
+fn load(name: &str) -> Option<(PathBuf, ModelFolder)> {
+    let root = shared_model(name)?;
+    let paths = ModelPaths::locate(&root, None).unwrap();
+    let cloud = read_cloud(&paths.point_cloud);
+    Some((root, ModelFolder::with_cloud(paths, cloud, 3).unwrap()))
+}
+
+/// Every array of an npz as f64.
+fn read_npz(path: &Path) -> BTreeMap<String, Vec<f64>> {
+    let mut archive = npyz::npz::NpzArchive::open(path).unwrap();
+    let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
+    let mut arrays = BTreeMap::new();
+    for name in names {
+        let file = archive.by_name(&name).unwrap().unwrap();
+        let values = match file.dtype().descr().as_str() {
+            "'<f4'" => file.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
+            "'<i8'" => file.into_vec::<i64>().unwrap().into_iter().map(|v| v as f64).collect(),
+            _ => file.into_vec::<f64>().unwrap(),
+        };
+        arrays.insert(name, values);
+    }
+    arrays
+}
+
+fn close(what: &str, got: f64, expected: f64, tolerance: f64) {
+    assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance}");
+}
+
+fn states_agree(name: &str) {
+    let Some((root, model)) = load(name) else { return };
+    let arrays = read_npz(&root.join("states.npz"));
+    let times = arrays["times"].clone();
+    let model = model.with_times(times.clone()).unwrap();
+    let n = model.info().count;
+    let extent = (0..3)
+        .map(|c| {
+            let plane = model.canonical().position.plane(c);
+            f64::from(plane.iter().fold(f32::MIN, |a, &b| a.max(b)) - plane.iter().fold(f32::MAX, |a, &b| a.min(b)))
+        })
+        .fold(0.0, f64::max);
+    let mut reader = model.open(Ids::Range(0..n)).unwrap();
+    let mut state = Gaussians::zeros(0, 3);
+    let mut worst = [0f64; 5];
+    for (frame, t) in arrays["frames"].iter().enumerate() {
+        reader.read(frame, Columns::ALL, &mut state).unwrap();
+        for i in 0..n {
+            let row = frame * n + i;
+            let at = |what: &str| format!("{name}, {what} of Gaussian {i} at frame {t}");
+            let p: [f32; 3] = state.position.row(i);
+            let s: [f32; 3] = state.log_scale.row(i);
+            for c in 0..3 {
+                let expected = arrays["xyz"][3 * row + c];
+                worst[0] = worst[0].max((f64::from(p[c]) - expected).abs() / extent);
+                close(&at("position"), f64::from(p[c]), expected, 1e-5 * extent);
+                let expected = arrays["scales"][3 * row + c];
+                let got = f64::from(s[c]).exp();
+                worst[1] = worst[1].max((got - expected).abs() / expected);
+                close(&at("scale"), got, expected, 1e-5 * expected);
+            }
+            let q = state.rotation.row::<4>(i).map(f64::from);
+            let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+            for c in 0..4 {
+                let expected = arrays["rotation"][4 * row + c];
+                worst[2] = worst[2].max((q[c] / length - expected).abs());
+                close(&at("rotation"), q[c] / length, expected, 2e-5);
+            }
+            let [logit] = state.opacity_logit.row(i).map(f64::from);
+            let expected = arrays["opacity"][row];
+            let got = 1.0 / (1.0 + (-logit).exp());
+            worst[3] = worst[3].max((got - expected).abs() / expected);
+            close(&at("opacity"), got, expected, 1e-5 * expected);
+            if let Some(sh) = arrays.get(&format!("sh_t{t}")) {
+                for k in 0..48 {
+                    let got = f64::from(state.sh.plane(k)[i]);
+                    worst[4] = worst[4].max((got - sh[48 * i + k]).abs());
+                    close(&at("SH"), got, sh[48 * i + k], 2e-5);
+                }
+            }
+        }
+    }
+    eprintln!("{name}: worst position/extent, scale, rotation, opacity, SH: {worst:?}");
+}
+
+#[test]
+fn states_of_deform2_agree_with_the_original_code() {
+    states_agree("deform2");
+}
+
+#[test]
+fn states_of_room2_dynerf_agree_with_the_original_code() {
+    states_agree("room2_dynerf");
+}
+
+#[test]
+fn states_of_room2_big_agree_with_the_original_code() {
+    states_agree("room2_big");
+}
