@@ -8,7 +8,7 @@
 //! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
-
+//! | L4 | [`pipeline`] | the order of the passes |
 //! | L5 | [`cli`] | arguments and exit codes |
 
 pub mod cli;
@@ -20,6 +20,7 @@ pub mod ingest;
 pub mod merge;
 pub mod model;
 pub mod pass;
+pub mod pipeline;
 pub mod recipe;
 pub mod score;
 pub mod select;

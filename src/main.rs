@@ -1,3 +1,7 @@
 //! The `splatsieve` command.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    splatsieve::cli::main()
+}

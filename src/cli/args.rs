@@ -18,18 +18,18 @@ Examples:
 /// Shrinks trained dynamic Gaussian-splatting models, without retraining.
 #[derive(Debug, Parser)]
 #[command(name = "splatsieve", version, about, before_help = EXAMPLES, max_term_width = 110)]
-pub struct Cli {
+pub(super) struct Cli {
     /// What to do.
     #[command(subcommand)]
-    pub verb: Verb,
+    pub(super) verb: Verb,
     /// Threads to work on; the result does not depend on it. Default: all.
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    pub threads: Option<u16>,
+    pub(super) threads: Option<u16>,
 }
 
 /// The verbs.
 #[derive(Debug, Subcommand)]
-pub enum Verb {
+pub(super) enum Verb {
     /// Write a smaller model that the same renderer opens
     Compress(Compress),
     /// Write the statistics and scores of every Gaussian as .npz or .csv
@@ -54,35 +54,35 @@ pub enum Verb {
 
 /// What to read.
 #[derive(Debug, Args)]
-pub struct Input {
+pub(super) struct Input {
     /// 4DGaussians model folder, folder of PLY frames, one .ply, or .gseq
-    pub input: PathBuf,
+    pub(super) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K")]
-    pub iteration: Option<u32>,
+    pub(super) iteration: Option<u32>,
     /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    pub frames: Option<u32>,
+    pub(super) frames: Option<u32>,
 }
 
 /// From where to look.
 #[derive(Debug, Args)]
-pub struct Cameras {
+pub(super) struct Cameras {
     /// transforms*.json, cameras.json, poses_bounds.npy, or a folder with one [default: beside the model's
     /// data if cfg_args names it, else a virtual rig]
     #[arg(long, value_name = "PATH")]
-    pub cameras: Option<PathBuf>,
+    pub(super) cameras: Option<PathBuf>,
     /// Picture size where the cameras name none
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
-    pub size: Option<(u32, u32)>,
+    pub(super) size: Option<(u32, u32)>,
     /// Which of the cameras' pictures to score with
     #[arg(long, value_enum, default_value_t = SplitArg::Train)]
-    pub split: SplitArg,
+    pub(super) split: SplitArg,
 }
 
 /// A part of a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum SplitArg {
+pub(super) enum SplitArg {
     /// Pictures the model was trained on
     Train,
     /// Held-out pictures
@@ -93,61 +93,61 @@ pub enum SplitArg {
 
 /// `compress`
 #[derive(Debug, Args)]
-pub struct Compress {
+pub(super) struct Compress {
     #[command(flatten)]
-    pub input: Input,
+    pub(super) input: Input,
     #[command(flatten)]
-    pub cameras: Cameras,
+    pub(super) cameras: Cameras,
     /// Where to write: a folder, NAME.gseq or NAME.ply
     #[arg(short, long, value_name = "PATH")]
-    pub output: PathBuf,
+    pub(super) output: PathBuf,
     /// What to write [default: by the output's name; a folder is of the input's own kind]
     #[arg(long = "as", value_enum, value_name = "KIND")]
-    pub kind: Option<OutputKind>,
+    pub(super) kind: Option<OutputKind>,
     /// Exactly this many Gaussians in the output
     #[arg(long, value_name = "N", conflicts_with = "target_ratio")]
-    pub target_count: Option<u64>,
+    pub(super) target_count: Option<u64>,
     /// Exactly this fraction of the Gaussians in the output
     #[arg(long, value_name = "R")]
-    pub target_ratio: Option<f64>,
+    pub(super) target_ratio: Option<f64>,
     /// Prune, do not merge
     #[arg(long, conflicts_with = "merge_only")]
-    pub prune_only: bool,
+    pub(super) prune_only: bool,
     /// Merge, do not prune
     #[arg(long)]
-    pub merge_only: bool,
+    pub(super) merge_only: bool,
     #[command(flatten)]
-    pub overrides: Overrides,
+    pub(super) overrides: Overrides,
     /// Say what would happen; write nothing
     #[arg(long)]
-    pub dry_run: bool,
+    pub(super) dry_run: bool,
     /// Replace an earlier output
     #[arg(long)]
-    pub overwrite: bool,
+    pub(super) overwrite: bool,
     /// Print the summary as JSON
     #[arg(long)]
-    pub json: bool,
+    pub(super) json: bool,
     #[command(flatten)]
-    pub recipe: RecipeFlags,
+    pub(super) recipe: RecipeFlags,
 }
 
 /// What the user knows better.
 #[derive(Debug, Args)]
-pub struct Overrides {
+pub(super) struct Overrides {
     /// Keep every Gaussian inside this box (at the reference frame), unmerged
     #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = parse_box, allow_hyphen_values = true)]
-    pub keep_box: Option<[f64; 6]>,
+    pub(super) keep_box: Option<[f64; 6]>,
     /// Keep these Gaussians, unmerged: a file with one id per line, or a list such as 3,10-20
     #[arg(long, value_name = "FILE|IDS")]
-    pub keep_ids: Option<String>,
+    pub(super) keep_ids: Option<String>,
     /// Drop these Gaussians: a file with one id per line, or a list such as 3,10-20
     #[arg(long, value_name = "FILE|IDS")]
-    pub drop_ids: Option<String>,
+    pub(super) drop_ids: Option<String>,
 }
 
 /// Kinds of output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum OutputKind {
+pub(super) enum OutputKind {
     /// 4DGaussians model folder
     Model,
     /// Container
@@ -160,121 +160,123 @@ pub enum OutputKind {
 
 /// `score`
 #[derive(Debug, Args)]
-pub struct Score {
+pub(super) struct Score {
     #[command(flatten)]
-    pub input: Input,
+    pub(super) input: Input,
     #[command(flatten)]
-    pub cameras: Cameras,
+    pub(super) cameras: Cameras,
     /// rows.npz (arrays D kappa V life C E vis static_score dynamic_score score keep) or rows.csv
     #[arg(short, long, value_name = "FILE")]
-    pub output: PathBuf,
+    pub(super) output: PathBuf,
     /// Replace an earlier output
     #[arg(long)]
-    pub overwrite: bool,
+    pub(super) overwrite: bool,
     #[command(flatten)]
-    pub recipe: RecipeFlags,
+    pub(super) recipe: RecipeFlags,
 }
 
 /// `pack`
 #[derive(Debug, Args)]
-pub struct Pack {
+pub(super) struct Pack {
     #[command(flatten)]
-    pub input: Input,
+    pub(super) input: Input,
     #[command(flatten)]
-    pub cameras: Cameras,
+    pub(super) cameras: Cameras,
     /// Container to write
     #[arg(short, long, value_name = "FILE.gseq")]
-    pub output: PathBuf,
+    pub(super) output: PathBuf,
     /// Store tiles as they are, to be used in place
     #[arg(long, conflicts_with = "level")]
-    pub raw: bool,
+    pub(super) raw: bool,
     /// zstd level
     #[arg(long, value_name = "1-19", default_value_t = 1, value_parser = clap::value_parser!(i32).range(1..=19))]
-    pub level: i32,
+    pub(super) level: i32,
     /// Replace an earlier output
     #[arg(long)]
-    pub overwrite: bool,
+    pub(super) overwrite: bool,
 }
 
 /// `info`
 #[derive(Debug, Args)]
-pub struct Info {
+pub(super) struct Info {
     #[command(flatten)]
-    pub input: Input,
+    pub(super) input: Input,
     /// Print JSON
     #[arg(long)]
-    pub json: bool,
+    pub(super) json: bool,
 }
 
 /// `verify`
 #[derive(Debug, Args)]
-pub struct Verify {
+pub(super) struct Verify {
     /// Container to check
-    pub input: PathBuf,
+    pub(super) input: PathBuf,
     /// Print JSON
     #[arg(long)]
-    pub json: bool,
+    pub(super) json: bool,
 }
 
 /// `unpack`
 #[derive(Debug, Args)]
-pub struct Unpack {
+pub(super) struct Unpack {
     #[command(flatten)]
-    pub input: Input,
+    pub(super) input: Input,
     #[command(flatten)]
-    pub cameras: Cameras,
+    pub(super) cameras: Cameras,
     /// Folder to write frame_NNNNN.ply into
     #[arg(short, long, value_name = "FOLDER")]
-    pub output: PathBuf,
+    pub(super) output: PathBuf,
     /// Replace an earlier output
     #[arg(long)]
-    pub overwrite: bool,
+    pub(super) overwrite: bool,
 }
 
 /// `recover`
 #[derive(Debug, Args)]
-pub struct Recover {
+pub(super) struct Recover {
     /// Container that was cut short
-    pub input: PathBuf,
+    pub(super) input: PathBuf,
     /// Container to write
     #[arg(short, long, value_name = "FILE.gseq")]
-    pub output: PathBuf,
+    pub(super) output: PathBuf,
     /// Replace an earlier output
     #[arg(long)]
-    pub overwrite: bool,
+    pub(super) overwrite: bool,
 }
 
 /// `demo`
 #[derive(Debug, Args)]
-pub struct Demo {
+pub(super) struct Demo {
     /// Keep the scene and the results in this folder [default: a temporary one]
     #[arg(short, long, value_name = "FOLDER")]
-    pub output: Option<PathBuf>,
+    pub(super) output: Option<PathBuf>,
     /// Gaussians of the scene
     #[arg(long, value_name = "N", default_value_t = 6000, value_parser = clap::value_parser!(u32).range(100..=10_000_000))]
-    pub gaussians: u32,
+    pub(super) gaussians: u32,
     /// Frames of the scene
     #[arg(long, value_name = "T", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    pub frames: u32,
+    pub(super) frames: u32,
     /// Replace an earlier output
     #[arg(long)]
-    pub overwrite: bool,
+    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) recipe: RecipeFlags,
 }
 
 /// `recipe`
 #[derive(Debug, Args)]
-pub struct RecipeVerb {
+pub(super) struct RecipeVerb {
     /// `default` or `paper`
     #[arg(long, default_value = "default")]
-    pub preset: String,
+    pub(super) preset: String,
 }
 
 /// `completions`
 #[derive(Debug, Args)]
-pub struct Completions {
+pub(super) struct Completions {
     /// Shell to complete for
     #[arg(value_enum)]
-    pub shell: clap_complete::Shell,
+    pub(super) shell: clap_complete::Shell,
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {

@@ -1,5 +1,195 @@
-//! Arguments and exit codes.
+//! Arguments and exit codes: 0 done, 1 failed, 2 misused. Data on stdout, everything else on stderr.
 
+mod args;
 mod recipe_flags;
 
-pub use recipe_flags::RecipeFlags;
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+use clap::{CommandFactory, Parser};
+use gseq::Compression;
+
+use crate::error::{Error, Result};
+use crate::model::Split;
+use crate::pipeline::compress::{CompressOptions, Only, Target, compress};
+use crate::pipeline::input::InputOptions;
+use crate::pipeline::output::OutputKind;
+use crate::pipeline::{container, demo, score};
+use crate::recipe::preset_text;
+use args::{Cameras, Cli, Compress, Input, SplitArg, Verb};
+use recipe_flags::RecipeFlags;
+
+/// Runs the program on the arguments of this process.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            // `--help` and `--version` arrive here too, with exit code 0.
+            let _ = error.print();
+            return ExitCode::from(error.exit_code() as u8);
+        }
+    };
+    match run(cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        // Whoever read our output has seen enough.
+        Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("splatsieve: {error}");
+            ExitCode::from(if matches!(error, Error::Usage(_)) { 2 } else { 1 })
+        }
+    }
+}
+
+fn run(cli: Cli) -> Result<()> {
+    if let Some(threads) = cli.threads {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads.into())
+            .build_global()
+            .map_err(|error| Error::usage(format!("--threads {threads}: {error}")))?;
+    }
+    match cli.verb {
+        Verb::Compress(args) => {
+            let json = args.json;
+            let summary = compress(&compress_options(args)?)?;
+            print(&if json { summary.json() } else { summary.text() })
+        }
+        Verb::Score(args) => {
+            let input = input_options(args.input, Some(args.cameras));
+            let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.overwrite)?;
+            notes(&report.notes);
+            print(&format!(
+                "{}: {} Gaussians, of which the recipe keeps {} before merging\n",
+                report.output.display(),
+                report.gaussians,
+                report.kept
+            ))
+        }
+        Verb::Pack(args) => {
+            let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
+            let input = input_options(args.input, Some(args.cameras));
+            let (scene, bytes) = container::pack(&input, &args.output, compression, args.overwrite)?;
+            let info = scene.input.source().info();
+            print(&format!(
+                "{}: {} Gaussians x {} frames in {bytes} bytes\n",
+                args.output.display(),
+                info.count,
+                info.times.len()
+            ))
+        }
+        Verb::Info(args) => {
+            let info = container::info(&input_options(args.input, None))?;
+            print(&if args.json { json(&info) } else { info.text() })
+        }
+        Verb::Verify(args) => {
+            let report = container::verify(&args.input)?;
+            let (path, frames, tiles) = (args.input.display(), report.frames, report.tiles);
+            let (stored, decoded) = (report.stored_bytes, report.decoded_bytes);
+            print(&if args.json {
+                json(&serde_json::json!({
+                    "path": path.to_string(), "frames": frames, "tiles": tiles,
+                    "stored_bytes": stored, "decoded_bytes": decoded,
+                }))
+            } else {
+                format!("{path}: sound; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n")
+            })
+        }
+        Verb::Unpack(args) => {
+            let input = input_options(args.input, Some(args.cameras));
+            let frames = container::unpack(&input, &args.output, args.overwrite)?;
+            print(&format!("{}: {frames} PLY files\n", args.output.display()))
+        }
+        Verb::Recover(args) => {
+            let report = container::recover(&args.input, &args.output, args.overwrite)?;
+            print(&format!(
+                "{}: {} complete frames of {} seen, {} tiles\n",
+                args.output.display(),
+                report.frames,
+                report.frames_seen,
+                report.tiles_saved
+            ))
+        }
+        Verb::Demo(args) => {
+            let recipe = args.recipe.recipe()?;
+            let output = args.output.as_deref();
+            let report = demo::run(args.gaussians as usize, args.frames as usize, recipe, output, args.overwrite)?;
+            print(&report.text())?;
+            if let Some(folder) = output {
+                eprintln!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display());
+            }
+            Ok(())
+        }
+        Verb::Recipe(args) => print(preset_text(&args.preset)?),
+        Verb::Completions(args) => {
+            let mut script = Vec::new();
+            clap_complete::generate(args.shell, &mut Cli::command(), "splatsieve", &mut script);
+            write_stdout(&script)
+        }
+    }
+}
+
+fn compress_options(args: Compress) -> Result<CompressOptions> {
+    let recipe = args.recipe.recipe()?;
+    let kind = args.kind.map(|kind| match kind {
+        args::OutputKind::Model => OutputKind::Model,
+        args::OutputKind::Gseq => OutputKind::Gseq,
+        args::OutputKind::PlySequence => OutputKind::PlySequence,
+        args::OutputKind::Ply => OutputKind::Ply,
+    });
+    Ok(CompressOptions {
+        input: input_options(args.input, Some(args.cameras)),
+        output: args.output,
+        kind,
+        recipe,
+        only: match (args.prune_only, args.merge_only) {
+            (true, _) => Only::Prune,
+            (_, true) => Only::Merge,
+            _ => Only::Both,
+        },
+        target: args.target_count.map(Target::Count).or(args.target_ratio.map(Target::Ratio)),
+        keep_ids: args.overrides.keep_ids,
+        drop_ids: args.overrides.drop_ids,
+        keep_box: args.overrides.keep_box,
+        dry_run: args.dry_run,
+        overwrite: args.overwrite,
+    })
+}
+
+fn input_options(input: Input, cameras: Option<Cameras>) -> InputOptions {
+    let mut options = InputOptions {
+        path: input.input,
+        iteration: input.iteration,
+        frames: input.frames.map(|frames| frames as usize),
+        ..InputOptions::default()
+    };
+    if let Some(cameras) = cameras {
+        options.cameras = cameras.cameras;
+        options.size = cameras.size;
+        options.split = match cameras.split {
+            SplitArg::Train => Some(Split::Train),
+            SplitArg::Test => Some(Split::Test),
+            SplitArg::All => None,
+        };
+    }
+    options
+}
+
+fn notes(notes: &[String]) {
+    for note in notes {
+        eprintln!("note: {note}");
+    }
+}
+
+fn json(value: &impl serde::Serialize) -> String {
+    let mut text = serde_json::to_string_pretty(value).expect("plain data");
+    text.push('\n');
+    text
+}
+
+fn print(text: &str) -> Result<()> {
+    write_stdout(text.as_bytes())
+}
+
+fn write_stdout(bytes: &[u8]) -> Result<()> {
+    let mut out = io::stdout().lock();
+    out.write_all(bytes).and_then(|()| out.flush()).map_err(Error::io("write", "standard output".as_ref()))
+}

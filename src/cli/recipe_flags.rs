@@ -12,7 +12,7 @@ const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a doc
 
 /// The recipe as the command line gives it: a preset or a file, and single parameters over it.
 #[derive(Debug, Clone, Default)]
-pub struct RecipeFlags {
+pub(super) struct RecipeFlags {
     preset: Option<String>,
     file: Option<PathBuf>,
     /// (section, key, value as TOML)
@@ -22,7 +22,7 @@ pub struct RecipeFlags {
 
 impl RecipeFlags {
     /// The effective recipe.
-    pub fn recipe(&self) -> Result<Recipe> {
+    pub(super) fn recipe(&self) -> Result<Recipe> {
         let fallback = self.preset.as_deref().unwrap_or("default");
         let mut recipe = match &self.file {
             None => Recipe::preset(fallback)?,

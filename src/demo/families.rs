@@ -51,6 +51,21 @@ impl Family {
         Family::Wire,
     ];
 
+    /// Its name, for tables.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Family::Wall => "wall",
+            Family::Double => "double",
+            Family::Buried => "buried",
+            Family::Dust => "dust",
+            Family::Egg => "egg",
+            Family::Cloth => "cloth",
+            Family::Fading => "fading",
+            Family::Spark => "spark",
+            Family::Wire => "wire",
+        }
+    }
+
     /// Parts of a thousand Gaussians.
     const fn share(self) -> usize {
         match self {

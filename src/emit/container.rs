@@ -91,9 +91,10 @@ fn encode_block(
     let mut state = Gaussians::zeros(len, info.sh_degree);
     let mut values: Vec<Vec<f32>> = vec![Vec::new(); columns.len()];
     for frame in frames.clone() {
+        // A column that never varies is one frame for all; the container stores it once.
         let want = if frame == frames.start { Columns::ALL } else { info.varying };
         reader.read(frame, want, &mut state)?;
-        for (values, &column) in values.iter_mut().zip(columns) {
+        for (values, &column) in values.iter_mut().zip(columns).filter(|(_, column)| want.contains(**column)) {
             values.extend_from_slice(state.column(column).planes());
         }
     }
@@ -102,7 +103,8 @@ fn encode_block(
         .zip(columns)
         .map(|(values, &column)| {
             let width = width(column, info.sh_degree) as u32;
-            Ok(encode_tile(values, frames.len() as u32, width, len as u32, compression)?)
+            let stored = if info.varying.contains(column) { frames.len() } else { 1 };
+            Ok(encode_tile(values, stored as u32, width, len as u32, compression)?)
         })
         .collect()
 }

@@ -4,6 +4,7 @@
 //! moves what was written to where the user asked for it.
 
 pub mod atomic;
+pub mod container;
 pub mod index_map;
 pub mod ply;
 pub mod rows;

@@ -21,7 +21,7 @@ pub mod proxy;
 use rayon::prelude::*;
 
 use crate::model::{Columns, Gaussians};
-use crate::recipe::{self, LengthUnit};
+use crate::recipe;
 use gates::{Gates, Look};
 pub use groups::Groups;
 use motion::{MotionGate, PairMeasure};
@@ -104,10 +104,7 @@ pub fn run<E>(
     mut measure: impl FnMut(&[(u32, u32)]) -> Result<Vec<PairMeasure>, E>,
 ) -> Result<Merged, E> {
     let importance = Importance { coverage: survivors.coverage, visibility: survivors.visibility };
-    let unit = match recipe.length_unit {
-        LengthUnit::Scene => 1.0,
-        LengthUnit::Extent => survivors.extent,
-    };
+    let unit = recipe.length_unit.in_scene_units(survivors.extent);
     let mut groups = Groups::alone(survivors.states.len());
     let mut states = survivors.states.clone();
     let (mut passes, mut left) = (Vec::new(), limit);

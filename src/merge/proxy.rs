@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::Groups;
 use super::gates::unit_rotation;
 use super::moments::{Ellipsoid, Part, align_axes, moments};
-use crate::model::{Columns, Gaussians};
+use crate::model::{self, Columns, Gaussians};
 use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
 
 /// Groups merged between two writes into the output planes.
@@ -34,6 +34,25 @@ pub struct ProxyState {
     pub opacity_logit: f64,
     /// Laid out as a row of [`Gaussians::sh`].
     pub sh: Vec<f64>,
+}
+
+impl ProxyState {
+    /// Writes the columns `want` into row `row` of `out`, rounded to f32.
+    pub fn write(&self, want: Columns, row: usize, out: &mut Gaussians) {
+        for column in want.iter() {
+            match column {
+                Columns::POSITION => out.position.set_row(row, self.position.to_array().map(|x| x as f32)),
+                Columns::ROTATION => out.rotation.set_row(row, self.rotation.map(|x| x as f32)),
+                Columns::LOG_SCALE => out.log_scale.set_row(row, self.log_scale.map(|x| x as f32)),
+                Columns::OPACITY => out.opacity_logit.set_row(row, [self.opacity_logit as f32]),
+                _ => {
+                    for (plane, &value) in self.sh.iter().enumerate() {
+                        out.sh.plane_mut(plane)[row] = value as f32;
+                    }
+                }
+            }
+        }
+    }
 }
 
 /// What makes a member weigh, for every row of the states.
@@ -128,13 +147,7 @@ pub fn merge_groups(
             })
             .collect();
         for (&group, proxy) in batch.iter().zip(&proxies) {
-            out.position.set_row(group, proxy.position.to_array().map(|x| x as f32));
-            out.rotation.set_row(group, proxy.rotation.map(|x| x as f32));
-            out.log_scale.set_row(group, proxy.log_scale.map(|x| x as f32));
-            out.opacity_logit.set_row(group, [proxy.opacity_logit as f32]);
-            for (plane, &value) in proxy.sh.iter().enumerate() {
-                out.sh.plane_mut(plane)[group] = value as f32;
-            }
+            proxy.write(Columns::ALL, group, &mut out);
         }
     }
     out
@@ -149,8 +162,7 @@ fn scales(states: &Gaussians, i: u32) -> DVec3 {
 }
 
 fn opacity(states: &Gaussians, i: u32) -> f64 {
-    let [logit] = states.opacity_logit.row(i as usize);
-    1.0 / (1.0 + (-f64::from(logit)).exp())
+    model::opacity(states.opacity_logit.plane(0)[i as usize])
 }
 
 fn logit(opacity: f64) -> f64 {

@@ -11,6 +11,11 @@ pub use rows::{Flags, Rows};
 /// Zeroth spherical-harmonic basis constant: colour = 0.5 + SH_C0 · f_dc.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;
 
+/// Opacity in [0, 1] of a stored logit, in f64.
+pub fn opacity(logit: f32) -> f64 {
+    1.0 / (1.0 + (-f64::from(logit)).exp())
+}
+
 /// Number of spherical-harmonic coefficients per channel of degree `d`: (d + 1)².
 pub const fn sh_coefficients(degree: usize) -> usize {
     (degree + 1) * (degree + 1)

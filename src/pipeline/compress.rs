@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::input::{InputOptions, Scene, open_scene};
-use super::merging::{Sieved, sieve};
+use super::merging::sieve;
 use super::output::{OutputKind, check_output, write_result};
 use super::overrides::parse_ids;
 use super::scored::{Scored, UserOverrides, score_scene};
@@ -71,11 +71,15 @@ pub fn compress(options: &CompressOptions) -> Result<Summary> {
         let count = scene.input.source().info().count;
         Ok::<_, Error>((scene, count))
     })?;
-    compress_scene(&scene, options, stages)
+    Ok(compress_scene(&scene, options, stages)?.0)
 }
 
-/// [`compress`] of a scene that is open already.
-pub fn compress_scene(scene: &Scene, options: &CompressOptions, mut stages: Stages) -> Result<Summary> {
+/// [`compress`] of a scene that is open already; also gives every Gaussian's place in the output.
+pub fn compress_scene(
+    scene: &Scene,
+    options: &CompressOptions,
+    mut stages: Stages,
+) -> Result<(Summary, Vec<Option<u32>>)> {
     let recipe = &options.recipe;
     let info = scene.input.source().info();
     let kind = OutputKind::of(&options.output, options.kind, &scene.input)?;
@@ -115,9 +119,10 @@ pub fn compress_scene(scene: &Scene, options: &CompressOptions, mut stages: Stag
     if options.dry_run {
         summary.notes.push("dry run: nothing was written".to_owned());
         summary.stages = stages.finish();
-        return Ok(summary);
+        return Ok((summary, sieved.index_map(info.count)));
     }
-    write_result(scene, &scored, &sieved, recipe, kind, options, summary, stages)
+    let summary = write_result(scene, &scored, &sieved, options, kind, summary, stages)?;
+    Ok((summary, sieved.index_map(info.count)))
 }
 
 impl Target {

@@ -2,14 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
+
 use crate::error::{Error, Result};
 use crate::ingest::cameras::{self, CameraOptions};
 use crate::ingest::container::Container;
-use crate::ingest::model_folder::ModelFolder;
+use crate::ingest::ModelFolder;
 use crate::ingest::ply_sequence::PlySequence;
-use crate::model::{Columns, Rig, Schedule, Split};
+use crate::model::{Column, Columns, Rig, Schedule, Split};
 use crate::pass::FrameSource;
 use crate::pipeline::summary::InputSummary;
+use crate::stats::RobustBox;
 use crate::stream::gather;
 
 /// What to read and from where to look.
@@ -57,40 +60,44 @@ pub struct Scene {
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     let path = &options.path;
     let mut notes = Vec::new();
-    let mut input = Input::open(path, options.iteration)?;
+    let input = Input::open(path, options.iteration)?;
     let camera_options = CameraOptions { size: options.size, frames: options.frames, ..CameraOptions::default() };
     let rig = match camera_path(options, &input) {
         Some(found) => Some(cameras::load(&found, &camera_options)?),
         None => None,
     };
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
-    if let Input::Model(model) = &mut input {
-        let times = match options.frames {
-            Some(frames) => (0..frames).map(|i| i as f64 / frames as f64).collect(),
-            None if !times.is_empty() => times.clone(),
-            None => {
-                notes.push(format!("the model names no frames: {DEFAULT_FRAMES} evenly spaced ones (--frames)"));
-                (0..DEFAULT_FRAMES).map(|i| i as f64 / DEFAULT_FRAMES as f64).collect()
-            }
-        };
-        model.set_times(times)?;
-    } else if options.frames.is_some() {
-        return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.display())));
-    }
-    if let Input::Frames(frames) = &mut input
-        && !times.is_empty()
-    {
-        let found = frames.info().times.len();
-        if times.len() != found {
-            return Err(Error::usage(format!(
-                "{}: {found} frames, but the cameras of {} have {} distinct times\n  give the cameras of this sequence",
-                path.display(),
-                rig.as_ref().map_or("", |rig| rig.origin.as_str()),
-                times.len()
-            )));
+    let input = match input {
+        Input::Model(model) => {
+            let times = match options.frames {
+                None if !times.is_empty() => times,
+                given => {
+                    let frames = given.unwrap_or(DEFAULT_FRAMES);
+                    if given.is_none() {
+                        notes.push(format!("nothing names the model's frames: {frames} evenly spaced ones (--frames)"));
+                    }
+                    (0..frames).map(|i| i as f64 / frames as f64).collect()
+                }
+            };
+            Input::Model(model.with_times(times)?)
         }
-        frames.set_times(times)?;
-    }
+        _ if options.frames.is_some() => {
+            return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.display())));
+        }
+        Input::Frames(frames) if !times.is_empty() => {
+            let found = frames.info().times.len();
+            if times.len() != found {
+                return Err(Error::usage(format!(
+                    "{}: {found} frames, but the cameras of {} have {} distinct times\n  give the cameras of this sequence",
+                    path.display(),
+                    rig.as_ref().map_or("", |rig| rig.origin.as_str()),
+                    times.len()
+                )));
+            }
+            Input::Frames(frames.with_times(times)?)
+        }
+        input => input,
+    };
     let rig = match rig {
         Some(rig) => rig,
         None => {
@@ -111,7 +118,7 @@ const DEFAULT_FRAMES: usize = 60;
 
 fn camera_path(options: &InputOptions, input: &Input) -> Option<PathBuf> {
     options.cameras.clone().or_else(|| match input {
-        Input::Model(model) => cameras::find(model.source_path()?, &options.path),
+        Input::Model(model) => cameras::find(model.config().source_path.as_deref()?, &options.path),
         _ => None,
     })
 }
@@ -119,8 +126,11 @@ fn camera_path(options: &InputOptions, input: &Input) -> Option<PathBuf> {
 /// A rig around the robust middle of the first frame.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
     let ids: Vec<u32> = (0..source.info().count as u32).collect();
+    if source.info().times.is_empty() {
+        return Ok(cameras::virtual_rig(DVec3::ZERO, 1.0));
+    }
     let state = gather(source, &ids, 0, Columns::POSITION)?;
-    let bounds = crate::stats::RobustBox::of(&state.position);
+    let bounds = RobustBox::of(&state.position);
     Ok(cameras::virtual_rig(bounds.middle, bounds.extent()))
 }
 
@@ -156,6 +166,14 @@ impl Input {
         }
     }
 
+    /// Scales before any deformation, of an input that has such.
+    pub fn canonical_log_scale(&self) -> Option<&Column> {
+        match self {
+            Input::Model(model) => Some(&model.canonical().log_scale),
+            _ => None,
+        }
+    }
+
     /// What it is, for people.
     pub fn kind(&self) -> &'static str {
         match self {
@@ -168,7 +186,7 @@ impl Input {
     /// Hash over the bytes read.
     pub fn digest(&self) -> Result<String> {
         match self {
-            Input::Model(model) => model.digest(),
+            Input::Model(model) => model.paths().digest(),
             Input::Frames(frames) => frames.digest(),
             Input::Container(container) => Ok(container.digest()),
         }
@@ -192,8 +210,8 @@ impl Input {
     /// Bytes of the files that grow with the Gaussians.
     fn bytes(&self) -> Result<u64> {
         let paths: Vec<&Path> = match self {
-            Input::Model(model) => vec![model.ply_path()],
-            Input::Frames(frames) => frames.paths().collect(),
+            Input::Model(model) => vec![&model.paths().point_cloud],
+            Input::Frames(frames) => frames.paths().iter().map(PathBuf::as_path).collect(),
             Input::Container(container) => vec![container.path()],
         };
         paths.iter().map(|path| Ok(std::fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()

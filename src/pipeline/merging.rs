@@ -11,7 +11,7 @@ use crate::merge::proxy::{Importance, weights};
 use crate::merge::{self, Merged, Survivors};
 use crate::merge::motion::PairMeasure;
 use crate::model::{Columns, Gaussians};
-use crate::recipe::Recipe;
+use crate::recipe::{self, Recipe};
 use crate::select::hash_id;
 use crate::stream::{gather, measure_motion};
 
@@ -142,6 +142,8 @@ struct Job<'a> {
     scene: &'a Scene,
     scored: &'a Scored,
     recipe: &'a Recipe,
+    /// The recipe's, with a noise floor no lower than that of the positions.
+    merge: recipe::Merge,
     /// Ids whose states are known, increasing, and these states at the reference frame.
     pool: Vec<u32>,
     states: Gaussians,
@@ -156,7 +158,10 @@ impl<'a> Job<'a> {
             true => Gaussians::zeros(pool.len(), source.info().sh_degree),
             false => gather(source, &pool, scored.reference_frame, Columns::ALL)?,
         };
-        Ok(Job { scene, scored, recipe, pool, states, measured: HashMap::new() })
+        let mut merge = recipe.merge.clone();
+        let unit = merge.length_unit.in_scene_units(scored.extent);
+        merge.motion_noise = merge.motion_noise.max(2.0 * scored.position_ulp / unit);
+        Ok(Job { scene, scored, recipe, merge, pool, states, measured: HashMap::new() })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -189,9 +194,8 @@ impl<'a> Job<'a> {
                 hash: &hash,
                 mergeable: &mergeable,
                 extent: scored.extent,
-                position_ulp: scored.position_ulp,
             },
-            &recipe.merge,
+            &self.merge,
             limit,
             |pairs| measure(scene, recipe, survivors, &states, pairs, &mut self.measured),
         )?;

@@ -1,10 +1,32 @@
 //! What a run writes: the smaller model and, beside it, the recipe, the index map and the summary.
 
+use std::collections::BTreeMap;
+use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::input::Input;
+use gseq::Compression;
+use rayon::prelude::*;
+
+use super::compress::CompressOptions;
+use super::input::{Input, Scene};
+use super::merging::{Cluster, Sieved};
+use super::proxies::{canonical_cloud, canonical_proxies};
+use super::scored::Scored;
+use super::summary::{Stages, Summary};
+use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::container::write_container;
+use crate::emit::index_map::write_index_map;
+use crate::emit::ply::{OutRow, write_inria, write_like};
 use crate::error::{Error, Result};
+use crate::ingest::ply::Ply;
+use crate::ingest::ply_sequence::PlySequence;
+use crate::model::{Columns, Gaussians};
+use crate::pass::{FrameSource, Ids};
 use crate::recipe::Recipe;
+use crate::stream::{MergedSequence, Progress, gather};
+
+/// zstd level of containers that are a result: higher ones gain about 1% on trained models.
+const LEVEL: i32 = 1;
 
 /// Kinds of result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,6 +73,10 @@ impl OutputKind {
     }
 }
 
+/// Files beside every result.
+const RECIPE: &str = "recipe.toml";
+const INDEX_MAP: &str = "index_map.npy";
+
 /// Path of a file beside the result: inside a folder, next to a file and named after it.
 pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     if is_folder {
@@ -60,6 +86,186 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     file.push(".");
     file.push(name);
     result.with_file_name(file)
+}
+
+/// Confirms, before any work, that the result and what goes beside it can be written.
+pub fn check_output(path: &Path, kind: OutputKind, scene: &Scene, overwrite: bool) -> Result<()> {
+    let inputs = [scene.path.as_path()];
+    if kind.is_folder() {
+        return check_target(path, Kind::Folder, &inputs, overwrite);
+    }
+    check_target(path, Kind::File, &inputs, overwrite)?;
+    for name in [RECIPE, INDEX_MAP, MARKER] {
+        check_target(&beside(path, false, name), Kind::File, &inputs, overwrite)?;
+    }
+    Ok(())
+}
+
+/// Writes the result and what goes beside it; everything appears under its name at the end, the
+/// result last.
+pub fn write_result(
+    scene: &Scene,
+    scored: &Scored,
+    sieved: &Sieved,
+    options: &CompressOptions,
+    kind: OutputKind,
+    mut summary: Summary,
+    mut stages: Stages,
+) -> Result<Summary> {
+    let target = options.output.as_path();
+    let kept = sieved.kept.len();
+    // Sequences are baked from a result that holds each of its frames: one more read of the kept.
+    let reads = if matches!(kind, OutputKind::Gseq | OutputKind::PlySequence) { 1.0 } else { 0.0 };
+    let job = Emission { scene, scored, sieved, recipe: &options.recipe };
+    let text = recipe_text(&options.recipe, &summary.input.digest);
+    let map = sieved.index_map(summary.input.gaussians);
+    if kind.is_folder() {
+        let staged = StagedFolder::new(target, options.overwrite)?;
+        let (notes, deviation) = stages.run("emit", kept, reads, || Ok::<_, Error>((job.write(kind, staged.path())?, kept)))?;
+        summary.finish(stages, notes, deviation, point_bytes(staged.path())?);
+        write_text(&staged.path().join(RECIPE), &text)?;
+        write_index_map(&map, &staged.path().join(INDEX_MAP))?;
+        write_text(&staged.path().join(MARKER), &summary.json())?;
+        staged.commit()?;
+    } else {
+        let staged = StagedFile::new(target, options.overwrite)?;
+        let companion = |name| StagedFile::new(&beside(target, false, name), options.overwrite);
+        let (recipe, index_map, marker) = (companion(RECIPE)?, companion(INDEX_MAP)?, companion(MARKER)?);
+        let (notes, deviation) = stages.run("emit", kept, reads, || Ok::<_, Error>((job.write(kind, staged.path())?, kept)))?;
+        summary.finish(stages, notes, deviation, file_bytes(staged.path())?);
+        write_text(recipe.path(), &text)?;
+        write_index_map(&map, index_map.path())?;
+        write_text(marker.path(), &summary.json())?;
+        for file in [recipe, index_map, marker, staged] {
+            file.commit()?;
+        }
+    }
+    Ok(summary)
+}
+
+fn write_text(path: &Path, text: &str) -> Result<()> {
+    fs::write(path, text).map_err(Error::io("write", path))
+}
+
+fn file_bytes(path: &Path) -> Result<u64> {
+    Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())
+}
+
+/// Bytes of all PLY files below a folder: what grows with the Gaussians.
+fn point_bytes(folder: &Path) -> Result<u64> {
+    let mut sum = 0;
+    for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
+        let path = entry.map_err(Error::io("list", folder))?.path();
+        sum += match path.extension() {
+            _ if path.is_dir() => point_bytes(&path)?,
+            Some(extension) if extension == "ply" => file_bytes(&path)?,
+            _ => 0,
+        };
+    }
+    Ok(sum)
+}
+
+/// The result, about to be written.
+struct Emission<'a> {
+    scene: &'a Scene,
+    scored: &'a Scored,
+    sieved: &'a Sieved,
+    recipe: &'a Recipe,
+}
+
+impl Emission<'_> {
+    /// Writes the result alone to `path`. Gives notes for the summary and, for a model, the furthest
+    /// that a proxy strays from its members.
+    fn write(&self, kind: OutputKind, path: &Path) -> Result<(Vec<String>, Option<f64>)> {
+        let Sieved { kept, clusters, .. } = self.sieved;
+        if let Input::Model(model) = &self.scene.input {
+            let found = canonical_proxies(model, self.scored, self.sieved, &self.recipe.merge)?;
+            let mut notes = found.notes;
+            match kind {
+                OutputKind::Model => {
+                    let paths = model.paths();
+                    let folder = path.join("point_cloud").join(format!("iteration_{}", paths.iteration));
+                    fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
+                    copy(&paths.cfg_args, &path.join("cfg_args"))?;
+                    copy(&paths.deformation, &folder.join("deformation.pth"))?;
+                    self.write_like(&paths.point_cloud, &found.raw, &folder.join("point_cloud.ply"))?;
+                    if paths.deformation_table.is_some() || paths.deformation_accum.is_some() {
+                        notes.push("deformation_table.pth and deformation_accum.pth, which only training reads, were left out".to_owned());
+                    }
+                }
+                OutputKind::Ply => self.write_like(&model.paths().point_cloud, &found.raw, path)?,
+                _ => {
+                    let cloud = canonical_cloud(model, self.sieved, &found.raw);
+                    write_sequence(&model.with_canonical(cloud), kind, path)?;
+                }
+            }
+            return Ok((notes, found.deviation));
+        }
+        let members = clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));
+        let result = MergedSequence::new(self.scene.input.source(), kept, members, &self.recipe.merge);
+        match &self.scene.input {
+            Input::Frames(frames) if kind != OutputKind::Gseq => self.write_like_frames(frames, &result, kind, path)?,
+            _ => write_sequence(&result, kind, path)?,
+        }
+        Ok((Vec::new(), None))
+    }
+
+    fn write_like(&self, template: &Path, proxies: &Gaussians, path: &Path) -> Result<()> {
+        write_like(&Ply::open(template)?, &self.rows(), proxies, path)
+    }
+
+    /// Every frame's file again with the properties, comments and names it had.
+    fn write_like_frames(&self, frames: &PlySequence, result: &MergedSequence<'_>, kind: OutputKind, path: &Path) -> Result<()> {
+        let places: Vec<u32> = self.sieved.clusters.iter().map(|cluster| cluster.output).collect();
+        let rows = self.rows();
+        let progress = Progress::new("emit", "frames", frames.paths().len() as u64);
+        (0..frames.paths().len()).into_par_iter().try_for_each(|frame| {
+            let mut proxies = Gaussians::zeros(0, frames.info().sh_degree);
+            result.open(Ids::List(&places))?.read(frame, Columns::ALL, &mut proxies)?;
+            let template = frames.frame(frame)?;
+            let target = match (kind, template.path().file_name()) {
+                (OutputKind::PlySequence, Some(name)) => path.join(name),
+                _ => path.to_owned(),
+            };
+            write_like(&template, &rows, &proxies, &target)?;
+            progress.advance(1);
+            Ok(())
+        })
+    }
+
+    fn rows(&self) -> Vec<OutRow> {
+        let mut rows: Vec<OutRow> = self.sieved.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
+        for (proxy, cluster) in self.sieved.clusters.iter().enumerate() {
+            rows[cluster.output as usize].proxy = Some(proxy as u32);
+        }
+        rows
+    }
+}
+
+fn copy(from: &Path, to: &Path) -> Result<()> {
+    fs::copy(from, to).map_err(Error::io("copy", from))?;
+    Ok(())
+}
+
+/// Writes every frame of `source`: as a container, as a folder of PLY files, or its only frame as one.
+pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path) -> Result<()> {
+    let info = source.info();
+    if kind == OutputKind::Gseq {
+        let progress = Progress::new("emit", "Gaussian frames", info.count as u64 * info.times.len() as u64);
+        return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
+    }
+    let ids: Vec<u32> = (0..info.count as u32).collect();
+    let progress = Progress::new("emit", "frames", info.times.len() as u64);
+    for frame in 0..info.times.len() {
+        let state = gather(source, &ids, frame, Columns::ALL)?;
+        let file = match kind {
+            OutputKind::Ply => path.to_owned(),
+            _ => path.join(format!("frame_{frame:05}.ply")),
+        };
+        write_inria(&state, &[], &file)?;
+        progress.advance(1);
+    }
+    Ok(())
 }
 
 /// Text of `recipe.toml`: where it comes from, then every parameter.

@@ -7,6 +7,10 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use crate::merge::PassCounts;
+use crate::recipe::ProxyOpacity;
+use crate::select::Counts;
+
 /// One stage of a run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Stage {
@@ -95,6 +99,33 @@ pub struct FlagSummary {
     pub never_in_view: usize,
 }
 
+/// Gaussians at each step of selection, as [`crate::select::Counts`] explains them.
+#[derive(Debug, Clone, Serialize)]
+#[expect(missing_docs, reason = "`Counts` documents each")]
+pub struct SelectionSummary {
+    pub candidates: usize,
+    pub rescued: usize,
+    pub pruned_by_stage_1: usize,
+    pub pruned_by_stage_2: usize,
+    pub forced_keep: usize,
+    pub forced_drop: usize,
+    pub kept: usize,
+}
+
+impl From<Counts> for SelectionSummary {
+    fn from(counts: Counts) -> Self {
+        SelectionSummary {
+            candidates: counts.candidates,
+            rescued: counts.rescued,
+            pruned_by_stage_1: counts.pruned_by_stage_1,
+            pruned_by_stage_2: counts.pruned_by_stage_2,
+            forced_keep: counts.forced_keep,
+            forced_drop: counts.forced_drop,
+            kept: counts.kept,
+        }
+    }
+}
+
 /// What merging did.
 #[derive(Debug, Clone, Serialize)]
 pub struct MergeSummary {
@@ -105,12 +136,12 @@ pub struct MergeSummary {
     /// Gaussians that went into them.
     pub members: usize,
     /// Rule by which a proxy's opacity was made.
-    pub opacity: String,
+    pub opacity: ProxyOpacity,
     /// One entry per pass.
     pub passes: Vec<MergePassSummary>,
-    /// Furthest that a proxy strays from the weighted mean of its members' trajectories, scene units,
-    /// over frames sampled; none without a deformation field.
-    pub largest_deviation: Option<f64>,
+    /// Furthest that a proxy strays from its place among its members over sampled frames, scene units;
+    /// none without a deformation field.
+    pub deviation: Option<f64>,
 }
 
 /// What one merge pass did.
@@ -130,6 +161,19 @@ pub struct MergePassSummary {
     pub sequential: bool,
 }
 
+impl From<&PassCounts> for MergePassSummary {
+    fn from(counts: &PassCounts) -> Self {
+        MergePassSummary {
+            truncated: counts.truncated,
+            candidates: counts.candidates,
+            passing: counts.passing,
+            joins: counts.joins,
+            rounds: counts.rounds,
+            sequential: counts.sequential,
+        }
+    }
+}
+
 /// A run from input to output.
 #[derive(Debug, Clone, Serialize)]
 pub struct Summary {
@@ -143,6 +187,8 @@ pub struct Summary {
     pub gaussians: usize,
     /// Bytes of the output's point cloud or container; none for a dry run.
     pub output_bytes: Option<u64>,
+    /// Stages 1 and 2.
+    pub selection: SelectionSummary,
     /// Everything in order.
     pub stages: Vec<Stage>,
     /// Percentiles of every term.
@@ -158,6 +204,23 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// Adds what is known once the result is written.
+    pub fn finish(&mut self, stages: Stages, notes: Vec<String>, deviation: Option<f64>, output_bytes: u64) {
+        self.stages = stages.finish();
+        self.notes.extend(notes);
+        self.output_bytes = Some(output_bytes);
+        if let Some(merge) = &mut self.merge {
+            merge.deviation = deviation;
+        }
+    }
+
+    /// As JSON, for programs.
+    pub fn json(&self) -> String {
+        let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
+        text.push('\n');
+        text
+    }
+
     /// A few lines for a person.
     pub fn text(&self) -> String {
         let mut out = String::new();

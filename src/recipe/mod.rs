@@ -161,6 +161,16 @@ pub enum LengthUnit {
     Extent,
 }
 
+impl LengthUnit {
+    /// Length of one unit in a scene of that extent.
+    pub fn in_scene_units(self, extent: f64) -> f64 {
+        match self {
+            LengthUnit::Scene => 1.0,
+            LengthUnit::Extent => extent,
+        }
+    }
+}
+
 /// How trajectories are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

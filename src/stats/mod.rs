@@ -9,6 +9,7 @@
 //! may be cut anywhere and run in any order without changing a bit.
 
 mod anisotropy;
+mod bounds;
 mod life;
 mod motion;
 mod noise;
@@ -18,6 +19,7 @@ mod scan;
 mod state;
 
 pub use anisotropy::fill_anisotropy;
+pub use bounds::RobustBox;
 pub use noise::{Snapped, snap, ulp};
 pub use plan::ScanPlan;
 pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics};

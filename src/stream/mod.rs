@@ -1,11 +1,13 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
 mod gather;
+mod merged;
 mod motion;
 mod progress;
 mod scan;
 
 pub use gather::gather;
+pub use merged::MergedSequence;
 pub use motion::measure_motion;
 pub use progress::Progress;
 pub use scan::{Scanned, scan};

@@ -4,17 +4,16 @@ use rayon::prelude::*;
 
 use super::{BLOCK, Progress};
 use crate::error::Result;
-use crate::merge::{PairMeasure, PairMotion};
-use crate::model::{Column, Columns, Gaussians};
+use crate::merge::motion::{PairMeasure, PairMotion};
+use crate::model::{Column, Columns, Gaussians, opacity};
 use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::recipe;
-use crate::stats::opacity;
 
 /// Motion of every pair in `pairs` (places in `ids`); `reference` holds the positions of `ids` at the
 /// reference frame.
 ///
 /// Memory: per Gaussian of `ids` its reader, its track and its position at one frame, and per pair its
-/// sums ([`crate::merge::PAIR_BYTES`]); nothing grows with the number of frames. A sequence in which
+/// sums ([`crate::merge::motion::PAIR_BYTES`]); nothing grows with the number of frames. A sequence in which
 /// neither positions nor opacities vary is measured by its first frame.
 pub fn measure_motion(
     source: &dyn FrameSource,

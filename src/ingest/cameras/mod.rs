@@ -29,7 +29,7 @@ use serde_json::Value;
 use crate::error::{Error, Result};
 use crate::model::Rig;
 
-pub use virtual_rig::{robust_bounds, virtual_rig};
+pub use virtual_rig::virtual_rig;
 
 /// Largest camera file that is read. 10⁵ pictures take some 60 MB of JSON.
 const MAX_FILE_BYTES: u64 = 256 << 20;

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::model::{Camera, Column, Rig, Shot, Split};
+use crate::model::{Camera, Rig, Shot, Split};
 
 /// Cameras of the rig: as many scoring views as the figures of METHOD section 6 were taken with.
 const CAMERAS: u32 = 12;
@@ -13,7 +13,7 @@ const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
 const SIDE_PX: u32 = 512;
 
 /// Cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, looking at it, every one at
-/// every frame, all for training; see [`robust_bounds`] for the two numbers.
+/// every frame, all for training; [`crate::stats::RobustBox`] gives the two numbers.
 ///
 /// Camera k of n looks from latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z is up in the
 /// pictures. An extent that is zero or not finite counts as 1, a centre that is not finite as 0.
@@ -39,32 +39,6 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
             center.x, center.y, center.z
         ),
     }
-}
-
-/// Centre and extent of `[3, N]` positions, untroubled by floaters: the median of each axis, and the
-/// largest P99 − P1 of the three (nearest rank, METHOD section 2), in scene units.
-///
-/// NaN and infinities do not count; `None` when an axis has no finite value. Takes 4 N bytes.
-pub fn robust_bounds(position: &Column) -> Option<(DVec3, f64)> {
-    let mut center = DVec3::ZERO;
-    let mut extent: f64 = 0.0;
-    let mut values = Vec::with_capacity(position.len());
-    for axis in 0..3 {
-        values.clear();
-        values.extend(position.plane(axis).iter().filter(|x| x.is_finite()));
-        if values.is_empty() {
-            return None;
-        }
-        center[axis] = percentile(&mut values, 50);
-        extent = extent.max(percentile(&mut values, 99) - percentile(&mut values, 1));
-    }
-    Some((center, extent))
-}
-
-/// Nearest rank: the ⌈p/100·n⌉-th smallest.
-fn percentile(values: &mut [f32], percent: usize) -> f64 {
-    let rank = (values.len() * percent).div_ceil(100).max(1);
-    f64::from(*values.select_nth_unstable_by(rank - 1, f32::total_cmp).1)
 }
 
 #[cfg(test)]
@@ -104,27 +78,5 @@ mod tests {
             let rig = virtual_rig(DVec3::NAN, extent);
             assert!(rig.cameras.iter().all(|camera| (camera.center().length() - 2.0).abs() < 1e-12));
         }
-    }
-
-    #[test]
-    fn bounds_ignore_floaters_and_what_is_not_finite() {
-        let mut position = Column::zeros(3, 1002);
-        for i in 0..1000 {
-            position.set_row(i, [i as f32, 2.0 * i as f32, -1.0]);
-        }
-        position.set_row(1000, [1e9, f32::INFINITY, -1.0]);
-        position.set_row(1001, [f32::NAN, -1e9, -1.0]);
-        let (center, extent) = robust_bounds(&position).unwrap();
-        // 1001 finite values on each axis: ranks 501, 991 and 11.
-        assert_eq!(center, DVec3::new(500.0, 998.0, -1.0));
-        assert_eq!(extent, 2.0 * (989.0 - 9.0));
-    }
-
-    #[test]
-    fn no_finite_position_means_no_bounds() {
-        assert_eq!(robust_bounds(&Column::zeros(3, 0)), None);
-        let mut one = Column::zeros(3, 1);
-        one.set_row(0, [0.0, f32::NAN, 0.0]);
-        assert_eq!(robust_bounds(&one), None);
     }
 }

@@ -18,6 +18,7 @@ use crate::model::{Column, Columns, Gaussians, SequenceInfo};
 use crate::pass::{BlockReader, FrameSource, Ids};
 
 use super::cfg_args::ModelConfig;
+use super::ply::Ply;
 use super::pth::read_state_dict;
 
 /// The files of a model folder.
@@ -128,6 +129,21 @@ impl ModelFolder {
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
         let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
         Ok(ModelFolder { paths, config, canonical: Arc::new(canonical), field: Arc::new(field), info })
+    }
+
+    /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
+    pub fn open(root: &Path, iteration: Option<u32>) -> Result<Self> {
+        let paths = ModelPaths::locate(root, iteration)?;
+        let ply = Ply::open(&paths.point_cloud)?;
+        let mut canonical = Gaussians::zeros(ply.count(), ply.sh_degree());
+        ply.gaussians(0..ply.count(), Columns::ALL, &mut canonical)?;
+        Self::with_cloud(paths, canonical, ply.sh_degree())
+    }
+
+    /// The same field and frames with other Gaussians, of the same SH degree.
+    pub fn with_canonical(&self, canonical: Gaussians) -> Self {
+        let info = SequenceInfo { count: canonical.len(), ..self.info.clone() };
+        ModelFolder { canonical: Arc::new(canonical), info, ..self.clone() }
     }
 
     /// The same model with frames at `times`.

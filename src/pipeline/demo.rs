@@ -1,0 +1,115 @@
+//! The built-in demo: a generated scene, compressed, and what happened to each kind of Gaussian in it.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::compress::{CompressOptions, Only, compress_scene};
+use super::input::{Input, InputOptions, Scene};
+use super::output::{OutputKind, write_sequence};
+use super::summary::{Stages, Summary};
+use crate::demo::{self, Family};
+use crate::emit::atomic::{Kind, MARKER, StagedFolder, check_target};
+use crate::error::{Error, Result};
+use crate::ingest::container::Container;
+use crate::model::{Camera, Rig, Split};
+use crate::recipe::Recipe;
+
+/// What the demo did.
+#[derive(Debug)]
+pub struct DemoReport {
+    /// The compression.
+    pub summary: Summary,
+    /// For every family its Gaussians: all, kept as they were or as leaders, merged away.
+    pub families: Vec<(Family, usize, usize, usize)>,
+}
+
+/// Generates the scene, packs it, compresses it. With `output` the folder keeps `scene.gseq`,
+/// `cameras.json` and `compressed.gseq`; without, everything is gone afterwards.
+pub fn run(gaussians: usize, frames: usize, recipe: Recipe, output: Option<&Path>, overwrite: bool) -> Result<DemoReport> {
+    if let Some(output) = output {
+        check_target(output, Kind::Folder, &[], overwrite)?;
+        let staged = StagedFolder::new(output, overwrite)?;
+        let report = run_in(staged.path(), gaussians, frames, recipe)?;
+        staged.commit()?;
+        return Ok(report);
+    }
+    let folder = tempfile::tempdir().map_err(Error::io("create a folder in", &std::env::temp_dir()))?;
+    run_in(folder.path(), gaussians, frames, recipe)
+}
+
+fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Result<DemoReport> {
+    let made = demo::Scene::new(gaussians, frames);
+    let packed = folder.join("scene.gseq");
+    write_sequence(&made, OutputKind::Gseq, &packed)?;
+    let rig = made.rig();
+    let cameras = folder.join("cameras.json");
+    fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
+
+    let input = Input::Container(Container::open(&packed)?);
+    let schedule = rig.schedule(&input.source().info().times, Some(Split::Train))?;
+    let scene = Scene { path: PathBuf::from("scene.gseq"), input, rig, schedule, notes: Vec::new() };
+    let options = CompressOptions {
+        input: InputOptions::default(),
+        output: folder.join("compressed.gseq"),
+        kind: None,
+        recipe,
+        only: Only::Both,
+        target: None,
+        keep_ids: None,
+        drop_ids: None,
+        keep_box: None,
+        dry_run: false,
+        overwrite: false,
+    };
+    let (summary, map) = compress_scene(&scene, &options, Stages::default())?;
+    let marker = folder.join(MARKER);
+    fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
+
+    let mut leaders = vec![false; summary.gaussians];
+    let families = Family::ALL
+        .iter()
+        .map(|&family| {
+            let members = made.members(family);
+            // The first Gaussian to reach a place of the output stands for it here.
+            let kept = members.clone().filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
+            let kept = kept.count();
+            let merged = members.clone().filter(|&id| map[id].is_some()).count() - kept;
+            (family, members.len(), kept, merged)
+        })
+        .collect();
+    Ok(DemoReport { summary, families })
+}
+
+/// The cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
+fn cameras_json(rig: &Rig) -> String {
+    let camera = |(id, camera): (usize, &Camera)| {
+        let to_world = camera.rotation.transpose();
+        let rows = [0, 1, 2].map(|row| to_world.row(row).to_array());
+        serde_json::json!({
+            "id": id,
+            "img_name": format!("view_{id:02}"),
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center().to_array(),
+            "rotation": rows,
+            "fx": camera.fx,
+            "fy": camera.fy,
+        })
+    };
+    let all: Vec<serde_json::Value> = rig.cameras.iter().enumerate().map(camera).collect();
+    format!("{:#}\n", serde_json::Value::from(all))
+}
+
+impl DemoReport {
+    /// A table for a person.
+    pub fn text(&self) -> String {
+        let mut out = self.summary.text();
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "family", "Gaussians", "kept", "merged", "pruned");
+        for &(family, all, kept, merged) in &self.families {
+            let _ = writeln!(out, "  {:<12} {all:>9} {kept:>9} {merged:>9} {:>9}", family.name(), all - kept - merged);
+        }
+        out
+    }
+}

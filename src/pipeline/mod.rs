@@ -1,0 +1,13 @@
+//! The order of the passes: what each verb does from input to output.
+
+pub mod compress;
+pub mod container;
+pub mod demo;
+pub mod input;
+pub mod merging;
+pub mod output;
+pub mod overrides;
+pub mod proxies;
+pub mod score;
+pub mod scored;
+pub mod summary;

@@ -1,0 +1,155 @@
+//! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is
+//! the merged one (METHOD section 5, "Motion").
+
+use super::merging::Sieved;
+use super::scored::Scored;
+use crate::error::Result;
+use crate::ingest::ModelFolder;
+use crate::model::{Columns, Gaussians};
+use crate::recipe::{Merge, Placement};
+use crate::stream::gather;
+
+/// Frames at which proxies are compared with their members.
+const SAMPLED_FRAMES: usize = 16;
+
+/// Proxies in canonical space.
+pub struct CanonicalProxies {
+    /// One row per cluster.
+    pub raw: Gaussians,
+    /// Furthest that a proxy strays from its place among its members, scene units; none without proxies.
+    pub deviation: Option<f64>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Raw parameters of the proxies of `sieved`: their states at the reference frame minus the field's
+/// deltas at their leaders' canonical positions.
+///
+/// A proxy placed at the mean is moved by the field there, not by its members' field. One that strays
+/// further than `max_drift` from its members goes back to its leader's canonical position; so does one
+/// for which no raw parameters exist, with all of its leader's parameters.
+pub fn canonical_proxies(model: &ModelFolder, scored: &Scored, sieved: &Sieved, merge: &Merge) -> Result<CanonicalProxies> {
+    let leaders: Vec<u32> = sieved.clusters.iter().map(|cluster| cluster.leader).collect();
+    let of_leaders = model.canonical().pick(&leaders);
+    let mut raw = of_leaders.clone();
+    let mut notes = Vec::new();
+    if leaders.is_empty() {
+        return Ok(CanonicalProxies { raw, deviation: None, notes });
+    }
+    let info = crate::pass::FrameSource::info(model);
+    let deltas = model.deltas_at(&of_leaders.position, info.times[scored.reference_frame])?;
+    // At the leader, the canonical position is the leader's to the bit, and so is the path.
+    let solved = match merge.placement {
+        Placement::Mean => Columns::ALL,
+        Placement::Leader => Columns::ALL.without(Columns::POSITION),
+    };
+    deltas.solve(&sieved.proxies, solved, &mut raw);
+    let unsolved = restore_unsolved(&mut raw, &of_leaders);
+    if unsolved > 0 {
+        notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
+    }
+    let mut deviations = deviations(model, scored, sieved, &raw)?;
+    let tolerance = merge.max_drift * merge.length_unit.in_scene_units(scored.extent);
+    let strayed: Vec<usize> = (0..leaders.len()).filter(|&i| deviations[i] > tolerance).collect();
+    if merge.placement == Placement::Mean && !strayed.is_empty() {
+        for &proxy in &strayed {
+            raw.position.set_row::<3>(proxy, of_leaders.position.row(proxy));
+        }
+        notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
+        deviations = self::deviations(model, scored, sieved, &raw)?;
+    }
+    Ok(CanonicalProxies { raw, deviation: deviations.into_iter().reduce(f64::max), notes })
+}
+
+/// Gives rows with a value that is not finite the leader's parameters; counts them.
+fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
+    let columns: Vec<Columns> = Columns::ALL.iter().collect();
+    let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
+        columns
+            .iter()
+            .flat_map(|&column| {
+                let column = state.column(column);
+                (0..column.width()).map(|c| column.plane(c)[row]).collect::<Vec<f32>>()
+            })
+            .collect()
+    };
+    let unsolved: Vec<usize> = (0..raw.len()).filter(|&row| planes(raw, row).iter().any(|x| !x.is_finite())).collect();
+    for &row in &unsolved {
+        for &column in &columns {
+            for c in 0..leaders.column(column).width() {
+                raw.column_mut(column).plane_mut(c)[row] = leaders.column(column).plane(c)[row];
+            }
+        }
+    }
+    unsolved.len()
+}
+
+/// For every proxy the largest change, over sampled frames, of its offset from the weighted mean of its
+/// members since the reference frame.
+fn deviations(model: &ModelFolder, scored: &Scored, sieved: &Sieved, raw: &Gaussians) -> Result<Vec<f64>> {
+    let frames = crate::pass::FrameSource::info(model).times.len();
+    let proxies = model.with_canonical(raw.clone());
+    let places: Vec<u32> = (0..raw.len() as u32).collect();
+    let ids: Vec<u32> = sieved.clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
+    let offsets = |frame: usize| -> Result<Vec<[f64; 3]>> {
+        let of_proxies = gather(&proxies, &places, frame, Columns::POSITION)?.position;
+        let of_members = gather(model, &ids, frame, Columns::POSITION)?.position;
+        let mut row = 0;
+        Ok(sieved
+            .clusters
+            .iter()
+            .enumerate()
+            .map(|(proxy, cluster)| {
+                let mut offset = of_proxies.row::<3>(proxy).map(f64::from);
+                for &(_, weight) in &cluster.members {
+                    let member = of_members.row::<3>(row).map(f64::from);
+                    (0..3).for_each(|axis| offset[axis] -= weight * member[axis]);
+                    row += 1;
+                }
+                offset
+            })
+            .collect())
+    };
+    let reference = offsets(scored.reference_frame)?;
+    let mut largest = vec![0.0f64; raw.len()];
+    for frame in sampled(frames) {
+        for (largest, (now, then)) in largest.iter_mut().zip(offsets(frame)?.iter().zip(&reference)) {
+            let change = (0..3).map(|axis| (now[axis] - then[axis]).powi(2)).sum::<f64>().sqrt();
+            *largest = largest.max(change);
+        }
+    }
+    Ok(largest)
+}
+
+/// At most [`SAMPLED_FRAMES`] of `frames`, evenly spread, first and last among them.
+fn sampled(frames: usize) -> impl Iterator<Item = usize> {
+    let count = frames.min(SAMPLED_FRAMES);
+    (0..count).map(move |k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) })
+}
+
+/// The whole canonical cloud of the result.
+pub fn canonical_cloud(model: &ModelFolder, sieved: &Sieved, raw: &Gaussians) -> Gaussians {
+    let mut cloud = model.canonical().pick(&sieved.kept);
+    for (proxy, cluster) in sieved.clusters.iter().enumerate() {
+        for column in Columns::ALL.iter() {
+            for c in 0..raw.column(column).width() {
+                cloud.column_mut(column).plane_mut(c)[cluster.output as usize] = raw.column(column).plane(c)[proxy];
+            }
+        }
+    }
+    cloud
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sampled_frames_hold_both_ends_and_no_other_twice() {
+        assert_eq!(sampled(0).count(), 0);
+        assert_eq!(sampled(1).collect::<Vec<_>>(), [0]);
+        assert_eq!(sampled(5).collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
+        let many: Vec<usize> = sampled(1000).collect();
+        assert!(many.len() == SAMPLED_FRAMES && many[0] == 0 && many[15] == 999);
+    }
+}
