@@ -161,3 +161,6 @@ fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
     }
     row[property.offset..property.offset + used.len()].copy_from_slice(used);
 }
+
+#[cfg(test)]
+mod tests;

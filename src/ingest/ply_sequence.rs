@@ -206,3 +206,6 @@ fn check_agrees(ply: &Ply, properties: &[Property], count: usize, first: &Path) 
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

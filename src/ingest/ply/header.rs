@@ -99,6 +99,10 @@ impl Header {
     /// Not a PLY; a header without `end_header`; a line, type or count that is none; a list property
     /// (its rows have no fixed size); a name used twice. Each names the line.
     pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<Header> {
+        let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
+        if first.trim_ascii_end() != b"ply" {
+            return Err(Error::input(path, "first line", "\"ply\"", found(first)).hint("this is not a PLY file"));
+        }
         let mut encoding = None;
         let mut elements: Vec<Element> = Vec::new();
         let mut comments = Vec::new();
@@ -108,9 +112,6 @@ impl Header {
             let place = || format!("header line {}", index + 1);
             let text = String::from_utf8_lossy(excerpt(raw));
             if index == 0 {
-                if raw.trim_ascii() != b"ply" {
-                    return Err(Error::input(path, "first line", "\"ply\"", found(raw)).hint("this is not a PLY file"));
-                }
                 continue;
             }
             if !raw.ends_with(b"\n") {

@@ -12,7 +12,7 @@ mod ascii;
 mod header;
 mod layout;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};

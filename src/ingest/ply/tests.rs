@@ -1,1 +1,363 @@
+use std::env;
+use std::fmt::Write as _;
+use std::fs;
 
+use proptest::prelude::*;
+
+use super::*;
+
+/// The properties of a degree-1 model, no normals, a foreign one between.
+pub(crate) fn names() -> Vec<String> {
+    let mut names: Vec<String> = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).to_vec();
+    names.extend((0..9).map(|k| format!("f_rest_{k}")));
+    names.extend(["opacity", "confidence", "scale_0", "scale_1", "scale_2"].map(String::from));
+    names.extend((0..4).map(|k| format!("rot_{k}")));
+    names
+}
+
+/// The value the tests give property `p` of Gaussian `i`: exact in every number type but the 8-bit ones.
+fn value(i: usize, p: usize) -> i16 {
+    (100 * i + p) as i16 - 50
+}
+
+fn header(format: &str, kind: &str, names: &[String], count: &str, line_end: &str) -> String {
+    let mut text = format!("ply\nformat {format} 1.0\ncomment SplatRenderMode: mip\nelement vertex {count}\n");
+    names.iter().for_each(|name| writeln!(text, "property {kind} {name}").unwrap());
+    (text + "end_header\n").replace('\n', line_end)
+}
+
+/// A file of `count` Gaussians with every property of type `kind`.
+pub(crate) fn file(format: &str, kind: &str, names: &[String], count: usize, line_end: &str) -> Vec<u8> {
+    let mut bytes = header(format, kind, names, &count.to_string(), line_end).into_bytes();
+    for i in 0..count {
+        for p in 0..names.len() {
+            let v = value(i, p);
+            if format == "ascii" {
+                bytes.extend(format!("{v} ").bytes());
+                continue;
+            }
+            let mut number = match kind {
+                "float" => f32::from(v).to_le_bytes().to_vec(),
+                "double" => f64::from(v).to_le_bytes().to_vec(),
+                "int" => i32::from(v).to_le_bytes().to_vec(),
+                "short" => v.to_le_bytes().to_vec(),
+                _ => panic!("{kind}"),
+            };
+            if format == "binary_big_endian" {
+                number.reverse();
+            }
+            bytes.extend(number);
+        }
+        if format == "ascii" {
+            bytes.extend(line_end.bytes());
+        }
+    }
+    bytes
+}
+
+fn float_file(count: usize) -> Vec<u8> {
+    file("binary_little_endian", "float", &names(), count, "\n")
+}
+
+/// Opens `bytes` as a file.
+fn open(bytes: &[u8]) -> Result<Ply> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    fs::write(&path, bytes).unwrap();
+    Ply::open(&path)
+}
+
+fn refusal(bytes: &[u8]) -> String {
+    let error = open(bytes).unwrap_err();
+    assert!(matches!(error, Error::Input(_)), "{error}");
+    error.to_string()
+}
+
+fn all(ply: &Ply) -> Gaussians {
+    let mut out = Gaussians::zeros(0, ply.sh_degree());
+    ply.gaussians(0..ply.count(), Columns::ALL, &mut out).unwrap();
+    out
+}
+
+/// What [`file`] holds, by name: independent of the layout under test.
+fn expected(count: usize, names: &[String]) -> Gaussians {
+    let mut out = Gaussians::zeros(count, 1);
+    for i in 0..count {
+        let of = |name: &str| f32::from(value(i, names.iter().position(|n| n == name).unwrap()));
+        out.position.set_row(i, [of("x"), of("y"), of("z")]);
+        out.rotation.set_row(i, [of("rot_0"), of("rot_1"), of("rot_2"), of("rot_3")]);
+        out.log_scale.set_row(i, [of("scale_0"), of("scale_1"), of("scale_2")]);
+        out.opacity_logit.set_row(i, [of("opacity")]);
+        // Coefficients 1, 2, 3 of red are f_rest_0..2, of green 3..5, of blue 6..8.
+        out.sh.set_row(
+            i,
+            [
+                "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0", "f_rest_3", "f_rest_6", "f_rest_1", "f_rest_4", "f_rest_7",
+                "f_rest_2", "f_rest_5", "f_rest_8",
+            ]
+            .map(of),
+        );
+    }
+    out
+}
+
+#[test]
+fn every_encoding_type_order_and_line_end_reads_the_same() {
+    let mut reversed = names();
+    reversed.reverse();
+    for names in [names(), reversed] {
+        for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
+            for kind in ["float", "double", "int", "short"] {
+                for line_end in ["\n", "\r\n"] {
+                    // 130 rows: more than one block.
+                    let ply = open(&file(format, kind, &names, 130, line_end)).unwrap();
+                    assert_eq!((ply.count(), ply.sh_degree()), (130, 1));
+                    assert_eq!(ply.comments(), ["SplatRenderMode: mip"]);
+                    assert!(all(&ply) == expected(130, &names), "{format} {kind} {line_end:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn any_list_in_any_order_reads_the_rows_of_the_whole() {
+    let ply = open(&float_file(300)).unwrap();
+    let whole = all(&ply);
+    let ids: Vec<u32> = (0..290).map(|i| (i * 97 + 13) % 300).collect();
+    let mut out = Gaussians::zeros(0, 1);
+    ply.gather(&Ids::List(&ids), Columns::ALL, &mut out).unwrap();
+    for (i, &id) in ids.iter().enumerate() {
+        assert_eq!(out.sh.row::<12>(i), whole.sh.row::<12>(id as usize));
+        assert_eq!(out.position.row::<3>(i), whole.position.row::<3>(id as usize));
+    }
+    ply.gaussians(120..260, Columns::ROTATION, &mut out).unwrap();
+    assert_eq!(out.rotation.plane(2), &whole.rotation.plane(2)[120..260]);
+}
+
+#[test]
+fn columns_not_asked_for_are_left_alone() {
+    let ply = open(&float_file(3)).unwrap();
+    let mut out = Gaussians::zeros(3, 1);
+    out.sh.planes_mut().fill(7.0);
+    ply.gaussians(0..3, Columns::ALL.without(Columns::SH), &mut out).unwrap();
+    assert!(out.sh.planes().iter().all(|&x| x == 7.0));
+    assert_eq!(out.position, expected(3, &names()).position);
+}
+
+#[test]
+fn ids_beyond_the_last_gaussian_are_refused() {
+    let ply = open(&float_file(3)).unwrap();
+    let mut out = Gaussians::zeros(0, 1);
+    assert!(ply.gaussians(1..4, Columns::ALL, &mut out).unwrap_err().to_string().contains("Gaussian 3 "));
+    assert!(ply.gather(&Ids::List(&[0, 9]), Columns::ALL, &mut out).unwrap_err().to_string().contains("Gaussian 9 "));
+    ply.gaussians(3..3, Columns::ALL, &mut out).unwrap();
+}
+
+#[test]
+fn every_bit_of_an_f32_survives() {
+    let patterns = [0x7fc0_1234u32, 0x7f80_0001, 0xff80_0000, 0x8000_0000, 1, 0x7f7f_ffff];
+    let names = names();
+    let mut bytes = header("binary_little_endian", "float", &names, "6", "\n").into_bytes();
+    for pattern in patterns {
+        (0..names.len()).for_each(|_| bytes.extend(pattern.to_le_bytes()));
+    }
+    let out = all(&open(&bytes).unwrap());
+    for plane in 0..3 {
+        assert_eq!(out.position.plane(plane).iter().map(|x| x.to_bits()).collect::<Vec<_>>(), patterns);
+    }
+}
+
+#[test]
+fn a_surfel_is_a_thousandth_as_thick_as_its_smaller_axis() {
+    let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
+    let out = all(&open(&file("binary_little_endian", "float", &names, 2, "\n")).unwrap());
+    for i in 0..2 {
+        let [a, b, c] = out.log_scale.row::<3>(i);
+        let ratio = f64::from(c - a.min(b)).exp();
+        assert!((ratio - 1e-3).abs() < 1e-8, "thickness over smaller axis: got {ratio}, expected 1e-3");
+    }
+}
+
+#[test]
+fn further_elements_and_bytes_are_stepped_over() {
+    let names = names();
+    let plain = float_file(2);
+    let text = header("binary_little_endian", "float", &names, "2", "\n");
+    let body = &plain[text.len()..];
+    let before = "element camera 3\nproperty uchar id\nproperty double f\n";
+    let after = "element note 1\nproperty uint32 code\nend_header\n";
+    let text = text.replace("element vertex", &format!("{before}element vertex")).replace("end_header\n", after);
+    let bytes = [text.as_bytes(), &[9; 27], body, &[5; 4], b"trailing"].concat();
+    let ply = open(&bytes).unwrap();
+    assert_eq!(all(&ply), expected(2, &names));
+    assert_eq!((ply.lead(), ply.tail()), (&[9; 27][..], &b"\x05\x05\x05\x05trailing"[..]));
+
+    let list = text.replace("property uchar id", "property list uchar int vertex_indices");
+    let message = refusal(list.as_bytes());
+    assert!(message.contains("list property \"vertex_indices\"") && message.contains("camera"), "{message}");
+}
+
+#[test]
+fn what_is_no_ply_says_so() {
+    for bytes in [&b""[..], b"PK\x03\x04zip", b"plyx\n", &[0; 5000]] {
+        assert!(refusal(bytes).contains("not a PLY"), "{:?}", String::from_utf8_lossy(bytes));
+    }
+    let folder = tempfile::tempdir().unwrap();
+    assert!(matches!(Ply::open(folder.path()), Err(Error::Io { .. })));
+    assert!(matches!(Ply::open(&folder.path().join("none.ply")), Err(Error::Io { .. })));
+}
+
+#[test]
+fn a_missing_property_is_named() {
+    let of = |names: &[String]| refusal(&file("binary_little_endian", "float", names, 2, "\n"));
+    for name in ["x", "f_dc_2", "opacity", "scale_1", "rot_3"] {
+        let names: Vec<String> = names().into_iter().filter(|n| n != name).collect();
+        let message = of(&names);
+        assert!(message.contains(&format!("property {name:?}")), "{message}");
+    }
+    let names: Vec<String> = names().into_iter().filter(|n| n != "f_rest_3").collect();
+    assert!(of(&names).contains("0, 9, 24 or 45") && of(&names).contains("found 8"), "{}", of(&names));
+    assert!(of(&["packed_position".to_owned()]).contains("compressed PLY"));
+}
+
+#[test]
+fn a_truncated_body_counts_its_bytes() {
+    let bytes = float_file(10);
+    let message = refusal(&bytes[..bytes.len() - 1]);
+    let stride = 4 * names().len();
+    assert!(message.contains(&format!("10 rows × {stride} bytes = {} bytes", 10 * stride)), "{message}");
+    assert!(message.contains(&format!("found {} bytes", 10 * stride - 1)), "{message}");
+}
+
+#[test]
+fn absurd_counts_are_refused_before_anything_is_allocated() {
+    for format in ["ascii", "binary_little_endian"] {
+        for count in ["4000000000", "4294967296", "18446744073709551615", "999999999999999999999", "-1", "many"] {
+            let message = refusal(header(format, "float", &names(), count, "\n").as_bytes());
+            assert!(message.contains("expected"), "{message}");
+        }
+        // Rows of nothing take no bytes: no number of them may keep the reader busy.
+        let rest = header(format, "float", &names(), "0", "\n");
+        let endless = rest.replace("element vertex", "element nothing 18446744073709551615\nelement vertex");
+        assert_eq!(open(endless.as_bytes()).unwrap().count(), 0);
+    }
+}
+
+#[test]
+fn a_bad_word_in_text_is_shown_with_its_line() {
+    let good = String::from_utf8(file("ascii", "float", &names(), 3, "\n")).unwrap();
+    // Two lines of header come before the element, one per property, one to end it; blank lines count.
+    let row = 4 + names().len() + 1 + 1;
+    let message = refusal(good.replace("\n50 ", "\n\nfifty ").as_bytes());
+    assert!(message.contains(&format!("line {}", row + 2)) && message.contains("\"fifty\""), "{message}");
+    let message = refusal(good.replace("\n50 ", "\n").as_bytes());
+    assert!(message.contains(&format!("line {}", row + 1)) && message.contains("found 23"), "{message}");
+    let cut: String = good.lines().take(row + 1).map(|line| line.to_owned() + "\n").collect();
+    let message = refusal(cut.as_bytes());
+    assert!(message.contains("3 rows"), "{message}");
+    let special = good.replace("\n50 51 52 ", "\nnan -inf 1e-45 ");
+    let out = all(&open(special.as_bytes()).unwrap());
+    assert!(out.position.row::<3>(1)[0].is_nan());
+    assert_eq!(out.position.row::<3>(1)[1..], [f32::NEG_INFINITY, f32::from_bits(1)]);
+}
+
+#[test]
+fn headers_that_contradict_themselves_are_refused_by_line() {
+    let good = header("binary_little_endian", "float", &names(), "0", "\n");
+    open(good.as_bytes()).unwrap();
+    for (from, to, says) in [
+        ("format binary_little_endian 1.0\n", "", "format line"),
+        ("binary_little_endian", "binary_middle_endian", "line 2"),
+        ("property float y", "property float x", "\"x\" twice"),
+        ("property float y", "property quad y", "\"quad\""),
+        ("property float y", "nonsense", "\"nonsense\""),
+        ("end_header", "element vertex 3\nend_header", "\"vertex\" twice"),
+        ("element vertex 0", "element points 0", "\"vertex\""),
+        ("element vertex 0\n", "", "an element before"),
+        ("end_header\n", "", "end_header line"),
+        ("end_header\n", "end_header", "end_header line"),
+    ] {
+        let message = refusal(good.replace(from, to).as_bytes());
+        assert!(message.contains(says), "{from:?} -> {to:?}: {message}");
+    }
+}
+
+/// Opens and reads whatever `bytes` are; only a panic or a hang fails.
+fn survive(bytes: &[u8], path: &Path) -> bool {
+    fs::write(path, bytes).unwrap();
+    match Ply::open(path) {
+        Ok(ply) => {
+            let mut out = Gaussians::default();
+            ply.gaussians(0..ply.count(), Columns::ALL, &mut out).unwrap();
+            assert!(ply.count() <= bytes.len() && out.len() == ply.count());
+            true
+        }
+        Err(error) => {
+            assert!(error.to_string().contains("a.ply"), "an error that names no file: {error}");
+            false
+        }
+    }
+}
+
+#[test]
+fn no_truncation_is_read_as_a_whole_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
+        let bytes = file(format, "float", &names(), 3, "\n");
+        // Text may lose the space and the line end after its last number, and digits of it.
+        let whole = if format == "ascii" { bytes.len() - 4 } else { bytes.len() };
+        for len in 0..whole {
+            assert!(!survive(&bytes[..len], &path), "{format} cut to {len} of {} bytes", bytes.len());
+        }
+        assert!(survive(&bytes, &path));
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
+
+    #[test]
+    fn no_damage_makes_the_reader_panic(
+        format in prop::sample::select(vec!["ascii", "binary_little_endian", "binary_big_endian"]),
+        flips in prop::collection::vec((any::<prop::sample::Index>(), 0..8u32), 1..6),
+        splice in prop::option::of((any::<prop::sample::Index>(), "[ -~\n]{0,12}")),
+    ) {
+        let folder = tempfile::tempdir().unwrap();
+        let mut bytes = file(format, "float", &names(), 3, "\n");
+        for (at, bit) in flips {
+            let at = at.index(bytes.len());
+            bytes[at] ^= 1 << bit;
+        }
+        if let Some((at, text)) = splice {
+            let at = at.index(bytes.len());
+            bytes.splice(at..at, text.bytes());
+        }
+        survive(&bytes, &folder.path().join("a.ply"));
+    }
+}
+
+#[test]
+fn real_models_open() {
+    let Some(data) = shared_data() else { return };
+    for (name, count, degree) in [
+        ("deform2/point_cloud/iteration_600/point_cloud.ply", 20_883, 3),
+        ("static/guitar.ply", 90_854, 0),
+        ("static/biker.ply", 152_746, 0),
+    ] {
+        let ply = Ply::open(&data.join(name)).unwrap();
+        assert_eq!((ply.count(), ply.sh_degree()), (count, degree), "{name}");
+    }
+}
+
+/// The shared models, or none with a word about it.
+pub(crate) fn shared_data() -> Option<PathBuf> {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let data = env::var_os("SPLATSIEVE_DATA").map_or_else(beside, PathBuf::from);
+    if !data.is_dir() {
+        eprintln!("skipped: no shared models in {}", data.display());
+        return None;
+    }
+    Some(data)
+}
