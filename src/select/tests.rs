@@ -60,9 +60,12 @@ proptest! {
     #[test]
     fn kept_set_is_that_of_the_definition_and_a_prefix_of_the_ranking(
         parts in prop::collection::vec((any_part(), any_part()), 0..80),
+        // S of its own: weights may put first what fails the OR rule.
+        own in prop::collection::vec(any_part(), 80),
         recipe in any_rule(),
     ) {
-        let scores = scores(&parts);
+        let mut scores = scores(&parts);
+        scores.score = own[..parts.len()].to_vec();
         let selection = free(&scores, &recipe);
         prop_assert_eq!(&selection.keep, &kept_by_definition(&scores, &recipe));
         let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
@@ -92,6 +95,15 @@ proptest! {
         let kept: Vec<u32> = (0..parts.len() as u32).filter(|&i| selection.keep[i as usize]).collect();
         prop_assert_eq!(selection.ranking.take(selection.counts.kept), kept);
     }
+}
+
+#[test]
+fn few_candidates_of_which_the_best_fail_are_still_a_prefix() {
+    let parts: Vec<(f64, f64)> = (0..100).map(|i| (if i == 0 { 0.0 } else { 1.0 }, 0.0)).collect();
+    let mut scores = scores(&parts);
+    scores.score = (0..100).map(|i| -f64::from(i)).collect();
+    let selection = free(&scores, &rule(LowPriority::Drop, 0.02, 0.5, 0.5));
+    assert_eq!((selection.counts.kept, selection.ranking.take(1)), (1, vec![1]));
 }
 
 #[test]

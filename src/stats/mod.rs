@@ -13,10 +13,14 @@ mod bounds;
 mod life;
 mod motion;
 mod noise;
+#[cfg(test)]
+mod oracle;
 mod plan;
 pub mod projection;
 mod scan;
 mod state;
+#[cfg(test)]
+mod tests;
 
 pub use anisotropy::fill_anisotropy;
 pub use bounds::RobustBox;

@@ -153,6 +153,7 @@ impl Motion {
 
 /// History once the current frame has become the previous one.
 fn next(history: u8, alive: bool) -> u8 {
+    let now = if alive { ALIVE } else { 0 };
     let before = if history & ALIVE != 0 { ALIVE_BEFORE | BORN_BEFORE } else { 0 };
-    u8::from(alive) * ALIVE | before | history & BORN_BEFORE
+    now | before | (history & BORN_BEFORE)
 }

@@ -181,3 +181,63 @@ fn dot(a: &[f64; 3], b: [f64; 3]) -> f64 {
 fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::{DMat3, DVec3};
+
+    use super::*;
+    use crate::select::hash_id;
+
+    const LEN: usize = 1003;
+
+    fn random(k: usize) -> f64 {
+        (hash_id(k as u64) >> 11) as f64 / 2f64.powi(53)
+    }
+
+    /// Runs `with` on Gaussians around a camera, some behind it, some giant.
+    fn run(with: impl Fn(&View, &Footprints<'_>, Scale, &mut Sums<'_>)) -> (Vec<u64>, Vec<u32>) {
+        let camera = Camera {
+            width: 320,
+            height: 256,
+            fx: 250.0,
+            fy: 260.0,
+            cx: 160.0,
+            cy: 128.0,
+            rotation: DMat3::from_rotation_y(0.3),
+            translation: DVec3::new(0.1, -0.2, 3.0),
+        };
+        let position: [Vec<f32>; 3] =
+            std::array::from_fn(|axis| (0..LEN).map(|i| (10.0 * random(3 * i + axis) - 5.0) as f32).collect());
+        let axes: [Vec<f64>; 9] = std::array::from_fn(|plane| {
+            (0..LEN).map(|i| (random(7 * i + plane) - 0.5) * 10f64.powf(8.0 * random(i) - 5.0)).collect()
+        });
+        let opacity: Vec<f64> = (0..LEN).map(|i| random(i + 99)).collect();
+        let (mut coverage, mut touched) = (vec![0; LEN], vec![0; LEN]);
+        with(
+            &View::new(&camera),
+            &Footprints {
+                position: position.each_ref().map(|plane| &plane[..]),
+                axes: axes.each_ref().map(|plane| &plane[..]),
+                opacity: &opacity,
+            },
+            Scale { exponent: 34, alpha_min: 0.01 },
+            &mut Sums { coverage: &mut coverage, touched: &mut touched },
+        );
+        (coverage, touched)
+    }
+
+    #[test]
+    #[cfg(target_arch = "x86_64")]
+    fn avx2_gives_the_bits_of_the_baseline() {
+        if !std::arch::is_x86_feature_detected!("avx2") {
+            eprintln!("skipped: this processor has no AVX2");
+            return;
+        }
+        // SAFETY: the lines above saw that this processor has AVX2.
+        let wide = run(|view, from, scale, sums| unsafe { project_avx2(view, from, scale, sums) });
+        let baseline = run(project_planes);
+        assert!(baseline.1.iter().filter(|&&touched| touched > 0).count() > 200, "the case must see something");
+        assert_eq!(wide, baseline);
+    }
+}

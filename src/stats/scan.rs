@@ -102,6 +102,12 @@ impl<'a> BlockScan<'a> {
         }
     }
 
+    #[cfg(test)]
+    pub(super) fn resident_bytes(&self) -> usize {
+        let sums = size_of_val(&self.coverage[..]) + size_of_val(&self.touched[..]);
+        self.state.resident_bytes() + self.life.resident_bytes() + self.motion.resident_bytes() + sums
+    }
+
     /// The statistics, once every frame was added.
     ///
     /// # Panics

@@ -68,10 +68,8 @@ impl State {
             }
             let rotation = rotation_matrix(quaternion);
             let scale = gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).min(MAX_LOG_SCALE).exp());
-            for row in 0..3 {
-                for axis in 0..3 {
-                    self.axes[3 * row + axis][i] = rotation[row][axis] * scale[axis];
-                }
+            for (plane, axes) in self.axes.iter_mut().enumerate() {
+                axes[i] = rotation[plane / 3][plane % 3] * scale[plane % 3];
             }
         }
     }

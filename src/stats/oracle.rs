@@ -1,0 +1,124 @@
+//! The statistics over again, slowly: whole sequences in memory, METHOD's definitions written out in
+//! f64, sharing no code with the streaming scan.
+
+use crate::model::{Camera, Gaussians, Schedule};
+use crate::recipe::{Motion, Scan};
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Row {
+    pub(super) d: f64,
+    pub(super) kappa: f64,
+    pub(super) v: f64,
+    pub(super) life: u32,
+    pub(super) c: f64,
+    pub(super) vis: f64,
+}
+
+/// The row of Gaussian `i`; frames are evenly spaced.
+pub(super) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Scan) -> Row {
+    let last = frames.len() - 1;
+    let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
+    let alpha: Vec<f64> =
+        frames.iter().map(|frame| 1.0 / (1.0 + (-f64::from(frame.opacity_logit.plane(0)[i])).exp())).collect();
+    let alive = |t: usize| alpha[t] >= scan.alpha_min;
+    let life: Vec<usize> = (0..=last).filter(|&t| alive(t)).collect();
+    let step = |t: usize| norm(sub(x(t), x(t - 1)));
+    let turn = |t: usize| norm(sub(sub(x(t + 1), x(t)), sub(x(t), x(t - 1))));
+    let (d, kappa) = match scan.motion {
+        Motion::Literal => {
+            let steps: f64 = life.iter().filter(|&&t| t > 0).map(|&t| step(t).powi(2)).sum();
+            let centres = life.get(1..life.len().max(2) - 1).unwrap_or(&[]);
+            let turns: f64 = centres.iter().map(|&t| turn(t)).sum();
+            ((steps / life.len().max(1) as f64).sqrt(), turns / centres.len().max(1) as f64)
+        }
+        Motion::Runs => {
+            let steps: Vec<f64> = (1..=last).filter(|&t| alive(t) && alive(t - 1)).map(|t| step(t).powi(2)).collect();
+            let turns: Vec<f64> =
+                (1..last.max(1)).filter(|&t| alive(t - 1) && alive(t) && alive(t + 1)).map(turn).collect();
+            (mean(&steps).sqrt(), mean(&turns))
+        }
+    };
+    let lived: Vec<f64> = life.iter().map(|&t| alpha[t]).collect();
+    let deviations: Vec<f64> = lived.iter().map(|a| (a - mean(&lived)).powi(2)).collect();
+
+    let (mut c, mut touched) = (0.0, 0);
+    for (t, views) in schedule.frames.iter().enumerate() {
+        for &(_, camera) in views {
+            let area = area(&frames[t], i, &schedule.cameras[camera as usize]);
+            c += area * alpha[t];
+            touched += u32::from(alive(t) && area > 0.0);
+        }
+    }
+    let pairs = schedule.pairs().max(1) as f64;
+    Row { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
+}
+
+/// Area, px², by way of the 3-D covariance and its projection.
+pub(super) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
+    let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
+    let world = frame.position.row::<3>(i).map(f64::from);
+    let p: [f64; 3] = std::array::from_fn(|r| (0..3).map(|k| w[r][k] * world[k]).sum::<f64>() + camera.translation[r]);
+    if p[2] <= 0.2 {
+        return 0.0;
+    }
+    let q = frame.rotation.row::<4>(i).map(f64::from);
+    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let q = if length == 0.0 { [1.0, 0.0, 0.0, 0.0] } else { q.map(|x| x / length) };
+    let s = frame.log_scale.row::<3>(i).map(|log| f64::from(log).exp());
+    // Column k of R is the k-th unit vector turned by q.
+    let axes: [[f64; 3]; 3] = std::array::from_fn(|k| turn_unit_vector(q, k));
+    let sigma: [[f64; 3]; 3] =
+        std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| axes[k][r] * s[k] * s[k] * axes[k][c]).sum()));
+    let limit_x = 1.3 * f64::from(camera.width) / (2.0 * camera.fx);
+    let limit_y = 1.3 * f64::from(camera.height) / (2.0 * camera.fy);
+    let tx = (p[0] / p[2]).clamp(-limit_x, limit_x) * p[2];
+    let ty = (p[1] / p[2]).clamp(-limit_y, limit_y) * p[2];
+    let jacobian = [
+        [camera.fx / p[2], 0.0, -camera.fx * tx / (p[2] * p[2])],
+        [0.0, camera.fy / p[2], -camera.fy * ty / (p[2] * p[2])],
+    ];
+    let t: [[f64; 3]; 2] =
+        std::array::from_fn(|r| std::array::from_fn(|c| (0..3).map(|k| jacobian[r][k] * w[k][c]).sum()));
+    let flat = |r: usize, c: usize| -> f64 {
+        (0..3).flat_map(|a| (0..3).map(move |b| (a, b))).map(|(a, b)| t[r][a] * sigma[a][b] * t[c][b]).sum()
+    };
+    let (xx, xy, yy) = (flat(0, 0) + 0.3, flat(0, 1), flat(1, 1) + 0.3);
+    // Pixel (i, j) is sampled at integer coordinates, so the picture spans −½ to size − ½.
+    let u = camera.fx * p[0] / p[2] + camera.cx - 0.5;
+    let v = camera.fy * p[1] / p[2] + camera.cy - 0.5;
+    let share = |center: f64, reach: f64, size: f64| {
+        ((center + reach).min(size - 0.5) - (center - reach).max(-0.5)).max(0.0) / (2.0 * reach)
+    };
+    let fraction =
+        share(u, 3.0 * xx.sqrt(), f64::from(camera.width)) * share(v, 3.0 * yy.sqrt(), f64::from(camera.height));
+    9.0 * std::f64::consts::PI * (xx * yy - xy * xy).sqrt() * fraction
+}
+
+/// q e_k q*, multiplied out as quaternions.
+fn turn_unit_vector(q: [f64; 4], k: usize) -> [f64; 3] {
+    let mut e = [0.0; 4];
+    e[k + 1] = 1.0;
+    let turned = hamilton(hamilton(q, e), [q[0], -q[1], -q[2], -q[3]]);
+    [turned[1], turned[2], turned[3]]
+}
+
+fn hamilton(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+    [
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ]
+}
+
+fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+fn norm(a: [f64; 3]) -> f64 {
+    a.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
+}
