@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::{BLOCK, Progress};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::merge::motion::{PairMeasure, PairMotion};
 use crate::model::{Column, Columns, Gaussians, opacity};
 use crate::pass::{BlockReader, FrameSource, Ids};
@@ -43,7 +43,7 @@ pub fn measure_motion(
                 *alive = opacity(logit) >= scan.alpha_min;
             }
             progress.advance(alive.len() as u64);
-            Ok(())
+            Ok::<_, Error>(())
         })?;
         for c in 0..3 {
             for (to, (_, state)) in position.plane_mut(c).chunks_mut(BLOCK).zip(&blocks) {
