@@ -7,7 +7,8 @@
 //! set and matching are parallel on average", 2012): in synchronous rounds a node reads only what
 //! earlier rounds decided, so threads cannot change the outcome.
 //!
-//! In: ranks and directed pairs. Out: a leader for every node. Memory: 17 bytes per node, 4 per pair.
+//! In: ranks and directed pairs. Out: a leader for every node. Memory: 24 bytes per node and 4 per
+//! pair, beside the input.
 
 use rayon::prelude::*;
 

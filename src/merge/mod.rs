@@ -6,9 +6,10 @@
 //! ```
 //!
 //! In: the survivors' states at the reference frame, and whoever can measure the motion of pairs. Out:
-//! groups of survivors and one state per group. Memory per survivor: 23 bytes for the neighbour
-//! index, 17 for the clustering, 8 + 4 × `max_neighbors` at most for candidate pairs and again 4 for
-//! each that passes; the states of the proxies; whatever measuring takes ([`motion::PAIR_BYTES`]).
+//! groups of survivors and one state per group. Memory per survivor: 30 bytes for the neighbour index,
+//! 24 for the clustering, 48 for groups and ranks, and its state twice; per candidate pair (at most
+//! `max_neighbors` per survivor, 3.5 measured among evenly strewn Gaussians) 28 bytes, [`motion::PAIR_BYTES`] and a
+//! [`PairMeasure`].
 
 pub mod gates;
 pub mod greedy;
@@ -122,6 +123,7 @@ pub fn run<E>(
         let row = |node: u32| groups.leaders()[node as usize];
         let rows: Vec<(u32, u32)> = candidates.pairs.iter().map(|&(i, j)| (row(i), row(j))).collect();
         let measures = if rows.is_empty() { Vec::new() } else { measure(&rows)? };
+        debug_assert_eq!(measures.len(), rows.len(), "one measure per pair");
         let gate = MotionGate::new(recipe, pass, unit);
         let passing: Vec<(u32, u32)> = candidates
             .pairs

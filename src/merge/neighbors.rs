@@ -2,8 +2,8 @@
 //!
 //! In: positions. Out: for a Gaussian the at most K nearest others within ε, nearest first, ties by
 //! index. The answer is defined by (distance, index) alone, so it does not depend on the tree, on
-//! threads or on any partition of space. Memory: 16 bytes per point and 28 per node of the tree, one
-//! node for every 4 to 8 points: about 23 bytes per point.
+//! threads or on any partition of space. Memory: 16 bytes per point and 28 per node of the tree, two
+//! nodes for every 4 to 8 points: 23 to 30 bytes per point.
 //!
 //! Every node of the tree knows the smallest index below it, and a subtree is skipped unless it can
 //! hold a pair (distance, index) below the worst one kept. With ten million points at one place all

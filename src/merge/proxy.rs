@@ -1,8 +1,8 @@
 //! The proxy: the one Gaussian that stands for a cluster.
 //!
 //! In: states of all members at the reference frame and their weights. Out: a state in the stored
-//! encoding, one row per group. Memory: 1 KiB per group for at most [`BATCH`] groups at a time,
-//! beside the output.
+//! encoding, one row per group. Memory: 1 KiB per group for at most 4096 groups at a time, beside
+//! the output.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;

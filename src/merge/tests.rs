@@ -58,7 +58,7 @@ impl Scene {
     }
 
     fn merge(&self, recipe: &Merge, limit: Option<usize>) -> Merged {
-        self.merge_moving(recipe, limit, &[self.states.position.clone()])
+        self.merge_moving(recipe, limit, std::slice::from_ref(&self.states.position))
     }
 
     /// Merges with everything alive and at `frames`, the first of which is the reference.
