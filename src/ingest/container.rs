@@ -43,7 +43,12 @@ impl Container {
             };
             if !legal {
                 let place = format!("column {:?}", column.name());
-                return Err(Error::input(path, place, "the width of its kind (see SPEC.md)", format!("{width} components")));
+                return Err(Error::input(
+                    path,
+                    place,
+                    "the width of its kind (see SPEC.md)",
+                    format!("{width} components"),
+                ));
             }
             if column == Columns::SH {
                 sh_degree = (0..=3).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
@@ -111,7 +116,14 @@ impl FrameSource for Container {
             }
         }
         let kept = VecDeque::new();
-        Ok(Box::new(TileReader { source: self, len: ids.len(), runs, buffer: TileBuffer::default(), kept, kept_bytes: 0 }))
+        Ok(Box::new(TileReader {
+            source: self,
+            len: ids.len(),
+            runs,
+            buffer: TileBuffer::default(),
+            kept,
+            kept_bytes: 0,
+        }))
     }
 }
 

@@ -132,14 +132,18 @@ impl Target {
             Target::Count(wanted) => wanted,
             Target::Ratio(ratio) if ratio > 0.0 && ratio <= 1.0 => ((ratio * count as f64).round() as u64).max(1),
             Target::Ratio(ratio) => {
-                return Err(Error::usage(format!("--target-ratio: expected a number above 0 and at most 1, found {ratio}")));
+                return Err(Error::usage(format!(
+                    "--target-ratio: expected a number above 0 and at most 1, found {ratio}"
+                )));
             }
         };
         match usize::try_from(wanted) {
             Ok(wanted @ 1..) if wanted <= count => Ok(wanted),
             // The empty scene has one size only.
             _ if count == 0 => Ok(0),
-            _ => Err(Error::usage(format!("--target-count: expected 1 to {count}, the Gaussians of the input, found {wanted}"))),
+            _ => Err(Error::usage(format!(
+                "--target-count: expected 1 to {count}, the Gaussians of the input, found {wanted}"
+            ))),
         }
     }
 }
@@ -152,7 +156,10 @@ fn stages_left_out(options: &CompressOptions, recipe: &Recipe) -> Vec<LeftOut> {
     if options.only == Only::Prune {
         out.push(LeftOut { what: "merging, and its pass over the frames", why: "--prune-only".to_owned() });
     } else if recipe.merge.passes.is_empty() {
-        out.push(LeftOut { what: "merging, and its pass over the frames", why: "the recipe has no merge pass".to_owned() });
+        out.push(LeftOut {
+            what: "merging, and its pass over the frames",
+            why: "the recipe has no merge pass".to_owned(),
+        });
     }
     out
 }

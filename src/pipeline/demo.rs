@@ -26,7 +26,13 @@ pub struct DemoReport {
 
 /// Generates the scene, packs it, compresses it. With `output` the folder keeps `scene.gseq`,
 /// `cameras.json` and `compressed.gseq`; without, everything is gone afterwards.
-pub fn run(gaussians: usize, frames: usize, recipe: Recipe, output: Option<&Path>, overwrite: bool) -> Result<DemoReport> {
+pub fn run(
+    gaussians: usize,
+    frames: usize,
+    recipe: Recipe,
+    output: Option<&Path>,
+    overwrite: bool,
+) -> Result<DemoReport> {
     if let Some(output) = output {
         check_target(output, Kind::Folder, &[], overwrite)?;
         let staged = StagedFolder::new(output, overwrite)?;
@@ -72,7 +78,9 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Res
         .map(|&family| {
             let members = made.members(family);
             // The first Gaussian to reach a place of the output stands for it here.
-            let kept = members.clone().filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
+            let kept = members
+                .clone()
+                .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
             let kept = kept.count();
             let merged = members.clone().filter(|&id| map[id].is_some()).count() - kept;
             (family, members.len(), kept, merged)

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use crate::error::{Error, Result};
+use crate::ingest::ModelFolder;
 use crate::ingest::cameras::{self, CameraOptions};
 use crate::ingest::container::Container;
-use crate::ingest::ModelFolder;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::model::{Column, Columns, Rig, Schedule, Split};
 use crate::pass::FrameSource;
@@ -82,7 +82,10 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
             Input::Model(model.with_times(times)?)
         }
         _ if options.frames.is_some() => {
-            return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.display())));
+            return Err(Error::usage(format!(
+                "{}: --frames is for models that are continuous in time",
+                path.display()
+            )));
         }
         Input::Frames(frames) if !times.is_empty() => {
             let found = frames.info().times.len();
@@ -149,7 +152,12 @@ impl Input {
         } else if extension == "gseq" {
             Input::Container(Container::open(path)?)
         } else {
-            return Err(Error::input(path, "", "a 4DGaussians model folder, a folder of PLY files, a .ply or a .gseq", "another kind of file"));
+            return Err(Error::input(
+                path,
+                "",
+                "a 4DGaussians model folder, a folder of PLY files, a .ply or a .gseq",
+                "another kind of file",
+            ));
         };
         match iteration {
             Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.display()))),

@@ -7,9 +7,9 @@ use super::input::Scene;
 use super::scored::Scored;
 use super::summary::{MergePassSummary, MergeSummary, Stages};
 use crate::error::{Error, Result};
+use crate::merge::motion::PairMeasure;
 use crate::merge::proxy::{Importance, weights};
 use crate::merge::{self, Merged, Survivors};
-use crate::merge::motion::PairMeasure;
 use crate::model::{Columns, Gaussians};
 use crate::recipe::{self, Recipe};
 use crate::select::hash_id;
@@ -106,7 +106,9 @@ fn check_reachable(target: usize, scored: &Scored, all: usize) -> Result<()> {
     }
     if target > all {
         let dropped = scored.selection.counts.total - all;
-        return Err(Error::usage(format!("a target of {target} Gaussians, but {dropped} are to be dropped: {all} are left")));
+        return Err(Error::usage(format!(
+            "a target of {target} Gaussians, but {dropped} are to be dropped: {all} are left"
+        )));
     }
     Ok(())
 }
@@ -184,8 +186,7 @@ impl<'a> Job<'a> {
         let column = |values: &[f64]| -> Vec<f64> { survivors.iter().map(|&id| values[id as usize]).collect() };
         let (coverage, visibility) = (column(&scored.rows.c), column(&scored.rows.vis));
         let hash: Vec<u64> = survivors.iter().map(|&id| hash_id(id.into())).collect();
-        let mergeable: Vec<bool> =
-            survivors.iter().map(|id| scored.protected.binary_search(id).is_err()).collect();
+        let mergeable: Vec<bool> = survivors.iter().map(|id| scored.protected.binary_search(id).is_err()).collect();
         let merged = merge::run(
             &Survivors {
                 states: &states,

@@ -55,7 +55,9 @@ impl OutputKind {
         };
         let kind = asked.unwrap_or(by_name);
         if kind == OutputKind::Model && !is_model {
-            return Err(Error::usage("only a 4DGaussians model can be written as a model folder\n  write a .gseq or --as ply-sequence"));
+            return Err(Error::usage(
+                "only a 4DGaussians model can be written as a model folder\n  write a .gseq or --as ply-sequence",
+            ));
         }
         let frames = input.source().info().times.len();
         if kind == OutputKind::Ply && !is_model && frames != 1 {
@@ -121,7 +123,8 @@ pub fn write_result(
     let map = sieved.index_map(summary.input.gaussians);
     if kind.is_folder() {
         let staged = StagedFolder::new(target, options.overwrite)?;
-        let (notes, deviation) = stages.run("emit", kept, reads, || Ok::<_, Error>((job.write(kind, staged.path())?, kept)))?;
+        let (notes, deviation) =
+            stages.run("emit", kept, reads, || Ok::<_, Error>((job.write(kind, staged.path())?, kept)))?;
         summary.finish(stages, notes, deviation, point_bytes(staged.path())?);
         write_text(&staged.path().join(RECIPE), &text)?;
         write_index_map(&map, &staged.path().join(INDEX_MAP))?;
@@ -131,7 +134,8 @@ pub fn write_result(
         let staged = StagedFile::new(target, options.overwrite)?;
         let companion = |name| StagedFile::new(&beside(target, false, name), options.overwrite);
         let (recipe, index_map, marker) = (companion(RECIPE)?, companion(INDEX_MAP)?, companion(MARKER)?);
-        let (notes, deviation) = stages.run("emit", kept, reads, || Ok::<_, Error>((job.write(kind, staged.path())?, kept)))?;
+        let (notes, deviation) =
+            stages.run("emit", kept, reads, || Ok::<_, Error>((job.write(kind, staged.path())?, kept)))?;
         summary.finish(stages, notes, deviation, file_bytes(staged.path())?);
         write_text(recipe.path(), &text)?;
         write_index_map(&map, index_map.path())?;
@@ -190,7 +194,10 @@ impl Emission<'_> {
                     copy(&paths.deformation, &folder.join("deformation.pth"))?;
                     self.write_like(&paths.point_cloud, &found.raw, &folder.join("point_cloud.ply"))?;
                     if paths.deformation_table.is_some() || paths.deformation_accum.is_some() {
-                        notes.push("deformation_table.pth and deformation_accum.pth, which only training reads, were left out".to_owned());
+                        notes.push(
+                            "deformation_table.pth and deformation_accum.pth, which only training reads, were left out"
+                                .to_owned(),
+                        );
                     }
                 }
                 OutputKind::Ply => self.write_like(&model.paths().point_cloud, &found.raw, path)?,
@@ -215,7 +222,13 @@ impl Emission<'_> {
     }
 
     /// Every frame's file again with the properties, comments and names it had.
-    fn write_like_frames(&self, frames: &PlySequence, result: &MergedSequence<'_>, kind: OutputKind, path: &Path) -> Result<()> {
+    fn write_like_frames(
+        &self,
+        frames: &PlySequence,
+        result: &MergedSequence<'_>,
+        kind: OutputKind,
+        path: &Path,
+    ) -> Result<()> {
         let places: Vec<u32> = self.sieved.clusters.iter().map(|cluster| cluster.output).collect();
         let rows = self.rows();
         let progress = Progress::new("emit", "frames", frames.paths().len() as u64);

@@ -25,7 +25,10 @@ pub fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
             Some((from, to)) => from.trim().parse().and_then(|from| Ok((from, to.trim().parse()?))),
         };
         let (from, to) = bounds.map_err(|_| {
-            Error::usage(format!("{origin}, line {}: expected an id or a range such as 10-20, found {line:?}", number + 1))
+            Error::usage(format!(
+                "{origin}, line {}: expected an id or a range such as 10-20, found {line:?}",
+                number + 1
+            ))
         })?;
         if from > to || to as usize >= count {
             return Err(Error::usage(format!(

@@ -3,9 +3,11 @@
 
 use super::merging::Sieved;
 use super::scored::Scored;
+use crate::deform::Deltas;
 use crate::error::Result;
 use crate::ingest::ModelFolder;
 use crate::model::{Columns, Gaussians};
+use crate::pass::FrameSource;
 use crate::recipe::{Merge, Placement};
 use crate::stream::gather;
 
@@ -28,7 +30,12 @@ pub struct CanonicalProxies {
 /// A proxy placed at the mean is moved by the field there, not by its members' field. One that strays
 /// further than `max_drift` from its members goes back to its leader's canonical position; so does one
 /// for which no raw parameters exist, with all of its leader's parameters.
-pub fn canonical_proxies(model: &ModelFolder, scored: &Scored, sieved: &Sieved, merge: &Merge) -> Result<CanonicalProxies> {
+pub fn canonical_proxies(
+    model: &ModelFolder,
+    scored: &Scored,
+    sieved: &Sieved,
+    merge: &Merge,
+) -> Result<CanonicalProxies> {
     let leaders: Vec<u32> = sieved.clusters.iter().map(|cluster| cluster.leader).collect();
     let of_leaders = model.canonical().pick(&leaders);
     let mut raw = of_leaders.clone();
@@ -36,14 +43,14 @@ pub fn canonical_proxies(model: &ModelFolder, scored: &Scored, sieved: &Sieved, 
     if leaders.is_empty() {
         return Ok(CanonicalProxies { raw, deviation: None, notes });
     }
-    let info = crate::pass::FrameSource::info(model);
+    let info = model.info();
     let deltas = model.deltas_at(&of_leaders.position, info.times[scored.reference_frame])?;
     // At the leader, the canonical position is the leader's to the bit, and so is the path.
     let solved = match merge.placement {
         Placement::Mean => Columns::ALL,
         Placement::Leader => Columns::ALL.without(Columns::POSITION),
     };
-    deltas.solve(&sieved.proxies, solved, &mut raw);
+    deltas.solve(&with_leader_lengths(&deltas, &of_leaders, &sieved.proxies), solved, &mut raw);
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
     if unsolved > 0 {
         notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
@@ -59,6 +66,22 @@ pub fn canonical_proxies(model: &ModelFolder, scored: &Scored, sieved: &Sieved, 
         deviations = self::deviations(model, scored, sieved, &raw)?;
     }
     Ok(CanonicalProxies { raw, deviation: deviations.into_iter().reduce(f64::max), notes })
+}
+
+/// The merged states with rotations as long as their leaders' at that frame: the field adds its change of
+/// rotation to the raw quaternion, so how far it turns depends on the length.
+fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, proxies: &Gaussians) -> Gaussians {
+    let mut leaders = of_leaders.clone();
+    deltas.apply(of_leaders, Columns::ROTATION, &mut leaders);
+    let mut states = proxies.clone();
+    for row in 0..states.len() {
+        let length = leaders.rotation.row::<4>(row).iter().map(|x| x * x).sum::<f32>().sqrt();
+        // A leader without a direction leaves the proxy its unit quaternion.
+        if length > 0.0 && length.is_finite() {
+            states.rotation.set_row(row, states.rotation.row::<4>(row).map(|x| x * length));
+        }
+    }
+    states
 }
 
 /// Gives rows with a value that is not finite the leader's parameters; counts them.
@@ -87,7 +110,7 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
 /// For every proxy the largest change, over sampled frames, of its offset from the weighted mean of its
 /// members since the reference frame.
 fn deviations(model: &ModelFolder, scored: &Scored, sieved: &Sieved, raw: &Gaussians) -> Result<Vec<f64>> {
-    let frames = crate::pass::FrameSource::info(model).times.len();
+    let frames = model.info().times.len();
     let proxies = model.with_canonical(raw.clone());
     let places: Vec<u32> = (0..raw.len() as u32).collect();
     let ids: Vec<u32> = sieved.clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();

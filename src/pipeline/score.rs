@@ -33,7 +33,12 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bo
         _ => table.write_csv(staged.path())?,
     }
     staged.commit()?;
-    Ok(ScoreReport { output: output.to_owned(), gaussians: scored.rows.len(), kept: scored.selection.counts.kept, notes: scene.notes })
+    Ok(ScoreReport {
+        output: output.to_owned(),
+        gaussians: scored.rows.len(),
+        kept: scored.selection.counts.kept,
+        notes: scene.notes,
+    })
 }
 
 /// What `score` wrote.

@@ -161,7 +161,10 @@ impl Scored {
             out.push(LeftOut { what: "motion, curvature, opacity variance", why });
         } else {
             for column in Columns::ALL.without(info.varying).iter() {
-                out.push(LeftOut { what: constant(column), why: format!("{} is the same in every frame", column.name()) });
+                out.push(LeftOut {
+                    what: constant(column),
+                    why: format!("{} is the same in every frame", column.name()),
+                });
             }
         }
         if info.sh_degree == 0 {

@@ -253,7 +253,12 @@ impl Summary {
         let percent = 100.0 * self.gaussians as f64 / input.gaussians.max(1) as f64;
         let _ = write!(out, "{} of {} Gaussians ({percent:.1}%)", self.gaussians, input.gaussians);
         if let Some(bytes) = self.output_bytes {
-            let _ = write!(out, ", {bytes} of {} bytes ({:.1}%)", input.bytes, 100.0 * bytes as f64 / input.bytes.max(1) as f64);
+            let _ = write!(
+                out,
+                ", {bytes} of {} bytes ({:.1}%)",
+                input.bytes,
+                100.0 * bytes as f64 / input.bytes.max(1) as f64
+            );
         }
         out.push('\n');
         out

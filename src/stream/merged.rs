@@ -67,7 +67,13 @@ impl FrameSource for MergedSequence<'_> {
             }
         }
         let state = Gaussians::zeros(rows.len(), self.info.sh_degree);
-        Ok(Box::new(MergedReader { sequence: self, reader: self.source.open(Ids::List(&rows))?, state, len: places.len(), proxies }))
+        Ok(Box::new(MergedReader {
+            sequence: self,
+            reader: self.source.open(Ids::List(&rows))?,
+            state,
+            len: places.len(),
+            proxies,
+        }))
     }
 }
 
