@@ -87,3 +87,6 @@ fn half_to_f32(half: u16) -> f32 {
         _ => (1024.0 + mantissa) * 2f32.powi(exponent - 25),
     }
 }
+
+#[cfg(test)]
+mod tests;
