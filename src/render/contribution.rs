@@ -57,7 +57,7 @@ impl Contribution {
 
     /// Adds one tile's weight of Gaussian `i`.
     pub(super) fn add(&mut self, i: usize, sum: f32, max: f32) {
-        let units = (f64::from(sum) * (1.0 / Self::UNIT)).round() as u64;
+        let units = (f64::from(sum) * (1.0 / Self::UNIT) + 0.5) as u64;
         self.sum[i] = self.sum[i].saturating_add(units);
         self.max[i] = self.max[i].max(max);
     }

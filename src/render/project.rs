@@ -22,8 +22,8 @@ const NEAR: f64 = 0.2;
 const DILATION: f64 = 0.3;
 /// The Jacobian is taken at directions no further out than this many half fields of view.
 const FIELD_MARGIN: f64 = 1.3;
-/// Logarithms of scales are clamped to ± this: squares of squares stay finite in f64.
-const LOG_SCALE_LIMIT: f64 = 80.0;
+/// Logarithms of scales and logits are cut to ± this: squares of squares of scales stay finite in f64.
+const LOGARITHM_LIMIT: f64 = 80.0;
 /// Slack of the alpha bound in powers of two: thousands of times the rounding of the blend's exponent.
 const REACH_SLACK: f64 = 1e-3;
 
@@ -209,13 +209,13 @@ impl Footprints {
                 [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()];
             let axes = rotation_matrix(q);
             let s = [
-                exp(f64::from(log_scale[0][i]).clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
-                exp(f64::from(log_scale[1][i]).clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
-                exp(f64::from(log_scale[2][i]).clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)),
+                exp(limit(log_scale[0][i].into(), LOGARITHM_LIMIT)),
+                exp(limit(log_scale[1][i].into(), LOGARITHM_LIMIT)),
+                exp(limit(log_scale[2][i].into(), LOGARITHM_LIMIT)),
             ];
             // Rows of the Jacobian times the camera's rotation: world directions that move u and v.
             let (jx, jy) = (fx / z, fy / z);
-            let (kx, ky) = (slope_x.clamp(-lx, lx), slope_y.clamp(-ly, ly));
+            let (kx, ky) = (limit(slope_x, lx), limit(slope_y, ly));
             let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
             let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
             let a = [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]];
@@ -225,7 +225,7 @@ impl Footprints {
             let (xx, xy, yy) = (aa + DILATION, dot(a, b), bb + DILATION);
             // m² − det of the dilated covariance, written as a sum of squares.
             let spread = 0.25 * (aa - bb) * (aa - bb) + xy * xy;
-            let largest = 0.5 * (xx + yy) + spread.max(0.1).sqrt();
+            let largest = 0.5 * (xx + yy) + (if spread < 0.1 { 0.1 } else { spread }).sqrt();
             self.depth[i] = z;
             self.u[i] = fx * slope_x + px;
             self.v[i] = fy * slope_y + py;
@@ -234,7 +234,7 @@ impl Footprints {
             self.yy[i] = yy;
             self.det[i] = dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION;
             self.radius[i] = 3.0 * largest.sqrt();
-            self.opacity[i] = 1.0 / (1.0 + exp(-f64::from(logit[i]).clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)));
+            self.opacity[i] = 1.0 / (1.0 + exp(limit(-f64::from(logit[i]), LOGARITHM_LIMIT)));
         }
     }
 
@@ -283,6 +283,14 @@ fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     ((start as u32).min(tiles), (end as u32).min(tiles))
 }
 
+/// `x` cut to ± `bound`; NaN stays, so that it is noticed. (`f64::clamp` may panic, which keeps a loop
+/// from running in vectors.)
+#[inline(always)]
+fn limit(x: f64, bound: f64) -> f64 {
+    let x = if x > bound { bound } else { x };
+    if x < -bound { -bound } else { x }
+}
+
 #[inline(always)]
 fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -292,7 +300,8 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 #[inline(always)]
 fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     // 2/|q|² in place of normalising; the floor keeps 0 · s = 0 for a zero quaternion.
-    let s = 2.0 / (w * w + x * x + y * y + z * z).max(f64::MIN_POSITIVE);
+    let norm = w * w + x * x + y * y + z * z;
+    let s = 2.0 / if norm < f64::MIN_POSITIVE { f64::MIN_POSITIVE } else { norm };
     [
         [1.0 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)],
         [s * (x * y - w * z), 1.0 - s * (x * x + z * z), s * (y * z + w * x)],
