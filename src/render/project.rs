@@ -159,12 +159,14 @@ struct Footprints {
     depth: [f64; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
-    /// Dilated 2-D covariance, pixels², and its determinant.
-    xx: [f64; BLOCK],
-    xy: [f64; BLOCK],
-    yy: [f64; BLOCK],
-    det: [f64; BLOCK],
-    /// 3σ of the longest axis, before rounding up.
+    /// The exponent of alpha, see [`Splat`].
+    narrow: [f64; BLOCK],
+    slope: [f64; BLOCK],
+    fall: [f64; BLOCK],
+    /// Half the width and height of the ellipse where alpha has halved once, pixels.
+    half_u: [f64; BLOCK],
+    half_v: [f64; BLOCK],
+    /// 3σ of the longest axis rounded up, pixels.
     radius: [f64; BLOCK],
     opacity: [f64; BLOCK],
 }
@@ -176,10 +178,11 @@ impl Default for Footprints {
             depth: zero,
             u: zero,
             v: zero,
-            xx: zero,
-            xy: zero,
-            yy: zero,
-            det: zero,
+            narrow: zero,
+            slope: zero,
+            fall: zero,
+            half_u: zero,
+            half_v: zero,
             radius: zero,
             opacity: zero,
         }
@@ -229,11 +232,13 @@ impl Footprints {
             self.depth[i] = z;
             self.u[i] = fx * slope_x + px;
             self.v[i] = fy * slope_y + py;
-            self.xx[i] = xx;
-            self.xy[i] = xy;
-            self.yy[i] = yy;
-            self.det[i] = dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION;
-            self.radius[i] = 3.0 * largest.sqrt();
+            let det = dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION;
+            self.narrow[i] = 0.5 * LOG2_E * yy / det;
+            self.slope[i] = xy / yy;
+            self.fall[i] = 0.5 * LOG2_E / yy;
+            self.half_u[i] = (2.0 * LN_2 * xx).sqrt();
+            self.half_v[i] = (2.0 * LN_2 * yy).sqrt();
+            self.radius[i] = (3.0 * largest.sqrt()).ceil();
             self.opacity[i] = 1.0 / (1.0 + exp(limit(-f64::from(logit[i]), LOGARITHM_LIMIT)));
         }
     }
@@ -242,26 +247,24 @@ impl Footprints {
     #[inline(always)]
     fn splat(&self, i: usize, id: u32, view: &View) -> Option<(Splat, TileRect)> {
         let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
-        let (xx, xy, yy, det) = (self.xx[i], self.xy[i], self.yy[i], self.det[i]);
-        let finite = u.is_finite() && v.is_finite() && det.is_finite();
-        if !(depth > NEAR && depth.is_finite() && finite && opacity >= f64::from(MIN_ALPHA)) {
+        let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.narrow[i].is_finite();
+        if !(depth > NEAR && finite && opacity >= f64::from(MIN_ALPHA)) {
             return None;
         }
-        let reach = (opacity / f64::from(MIN_ALPHA)).log2() + REACH_SLACK;
+        let reach = log2_bound(opacity / f64::from(MIN_ALPHA)) + REACH_SLACK;
         // The reference kernel's square of tiles, then what of it the ellipse alpha ≥ 1/255 can touch.
-        let radius = self.radius[i].ceil();
-        let half = [(2.0 * LN_2 * reach * xx).sqrt(), (2.0 * LN_2 * reach * yy).sqrt()];
-        let (x0, x1) = tile_range(u, radius, half[0], view.tiles[0]);
-        let (y0, y1) = tile_range(v, radius, half[1], view.tiles[1]);
+        let root = reach.sqrt();
+        let (x0, x1) = tile_range(u, self.radius[i], root * self.half_u[i], view.tiles[0]);
+        let (y0, y1) = tile_range(v, self.radius[i], root * self.half_v[i], view.tiles[1]);
         if x0 >= x1 || y0 >= y1 {
             return None;
         }
         let splat = Splat {
             u,
             v,
-            narrow: (0.5 * LOG2_E * yy / det) as f32,
-            slope: (xy / yy) as f32,
-            fall: (0.5 * LOG2_E / yy) as f32,
+            narrow: self.narrow[i] as f32,
+            slope: self.slope[i] as f32,
+            fall: self.fall[i] as f32,
             reach: reach as f32,
             opacity: opacity as f32,
             depth: depth as f32,
@@ -281,6 +284,13 @@ fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
     let end = ((at + radius + tile - 1.0) / tile).floor().min(((at + half) / tile).floor() + 1.0);
     // A float-to-integer cast saturates: below the image it becomes 0.
     ((start as u32).min(tiles), (end as u32).min(tiles))
+}
+
+/// An upper bound of log₂ x, at most 0.087 above it, for normal positive x: the bits of a float read as an
+/// integer are its logarithm but for the mantissa, and log₂(1 + m) ≤ m + 0.0861.
+#[inline(always)]
+fn log2_bound(x: f64) -> f64 {
+    x.to_bits() as i64 as f64 * (1.0 / (1u64 << 52) as f64) - (1023.0 - 0.0861)
 }
 
 /// `x` cut to ± `bound`; NaN stays, so that it is noticed. (`f64::clamp` may panic, which keeps a loop
@@ -353,6 +363,15 @@ mod tests {
             let x = f64::from(step) * 1e-3 + 1e-4;
             let error = (exp(x) / x.exp() - 1.0).abs();
             assert!(error < 1e-15, "exp({x}) is off by {error:e}, expected below 1e-15");
+        }
+    }
+
+    #[test]
+    fn log2_bound_is_above_by_less_than_0_087() {
+        for step in 0..100_000 {
+            let x = 1.0 + f64::from(step) * 2.54e-3;
+            let excess = log2_bound(x) - x.log2();
+            assert!((0.0..0.087).contains(&excess), "log2 of {x} is exceeded by {excess}");
         }
     }
 
