@@ -12,7 +12,7 @@ use super::project::Splats;
 /// Indices of splats, grouped by tile, nearest first.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
-    /// (f32 depth bits, splat) of every splat, to sort.
+    /// (ordered depth bits, splat) of every splat, to sort.
     keys: Vec<u64>,
     /// End of each tile's pairs; tile t begins where t − 1 ends.
     ends: Vec<usize>,
@@ -23,8 +23,8 @@ impl Bins {
     /// Bins `splats` into `tiles` = (across, down) tiles, on all threads of the pool if `parallel`.
     pub(super) fn fill(&mut self, splats: &Splats, tiles: [u32; 2], parallel: bool) {
         self.keys.clear();
-        // Depths are positive, so their bits sort as they do; ties fall to the lower index.
-        let depths = splats.splats.iter().map(|splat| u64::from(splat.depth.to_bits()));
+        // Ties fall to the lower index.
+        let depths = splats.splats.iter().map(|splat| u64::from(ordered_bits(splat.order)));
         self.keys.extend(depths.enumerate().map(|(i, bits)| bits << 32 | i as u64));
         if parallel {
             self.keys.par_sort_unstable();
@@ -72,5 +72,23 @@ impl Bins {
     pub(super) fn range(&self, tiles: Range<usize>) -> Range<usize> {
         let end = |tile: usize| tile.checked_sub(1).map_or(0, |before| self.ends[before]);
         end(tiles.start)..end(tiles.end)
+    }
+}
+
+/// The bits of an f32, ordered as its values are. (Rounding far from the origin can leave a visible
+/// Gaussian a negative f32 depth.)
+fn ordered_bits(x: f32) -> u32 {
+    let bits = x.to_bits();
+    if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_are_ordered_as_their_floats() {
+        let values = [f32::NEG_INFINITY, -3.0, -1e-30, 0.0, 1e-40, 0.2, 7.5, f32::INFINITY];
+        assert!(values.is_sorted_by(|&a, &b| ordered_bits(a) < ordered_bits(b)));
     }
 }

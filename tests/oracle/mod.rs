@@ -55,10 +55,16 @@ fn basis(d: DVec3) -> [f64; 16] {
     ]
 }
 
+/// View depth in f32, added up as the original kernel does.
+fn order([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
+    let row = camera.rotation.row(2).as_vec3();
+    (row.x * x + row.y * y) + (row.z * z + camera.translation.z as f32)
+}
+
 fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footprint> {
     let world = DVec3::from_array(gaussians.position.row::<3>(id).map(f64::from));
     let p = camera.rotation * world + camera.translation;
-    if p.z <= 0.2 {
+    if p.z <= f64::from(0.2f32) {
         return None;
     }
     let [w, x, y, z] = gaussians.rotation.row::<4>(id).map(f64::from);
@@ -82,10 +88,7 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
     let center = DVec2::new(camera.fx * p.x / p.z + camera.cx - 0.5, camera.fy * p.y / p.z + camera.cy - 0.5);
     let tiles = [(center.x, width), (center.y, height)].map(|(at, size)| {
         let count = (size / 16.0).ceil() as i64;
-        [
-            (((at - radius) / 16.0) as i64).clamp(0, count),
-            (((at + radius + 15.0) / 16.0) as i64).clamp(0, count),
-        ]
+        [(((at - radius) / 16.0) as i64).clamp(0, count), (((at + radius + 15.0) / 16.0) as i64).clamp(0, count)]
     });
     let toward = (world - camera.center()).normalize();
     let coefficients = gaussians.sh.width() / 3;
@@ -95,7 +98,7 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
     }
     Some(Footprint {
         id,
-        depth: p.z as f32,
+        depth: order(gaussians.position.row(id), camera),
         center,
         inverse: DMat2::from_cols(DVec2::new(a, b), DVec2::new(b, c)).inverse(),
         opacity: 1.0 / (1.0 + (-f64::from(gaussians.opacity_logit.plane(0)[id])).exp()),
