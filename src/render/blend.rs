@@ -100,9 +100,8 @@ impl Ink for Colour {
     }
     #[inline(always)]
     fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, weight: V) -> [V; 3] {
-        for c in 0..3 {
-            let plane = &mut self.planes[c][group];
-            V::load(plane).add(colour[c].mul(weight)).store(plane);
+        for (plane, colour) in self.planes.iter_mut().zip(colour) {
+            V::load(&plane[group]).add(colour.mul(weight)).store(&mut plane[group]);
         }
         colour
     }

@@ -11,7 +11,8 @@ pub(super) const LANES: usize = 8;
 const ROUND: f32 = 12_582_912.0;
 
 /// 2^f = 1 + f·(c₁ + f·(c₂ + …)) on |f| ≤ ½: minimax of relative error, 4e-9 before rounding.
-const EXP2: [f32; 6] = [0.693_147_18, 0.240_226_45, 0.055_503_38, 0.009_618_489, 0.001_341_352_7, 0.000_154_697_53];
+const EXP2: [f32; 6] =
+    [std::f32::consts::LN_2, 0.240_226_48, 0.055_503_324, 0.009_618_437, 0.001_339_887_5, 0.000_153_533_62];
 
 /// Eight f32 values, or eight masks of all or no bits.
 ///
