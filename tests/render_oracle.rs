@@ -141,6 +141,32 @@ fn random_scenes_match_the_oracle() {
 }
 
 #[test]
+fn an_opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
+    // Above opacity 0.36, alpha is still 1/255 beyond 3σ: there the square of tiles decides.
+    // Centred on pixel 32, a radius of 16 stops short of pixel 48.
+    let camera = Camera { cx: 32.5, ..plain_camera(64) };
+    let mut cut = 0;
+    for step in 0..60 {
+        let one = single(2.0, 0.15 + 0.001 * step as f32, 0.95);
+        let expected = oracle::picture(&one, &camera, [0.0; 3], 1);
+        let got = seen(&one, &camera, 1);
+        assert!(
+            (got.pixels(0) - expected.sum[0]).abs() < 1e-5 * expected.sum[0],
+            "step {step}: got {}, expected {}",
+            got.pixels(0),
+            expected.sum[0]
+        );
+        // The reach without the rule, in pixels of the picture's middle row.
+        let sigma = (25.0 * f64::from(0.15 + 0.001 * step as f32)).hypot(0.3f64.sqrt());
+        let half = sigma * (2.0 * (255.0f64 * 0.95).ln()).sqrt();
+        let drawn = render(&one, &camera, [0.0; 3]);
+        let in_row = (0..64).filter(|&x| pixel(&drawn, x, 32)[0] > 0.0).count();
+        cut += usize::from(in_row < 2 * half as usize + 1);
+    }
+    assert!(cut > 5, "only {cut} Gaussians were cut: the rule is not put to the test");
+}
+
+#[test]
 fn contributions_match_the_oracle_at_every_stride() {
     for (seed, s) in [(11, 1), (12, 2), (13, 3), (14, 4), (15, 7), (16, 40)] {
         let (scene, camera) = (scene(seed, 400, 0), camera(67, 45));
@@ -180,7 +206,7 @@ fn weights_and_transmittance_add_up_to_every_pixel() {
 }
 
 #[test]
-fn strides_partition_nothing_away() {
+fn a_stride_beyond_the_picture_sees_nothing() {
     // A stride of 1 sees what the picture sees; a stride beyond the picture sees nothing.
     let (scene, camera) = (scene(22, 200, 0), camera(40, 40));
     assert!(seen(&scene, &camera, 1).sum.iter().any(|&sum| sum > 0));
@@ -220,7 +246,7 @@ fn contributions_are_the_same_in_any_order_of_pictures() {
 }
 
 #[test]
-fn near_ties_in_depth_fall_to_the_lower_index() {
+fn ties_in_depth_fall_to_the_lower_index() {
     let mut two = Gaussians::zeros(2, 0);
     for i in 0..2 {
         two.position.set_row(i, [0.0, 0.0, 2.0]);
