@@ -1,7 +1,7 @@
 //! Which splats reach which tile, front to back.
 //!
 //! One sort by depth over the whole picture, then a counting sort into tiles that keeps that order.
-//! Memory: 16 bytes per splat and 4 bytes per (splat, tile) pair.
+//! Memory: 8 bytes per splat and 4 bytes per (splat, tile) pair.
 
 use std::ops::Range;
 
