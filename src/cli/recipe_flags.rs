@@ -48,7 +48,7 @@ impl RecipeFlags {
 impl Args for RecipeFlags {
     fn augment_args(command: Command) -> Command {
         let mut command = command
-            .arg(Arg::new("preset").long("preset").value_parser(["default", "paper"]).help(
+            .arg(Arg::new("preset").long("preset").value_parser(PRESETS.map(|(name, _)| name)).help(
                 "Where the parameters start from: `default`, the best known; `paper`, the paper to the letter; `gentle`; `strong`",
             ))
             .arg(
