@@ -14,8 +14,9 @@ use crate::error::Result;
 use crate::model::{Columns, Gaussians, sh_coefficients};
 use crate::pass::{FrameSource, Ids};
 
-/// Gaussians per tile. Fixed, so that the bytes depend on nothing but the content.
-pub const GAUSSIAN_BLOCK: usize = 4096;
+/// Gaussians per tile: what one task of a scan reads. Fixed, so that the bytes depend on nothing but
+/// the content.
+pub const GAUSSIAN_BLOCK: usize = 1024;
 /// Frames per tile.
 pub const FRAME_BLOCK: usize = 32;
 

@@ -10,7 +10,7 @@ use crate::model::{Columns, Gaussians, SequenceInfo, sh_coefficients};
 use crate::pass::{BlockReader, FrameSource, Ids};
 
 /// Bytes of decoded tiles a reader keeps; one over more Gaussians decodes the others frame by frame.
-const KEPT_BYTES: usize = 64 << 20;
+const KEPT_BYTES: usize = 256 << 20;
 
 /// An open container with all columns of a Gaussian model.
 pub struct Container {
@@ -115,6 +115,8 @@ impl FrameSource for Container {
                 _ => runs.push(Run { gaussian_block: tile, from, to, len: 1 }),
             }
         }
+        // Each tile is visited once per frame, in whatever order the Gaussians were asked for.
+        runs.sort_by_key(|run| run.gaussian_block);
         let kept = VecDeque::new();
         Ok(Box::new(TileReader {
             source: self,
