@@ -300,7 +300,7 @@ fn existing_outputs_stay_unless_overwritten_and_foreign_ones_always() {
 }
 
 #[test]
-fn outputs_onto_or_around_the_input_are_refused() {
+fn outputs_onto_around_or_inside_the_input_are_refused() {
     let workplace = with_model();
     for output in ["model", "./model", "model/../model"] {
         workplace.refused(2, &format!("compress model -o {output} --overwrite"), &["the input itself"]);
@@ -310,6 +310,13 @@ fn outputs_onto_or_around_the_input_are_refused() {
         "compress model/point_cloud/iteration_7/point_cloud.ply -o model --as ply --overwrite",
         &["model"],
     );
+    for output in ["model/out", "model/point_cloud/iteration_8", "model/out.gseq", "model/../model/out"] {
+        workplace.refused(2, &format!("compress model -o {output}"), &["inside the input model"]);
+    }
+    workplace.refused(2, "score model -o model/rows.npz", &["inside the input model"]);
+    workplace.done("unpack model -o frames");
+    workplace.refused(2, "compress frames -o frames/out.ply --as ply", &["out.ply"]);
+    workplace.refused(2, "compress frames -o frames/out", &["inside the input frames"]);
     workplace.done("pack model -o scene.gseq");
     for verb in ["compress", "pack", "recover"] {
         workplace.refused(2, &format!("{verb} scene.gseq -o scene.gseq --overwrite"), &["the input itself"]);
