@@ -70,7 +70,7 @@ fn misuse_exits_with_2() {
         ("squash {tiny}", "squash"),
         ("compress {tiny}", "--output"),
         ("compress {tiny} -o out --no-such-flag", "--no-such-flag"),
-        ("compress {tiny} -o out --preset gentle", "gentle"),
+        ("compress {tiny} -o out --preset reckless", "reckless"),
         ("compress {tiny} -o out --mu many", "--mu"),
         ("compress {tiny} -o out --keep-fraction 1.5", "keep_fraction"),
         ("compress {tiny} -o out --keep-box 0,0,0,1,1", "six numbers"),
@@ -80,7 +80,7 @@ fn misuse_exits_with_2() {
         ("compress {tiny} -o out --split none", "--split"),
         ("compress {tiny} -o missing/out", "missing"),
         ("score {tiny} -o rows.txt", ".npz or .csv"),
-        ("recipe --preset gentle", "gentle"),
+        ("recipe --preset reckless", "reckless"),
     ] {
         workplace.refused(2, arguments, &[part]);
     }
@@ -95,7 +95,7 @@ fn recipe_files_with_unknown_or_impossible_parameters_are_refused() {
         ("[score]\nmu = \"many\"\n", "mu"),
         ("[select]\nkeep_fraction = -1.0\n", "select.keep_fraction"),
         ("[score\n", "recipe.toml"),
-        ("preset = \"gentle\"\n", "gentle"),
+        ("preset = \"reckless\"\n", "reckless"),
     ] {
         fs::write(workplace.path("recipe.toml"), text).unwrap();
         workplace.refused(2, "compress {tiny} -o out --recipe recipe.toml", &[part]);

@@ -21,6 +21,9 @@ fn balls(n: usize) -> Gaussians {
     balls
 }
 
+/// Makes something of a scene odd.
+type Edit = fn(&mut Gaussians);
+
 /// One camera as 3DGS writes them, which sees all of [`balls`] at every frame.
 const CAMERA: &str = r#"[{"id": 0, "img_name": "a", "width": 64, "height": 64, "fx": 60, "fy": 60,
     "position": [0.5, 0.5, -3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]"#;
@@ -171,7 +174,7 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
 
 #[test]
 fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
-    let edits: [(&str, fn(&mut Gaussians)); 5] = [
+    let edits: [(&str, Edit); 5] = [
         ("position", |g| g.position.plane_mut(1)[7] = f32::NAN),
         ("scale", |g| g.log_scale.plane_mut(0)[7] = f32::INFINITY),
         ("opacity", |g| g.opacity_logit.plane_mut(0)[7] = f32::NAN),

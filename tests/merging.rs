@@ -15,6 +15,9 @@ use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
 use splatsieve::pipeline::summary::Stages;
 use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
 
+/// Tightens a gate.
+type Edit = fn(&mut Merge);
+
 /// A model in memory, every frame of it.
 struct Whole {
     frames: Vec<Gaussians>,
@@ -321,7 +324,7 @@ fn every_gate_binds_as_the_sequential_rule() {
         recipe
     };
     let all = merges_as_method_says(&base(), Only::Merge);
-    let edits: [(&str, fn(&mut Merge)); 9] = [
+    let edits: [(&str, Edit); 9] = [
         ("epsilon", |m| m.passes[0].epsilon = 0.004),
         ("d0", |m| m.passes[0].d0 = 0.2),
         ("rho", |m| m.passes[0].rho = 0.9999),

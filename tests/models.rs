@@ -6,7 +6,6 @@ use std::path::Path;
 
 use scene::{arrays, shared, state, tiny};
 use splatsieve::model::{Gaussians, Rows};
-use splatsieve::pass::FrameSource;
 use splatsieve::pipeline::scored::{UserOverrides, score_scene};
 use splatsieve::pipeline::summary::Stages;
 use splatsieve::recipe::{Motion, Recipe};
@@ -46,8 +45,8 @@ fn frames_agree(model: &Path) {
                 let wanted = values("scales", 3)[3 * i + c];
                 close(&at("scale"), scale, wanted, 1e-5 * wanted);
             }
-            for c in 0..4 {
-                close(&at("rotation"), q[c] / length, values("rotation", 4)[4 * i + c], 2e-5);
+            for (found, wanted) in q.iter().zip(&values("rotation", 4)[4 * i..]) {
+                close(&at("rotation"), found / length, *wanted, 2e-5);
             }
             let opacity = 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
             close(&at("opacity"), opacity, values("opacity", 1)[i], 1e-5 * values("opacity", 1)[i]);
@@ -84,10 +83,10 @@ fn statistics_agree(model: &Path) {
         let (rows, ulp) = rows(model, motion);
         let (e, a) = (ulp, 1e-6);
         let mut worst = [0f64; 3];
-        for i in 0..rows.len() {
+        for (i, &v) in expected["V"].iter().enumerate() {
             let at = |what: &str| format!("{}, {name}, {what} of Gaussian {i}", model.display());
             let find = |key: String| expected[&key][i];
-            let (d, kappa, v) = (find(format!("D_{name}")), find(format!("kappa_{name}")), expected["V"][i]);
+            let (d, kappa) = (find(format!("D_{name}")), find(format!("kappa_{name}")));
             // No opacity of these models lies within f32 rounding of the threshold.
             assert_eq!(f64::from(rows.life[i]), expected["life_frames"][i], "{}", at("life"));
             close(&at("D"), rows.d[i], d, 2.0 * 3f64.sqrt() * e);

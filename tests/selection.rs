@@ -30,7 +30,7 @@ fn norm(values: &[f64], epsilon: f64, clip: bool) -> Vec<f64> {
             return if x > p99 { 1.0 } else { 0.0 };
         }
         let y = (x - p1) / (p99 - p1 + epsilon);
-        if clip { y.max(0.0).min(1.0) } else { y }
+        if clip { y.clamp(0.0, 1.0) } else { y }
     };
     values.iter().map(|&x| scaled(x)).collect()
 }
