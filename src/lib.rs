@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
 //! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
-//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`] | pure mathematics: slices in, values out |
+//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
 //! | L4 | [`pipeline`] | the order of the passes |
 //! | L5 | [`cli`] | arguments and exit codes |
@@ -18,10 +18,12 @@ pub mod emit;
 pub mod error;
 pub mod ingest;
 pub mod merge;
+pub mod metrics;
 pub mod model;
 pub mod pass;
 pub mod pipeline;
 pub mod recipe;
+pub mod render;
 pub mod score;
 pub mod select;
 pub mod stats;

@@ -266,8 +266,8 @@ pub(super) struct Demo {
 /// `recipe`
 #[derive(Debug, Args)]
 pub(super) struct RecipeVerb {
-    /// `default` or `paper`
-    #[arg(long, default_value = "default")]
+    /// `default`, `paper` (which documents every parameter), `gentle` or `strong`
+    #[arg(long, default_value = "paper")]
     pub(super) preset: String,
 }
 

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use crate::error::{Error, Result};
-use crate::recipe::{MergePass, Recipe, parameters};
+use crate::recipe::{MergePass, PRESETS, Recipe, parameters};
 
 const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a documented file)";
 
@@ -48,8 +48,8 @@ impl RecipeFlags {
 impl Args for RecipeFlags {
     fn augment_args(command: Command) -> Command {
         let mut command = command
-            .arg(Arg::new("preset").long("preset").value_parser(["default", "paper"]).help(
-                "Where the parameters start from: `default`, the best known, or `paper`, the paper to the letter",
+            .arg(Arg::new("preset").long("preset").value_parser(PRESETS.map(|(name, _)| name)).help(
+                "Where the parameters start from: `default`, the best known; `paper`, the paper to the letter; `gentle`; `strong`",
             ))
             .arg(
                 Arg::new("recipe")

@@ -7,6 +7,8 @@ mod linear;
 mod oracle;
 mod planes;
 mod tensors;
+#[cfg(test)]
+mod tests;
 mod voxel;
 
 pub use deltas::Deltas;

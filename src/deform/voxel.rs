@@ -49,15 +49,15 @@ impl VoxelMask {
         for corner in 0..8 {
             let mut weight = 1.0;
             let mut index = 0;
-            for axis in 0..3 {
-                let low = at[axis].floor();
+            for ((axis, &at), &size) in at.iter().enumerate().zip(&self.size) {
+                let low = at.floor();
                 let (texel, share) =
-                    if corner >> axis & 1 == 0 { (low, 1.0 - (at[axis] - low)) } else { (low + 1.0, at[axis] - low) };
-                if texel < 0.0 || texel >= self.size[axis] as f32 {
+                    if corner >> axis & 1 == 0 { (low, 1.0 - (at - low)) } else { (low + 1.0, at - low) };
+                if texel < 0.0 || texel >= size as f32 {
                     weight = 0.0;
                 } else {
                     weight *= share;
-                    index = index * self.size[axis] + texel as usize;
+                    index = index * size + texel as usize;
                 }
             }
             if weight != 0.0 {

@@ -198,3 +198,129 @@ impl<'a> Key<'a> {
         Ok(Key { name, value, path: self.path })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<ModelConfig> {
+        ModelConfig::parse(text, Path::new("model/cfg_args"))
+    }
+
+    fn refusal(text: &str) -> String {
+        parse(text).expect_err("must be refused").to_string()
+    }
+
+    #[test]
+    fn a_namespace_as_the_original_prints_it_is_read() {
+        let config = parse(
+            "Namespace(sh_degree=2, source_path='data/lego', eval=True, white_background=True, net_width=128, \
+             defor_depth=0, bounds=1.6, plane_tv_weight=0.0001, time_smoothness_weight=1e-05, \
+             kplanes_config={'grid_dimensions': 2, 'input_coordinate_dim': 4, 'output_coordinate_dim': 16, \
+             'resolution': [64, 64, 64, 150]}, multires=[1, 2], no_dx=False, no_do=False, no_dshs=False, \
+             static_mlp=True, grid_pe=2, apply_rotation=True)",
+        )
+        .unwrap();
+        assert_eq!(
+            config,
+            ModelConfig {
+                sh_degree: 2,
+                source_path: Some("data/lego".into()),
+                white_background: true,
+                net_width: 128,
+                defor_depth: 0,
+                multires: vec![1, 2],
+                resolution: vec![64, 64, 64, 150],
+                channels: 16,
+                bounds: 1.6,
+                no_dx: false,
+                no_ds: false,
+                no_dr: false,
+                no_do: false,
+                no_dshs: false,
+                no_grid: false,
+                static_mlp: true,
+                empty_voxel: false,
+                grid_pe: 2,
+                apply_rotation: true,
+            }
+        );
+        assert_eq!(config.field().active, Columns::ALL);
+    }
+
+    #[test]
+    fn missing_keys_take_the_defaults_of_the_original() {
+        let config = parse("Namespace()").unwrap();
+        assert_eq!((config.net_width, config.defor_depth, config.sh_degree), (64, 1, 3));
+        assert_eq!(config.field().active, Columns::POSITION | Columns::LOG_SCALE | Columns::ROTATION);
+        assert_eq!(config, parse("Namespace(source_path=None, unknown=3)\n").unwrap());
+    }
+
+    #[test]
+    fn keys_not_needed_may_hold_any_balanced_text() {
+        let config = parse(
+            "Namespace(a=device(type='cu,d)a', index=0), b=PosixPath('/x'), c=<function f at 0x7f>, d={1, 2}, \
+             e=[None, -1.5e-3, (1,), {}], f=np.float64(0.5), g=range(0, 3), h=b'x', i=lambda, net_width=32)",
+        )
+        .unwrap();
+        assert_eq!(config.net_width, 32);
+    }
+
+    #[test]
+    fn strings_keep_their_escapes() {
+        let path = |text: &str| parse(&format!("Namespace(source_path={text})")).unwrap().source_path.unwrap();
+        assert_eq!(path(r"'C:\\data\\it\'s'"), r"C:\data\it's");
+        assert_eq!(path(r#""it's""#), "it's");
+        assert_eq!(path(r"'\x41\u00e9\U0001F600\n'"), "Aé😀\n");
+        assert_eq!(path("'данные, (1)'"), "данные, (1)");
+    }
+
+    #[test]
+    fn a_value_of_the_wrong_type_is_named() {
+        for (text, parts) in [
+            ("Namespace(net_width='64')", ["key net_width", "an integer", "the string \"64\""]),
+            ("Namespace(no_dx=2)", ["key no_dx", "True or False", "2"]),
+            ("Namespace(multires=[1, 'a'])", ["key multires", "an integer", "\"a\""]),
+            ("Namespace(kplanes_config=[1])", ["key kplanes_config", "a dictionary", "a list of 1"]),
+            ("Namespace(bounds=device(type='cpu'))", ["key bounds", "a number", "device(type='cpu')"]),
+        ] {
+            let message = refusal(text);
+            assert!(parts.iter().all(|part| message.contains(part)), "{text}: {message}");
+        }
+    }
+
+    #[test]
+    fn malformed_text_is_refused_with_its_line_and_byte() {
+        for (text, place, expected) in [
+            ("", "line 1, byte 0", "Namespace"),
+            ("{'a': 1}", "line 1, byte 0", "Namespace"),
+            ("Namespace(a=1,\nb=[1, 2", "line 2, byte 22", "closing bracket"),
+            ("Namespace(a=1\nb=2)", "line 2, byte 15", "`,` or `)`"),
+            ("Namespace(a=)", "byte 12", "a value"),
+            ("Namespace(a='x)", "byte 12", "closing quote"),
+            ("Namespace(a=1) b", "byte 15", "nothing after"),
+            (r"Namespace(a='\xzz')", "byte 13", "escape"),
+        ] {
+            let message = refusal(text);
+            assert!(message.contains(place) && message.contains(expected), "{text:?}: {message}");
+        }
+    }
+
+    #[test]
+    fn nesting_is_bounded() {
+        assert!(refusal(&format!("Namespace(a={})", "[".repeat(100_000))).contains("32 levels"));
+        // Opaque text nests without a stack frame per level.
+        parse(&format!("Namespace(a=f{}{})", "(".repeat(100_000), ")".repeat(100_000))).unwrap();
+    }
+
+    #[test]
+    fn no_cut_or_changed_byte_panics() {
+        let text = r"Namespace(a=-1.5e-3, b={'k': [1, (2,)], 'é': '\x41'}, c=f('x'), no_dx=True)";
+        for end in (0..=text.len()).filter(|&end| text.is_char_boundary(end)) {
+            let _ = parse(&text[..end]);
+            for other in ['\'', '(', ')', '{', ']', ':', ',', '\\', '\0', 'é', '-'] {
+                let _ = parse(&format!("{}{other}{}", &text[..end], &text[end..]));
+            }
+        }
+    }
+}

@@ -264,7 +264,7 @@ impl<'a> Parser<'a> {
         Err(unterminated)
     }
 
-    /// Moves to the next `,`, `:` or closing bracket that belongs to the enclosing construct.
+    /// Moves to the next `,`, `:`, `=` or closing bracket that belongs to the enclosing construct.
     fn skip_balanced(&mut self) -> Parsed<()> {
         let mut open = Vec::new();
         while let Some(c) = self.rest().chars().next() {
@@ -281,7 +281,8 @@ impl<'a> Parser<'a> {
                     Some(close) if close == c => {}
                     Some(_) => return Err(self.error("brackets that match")),
                 },
-                ',' | ':' if open.is_empty() => return Ok(()),
+                // `=` would be the next key after a forgotten comma: skipping it would lose that key.
+                ',' | ':' | '=' if open.is_empty() => return Ok(()),
                 _ => {}
             }
             self.at += c.len_utf8();

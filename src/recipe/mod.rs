@@ -12,9 +12,15 @@ use crate::error::{Error, Result};
 pub use parameters::{Parameter, parameters};
 
 /// Text of preset `paper`, with a comment on every parameter.
-pub const PAPER: &str = include_str!("paper.toml");
-/// Text of preset `default`.
-pub const DEFAULT: &str = include_str!("default.toml");
+const PAPER: &str = include_str!("paper.toml");
+
+/// Every preset: its name and its text. Those that start from another name it by `preset`.
+pub const PRESETS: [(&str, &str); 4] = [
+    ("default", include_str!("default.toml")),
+    ("paper", PAPER),
+    ("gentle", include_str!("gentle.toml")),
+    ("strong", include_str!("strong.toml")),
+];
 
 /// All hyper-parameters; see `paper.toml` for the meaning of each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -216,23 +222,16 @@ pub enum ShHigh {
 impl Recipe {
     /// The preset of that name.
     pub fn preset(name: &str) -> Result<Recipe> {
-        Ok(toml::from_str(preset_text(name)?).expect("presets parse: tested"))
+        preset_text(name)?;
+        Ok(Recipe::from_toml("", name).expect("presets parse: tested"))
     }
 
     /// A recipe file's text: any subset of the parameters, over the preset named by its first key
     /// `preset` (or `fallback`). A table `[provenance]`, as written beside results, is ignored.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
-        let mut over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
-        over.remove("provenance");
-        let name = match over.remove("preset") {
-            None => fallback.to_owned(),
-            Some(toml::Value::String(name)) => name,
-            Some(other) => return Err(format!("preset: expected a name, found {other}")),
-        };
-        let base = preset_text(&name).map_err(|e| e.to_string())?;
-        let mut table: toml::Table = toml::from_str(base).expect("presets parse: tested");
-        overlay(&mut table, over);
-        let recipe: Recipe = table.try_into().map_err(|e: toml::de::Error| e.to_string())?;
+        let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
+        let recipe: Recipe =
+            over_preset(over, Some(fallback))?.try_into().map_err(|e: toml::de::Error| e.to_string())?;
         recipe.validate()?;
         Ok(recipe)
     }
@@ -306,11 +305,29 @@ impl Recipe {
 
 /// Text of the preset of that name.
 pub fn preset_text(name: &str) -> Result<&'static str> {
-    match name {
-        "paper" => Ok(PAPER),
-        "default" => Ok(DEFAULT),
-        _ => Err(Error::usage(format!("no preset is called {name:?}; there are: paper, default"))),
+    match PRESETS.iter().find(|(known, _)| *known == name) {
+        Some((_, text)) => Ok(text),
+        None => {
+            Err(Error::usage(format!("no preset is called {name:?}; there are: {}", PRESETS.map(|p| p.0).join(", "))))
+        }
     }
+}
+
+/// All parameters: those of `over`, the others from the preset it names or from `fallback`. Presets
+/// themselves may name one more.
+fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
+    over.remove("provenance");
+    let named = over.remove("preset");
+    let base = match (&named, fallback) {
+        (Some(toml::Value::String(name)), _) => name.as_str(),
+        (Some(other), _) => return Err(format!("preset: expected a name, found {other}")),
+        (None, Some(fallback)) => fallback,
+        (None, None) => return Ok(over),
+    };
+    let text = preset_text(base).map_err(|e| e.to_string())?;
+    let mut table = over_preset(toml::from_str(text).map_err(|e| e.to_string())?, None)?;
+    overlay(&mut table, over);
+    Ok(table)
 }
 
 /// Replaces the leaves of `base` by those of `over`; keys that `base` lacks are added, to be
@@ -332,9 +349,11 @@ mod tests {
 
     #[test]
     fn presets_parse_and_are_in_range() {
-        for name in ["paper", "default"] {
+        for (name, _) in PRESETS {
             Recipe::preset(name).unwrap().validate().unwrap();
         }
+        assert_eq!(Recipe::preset("gentle").unwrap().merge.passes, []);
+        assert_eq!(Recipe::preset("strong").unwrap().merge.passes.len(), 2);
     }
 
     #[test]

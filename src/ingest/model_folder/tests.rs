@@ -134,3 +134,120 @@ fn states_of_room2_dynerf_agree_with_the_original_code() {
 fn states_of_room2_big_agree_with_the_original_code() {
     states_agree("room2_big");
 }
+
+#[test]
+fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
+    let Some((_, model)) = load("deform2") else { return };
+    let model = model.with_times(vec![0.0, 0.5]).unwrap();
+    let n = model.info().count;
+    let read = |ids: Ids<'_>, frame| {
+        let mut state = Gaussians::zeros(0, 3);
+        model.open(ids).unwrap().read(frame, Columns::ALL, &mut state).unwrap();
+        state
+    };
+    let whole = read(Ids::Range(0..n), 1);
+    let list: Vec<u32> = (0..n as u32).rev().step_by(37).collect();
+    let part = std::thread::scope(|scope| scope.spawn(|| read(Ids::List(&list), 1)).join().unwrap());
+    for column in Columns::ALL.iter() {
+        for c in 0..whole.column(column).width() {
+            for (at, &id) in list.iter().enumerate() {
+                let (got, expected) = (part.column(column).plane(c)[at], whole.column(column).plane(c)[id as usize]);
+                assert_eq!(got.to_bits(), expected.to_bits(), "{} of Gaussian {id}: {got}, {expected}", column.name());
+            }
+        }
+    }
+}
+
+#[test]
+fn columns_that_do_not_vary_are_the_canonical_ones() {
+    let Some((_, model)) = load("deform2") else { return };
+    let model = model.with_times(vec![0.25]).unwrap();
+    assert_eq!(model.info().varying, Columns::POSITION | Columns::LOG_SCALE | Columns::ROTATION);
+    let mut state = Gaussians::zeros(0, 3);
+    model.open(Ids::Range(0..100)).unwrap().read(0, Columns::OPACITY | Columns::SH, &mut state).unwrap();
+    for i in 0..100 {
+        assert_eq!(state.opacity_logit.row::<1>(i), model.canonical().opacity_logit.row::<1>(i));
+        assert_eq!(state.sh.row::<48>(i), model.canonical().sh.row::<48>(i));
+    }
+}
+
+#[test]
+fn deltas_at_the_canonical_positions_lead_to_the_states() {
+    let Some((_, model)) = load("room2_dynerf") else { return };
+    let deltas = model.deltas_at(&model.canonical().position, 0.3).unwrap();
+    let model = model.with_times(vec![0.3]).unwrap();
+    let mut state = Gaussians::zeros(0, 3);
+    model.open(Ids::Range(0..model.info().count)).unwrap().read(0, Columns::ALL, &mut state).unwrap();
+    let mut applied = Gaussians::zeros(0, 3);
+    deltas.apply(model.canonical(), Columns::ALL, &mut applied);
+    assert!(applied == state, "apply(deltas_at) differs from read");
+}
+
+#[test]
+fn times_that_do_not_increase_are_refused_with_their_frames() {
+    let Some((_, model)) = load("deform2") else { return };
+    for (times, says) in [
+        (vec![0.0, 0.5, 0.5], "frame 1 is at 0.5, frame 2 at 0.5"),
+        (vec![0.5, 0.25], "frame 0 is at 0.5, frame 1 at 0.25"),
+        (vec![0.0, f64::NAN], "frame 1 has time NaN"),
+    ] {
+        let error = model.clone().with_times(times).expect_err("must be refused").to_string();
+        assert!(error.contains(says), "{error}");
+    }
+    let model = model.with_times(vec![0.0]).unwrap();
+    assert!(model.open(Ids::List(&[1 << 30])).is_err(), "a Gaussian beyond the last");
+    let mut reader = model.open(Ids::Range(0..1)).unwrap();
+    assert!(reader.read(1, Columns::ALL, &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
+}
+
+/// A folder laid out like a model, with empty files.
+fn folder(iterations: &[&str]) -> tempfile::TempDir {
+    let root = tempfile::tempdir().unwrap();
+    fs::write(root.path().join("cfg_args"), "Namespace()").unwrap();
+    for name in iterations {
+        let folder = root.path().join("point_cloud").join(name);
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("point_cloud.ply"), "ply").unwrap();
+        fs::write(folder.join("deformation.pth"), "pth").unwrap();
+    }
+    root
+}
+
+#[test]
+fn the_largest_iteration_is_the_default_and_any_can_be_asked_for() {
+    let root = folder(&["iteration_900", "iteration_14000", "iteration_x", "coarse_iteration_99999"]);
+    assert_eq!(ModelPaths::locate(root.path(), None).unwrap().iteration, 14000);
+    let paths = ModelPaths::locate(root.path(), Some(900)).unwrap();
+    assert!(paths.point_cloud.ends_with("iteration_900/point_cloud.ply"));
+    assert_eq!(paths.deformation_table, None);
+    let error = ModelPaths::locate(root.path(), Some(7)).expect_err("must be refused").to_string();
+    assert!(error.contains("iteration_7") && error.contains("iteration_900, iteration_14000"), "{error}");
+}
+
+#[test]
+fn a_missing_file_of_the_folder_is_named() {
+    let root = folder(&["iteration_1"]);
+    for file in ["point_cloud/iteration_1/deformation.pth", "cfg_args"] {
+        fs::remove_file(root.path().join(file)).unwrap();
+        let error = ModelPaths::locate(root.path(), None).expect_err("must be refused").to_string();
+        assert!(error.contains(file) && error.contains("model folder holds"), "{error}");
+        fs::write(root.path().join(file), "").unwrap();
+    }
+    let error = ModelPaths::locate(&root.path().join("nowhere"), None).expect_err("must be refused");
+    assert!(matches!(error, Error::Io { .. }), "{error}");
+}
+
+#[test]
+fn the_digest_depends_on_every_byte_of_the_three_files() {
+    let root = folder(&["iteration_1"]);
+    let paths = ModelPaths::locate(root.path(), None).unwrap();
+    let mut digests = vec![paths.digest().unwrap()];
+    for path in [&paths.point_cloud, &paths.deformation, &paths.cfg_args] {
+        fs::write(path, "changed").unwrap();
+        digests.push(paths.digest().unwrap());
+    }
+    assert!(digests.iter().all(|digest| digest.len() == 32), "{digests:?}");
+    digests.sort();
+    digests.dedup();
+    assert_eq!(digests.len(), 4, "{digests:?}");
+}

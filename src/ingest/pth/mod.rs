@@ -58,8 +58,11 @@ fn is_system(error: &io::Error) -> bool {
     !matches!(error.kind(), io::ErrorKind::InvalidData | io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidInput)
 }
 
+/// Turns the native-endian bytes of a tensor into f32.
+type Decode = fn(&[u8]) -> Vec<f32>;
+
 /// How to turn native-endian bytes of a floating-point type into f32; none for other types.
-fn decoder(dtype: DType) -> Option<fn(&[u8]) -> Vec<f32>> {
+fn decoder(dtype: DType) -> Option<Decode> {
     fn each<const N: usize>(bytes: &[u8], value: fn([u8; N]) -> f32) -> Vec<f32> {
         bytes.as_chunks().0.iter().map(|&chunk| value(chunk)).collect()
     }
@@ -84,3 +87,6 @@ fn half_to_f32(half: u16) -> f32 {
         _ => (1024.0 + mantissa) * 2f32.powi(exponent - 25),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,335 @@
+use std::path::Path;
+
+use super::oracle::{Oracle, Parameters};
+use super::*;
+use crate::model::{Column, Columns, Gaussians};
+
+/// Values in [−1, 1), the same on every run.
+struct Noise(u64);
+
+impl Noise {
+    fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
+    }
+}
+
+const WIDTH: usize = 24;
+const CHANNELS: usize = 5;
+
+fn plain() -> FieldConfig {
+    FieldConfig {
+        active: Columns::ALL,
+        static_mlp: false,
+        empty_voxel: false,
+        grid_pe: 0,
+        no_grid: false,
+        apply_rotation: false,
+    }
+}
+
+/// A random state dict for `config` with `depth` trunk layers. Resolutions differ along every axis, so
+/// that swapped axes cannot pass.
+fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
+    let mut noise = Noise(7);
+    let mut tensors = Tensors::new();
+    let mut add = |name: &str, shape: &[usize], scale: f32| {
+        let data = (0..shape.iter().product()).map(|_| scale * noise.next()).collect();
+        tensors.insert(format!("deformation_net.{name}"), Tensor { shape: shape.to_vec(), data });
+    };
+    for level in 0..2 {
+        let size = [6 << level, 4 << level, 5 << level, 7];
+        for (plane, (a, b)) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].into_iter().enumerate() {
+            add(&format!("grid.grids.{level}.{plane}"), &[1, CHANNELS, size[b], size[a]], 1.5);
+        }
+    }
+    let features = match (config.no_grid, config.grid_pe > 1) {
+        (true, _) => 4,
+        (_, true) => 6 * CHANNELS,
+        _ => 2 * CHANNELS,
+    };
+    for layer in 0..depth {
+        let inputs = if layer == 0 { features } else { WIDTH };
+        add(&format!("feature_out.{}.weight", 2 * layer), &[WIDTH, inputs], 0.5);
+        add(&format!("feature_out.{}.bias", 2 * layer), &[WIDTH], 0.5);
+    }
+    let heads = [
+        ("pos_deform", 3),
+        ("scales_deform", 3),
+        ("rotations_deform", 4),
+        ("opacity_deform", 1),
+        ("shs_deform", 48),
+        ("static_mlp", 1),
+    ];
+    for (head, outputs) in heads {
+        add(&format!("{head}.1.weight"), &[WIDTH, WIDTH], 0.4);
+        add(&format!("{head}.1.bias"), &[WIDTH], 0.4);
+        add(&format!("{head}.3.weight"), &[outputs, WIDTH], 0.4);
+        add(&format!("{head}.3.bias"), &[outputs], 0.4);
+    }
+    add("empty_voxel.grid", &[1, 1, 3, 4, 5], 1.0);
+    for (name, shape, data) in [
+        ("grid.aabb", vec![2, 3], vec![1.5, 1.25, 1.0, -1.0, -1.25, -0.5]),
+        ("empty_voxel.xyz_min", vec![3], vec![-0.75, -1.0, -0.5]),
+        ("empty_voxel.xyz_max", vec![3], vec![1.0, 0.75, 1.0]),
+    ] {
+        tensors.insert(format!("deformation_net.{name}"), Tensor { shape, data });
+    }
+    tensors
+}
+
+/// Random raw Gaussians; some lie outside the field's box.
+fn cloud(len: usize) -> Gaussians {
+    let mut noise = Noise(99);
+    let mut cloud = Gaussians::zeros(len, 3);
+    for column in Columns::ALL.iter() {
+        cloud.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
+    }
+    cloud
+}
+
+fn states(field: &Field, raw: &Gaussians, time: f64, want: Columns) -> (Gaussians, Deltas) {
+    let mut deltas = Deltas::new(3);
+    field.deltas(&field.prepare(&raw.position), time, want, &mut Scratch::default(), &mut deltas).unwrap();
+    let mut state = Gaussians::zeros(0, 3);
+    deltas.apply(raw, want, &mut state);
+    (state, deltas)
+}
+
+fn build(config: &FieldConfig, depth: usize) -> Field {
+    Field::new(&tensors(config, depth), config.clone(), 3, Path::new("synthetic.pth")).unwrap()
+}
+
+fn values(column: &Column, i: usize) -> Vec<f64> {
+    (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect()
+}
+
+fn agrees_with_oracle(what: &str, config: FieldConfig, depth: usize) {
+    let tensors = tensors(&config, depth);
+    let oracle = Oracle { tensors: &tensors, config: &config };
+    let field = build(&config, depth);
+    let raw = cloud(40);
+    for time in [0.0, 0.37, 1.0] {
+        let (state, _) = states(&field, &raw, time, Columns::ALL);
+        for i in 0..raw.len() {
+            let expected = oracle.state(
+                &Parameters {
+                    position: values(&raw.position, i),
+                    rotation: values(&raw.rotation, i),
+                    log_scale: values(&raw.log_scale, i),
+                    opacity_logit: values(&raw.opacity_logit, i),
+                    sh: values(&raw.sh, i),
+                },
+                time,
+            );
+            for (column, expected) in [
+                (&state.position, &expected.position),
+                (&state.rotation, &expected.rotation),
+                (&state.log_scale, &expected.log_scale),
+                (&state.opacity_logit, &expected.opacity_logit),
+                (&state.sh, &expected.sh),
+            ] {
+                for (got, expected) in values(column, i).into_iter().zip(expected) {
+                    // 60 f32 roundings of numbers of this size; a wrong axis or order is off by 0.1.
+                    let tolerance = 2e-5 * (1.0 + expected.abs());
+                    assert!(
+                        (got - expected).abs() <= tolerance,
+                        "{what}, time {time}, Gaussian {i}: got {got}, expected {expected}, tolerance {tolerance}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn every_flag_agrees_with_the_f64_oracle() {
+    agrees_with_oracle("plain", plain(), 1);
+    agrees_with_oracle("static_mlp", FieldConfig { static_mlp: true, ..plain() }, 1);
+    agrees_with_oracle("empty_voxel", FieldConfig { empty_voxel: true, ..plain() }, 1);
+    agrees_with_oracle(
+        "static_mlp over empty_voxel",
+        FieldConfig { static_mlp: true, empty_voxel: true, ..plain() },
+        1,
+    );
+    agrees_with_oracle("grid_pe", FieldConfig { grid_pe: 3, ..plain() }, 1);
+    agrees_with_oracle("grid_pe of 1 is none", FieldConfig { grid_pe: 1, ..plain() }, 1);
+    agrees_with_oracle("no_grid", FieldConfig { no_grid: true, ..plain() }, 1);
+    agrees_with_oracle("apply_rotation", FieldConfig { apply_rotation: true, static_mlp: true, ..plain() }, 1);
+    agrees_with_oracle("everything", FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain() }, 3);
+}
+
+#[test]
+fn every_trunk_depth_agrees_with_the_f64_oracle() {
+    for depth in [1, 2, 4] {
+        agrees_with_oracle(&format!("depth {depth}"), plain(), depth);
+    }
+}
+
+#[test]
+fn every_head_can_be_off_and_its_column_is_then_raw_and_unmasked() {
+    for column in Columns::ALL.iter() {
+        let config = FieldConfig { active: Columns::ALL.without(column), static_mlp: true, ..plain() };
+        agrees_with_oracle(&format!("without {}", column.name()), config, 1);
+    }
+    agrees_with_oracle("no head at all", FieldConfig { active: Columns::NONE, ..plain() }, 1);
+}
+
+#[test]
+fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_columns() {
+    let config = FieldConfig { static_mlp: true, ..plain() };
+    let field = build(&config, 2);
+    let raw = cloud(1100);
+    let (all, _) = states(&field, &raw, 0.6, Columns::ALL);
+    for (start, len) in [(0, 1), (3, 7), (255, 2), (250, 513), (1099, 1)] {
+        let mut part = Gaussians::zeros(len, 3);
+        for column in Columns::ALL.iter() {
+            for c in 0..raw.column(column).width() {
+                part.column_mut(column).plane_mut(c).copy_from_slice(&raw.column(column).plane(c)[start..start + len]);
+            }
+        }
+        for want in [Columns::ALL, Columns::POSITION, Columns::OPACITY | Columns::SH, Columns::ROTATION] {
+            let (state, _) = states(&field, &part, 0.6, want);
+            for column in want.iter() {
+                for c in 0..state.column(column).width() {
+                    for i in 0..len {
+                        let (got, expected) =
+                            (state.column(column).plane(c)[i], all.column(column).plane(c)[start + i]);
+                        assert_eq!(
+                            got.to_bits(),
+                            expected.to_bits(),
+                            "{} component {c} of Gaussian {} in a block of {len}: got {got}, expected {expected}",
+                            column.name(),
+                            start + i
+                        );
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn raw_parameters_solved_from_a_state_lead_back_to_it() {
+    for apply_rotation in [false, true] {
+        let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain() }, 1);
+        let raw = cloud(50);
+        let (state, deltas) = states(&field, &raw, 0.4, Columns::ALL);
+        let mask = deltas.mask.as_ref().unwrap();
+        let mut solved = Gaussians::zeros(0, 3);
+        deltas.solve(&state, Columns::ALL, &mut solved);
+        let mut again = Gaussians::zeros(0, 3);
+        deltas.apply(&solved, Columns::ALL, &mut again);
+        for column in Columns::ALL.iter() {
+            for i in 0..raw.len() {
+                let (got, expected) = (values(again.column(column), i), values(state.column(column), i));
+                for (got, expected) in got.into_iter().zip(expected) {
+                    let tolerance = 1e-5 * (1.0 + expected.abs());
+                    assert!(
+                        (got - expected).abs() <= tolerance,
+                        "{} of Gaussian {i}, mask {}: got {got}, expected {expected}, tolerance {tolerance}",
+                        column.name(),
+                        mask[i]
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_position_that_is_nan_gives_nan_and_touches_no_other_gaussian() {
+    let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
+    let raw = cloud(20);
+    let (clean, _) = states(&field, &raw, 0.5, Columns::ALL);
+    let mut broken = raw.clone();
+    for (i, value) in [(4, f32::NAN), (5, f32::INFINITY), (6, f32::NEG_INFINITY), (7, f32::MAX)] {
+        broken.position.set_row(i, [value; 3]);
+    }
+    let (state, _) = states(&field, &broken, 0.5, Columns::ALL);
+    assert!(state.position.row::<3>(4).iter().all(|x| x.is_nan()) && state.opacity_logit.row::<1>(4)[0].is_nan());
+    for i in (0..20).filter(|i| !(4..8).contains(i)) {
+        assert_eq!(state.position.row::<3>(i), clean.position.row::<3>(i), "Gaussian {i}");
+    }
+}
+
+#[test]
+fn a_zero_quaternion_product_stays_zero() {
+    let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 1);
+    let mut raw = cloud(3);
+    raw.rotation.set_row(1, [0.0; 4]);
+    assert_eq!(states(&field, &raw, 0.5, Columns::ALL).0.rotation.row::<4>(1), [0.0; 4]);
+}
+
+#[test]
+fn an_empty_block_is_empty() {
+    let field = build(&plain(), 1);
+    assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Columns::ALL).0.is_empty());
+}
+
+fn refusal(config: FieldConfig, change: impl FnOnce(&mut Tensors)) -> String {
+    let mut tensors = tensors(&config, 1);
+    change(&mut tensors);
+    Field::new(&tensors, config, 3, Path::new("synthetic.pth")).expect_err("must be refused").to_string()
+}
+
+fn assert_says(message: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(message.contains(part), "expected {part:?} in: {message}");
+    }
+}
+
+#[test]
+fn a_missing_tensor_is_named_with_the_flag_that_asks_for_it() {
+    let name = "deformation_net.opacity_deform.3.bias";
+    let message = refusal(plain(), |tensors| drop(tensors.remove(name)));
+    assert_says(&message, &["synthetic.pth", name, "no_do=False", "none"]);
+    let message = refusal(FieldConfig { empty_voxel: true, ..plain() }, |tensors| {
+        drop(tensors.remove("deformation_net.empty_voxel.grid"));
+    });
+    assert_says(&message, &["empty_voxel.grid", "empty_voxel=True"]);
+    assert_says(&refusal(plain(), Tensors::clear), &["deformation_net.grid.aabb"]);
+}
+
+#[test]
+fn a_tensor_of_the_wrong_shape_is_named_with_both_shapes() {
+    let reshape = |name: &'static str, shape: Vec<usize>| {
+        refusal(plain(), move |tensors| {
+            let data = vec![0.0; shape.iter().product()];
+            tensors.insert(format!("deformation_net.{name}"), Tensor { shape, data });
+        })
+    };
+    assert_says(&reshape("pos_deform.3.weight", vec![4, 24]), &["pos_deform.3.weight", "[3, 24]", "[4, 24]"]);
+    assert_says(&reshape("feature_out.0.weight", vec![24, 11]), &["feature_out.0.weight", "[any, 10]", "[24, 11]"]);
+    assert_says(&reshape("feature_out.2.weight", vec![24, 25]), &["feature_out.2.weight", "[24, 24]", "[24, 25]"]);
+    assert_says(&reshape("grid.grids.1.3", vec![1, 6, 4, 4]), &["grid.grids.1.3", "[1, 5, any, any]", "[1, 6, 4, 4]"]);
+    assert_says(&reshape("grid.grids.0.0", vec![1, 5, 0, 4]), &["grid.grids.0.0", "[1, 5, 0, 4]"]);
+    assert_says(&reshape("grid.aabb", vec![2, 3]), &["grid.aabb", "corners that differ"]);
+}
+
+#[test]
+fn a_weight_that_is_not_finite_is_refused() {
+    let message = refusal(plain(), |tensors| {
+        tensors.get_mut("deformation_net.feature_out.0.weight").unwrap().data[17] = f32::NAN;
+    });
+    assert_says(&message, &["feature_out.0.weight", "finite", "NaN at element 17"]);
+}
+
+#[test]
+fn tensors_the_evaluation_does_not_use_may_hold_anything() {
+    let config = FieldConfig { active: Columns::POSITION, ..plain() };
+    let mut tensors = tensors(&config, 1);
+    tensors.insert("timenet.0.weight".into(), Tensor { shape: vec![1], data: vec![f32::NAN] });
+    tensors.insert("deformation_net.shs_deform.1.weight".into(), Tensor { shape: vec![], data: vec![f32::NAN] });
+    Field::new(&tensors, config, 3, Path::new("synthetic.pth")).unwrap();
+}
+
+#[test]
+fn a_time_that_is_not_finite_is_refused() {
+    let field = build(&plain(), 1);
+    let prepared = field.prepare(&cloud(1).position);
+    let error = field
+        .deltas(&prepared, f64::NAN, Columns::ALL, &mut Scratch::default(), &mut Deltas::new(3))
+        .expect_err("must be refused");
+    assert_says(&error.to_string(), &["NaN"]);
+}

@@ -1,0 +1,31 @@
+//! PSNR and SSIM against an independent implementation: `scripts/record_metrics.py` made the fixtures.
+
+use std::fs::{self, File};
+use std::path::Path;
+
+use splatsieve::metrics::{psnr, ssim};
+use splatsieve::render::Image;
+
+/// The pictures of one fixture, `[pictures, height, width, 3]`.
+fn pictures(folder: &Path, name: &str) -> Vec<Image> {
+    let file = npyz::NpyFile::new(File::open(folder.join(name)).unwrap()).unwrap();
+    let [count, height, width, 3] = file.shape() else { panic!("{name} has the wrong shape") };
+    let (count, height, width) = (*count as usize, *height as u32, *width as u32);
+    let data: Vec<f32> = file.into_vec().unwrap();
+    data.chunks_exact(data.len() / count).map(|data| Image { width, height, data: data.to_vec() }).collect()
+}
+
+#[test]
+fn psnr_and_ssim_agree_with_pytorch_to_1e_9() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/metrics");
+    let expected: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(folder.join("expected.json")).unwrap()).unwrap();
+    let (a, b) = (pictures(&folder, "a.npy"), pictures(&folder, "b.npy"));
+    assert_eq!(a.len(), 4);
+    for (i, (a, b)) in a.iter().zip(&b).enumerate() {
+        for (name, got) in [("psnr", psnr(a, b)), ("ssim", ssim(a, b))] {
+            let expected = expected[name][i].as_f64().unwrap();
+            assert!((got - expected).abs() < 1e-9, "{name} of picture {i}: got {got}, expected {expected}");
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! The rasteriser's conventions a second time, slowly: f64 throughout, pixel by pixel, full matrices, no
+//! bound on the reach of an alpha but the tiles of the original kernel.
+
+#![allow(dead_code, reason = "each test and bench uses its part")]
+
+use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
+use splatsieve::model::{Camera, Gaussians};
+
+/// What the oracle sees in one picture.
+pub(crate) struct Picture {
+    /// `[height · width]`.
+    pub(crate) rgb: Vec<[f64; 3]>,
+    /// Whether some decision of the pixel fell within 1e-4 (relative) of its threshold: f32 may differ.
+    pub(crate) doubtful: Vec<bool>,
+    /// Per Gaussian Σ and max over sampled pixels of alpha · transmittance.
+    pub(crate) sum: Vec<f64>,
+    pub(crate) max: Vec<f64>,
+    /// Number of (Gaussian, pixel) pairs blended.
+    pub(crate) events: u64,
+}
+
+struct Footprint {
+    id: usize,
+    depth: f32,
+    center: DVec2,
+    inverse: DMat2,
+    opacity: f64,
+    rgb: DVec3,
+    /// First and one-past-last tile, x then y.
+    tiles: [[i64; 2]; 2],
+}
+
+/// Real spherical harmonics of degree up to 3 as products of x, y and z.
+fn basis(d: DVec3) -> [f64; 16] {
+    let DVec3 { x, y, z } = d;
+    let pi = std::f64::consts::PI;
+    let root = |numerator: f64, denominator: f64| (numerator / (denominator * pi)).sqrt();
+    [
+        root(1.0, 4.0),
+        -root(3.0, 4.0) * y,
+        root(3.0, 4.0) * z,
+        -root(3.0, 4.0) * x,
+        root(15.0, 4.0) * x * y,
+        -root(15.0, 4.0) * y * z,
+        root(5.0, 16.0) * (3.0 * z * z - 1.0),
+        -root(15.0, 4.0) * x * z,
+        root(15.0, 16.0) * (x * x - y * y),
+        -root(35.0, 32.0) * y * (3.0 * x * x - y * y),
+        root(105.0, 4.0) * x * y * z,
+        -root(21.0, 32.0) * y * (5.0 * z * z - 1.0),
+        root(7.0, 16.0) * z * (5.0 * z * z - 3.0),
+        -root(21.0, 32.0) * x * (5.0 * z * z - 1.0),
+        root(105.0, 16.0) * z * (x * x - y * y),
+        -root(35.0, 32.0) * x * (x * x - 3.0 * y * y),
+    ]
+}
+
+/// View depth in f32, added up as the original kernel does.
+fn order([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
+    let row = camera.rotation.row(2).as_vec3();
+    (row.x * x + row.y * y) + (row.z * z + camera.translation.z as f32)
+}
+
+fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footprint> {
+    let world = DVec3::from_array(gaussians.position.row::<3>(id).map(f64::from));
+    let p = camera.rotation * world + camera.translation;
+    if p.z <= f64::from(0.2f32) {
+        return None;
+    }
+    let [w, x, y, z] = gaussians.rotation.row::<4>(id).map(f64::from);
+    let axes = match DQuat::from_xyzw(x, y, z, w) {
+        zero if zero.length() == 0.0 => DMat3::IDENTITY,
+        q => DMat3::from_quat(q.normalize()),
+    };
+    let scale = DMat3::from_diagonal(DVec3::from_array(gaussians.log_scale.row::<3>(id).map(|s| f64::from(s).exp())));
+    let covariance = axes * scale * scale * axes.transpose();
+    let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+    let limit = |slope: f64, half_field: f64| slope.max(-1.3 * half_field).min(1.3 * half_field);
+    let sx = limit(p.x / p.z, width / 2.0 / camera.fx);
+    let sy = limit(p.y / p.z, height / 2.0 / camera.fy);
+    let to_u = DVec3::new(camera.fx / p.z, 0.0, -camera.fx * sx / p.z);
+    let to_v = DVec3::new(0.0, camera.fy / p.z, -camera.fy * sy / p.z);
+    let seen = camera.rotation * covariance * camera.rotation.transpose();
+    let (a, b, c) = (to_u.dot(seen * to_u) + 0.3, to_u.dot(seen * to_v), to_v.dot(seen * to_v) + 0.3);
+    let determinant = a * c - b * b;
+    let middle = (a + c) / 2.0;
+    let radius = (3.0 * (middle + (middle * middle - determinant).max(0.1).sqrt()).sqrt()).ceil();
+    let center = DVec2::new(camera.fx * p.x / p.z + camera.cx - 0.5, camera.fy * p.y / p.z + camera.cy - 0.5);
+    let tiles = [(center.x, width), (center.y, height)].map(|(at, size)| {
+        let count = (size / 16.0).ceil() as i64;
+        [(((at - radius) / 16.0) as i64).clamp(0, count), (((at + radius + 15.0) / 16.0) as i64).clamp(0, count)]
+    });
+    let toward = (world - camera.center()).normalize();
+    let coefficients = gaussians.sh.width() / 3;
+    let mut rgb = DVec3::splat(0.5);
+    for (k, y) in basis(toward).into_iter().enumerate().take(coefficients) {
+        rgb += y * DVec3::from_array(std::array::from_fn(|ch| f64::from(gaussians.sh.plane(3 * k + ch)[id])));
+    }
+    Some(Footprint {
+        id,
+        depth: order(gaussians.position.row(id), camera),
+        center,
+        inverse: DMat2::from_cols(DVec2::new(a, b), DVec2::new(b, c)).inverse(),
+        opacity: 1.0 / (1.0 + (-f64::from(gaussians.opacity_logit.plane(0)[id])).exp()),
+        rgb: rgb.max(DVec3::ZERO),
+        tiles,
+    })
+}
+
+/// Renders, and weighs the pixels of every `stride`-th column and row.
+pub(crate) fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> Picture {
+    let mut footprints: Vec<Footprint> =
+        (0..gaussians.len()).filter_map(|id| footprint(gaussians, id, camera)).collect();
+    footprints.sort_by(|a, b| a.depth.total_cmp(&b.depth).then(a.id.cmp(&b.id)));
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let across = width.div_ceil(16);
+    let mut tiles = vec![Vec::new(); across * height.div_ceil(16)];
+    for (at, footprint) in footprints.iter().enumerate() {
+        let [[x0, x1], [y0, y1]] = footprint.tiles;
+        for y in y0..y1 {
+            for x in x0..x1 {
+                tiles[y as usize * across + x as usize].push(at);
+            }
+        }
+    }
+    let mut seen = Picture {
+        rgb: Vec::with_capacity(width * height),
+        doubtful: Vec::with_capacity(width * height),
+        sum: vec![0.0; gaussians.len()],
+        max: vec![0.0; gaussians.len()],
+        events: 0,
+    };
+    let near = |value: f64, threshold: f64| (value / threshold - 1.0).abs() < 1e-4;
+    for y in 0..height {
+        for x in 0..width {
+            let sampled = [x, y].iter().all(|&at| at as u32 % stride == stride / 2);
+            let (mut rgb, mut transmittance, mut doubtful) = (DVec3::ZERO, 1.0f64, false);
+            for footprint in tiles[y / 16 * across + x / 16].iter().map(|&at| &footprints[at]) {
+                let offset = DVec2::new(x as f64, y as f64) - footprint.center;
+                let alpha = (footprint.opacity * (-0.5 * offset.dot(footprint.inverse * offset)).exp()).min(0.99);
+                doubtful |= near(alpha, 1.0 / 255.0);
+                if alpha < 1.0 / 255.0 {
+                    continue;
+                }
+                let after = transmittance * (1.0 - alpha);
+                doubtful |= near(after, 1e-4);
+                if after < 1e-4 {
+                    break;
+                }
+                let weight = alpha * transmittance;
+                rgb += weight * footprint.rgb;
+                if sampled {
+                    seen.sum[footprint.id] += weight;
+                    seen.max[footprint.id] = seen.max[footprint.id].max(weight);
+                }
+                seen.events += 1;
+                transmittance = after;
+            }
+            rgb += transmittance * DVec3::from_array(background.map(f64::from));
+            seen.rgb.push(rgb.to_array());
+            seen.doubtful.push(doubtful);
+        }
+    }
+    seen
+}

@@ -1,0 +1,334 @@
+//! The rasteriser against arithmetic done another way: closed forms, a slow f64 oracle, and laws.
+
+mod oracle;
+
+use std::num::NonZeroU32;
+
+use glam::{DMat3, DQuat, DVec3};
+use splatsieve::model::{Camera, Gaussians};
+use splatsieve::render::{Contribution, Image, Renderer, contribution, render};
+
+/// A camera at the origin that looks along +z, turned a little so that no axis is special.
+fn camera(width: u32, height: u32) -> Camera {
+    Camera {
+        width,
+        height,
+        fx: 0.9 * f64::from(width),
+        fy: 0.95 * f64::from(width),
+        cx: 0.5 * f64::from(width) + 1.3,
+        cy: 0.5 * f64::from(height) - 0.7,
+        rotation: DMat3::from_quat(DQuat::from_xyzw(0.05, -0.03, 0.02, 1.0).normalize()),
+        translation: DVec3::new(0.1, -0.2, 0.3),
+    }
+}
+
+/// A camera at the origin whose axes are the world's.
+fn plain_camera(size: u32) -> Camera {
+    Camera {
+        width: size,
+        height: size,
+        fx: 50.0,
+        fy: 50.0,
+        cx: 0.5 * f64::from(size),
+        cy: 0.5 * f64::from(size),
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::ZERO,
+    }
+}
+
+/// Pseudo-random numbers in [0, 1) (splitmix64).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    fn within(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * self.next()
+    }
+}
+
+/// A cloud with needles, pancakes, giants, specks, quaternions of any length and Gaussians off-screen.
+fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
+    let mut random = Random(seed);
+    let mut scene = Gaussians::zeros(count, degree);
+    for i in 0..count {
+        let depth = random.within(-0.5, 6.0);
+        let reach = depth.abs() + 0.3;
+        scene.position.set_row(i, [random.within(-reach, reach), random.within(-reach, reach), depth]);
+        scene.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.within(-2.0, 2.0)));
+        scene.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.within(-6.5, -1.0)));
+        scene.opacity_logit.set_row(i, [random.within(-6.0, 6.0)]);
+        for c in 0..scene.sh.width() {
+            scene.sh.plane_mut(c)[i] = random.within(-0.5, 0.5) * if c < 3 { 3.0 } else { 1.0 };
+        }
+    }
+    scene
+}
+
+/// One Gaussian on the axis of [`plain_camera`], `depth` away, of the colour 1, ½, 0.
+fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
+    let mut one = Gaussians::zeros(1, 0);
+    one.position.set_row(0, [0.0, 0.0, depth]);
+    one.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
+    one.log_scale.set_row(0, [scale.ln(); 3]);
+    one.opacity_logit.set_row(0, [(opacity / (1.0 - opacity)).ln()]);
+    one.sh.set_row(0, [0.5 / 0.282_094_8, 0.0, -9.0]);
+    one
+}
+
+fn stride(s: u32) -> NonZeroU32 {
+    NonZeroU32::new(s).unwrap()
+}
+
+fn seen(gaussians: &Gaussians, camera: &Camera, s: u32) -> Contribution {
+    let mut seen = Contribution::new(gaussians.len());
+    contribution(gaussians, camera, stride(s), &mut seen);
+    seen
+}
+
+fn pixel(image: &Image, x: usize, y: usize) -> [f32; 3] {
+    let at = (y * image.width as usize + x) * 3;
+    image.data[at..at + 3].try_into().unwrap()
+}
+
+#[test]
+fn one_gaussian_is_its_closed_form() {
+    let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
+    let image = render(&single(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
+    // An isotropic Gaussian on the axis: variance (f·s/z)² + 0.3 about the picture's middle.
+    let variance = (50.0 * scale / depth).powi(2) + 0.3;
+    let middle = f64::from(size) / 2.0 - 0.5;
+    for y in 0..size as usize {
+        for x in 0..size as usize {
+            let square = (x as f64 - middle).powi(2) + (y as f64 - middle).powi(2);
+            let alpha = opacity * (-0.5 * square / variance).exp();
+            let alpha = if alpha < 1.0 / 255.0 { 0.0 } else { alpha };
+            for (c, colour) in [1.0, 0.5, 0.0].into_iter().enumerate() {
+                let expected = alpha * colour + (1.0 - alpha) * 0.25;
+                let got = f64::from(pixel(&image, x, y)[c]);
+                assert!((got - expected).abs() < 1e-6, "pixel {x},{y} channel {c}: got {got}, expected {expected}");
+            }
+        }
+    }
+}
+
+#[test]
+fn random_scenes_match_the_oracle() {
+    for (seed, count, degree, width, height) in
+        [(1, 300, 3, 67, 45), (2, 2000, 2, 64, 64), (3, 40, 1, 33, 100), (4, 6000, 0, 80, 50)]
+    {
+        let (scene, camera) = (scene(seed, count, degree), camera(width, height));
+        let background = [0.1, 0.9, 0.4];
+        let expected = oracle::picture(&scene, &camera, background, 1);
+        let got = render(&scene, &camera, background);
+        let doubtful = expected.doubtful.iter().filter(|&&doubtful| doubtful).count();
+        assert!(doubtful * 20 < expected.doubtful.len(), "seed {seed}: {doubtful} pixels say nothing");
+        for (i, (got, rgb)) in got.data.chunks_exact(3).zip(&expected.rgb).enumerate() {
+            // A decision that f32 takes the other way changes a pixel by an alpha of 1/255 of a colour.
+            let tolerance = if expected.doubtful[i] { 4.0 / 255.0 } else { 4e-6 };
+            for c in 0..3 {
+                let error = (f64::from(got[c]) - rgb[c]).abs();
+                assert!(error <= tolerance, "seed {seed} pixel {i}: got {got:?}, expected {rgb:?} ± {tolerance}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
+    // Above opacity 0.36, alpha is still 1/255 beyond 3σ: there the square of tiles decides.
+    // Centred on pixel 32, a radius of 16 stops short of pixel 48.
+    let camera = Camera { cx: 32.5, ..plain_camera(64) };
+    let mut cut = 0;
+    for step in 0..60 {
+        let one = single(2.0, 0.15 + 0.001 * step as f32, 0.95);
+        let expected = oracle::picture(&one, &camera, [0.0; 3], 1);
+        let got = seen(&one, &camera, 1);
+        assert!(
+            (got.pixels(0) - expected.sum[0]).abs() < 1e-5 * expected.sum[0],
+            "step {step}: got {}, expected {}",
+            got.pixels(0),
+            expected.sum[0]
+        );
+        // The reach without the rule, in pixels of the picture's middle row.
+        let sigma = (25.0 * f64::from(0.15 + 0.001 * step as f32)).hypot(0.3f64.sqrt());
+        let half = sigma * (2.0 * (255.0f64 * 0.95).ln()).sqrt();
+        let drawn = render(&one, &camera, [0.0; 3]);
+        let in_row = (0..64).filter(|&x| pixel(&drawn, x, 32)[0] > 0.0).count();
+        cut += usize::from(in_row < 2 * half as usize + 1);
+    }
+    assert!(cut > 5, "only {cut} Gaussians were cut: the rule is not put to the test");
+}
+
+#[test]
+fn contributions_match_the_oracle_at_every_stride() {
+    for (seed, s) in [(11, 1), (12, 2), (13, 3), (14, 4), (15, 7), (16, 40)] {
+        let (scene, camera) = (scene(seed, 400, 0), camera(67, 45));
+        let expected = oracle::picture(&scene, &camera, [0.0; 3], s);
+        let got = seen(&scene, &camera, s);
+        // Pixels in doubt may count or not count an alpha of 1/255.
+        let doubtful = expected.doubtful.iter().filter(|&&doubtful| doubtful).count() as f64;
+        for i in 0..scene.len() {
+            let (sum, max) = (expected.sum[i], expected.max[i]);
+            let tolerance = 1e-5 * sum + 1e-7 + if s < 3 { doubtful / 255.0 } else { 2.0 / 255.0 };
+            assert!(
+                (got.pixels(i) - sum).abs() <= tolerance,
+                "seed {seed} Gaussian {i}: sum {} for {sum}",
+                got.pixels(i)
+            );
+            assert!(
+                (f64::from(got.max[i]) - max).abs() <= 1e-5 + 1.0 / 255.0,
+                "Gaussian {i}: max {} for {max}",
+                got.max[i]
+            );
+        }
+        let (total, expected) =
+            ((0..scene.len()).map(|i| got.pixels(i)).sum::<f64>(), expected.sum.iter().sum::<f64>());
+        assert!((total / expected - 1.0).abs() < 1e-4, "seed {seed}: total {total}, expected {expected}");
+    }
+}
+
+#[test]
+fn weights_and_transmittance_add_up_to_every_pixel() {
+    // White Gaussians before black: a picture is the sum of its weights.
+    let (mut scene, camera) = (scene(21, 500, 0), camera(70, 41));
+    (0..3).for_each(|c| scene.sh.plane_mut(c).fill(0.5 / 0.282_094_8));
+    let light: f64 = render(&scene, &camera, [0.0; 3]).data.iter().map(|&v| f64::from(v)).sum::<f64>() / 3.0;
+    let seen = seen(&scene, &camera, 1);
+    let weights: f64 = (0..scene.len()).map(|i| seen.pixels(i)).sum();
+    assert!((light / weights - 1.0).abs() < 1e-6, "light {light}, weights {weights}");
+}
+
+#[test]
+fn a_stride_beyond_the_picture_sees_nothing() {
+    // A stride of 1 sees what the picture sees; a stride beyond the picture sees nothing.
+    let (scene, camera) = (scene(22, 200, 0), camera(40, 40));
+    assert!(seen(&scene, &camera, 1).sum.iter().any(|&sum| sum > 0));
+    assert!(seen(&scene, &camera, 1000).sum.iter().all(|&sum| sum == 0));
+}
+
+#[test]
+fn threads_and_kept_buffers_do_not_change_a_bit() {
+    let camera = camera(131, 77);
+    let mut kept = Renderer::new();
+    for (seed, count) in [(31, 20_000), (32, 300), (33, 9000)] {
+        let scene = scene(seed, count, 1);
+        let expected = (kept.render(&scene, &camera, [0.2; 3]), {
+            let mut seen = Contribution::new(count);
+            kept.contribution(&scene, &camera, stride(2), &mut seen);
+            seen
+        });
+        for threads in [1, 2, 5] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let got = pool.install(|| (render(&scene, &camera, [0.2; 3]), seen(&scene, &camera, 2)));
+            assert!(got == expected, "seed {seed}: {threads} threads differ from the single-thread renderer");
+        }
+    }
+}
+
+#[test]
+fn contributions_are_the_same_in_any_order_of_pictures() {
+    let scene = scene(41, 500, 0);
+    let cameras: Vec<Camera> =
+        (0..4).map(|k| Camera { translation: DVec3::new(0.2 * f64::from(k), 0.0, 0.1), ..camera(50, 50) }).collect();
+    let mut forward = Contribution::new(scene.len());
+    cameras.iter().for_each(|camera| contribution(&scene, camera, stride(1), &mut forward));
+    let mut parts: Vec<Contribution> = cameras.iter().map(|camera| seen(&scene, camera, 1)).collect();
+    let mut backward = parts.pop().unwrap();
+    parts.iter().rev().for_each(|part| backward.merge(part));
+    assert_eq!(forward, backward);
+}
+
+#[test]
+fn ties_in_depth_fall_to_the_lower_index() {
+    let mut two = Gaussians::zeros(2, 0);
+    for i in 0..2 {
+        two.position.set_row(i, [0.0, 0.0, 2.0]);
+        two.log_scale.set_row(i, [-1.0; 3]);
+        two.opacity_logit.set_row(i, [2.0]);
+        two.sh.set_row(i, if i == 0 { [1.5, -9.0, -9.0] } else { [-9.0, 1.5, -9.0] });
+    }
+    let [red, green, _] = pixel(&render(&two, &plain_camera(32), [0.0; 3]), 16, 16);
+    assert!(red > 4.0 * green, "the first of two at one place is in front: red {red}, green {green}");
+}
+
+// EXTREMES 26.
+#[test]
+fn what_is_nearer_than_0_2_or_behind_is_not_drawn() {
+    for depth in [-3.0, -0.1, 0.0, 0.1999, 0.2] {
+        let image = render(&single(depth, 0.5, 0.9), &plain_camera(32), [0.5; 3]);
+        assert!(image.data.iter().all(|&v| v == 0.5), "something is drawn at depth {depth}");
+    }
+    // The camera inside a Gaussian whose centre is past the near plane: drawn.
+    let image = render(&single(0.25, 300.0, 0.9), &plain_camera(32), [0.5; 3]);
+    assert!((pixel(&image, 0, 31)[0] - 0.95).abs() < 1e-4, "got {:?}", pixel(&image, 0, 31));
+}
+
+// EXTREMES 27.
+#[test]
+fn a_giant_across_the_near_plane_covers_the_image_and_no_more() {
+    let mut giant = single(0.21, 1.0, 0.9);
+    giant.log_scale.set_row(0, [80.0f32; 3]);
+    let seen = seen(&giant, &plain_camera(40), 1);
+    assert!((seen.pixels(0) - 0.9 * 1600.0).abs() < 1e-2, "got {} pixels, expected {}", seen.pixels(0), 0.9 * 1600.0);
+}
+
+// EXTREMES 29.
+#[test]
+fn what_is_wholly_occluded_contributes_exactly_nothing() {
+    let mut stack = Gaussians::zeros(4, 0);
+    for i in 0..4 {
+        stack.position.set_row(i, [0.0, 0.0, 2.0 + i as f32]);
+        stack.log_scale.set_row(i, [if i < 3 { 4.0f32 } else { -3.0 }; 3]);
+        stack.opacity_logit.set_row(i, [3.9]);
+    }
+    let seen = seen(&stack, &plain_camera(32), 1);
+    // Each of the first two leaves a fiftieth; the third would pass 1e-4 and ends the pixel unblended.
+    assert!(seen.sum[0] > 0 && seen.sum[1] > 0, "the two in front are seen: {:?}", seen.sum);
+    assert_eq!((seen.sum[3], seen.max[3]), (0, 0.0));
+}
+
+// EXTREMES 30.
+#[test]
+fn one_giant_background_gaussian_is_seen_around_what_stands_before_it() {
+    let mut both = Gaussians::zeros(2, 0);
+    both.position.set_row(0, [0.0, 0.0, 1000.0]);
+    both.log_scale.set_row(0, [1e6f32.ln(); 3]);
+    both.opacity_logit.set_row(0, [5.0]);
+    both.position.set_row(1, [0.0, 0.0, 2.0]);
+    both.log_scale.set_row(1, [-3.0f32; 3]);
+    both.opacity_logit.set_row(1, [1.0]);
+    let seen = seen(&both, &plain_camera(64), 1);
+    assert!(seen.pixels(0) > 3900.0 && seen.pixels(1) > 5.0, "got {} and {}", seen.pixels(0), seen.pixels(1));
+}
+
+#[test]
+fn values_that_are_not_finite_are_not_drawn() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for place in 0..3 {
+            let mut one = single(2.0, 0.1, 0.9);
+            match place {
+                0 => one.position.set_row(0, [bad, 0.0, 2.0]),
+                1 => one.position.set_row(0, [0.0, 0.0, bad]),
+                _ => one.rotation.set_row(0, [1.0, bad, 0.0, 0.0]),
+            }
+            let image = render(&one, &plain_camera(32), [0.5; 3]);
+            assert!(image.data.iter().all(|&v| v == 0.5), "{bad} at {place} is drawn");
+        }
+    }
+}
+
+#[test]
+fn empty_scenes_and_empty_pictures_are_valid() {
+    let image = render(&Gaussians::zeros(0, 3), &plain_camera(17), [0.1, 0.2, 0.3]);
+    assert!(image.data.chunks_exact(3).all(|pixel| pixel == [0.1, 0.2, 0.3]));
+    let nothing = Camera { width: 0, height: 0, ..plain_camera(16) };
+    assert!(render(&single(2.0, 0.1, 0.5), &nothing, [0.0; 3]).data.is_empty());
+    assert_eq!(seen(&single(2.0, 0.1, 0.5), &nothing, 1).sum, [0]);
+}
