@@ -293,7 +293,7 @@ fn proxies_are_solved_at_their_leaders(
 
 #[test]
 fn presets_merge_as_the_sequential_rule() {
-    for (preset, least) in [("paper", 100), ("default", 30)] {
+    for (preset, least) in [("paper", 100), ("default", 30), ("strong", 30)] {
         let joined = merges_as_method_says(&Recipe::preset(preset).unwrap(), Only::Both);
         assert!(joined >= least, "{preset}: only {joined} joined");
     }

@@ -2,6 +2,7 @@
 
 mod scene;
 
+use std::fmt::{self, Display, Formatter};
 use std::path::Path;
 
 use scene::{arrays, shared, state, tiny};
@@ -10,8 +11,22 @@ use splatsieve::pipeline::scored::{UserOverrides, score_scene};
 use splatsieve::pipeline::summary::Stages;
 use splatsieve::recipe::{Motion, Recipe};
 
-fn close(what: &str, got: f64, expected: f64, tolerance: f64) {
+fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance:e}");
+}
+
+/// A place in a model, put into words only when something is wrong there: millions of values are looked at.
+struct At<'a, F> {
+    model: &'a Path,
+    what: &'a str,
+    i: usize,
+    frame: F,
+}
+
+impl<F: Display> Display for At<'_, F> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "{}, {} of Gaussian {}, frame {}", self.model.display(), self.what, self.i, self.frame)
+    }
 }
 
 /// The largest side of the box of all positions.
@@ -35,24 +50,24 @@ fn frames_agree(model: &Path) {
         let (n, extent) = (state.len(), extent(&state));
         let values = |name: &str, width: usize| &expected[name][row * n * width..(row + 1) * n * width];
         for i in 0..n {
-            let at = |what: &str| format!("{}, {what} of Gaussian {i} at frame {frame}", model.display());
+            let at = |what| At { model, what, i, frame };
             let q = state.rotation.row::<4>(i).map(f64::from);
             let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
             for c in 0..3 {
                 let position = f64::from(state.position.plane(c)[i]);
-                close(&at("position"), position, values("xyz", 3)[3 * i + c], 1e-5 * extent);
+                close(at("position"), position, values("xyz", 3)[3 * i + c], 1e-5 * extent);
                 let scale = f64::from(state.log_scale.plane(c)[i]).exp();
                 let wanted = values("scales", 3)[3 * i + c];
-                close(&at("scale"), scale, wanted, 1e-5 * wanted);
+                close(at("scale"), scale, wanted, 1e-5 * wanted);
             }
             for (found, wanted) in q.iter().zip(&values("rotation", 4)[4 * i..]) {
-                close(&at("rotation"), found / length, *wanted, 2e-5);
+                close(at("rotation"), found / length, *wanted, 2e-5);
             }
             let opacity = 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
-            close(&at("opacity"), opacity, values("opacity", 1)[i], 1e-5 * values("opacity", 1)[i]);
+            close(at("opacity"), opacity, values("opacity", 1)[i], 1e-5 * values("opacity", 1)[i]);
             if let Some(sh) = expected.get(&format!("sh_t{frame}")) {
                 for k in 0..48 {
-                    close(&at("SH"), f64::from(state.sh.plane(k)[i]), sh[48 * i + k], 2e-5);
+                    close(at("SH"), f64::from(state.sh.plane(k)[i]), sh[48 * i + k], 2e-5);
                 }
             }
         }
@@ -82,16 +97,16 @@ fn statistics_agree(model: &Path) {
     for (motion, name) in [(Motion::Literal, "literal"), (Motion::Runs, "runs")] {
         let (rows, ulp) = rows(model, motion);
         let (e, a) = (ulp, 1e-6);
+        let (of_d, of_kappa) = (&expected[&format!("D_{name}")], &expected[&format!("kappa_{name}")]);
         let mut worst = [0f64; 3];
         for (i, &v) in expected["V"].iter().enumerate() {
-            let at = |what: &str| format!("{}, {name}, {what} of Gaussian {i}", model.display());
-            let find = |key: String| expected[&key][i];
-            let (d, kappa) = (find(format!("D_{name}")), find(format!("kappa_{name}")));
+            let at = |what| At { model, what, i, frame: name };
+            let (d, kappa) = (of_d[i], of_kappa[i]);
             // No opacity of these models lies within f32 rounding of the threshold.
             assert_eq!(f64::from(rows.life[i]), expected["life_frames"][i], "{}", at("life"));
-            close(&at("D"), rows.d[i], d, 2.0 * 3f64.sqrt() * e);
-            close(&at("kappa"), rows.kappa[i], kappa, 4.0 * 3f64.sqrt() * e);
-            close(&at("V"), rows.v[i], v, 4.0 * a * v.sqrt() + 4.0 * a * a);
+            close(at("D"), rows.d[i], d, 2.0 * 3f64.sqrt() * e);
+            close(at("kappa"), rows.kappa[i], kappa, 4.0 * 3f64.sqrt() * e);
+            close(at("V"), rows.v[i], v, 4.0 * a * v.sqrt() + 4.0 * a * a);
             let errors = [(rows.d[i] - d) / ulp, (rows.kappa[i] - kappa) / ulp, rows.v[i] - v];
             (0..3).for_each(|k| worst[k] = worst[k].max(errors[k].abs()));
         }
@@ -111,8 +126,9 @@ fn frames_of_the_tiny_model_are_those_of_pytorch() {
 }
 
 #[test]
-fn frames_of_shared_models_are_those_of_pytorch() {
-    ["deform2", "room2_dynerf", "room2_big"].iter().for_each(|name| on_shared(name, frames_agree));
+fn frames_of_deform2_are_those_of_pytorch() {
+    // The field is held against all three models beside its code; here it is cameras and point cloud as well.
+    on_shared("deform2", frames_agree);
 }
 
 #[test]
