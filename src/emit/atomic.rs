@@ -32,8 +32,8 @@ pub enum Kind {
 
 /// Confirms, before any work, that an output may be written to `target` by a run that reads `inputs`.
 ///
-/// Refused are: a target without a name or in a folder that does not exist; a target that is an input
-/// or holds one, overwriting or not, whatever links lead there; an existing target unless `overwrite`;
+/// Refused are: a target without a name or in a folder that does not exist; a target that is an input,
+/// holds one or lies inside one, overwriting or not, whatever links lead there; an existing target unless `overwrite`;
 /// and with it a file in place of a folder or the reverse, what is neither, and a folder that is neither
 /// empty nor known by its [`MARKER`]: `--overwrite` never deletes what this program did not write.
 ///
@@ -63,6 +63,11 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool
         if real.starts_with(&named) || real.starts_with(&meant) {
             let input = input.display();
             return Err(Error::usage(format!("{shown} contains the input {input}; give another output")));
+        }
+        // A PLY among frames would be another frame, a folder in a model another iteration.
+        if named.starts_with(&real) || meant.starts_with(&real) {
+            let input = input.display();
+            return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
         }
     }
     let Ok(found) = fs::symlink_metadata(target) else { return Ok(()) };

@@ -60,7 +60,8 @@ pub struct Counts {
 ///
 /// Stage 1 takes the round(`keep_fraction`·N) best (halves up) by S, ties by hashed id. Stage 2 keeps
 /// those with norm(S_static) ≥ τ_S or norm(S_dynamic) ≥ τ_D: of the candidates, or under
-/// [`LowPriority::Rescue`] of all.
+/// [`LowPriority::Rescue`] of all. Where both norms are 0 throughout, as for a single Gaussian or for copies
+/// of one, nothing tells Gaussians apart and stage 2 prunes nobody.
 ///
 /// # Errors
 /// [`Error::Usage`] for an id beyond N, or one to be both kept and dropped.
@@ -68,15 +69,15 @@ pub fn select(scores: &Scores, recipe: &Select, overrides: &Overrides) -> Result
     let n = scores.score.len();
     let forced = forced_fates(n, overrides)?;
     let candidates = (recipe.keep_fraction * n as f64).round() as usize;
-    let ordered = ranking::orders(scores, recipe, candidates);
+    let passes = passes(scores, recipe);
+    let ordered = ranking::orders(scores, recipe, candidates, &passes);
 
     let rescue = recipe.low_priority == LowPriority::Rescue;
     let mut counts = Counts { total: n, candidates, ..Counts::default() };
     let mut keep: Vec<bool> = (0..n)
         .map(|i| {
             let candidate = (ordered.by_score[i] as usize) < candidates;
-            let passes = passes(scores, recipe, i);
-            match (candidate, passes) {
+            match (candidate, passes[i]) {
                 (true, true) => true,
                 (true, false) => {
                     counts.pruned_by_stage_2 += 1;
@@ -105,9 +106,14 @@ pub fn select(scores: &Scores, recipe: &Select, overrides: &Overrides) -> Result
     Ok(Selection { keep, ranking: ordered.ranking(&forced), counts })
 }
 
-/// Stage 2 for Gaussian `i`.
-fn passes(scores: &Scores, recipe: &Select, i: usize) -> bool {
-    scores.static_norm[i] >= recipe.tau_static || scores.dynamic_norm[i] >= recipe.tau_dynamic
+/// Stage 2 for every Gaussian.
+fn passes(scores: &Scores, recipe: &Select) -> Vec<bool> {
+    let Scores { static_norm, dynamic_norm, .. } = scores;
+    let norms = || static_norm.iter().zip(dynamic_norm);
+    let ungraded = norms().all(|(&of_static, &of_dynamic)| of_static == 0.0 && of_dynamic == 0.0);
+    norms()
+        .map(|(&of_static, &of_dynamic)| ungraded || of_static >= recipe.tau_static || of_dynamic >= recipe.tau_dynamic)
+        .collect()
 }
 
 /// For every Gaussian what the user wants, if anything.

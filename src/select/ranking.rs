@@ -3,7 +3,7 @@
 
 use rayon::slice::ParallelSliceMut;
 
-use super::{hash_id, passes};
+use super::hash_id;
 use crate::recipe::{LowPriority, Select};
 use crate::score::Scores;
 
@@ -38,8 +38,8 @@ pub(super) struct Orders {
     stage_2: usize,
 }
 
-/// Ranks all Gaussians in both orders.
-pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize) -> Orders {
+/// Ranks all Gaussians in both orders; `passes` is stage 2's verdict on each.
+pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize, passes: &[bool]) -> Orders {
     let n = scores.score.len();
     let mut by_score: Vec<u32> = (0..n as u32).collect();
     // Adding 0 makes −0 equal to 0 under a total order.
@@ -64,7 +64,7 @@ pub(super) fn orders(scores: &Scores, recipe: &Select, candidates: usize) -> Ord
         by_rule: places(&by_rule),
         by_score,
         stage_1: (recipe.low_priority == LowPriority::Drop).then_some(candidates),
-        stage_2: (0..n).filter(|&i| passes(scores, recipe, i)).count(),
+        stage_2: passes.iter().filter(|&&passes| passes).count(),
     }
 }
 

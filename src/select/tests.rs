@@ -27,7 +27,7 @@ fn free(scores: &Scores, recipe: &Select) -> Selection {
     select(scores, recipe, &Overrides::default()).unwrap()
 }
 
-/// The kept set by the definition: full sort, then the OR rule.
+/// The kept set by the definition: full sort, then the OR rule, unless all norms are 0.
 fn kept_by_definition(scores: &Scores, recipe: &Select) -> Vec<bool> {
     let n = scores.score.len();
     let mut order: Vec<usize> = (0..n).collect();
@@ -35,9 +35,11 @@ fn kept_by_definition(scores: &Scores, recipe: &Select) -> Vec<bool> {
         scores.score[b].partial_cmp(&scores.score[a]).unwrap().then(hash_id(a as u64).cmp(&hash_id(b as u64)))
     });
     let candidates = &order[..(recipe.keep_fraction * n as f64 + 0.5).floor() as usize];
+    let graded = scores.static_norm.iter().chain(&scores.dynamic_norm).any(|&norm| norm != 0.0);
     (0..n)
         .map(|i| {
-            let passes = scores.static_norm[i] >= recipe.tau_static || scores.dynamic_norm[i] >= recipe.tau_dynamic;
+            let passes =
+                !graded || scores.static_norm[i] >= recipe.tau_static || scores.dynamic_norm[i] >= recipe.tau_dynamic;
             passes && (recipe.low_priority == LowPriority::Rescue || candidates.contains(&i))
         })
         .collect()
@@ -104,6 +106,14 @@ fn few_candidates_of_which_the_best_fail_are_still_a_prefix() {
     scores.score = (0..100).map(|i| -f64::from(i)).collect();
     let selection = free(&scores, &rule(LowPriority::Drop, 0.02, 0.5, 0.5));
     assert_eq!((selection.counts.kept, selection.ranking.take(1)), (1, vec![1]));
+}
+
+#[test]
+fn a_lone_gaussian_is_kept() {
+    for preset in ["paper", "default"] {
+        let recipe = Recipe::preset(preset).unwrap().select;
+        assert_eq!(free(&scores(&[(0.0, -0.0)]), &recipe).keep, [true], "{preset}");
+    }
 }
 
 #[test]

@@ -87,7 +87,7 @@ fn an_existing_target_is_refused_before_work_and_again_at_commit() {
 }
 
 #[test]
-fn the_input_and_what_holds_it_are_never_a_target() {
+fn the_input_what_holds_it_and_what_lies_in_it_are_never_a_target() {
     let base = tempfile::tempdir().unwrap();
     let model = base.path().join("scenes/model");
     let cloud = model.join("point_cloud.ply");
@@ -100,8 +100,8 @@ fn the_input_and_what_holds_it_are_never_a_target() {
         assert!(refusal(&base.path().join("scenes"), Kind::Folder, &[&model], overwrite).contains("contains"));
         let detour = model.join("../../scenes/model");
         assert!(refusal(&detour, Kind::Folder, &[&model], overwrite).contains("input itself"));
+        assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], overwrite).contains("lies inside the input"));
     }
-    check_target(&model.join("smaller"), Kind::Folder, &[&model], false).unwrap();
     // A name that merely starts like the input's is another one.
     check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], false).unwrap();
 }

@@ -1,0 +1,262 @@
+//! Stiff scenes through the binary: what EXTREME input comes out as, file to file.
+
+mod scene;
+
+use std::fs;
+
+use scene::{PlyRows, Workplace, index_map};
+use splatsieve::model::Gaussians;
+
+/// `n` grey balls of radius 0.05 strewn over a unit square by the golden ratio, opacity 0.73.
+fn balls(n: usize) -> Gaussians {
+    let mut balls = Gaussians::zeros(n, 0);
+    for i in 0..n {
+        let x = (i as f32 * 0.618_034).fract();
+        balls.position.set_row(i, [x, i as f32 / n as f32, 0.0]);
+        balls.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+        balls.log_scale.set_row(i, [-3.0; 3]);
+        balls.opacity_logit.set_row(i, [1.0]);
+        balls.sh.set_row(i, [0.2; 3]);
+    }
+    balls
+}
+
+/// Makes something of a scene odd.
+type Edit = fn(&mut Gaussians);
+
+/// One camera as 3DGS writes them, which sees all of [`balls`] at every frame.
+const CAMERA: &str = r#"[{"id": 0, "img_name": "a", "width": 64, "height": 64, "fx": 60, "fy": 60,
+    "position": [0.5, 0.5, -3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]"#;
+
+fn numbers(summary: &serde_json::Value, key: &str) -> Vec<f64> {
+    summary["terms"].as_array().unwrap().iter().map(|term| term[key].as_f64().unwrap()).collect()
+}
+
+fn says(summary: &serde_json::Value, list: &str, part: &str) -> bool {
+    summary[list].to_string().contains(part)
+}
+
+#[test]
+fn no_gaussians_give_a_valid_empty_output() {
+    let workplace = Workplace::new();
+    let path = workplace.ply("empty.ply", &balls(0));
+    for preset in ["paper", "default"] {
+        let summary = workplace.summary(&format!("empty.ply --overwrite -o out.ply --preset {preset}"));
+        assert_eq!(summary["gaussians"], 0);
+        assert_eq!(fs::read(workplace.path("out.ply")).unwrap(), fs::read(&path).unwrap());
+        assert!(index_map(&workplace.path("out.ply.index_map.npy")).is_empty());
+        workplace.done(&format!("compress empty.ply --overwrite -o out.gseq --preset {preset}"));
+        workplace.done("verify out.gseq");
+        workplace.done("score empty.ply --overwrite -o rows.npz");
+    }
+}
+
+#[test]
+fn one_gaussian_is_kept_byte_for_byte() {
+    let workplace = Workplace::new();
+    let path = workplace.ply("one.ply", &balls(1));
+    for request in ["--preset paper", "--preset default", "--target-count 1", "--target-ratio 0.01", "--merge-only"] {
+        workplace.done(&format!("compress one.ply --overwrite -o out.ply {request}"));
+        assert_eq!(fs::read(workplace.path("out.ply")).unwrap(), fs::read(&path).unwrap(), "{request}");
+    }
+}
+
+#[test]
+fn one_frame_is_static_and_said_to_be() {
+    let workplace = Workplace::new();
+    workplace.ply("one.ply", &balls(50));
+    let summary = workplace.summary("one.ply -o out.ply");
+    assert!(says(&summary, "left_out", "motion, curvature, opacity variance"), "{}", summary["left_out"]);
+    assert!(says(&summary, "left_out", "1 frame"));
+    workplace.done("score one.ply -o rows.npz");
+    let rows = scene::arrays(&workplace.path("rows.npz"));
+    for name in ["D", "kappa", "V", "dynamic_score"] {
+        assert!(rows[name].iter().all(|&x| x == 0.0), "{name}: {:?}", rows[name]);
+    }
+    assert!(rows["life"].iter().all(|&frames| frames == 1.0));
+}
+
+#[test]
+fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
+    let workplace = Workplace::new();
+    let one = balls(1).pick(&[0; 100]);
+    workplace.ply("same.ply", &one);
+    for preset in ["paper", "default"] {
+        let request = format!("same.ply --overwrite -o out.ply --prune-only --preset {preset}");
+        let summary = workplace.summary(&format!("{request} --target-count 37"));
+        assert_eq!(summary["gaussians"], 37);
+        assert!(says(&summary, "left_out", "grading by coverage"), "{}", summary["left_out"]);
+        let map = index_map(&workplace.path("out.ply.index_map.npy"));
+        let kept: Vec<usize> = (0..100).filter(|&i| map[i] >= 0).collect();
+        assert_ne!(kept, (0..37).collect::<Vec<_>>(), "{preset}: places in the file decide");
+        // Without a target: stage 1 alone, which counts; stage 2 has nothing to tell them apart by.
+        let expected = if preset == "paper" { 80 } else { 100 };
+        assert_eq!(workplace.summary(&request)["gaussians"], expected, "{preset}");
+        assert!(kept.iter().any(|&i| i < 20) && kept.iter().any(|&i| i > 80), "{preset}: {kept:?}");
+    }
+}
+
+#[test]
+fn static_neighbours_merge_and_the_dynamic_arm_is_off() {
+    let workplace = Workplace::new();
+    let mut cloud = balls(40).pick(&(0..80).map(|i| i / 2).collect::<Vec<_>>());
+    // Beside each other, not at one place.
+    for i in (0..80).step_by(2) {
+        cloud.position.plane_mut(2)[i] = 0.001;
+    }
+    for frame in 0..4 {
+        workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
+    }
+    let summary = workplace.summary("frames -o out");
+    assert!(says(&summary, "left_out", "grading by motion"), "{}", summary["left_out"]);
+    assert!(says(&summary, "left_out", "grading by the dynamic score"));
+    assert_eq!(summary["merge"]["proxies"], summary["gaussians"], "each pair is one");
+    let gaussians = summary["gaussians"].as_u64().unwrap();
+    assert_eq!(gaussians * 2, summary["selection"]["kept"].as_u64().unwrap());
+    // The rows of a result that nothing moves are the same in every frame.
+    let frames: Vec<PlyRows> =
+        (0..4).map(|frame| PlyRows::read(&workplace.path(&format!("out/frame_{frame}.ply")))).collect();
+    assert!(frames.iter().all(|frame| frame.rows == frames[0].rows));
+}
+
+#[test]
+fn movers_around_one_percent_are_kept_whatever_their_number() {
+    for movers in [1, 2, 3] {
+        let workplace = Workplace::new();
+        let mut cloud = balls(200);
+        for frame in 0..4 {
+            for i in 0..movers {
+                cloud.position.plane_mut(2)[50 * i] = 0.1 * frame as f32;
+            }
+            workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
+        }
+        // Exact percentiles: default's dynamic threshold is 1, and the middle of a sketch's bucket may lie above
+        // the value that all movers share.
+        let default = "--preset default --tau-static 0.99 --exact-percentiles";
+        for request in ["--preset paper --target-count 20", default] {
+            workplace.done(&format!("compress frames -o out --overwrite --prune-only {request}"));
+            let map = index_map(&workplace.path("out/index_map.npy"));
+            assert!((0..movers).all(|i| map[50 * i] >= 0), "{request}, {movers} movers of 200: one was pruned");
+            assert!(map.iter().filter(|&&place| place >= 0).count() < 100, "{request}: nothing was pruned");
+        }
+    }
+}
+
+#[test]
+fn invisible_gaussians_are_all_prunable_without_nan() {
+    for logit in [-100.0, -30.0] {
+        let workplace = Workplace::new();
+        let mut cloud = balls(60);
+        cloud.opacity_logit.plane_mut(0).fill(logit);
+        workplace.ply("dark.ply", &cloud);
+        for preset in ["paper", "default"] {
+            let request = format!("dark.ply --overwrite --preset {preset} -o out.ply");
+            let summary = workplace.summary(&format!("{request} --target-count 1"));
+            assert_eq!(summary["gaussians"], 1, "{preset}");
+            assert_eq!(summary["flags"]["never_alive"], 60);
+            assert!(numbers(&summary, "p99").iter().all(|x| x.is_finite()));
+            workplace.done(&format!("compress {request}"));
+        }
+    }
+}
+
+#[test]
+fn solid_gaussians_have_no_variance_and_finite_logits() {
+    let workplace = Workplace::new();
+    let mut cloud = balls(30).pick(&(0..60).map(|i| i / 2).collect::<Vec<_>>());
+    cloud.opacity_logit.plane_mut(0).fill(100.0);
+    for frame in 0..3 {
+        workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
+    }
+    workplace.done("score frames -o rows.npz");
+    assert!(scene::arrays(&workplace.path("rows.npz"))["V"].iter().all(|&v| v == 0.0));
+    for preset in ["paper", "default"] {
+        let summary = workplace.summary(&format!("frames --preset {preset} --trajectory alignment --overwrite -o out"));
+        assert!(summary["merge"]["proxies"].as_u64().unwrap() > 0);
+        let rows = PlyRows::read(&workplace.path("out/frame_0.ply"));
+        assert!((0..rows.rows.len()).all(|i| rows.value(i, "opacity").is_finite() && rows.value(i, "opacity") > 10.0));
+    }
+}
+
+#[test]
+fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
+    let edits: [(&str, Edit); 5] = [
+        ("position", |g| g.position.plane_mut(1)[7] = f32::NAN),
+        ("scale", |g| g.log_scale.plane_mut(0)[7] = f32::INFINITY),
+        ("opacity", |g| g.opacity_logit.plane_mut(0)[7] = f32::NAN),
+        ("rotation", |g| g.rotation.plane_mut(3)[7] = f32::NAN),
+        ("colour", |g| g.sh.plane_mut(2)[7] = f32::NEG_INFINITY),
+    ];
+    for (what, edit) in edits {
+        let workplace = Workplace::new();
+        let mut odd_cloud = balls(100);
+        edit(&mut odd_cloud);
+        let odd = workplace.ply("odd.ply", &odd_cloud);
+        workplace.refused(
+            1,
+            "compress odd.ply -o out.ply",
+            &["odd.ply", "Gaussian 7", "NaN or infinity", "--non-finite"],
+        );
+
+        let summary = workplace.summary("odd.ply -o dropped.ply --non-finite drop --merge-only");
+        assert_eq!((&summary["gaussians"], &summary["flags"]["non_finite"]), (&99.into(), &1.into()), "{what}");
+        assert_eq!(index_map(&workplace.path("dropped.ply.index_map.npy"))[7], -1, "{what}");
+
+        workplace.done("compress odd.ply -o kept.ply --non-finite keep");
+        let place = index_map(&workplace.path("kept.ply.index_map.npy"))[7];
+        let (before, after) = (PlyRows::read(&odd), PlyRows::read(&workplace.path("kept.ply")));
+        assert!(place >= 0 && after.rows[place as usize] == before.rows[7], "{what}");
+
+        // The percentiles are those of the other 99, from the same camera.
+        fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
+        let others: Vec<u32> = (0..100).filter(|&i| i != 7).collect();
+        workplace.ply("others.ply", &odd_cloud.pick(&others));
+        let [found, expected] = ["odd.ply --non-finite keep", "others.ply"]
+            .map(|request| workplace.summary(&format!("{request} --cameras cameras.json --dry-run -o x.ply")));
+        assert_eq!(found["terms"], expected["terms"], "{what}");
+    }
+}
+
+#[test]
+fn without_cameras_a_virtual_rig_is_used_and_said() {
+    let workplace = Workplace::new();
+    workplace.ply("some.ply", &balls(20));
+    let summary = workplace.summary("some.ply -o out.ply");
+    assert!(says(&summary, "notes", "no cameras given or found: virtual rig"), "{}", summary["notes"]);
+    assert!(summary["cameras"]["origin"].as_str().unwrap().contains("virtual rig"));
+    assert!(summary["cameras"]["pairs"].as_u64().unwrap() > 1);
+    assert_eq!(summary["flags"]["never_in_view"], 0);
+}
+
+#[test]
+fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
+    let workplace = Workplace::new();
+    let cloud = balls(10).pick(&(0..30).map(|i| i / 3).collect::<Vec<_>>());
+    workplace.ply("three.ply", &cloud);
+    let single = PlyRows::read(&workplace.ply("single.ply", &balls(10)));
+    // Three opacities of 0.731 over one area.
+    let rules = [("sum", 1.0f64), ("union", 1.0 - (1.0f64 - 0.731_058_6).powi(3)), ("area", 1.0)];
+    for (rule, opacity) in rules {
+        let request = format!("three.ply --overwrite -o out.ply --merge-only --opacity {rule}");
+        let summary = workplace.summary(&request);
+        assert_eq!((&summary["gaussians"], &summary["merge"]["opacity"]), (&10.into(), &rule.into()));
+        let rows = PlyRows::read(&workplace.path("out.ply"));
+        for i in 0..10 {
+            for name in rows.names.iter().filter(|name| *name != "opacity") {
+                let (found, expected) = (rows.value(i, name), single.value(i, name));
+                assert!((found - expected).abs() <= 2e-6 * expected.abs(), "{name}: {found}, expected {expected}");
+            }
+            let found = 1.0 / (1.0 + (-f64::from(rows.value(i, "opacity"))).exp());
+            assert!((found - opacity).abs() < 1e-6, "{rule}: {found}, expected {opacity}");
+        }
+    }
+}
+
+#[test]
+fn frames_that_disagree_are_named() {
+    let workplace = Workplace::new();
+    workplace.ply("frames/frame_1.ply", &balls(5));
+    workplace.ply("frames/frame_2.ply", &balls(5));
+    workplace.ply("frames/frame_10.ply", &balls(4));
+    workplace.refused(1, "compress frames -o out", &["frame_10.ply", "5", "4"]);
+}

@@ -1,0 +1,344 @@
+//! Clusters and proxies of whole models against METHOD section 5 written down plainly: neighbours by looking
+//! at all pairs, gates by their formulas, leaders one after the other.
+
+mod scene;
+
+use std::path::Path;
+
+use glam::{DMat3, DQuat, DVec3};
+use scene::{PlyRows, state, tiny};
+use splatsieve::merge::proxy::merge_state;
+use splatsieve::model::{Gaussians, SH_C0};
+use splatsieve::pipeline::compress::{CompressOptions, Only, compress_scene};
+use splatsieve::pipeline::input::{InputOptions, Scene};
+use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
+use splatsieve::pipeline::summary::Stages;
+use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
+
+/// Tightens a gate.
+type Edit = fn(&mut Merge);
+
+/// A model in memory, every frame of it.
+struct Whole {
+    frames: Vec<Gaussians>,
+    alive: Vec<Vec<bool>>,
+    reference: usize,
+    extent: f64,
+}
+
+impl Whole {
+    fn read(scene: &Scene) -> Whole {
+        let source = scene.input.source();
+        let frames: Vec<Gaussians> = (0..source.info().times.len()).map(|frame| state(source, frame)).collect();
+        let alive: Vec<Vec<bool>> = frames
+            .iter()
+            .map(|f| f.opacity_logit.plane(0).iter().map(|&x| 1.0 / (1.0 + (-f64::from(x)).exp()) >= 0.01).collect())
+            .collect();
+        let living = |frame: &[bool]| frame.iter().filter(|&&alive| alive).count();
+        let most = alive.iter().map(|frame| living(frame)).max().unwrap();
+        let reference = alive.iter().position(|frame| living(frame) == most).unwrap();
+        let extent = (0..3)
+            .map(|c| {
+                let mut plane = frames[reference].position.plane(c).to_vec();
+                plane.sort_by(f32::total_cmp);
+                let rank = |percent: usize| f64::from(plane[(percent * plane.len()).div_ceil(100) - 1]);
+                rank(99) - rank(1)
+            })
+            .fold(0.0, f64::max);
+        Whole { frames, alive, reference, extent }
+    }
+
+    fn at(&self, frame: usize, i: usize) -> DVec3 {
+        DVec3::from(self.frames[frame].position.row::<3>(i).map(f64::from))
+    }
+}
+
+fn rotation(state: &Gaussians, i: usize) -> DQuat {
+    let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
+    DQuat::from_xyzw(x, y, z, w).normalize()
+}
+
+fn covariance(state: &Gaussians, i: usize) -> DMat3 {
+    let axes = DMat3::from_quat(rotation(state, i));
+    let scale = DVec3::from(state.log_scale.row::<3>(i).map(|x| f64::from(x).exp()));
+    axes * DMat3::from_diagonal(scale * scale) * axes.transpose()
+}
+
+/// Tests 1 and 2 for two nodes with these states.
+fn alike(state: &Gaussians, i: usize, j: usize, merge: &Merge, pass: &MergePass) -> bool {
+    let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
+    let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
+    let regular = sigma + DMat3::from_diagonal(DVec3::splat(1e-6 * trace));
+    let position = |i: usize| DVec3::from(state.position.row::<3>(i).map(f64::from));
+    let delta = position(i) - position(j);
+    let mahalanobis = delta.dot(regular.inverse() * delta).sqrt();
+
+    let sorted = |i: usize| {
+        let mut log = state.log_scale.row::<3>(i).map(f64::from);
+        log.sort_by(|a, b| b.partial_cmp(a).unwrap());
+        // Thinner than a tenth of its middle scale is flat, however flat.
+        log[2] = log[2].max(log[1] + 0.1f64.ln());
+        log
+    };
+    let ratio = sorted(i).iter().zip(sorted(j)).map(|(a, b)| (a - b).abs().exp()).fold(0.0, f64::max);
+
+    let dc = |i: usize| DVec3::from(state.sh.row::<3>(i).map(f64::from));
+    let cosine = dc(i).dot(dc(j)) / (dc(i).length() * dc(j).length() + 1e-8);
+    let color = |i: usize| (dc(i) * SH_C0 + DVec3::splat(0.5)).max(DVec3::ZERO);
+    mahalanobis < pass.d0
+        && cosine > pass.rho
+        && ratio <= merge.max_scale_ratio
+        && (color(i) - color(j)).length() <= merge.max_color_difference
+}
+
+/// Test 3 for two Gaussians.
+fn move_alike(whole: &Whole, i: usize, j: usize, recipe: &Recipe, pass: &MergePass) -> bool {
+    let merge = &recipe.merge;
+    let unit = merge.length_unit.in_scene_units(whole.extent);
+    let both = |t: usize| whole.alive[t][i] && whole.alive[t][j];
+    let common: Vec<usize> = (0..whole.frames.len()).filter(|&t| both(t)).collect();
+    let either = (0..whole.frames.len()).filter(|&t| whole.alive[t][i] || whole.alive[t][j]).count();
+    if common.is_empty() {
+        return false;
+    }
+    let steps: Vec<(DVec3, DVec3)> = common
+        .iter()
+        .filter(|&&t| t > 0 && (recipe.scan.motion == Motion::Literal || both(t - 1)))
+        .map(|&t| (whole.at(t, i) - whole.at(t - 1, i), whole.at(t, j) - whole.at(t - 1, j)))
+        .collect();
+    let similarity = match merge.trajectory {
+        Trajectory::Cosine => {
+            let cosines = steps.iter().filter(|(a, b)| a.length() * b.length() > 0.0);
+            let sum: f64 = cosines.map(|(a, b)| a.dot(*b) / (a.length() * b.length())).sum();
+            let terms = if recipe.scan.motion == Motion::Literal { common.len() } else { steps.len() };
+            if terms == 0 { 0.0 } else { sum / terms as f64 }
+        }
+        Trajectory::Alignment => {
+            let noise = 2.0 * steps.len() as f64 * (merge.motion_noise * unit).powi(2);
+            let dot: f64 = steps.iter().map(|(a, b)| a.dot(*b)).sum();
+            let squares: f64 = steps.iter().map(|(a, b)| a.length_squared() + b.length_squared()).sum();
+            if squares + noise == 0.0 { 1.0 } else { (2.0 * dot + noise) / (squares + noise) }
+        }
+    };
+    let offset = |t: usize| whole.at(t, i) - whole.at(t, j);
+    let drift = common.iter().map(|&t| (offset(t) - offset(whole.reference)).length()).fold(0.0, f64::max);
+    let dead = (either - common.len()) as f64 / either as f64;
+    similarity > pass.tau_m && drift <= merge.max_drift * unit && dead <= merge.max_dead_time
+}
+
+/// Members of every cluster by leader, the leader first, as ids; leaders ascending.
+fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> Vec<Vec<usize>> {
+    let merge = &recipe.merge;
+    let unit = merge.length_unit.in_scene_units(whole.extent);
+    let mut groups: Vec<Vec<usize>> = kept.iter().map(|&id| vec![id]).collect();
+    for pass in &merge.passes {
+        // The state of a node: its Gaussian's own, or its proxy's so far.
+        let mut nodes = whole.frames[whole.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
+        for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
+            let members = weighted(scored, group);
+            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge).write(
+                splatsieve::model::Columns::ALL,
+                node,
+                &mut nodes,
+            );
+        }
+        let size = |node: usize| groups[node].iter().map(|&id| scored.rows.c[id]).sum::<f64>();
+        let hash = |node: usize| splatsieve::select::hash_id(groups[node][0] as u64);
+        let mut order: Vec<usize> = (0..groups.len()).collect();
+        order.sort_by(|&a, &b| size(b).partial_cmp(&size(a)).unwrap().then(hash(a).cmp(&hash(b))));
+        let position = |node: usize| DVec3::from(nodes.position.row::<3>(node).map(f64::from));
+        let mut leader: Vec<Option<usize>> = vec![None; groups.len()];
+        for &node in &order {
+            if leader[node].is_some() {
+                continue;
+            }
+            leader[node] = Some(node);
+            let mut near: Vec<(f64, usize)> = (0..groups.len())
+                .filter(|&other| other != node)
+                .map(|other| ((position(other) - position(node)).length_squared(), other))
+                .filter(|(squared, _)| *squared <= (pass.epsilon * unit).powi(2))
+                .collect();
+            near.sort_by(|a, b| a.partial_cmp(b).unwrap());
+            for (_, other) in near.into_iter().take(merge.max_neighbors) {
+                if leader[other].is_none()
+                    && alike(&nodes, node, other, merge, pass)
+                    && move_alike(whole, groups[node][0], groups[other][0], recipe, pass)
+                {
+                    leader[other] = Some(node);
+                }
+            }
+        }
+        let joined = |node: usize| {
+            let others = (0..groups.len()).filter(|&other| other != node && leader[other] == Some(node));
+            groups[node].iter().copied().chain(others.flat_map(|other| groups[other].clone())).collect()
+        };
+        groups = (0..groups.len()).filter(|&node| leader[node] == Some(node)).map(joined).collect();
+    }
+    groups.sort_by_key(|group| group[0]);
+    groups
+}
+
+/// Ids, ascending, with weights ∝ C·Vis.
+fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
+    let mut ids = group.to_vec();
+    ids.sort_unstable();
+    let seen: Vec<f64> = ids.iter().map(|&id| scored.rows.c[id] * scored.rows.vis[id]).collect();
+    let total: f64 = seen.iter().sum();
+    assert!(total > 0.0, "a cluster that nobody saw");
+    ids.iter().zip(seen).map(|(&id, weight)| (id as u32, weight / total)).collect()
+}
+
+fn options(output: &Path, recipe: &Recipe, only: Only) -> CompressOptions {
+    CompressOptions {
+        input: InputOptions { path: tiny(), ..InputOptions::default() },
+        output: output.to_owned(),
+        kind: None,
+        recipe: recipe.clone(),
+        only,
+        target: None,
+        keep_ids: None,
+        drop_ids: None,
+        keep_box: None,
+        dry_run: false,
+        overwrite: false,
+    }
+}
+
+/// Compresses the tiny model and compares clusters and proxies; gives how many Gaussians joined others.
+fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("out");
+    let scene = scene::scene(&tiny());
+    let (summary, map) = compress_scene(&scene, &options(&output, recipe, only), Stages::default()).unwrap();
+    let scored = score_scene(&scene, recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
+    let whole = Whole::read(&scene);
+    assert_eq!(summary.merge.unwrap().reference_frame, whole.reference);
+    let kept: Vec<usize> = (0..map.len()).filter(|&id| only == Only::Merge || scored.selection.keep[id]).collect();
+
+    let expected = clusters(&whole, &scored, &kept, recipe);
+    let mut expected_map = vec![None; map.len()];
+    for (place, group) in expected.iter().enumerate() {
+        group.iter().for_each(|&id| expected_map[id] = Some(place as u32));
+    }
+    assert_eq!(map, expected_map, "clusters differ from the sequential rule");
+
+    proxies_are_solved_at_their_leaders(&output, &scene, &whole, &scored, &expected, &recipe.merge);
+    kept.len() - expected.len()
+}
+
+/// The raw parameters of a proxy are its merged state at the reference frame minus what the field adds to
+/// its leader there; its quaternion is as long as the leader's in that frame. Then, if it was placed at its
+/// leader, its state at the reference frame is the merged one, and its path the leader's to the bit.
+fn proxies_are_solved_at_their_leaders(
+    output: &Path,
+    scene: &Scene,
+    whole: &Whole,
+    scored: &Scored,
+    clusters: &[Vec<usize>],
+    merge: &Merge,
+) {
+    let cloud = "point_cloud/iteration_7/point_cloud.ply";
+    let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
+    let result = splatsieve::ingest::ModelFolder::open(output, None).unwrap();
+    let result = result.with_times(scene.input.source().info().times.clone()).unwrap();
+    let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
+    let at_reference = &whole.frames[whole.reference];
+    for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
+        let leader = group[0];
+        let merged = merge_state(&weighted(scored, group), at_reference, leader as u32, merge);
+        let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
+        // (property, merged state, state of the leader), then the state found in the result.
+        let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();
+        let found = &frames[whole.reference];
+        for c in 0..3 {
+            let of = |state: &Gaussians, i: usize| state.position.plane(c)[i];
+            columns.push((["x", "y", "z"][c].into(), merged.position[c], of(at_reference, leader), of(found, place)));
+            let of = |state: &Gaussians, i: usize| state.log_scale.plane(c)[i];
+            columns.push((format!("scale_{c}"), merged.log_scale[c], of(at_reference, leader), of(found, place)));
+        }
+        for c in 0..4 {
+            let of = |state: &Gaussians, i: usize| state.rotation.plane(c)[i];
+            let rotation = merged.rotation[c] * length;
+            columns.push((format!("rot_{c}"), rotation, of(at_reference, leader), of(found, place)));
+        }
+        let of = |state: &Gaussians, i: usize| state.opacity_logit.plane(0)[i];
+        columns.push(("opacity".into(), merged.opacity_logit, of(at_reference, leader), of(found, place)));
+        for k in 0..16 {
+            for channel in 0..3 {
+                let name = if k == 0 { format!("f_dc_{channel}") } else { format!("f_rest_{}", 15 * channel + k - 1) };
+                let of = |state: &Gaussians, i: usize| state.sh.plane(3 * k + channel)[i];
+                columns.push((name, merged.sh[3 * k + channel], of(at_reference, leader), of(found, place)));
+            }
+        }
+        assert_eq!(columns.len(), 59);
+        for (name, merged, of_leader, found) in columns {
+            let (raw, raw_leader) = (after.value(place, &name), before.value(leader, &name));
+            let expected = merged - (f64::from(of_leader) - f64::from(raw_leader));
+            // Four f32 numbers of this size were rounded on the way.
+            let size = merged.abs().max(of_leader.abs().into()).max(raw_leader.abs().into()).max(1e-3);
+            let tolerance = 4.0 * f64::from(f32::EPSILON) * size;
+            let at = format!("{name} of the proxy at {place}, led by {leader}");
+            assert!((f64::from(raw) - expected).abs() <= tolerance, "raw {at}: got {raw}, expected {expected}");
+            if merge.placement == Placement::Leader {
+                assert!((f64::from(found) - merged).abs() <= tolerance, "{at}: got {found}, expected {merged}");
+            }
+        }
+        if merge.placement == Placement::Leader {
+            for (now, then) in frames.iter().zip(&whole.frames) {
+                assert_eq!(now.position.row::<3>(place), then.position.row::<3>(leader), "path of {place}");
+            }
+        }
+    }
+}
+
+#[test]
+fn presets_merge_as_the_sequential_rule() {
+    for (preset, least) in [("paper", 100), ("default", 30), ("strong", 30)] {
+        let joined = merges_as_method_says(&Recipe::preset(preset).unwrap(), Only::Both);
+        assert!(joined >= least, "{preset}: only {joined} joined");
+    }
+}
+
+#[test]
+fn merging_alone_merges_as_the_sequential_rule() {
+    for preset in ["paper", "default"] {
+        assert!(merges_as_method_says(&Recipe::preset(preset).unwrap(), Only::Merge) > 30);
+    }
+}
+
+#[test]
+fn later_passes_merge_groups_as_the_sequential_rule() {
+    let mut recipe = Recipe::preset("paper").unwrap();
+    let one = merges_as_method_says(&recipe, Only::Both);
+    recipe.merge.passes.push(MergePass { epsilon: 0.3, d0: 4.0, rho: 0.5, tau_m: 0.3 });
+    let two = merges_as_method_says(&recipe, Only::Both);
+    assert!(two > one, "{two} joined in two passes, {one} in one");
+}
+
+#[test]
+fn every_gate_binds_as_the_sequential_rule() {
+    let base = || {
+        let mut recipe = Recipe::preset("default").unwrap();
+        recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
+        (recipe.merge.max_drift, recipe.merge.max_dead_time) = (0.05, 0.5);
+        recipe
+    };
+    let all = merges_as_method_says(&base(), Only::Merge);
+    let edits: [(&str, Edit); 9] = [
+        ("epsilon", |m| m.passes[0].epsilon = 0.004),
+        ("d0", |m| m.passes[0].d0 = 0.2),
+        ("rho", |m| m.passes[0].rho = 0.9999),
+        ("tau_m", |m| m.passes[0].tau_m = 0.999),
+        ("max_neighbors", |m| m.max_neighbors = 2),
+        ("max_scale_ratio", |m| m.max_scale_ratio = 1.1),
+        ("max_color_difference", |m| m.max_color_difference = 0.01),
+        ("max_drift", |m| m.max_drift = 0.001),
+        ("max_dead_time", |m| m.max_dead_time = 0.0),
+    ];
+    for (gate, edit) in edits {
+        let mut recipe = base();
+        edit(&mut recipe.merge);
+        let joined = merges_as_method_says(&recipe, Only::Merge);
+        assert!(joined < all, "{gate} binds nothing: {joined} joined, {all} without");
+    }
+}

@@ -1,0 +1,199 @@
+//! What the tests of the whole program share: models to read, the program to run, and plain readers of
+//! what it writes that share no code with it.
+
+#![allow(dead_code, reason = "every test crate compiles this module and uses a part of it")]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use assert_cmd::Command;
+use splatsieve::model::{Columns, Gaussians};
+use splatsieve::pass::FrameSource;
+use splatsieve::pipeline::input::{InputOptions, Scene, open_scene};
+use splatsieve::stream::gather;
+use tempfile::TempDir;
+
+/// The model that lives with the code; see `scripts/make_fixture.py`.
+pub(crate) fn tiny() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
+}
+
+/// A shared model, or none with a note where this machine has none.
+pub(crate) fn shared(name: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os("SPLATSIEVE_DATA")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from)
+        .join(name);
+    if folder.is_dir() {
+        return Some(folder);
+    }
+    eprintln!("skipped: {} is not here", folder.display());
+    None
+}
+
+/// The scene of a model folder that holds its cameras, all pictures.
+pub(crate) fn scene(model: &Path) -> Scene {
+    let options = InputOptions { path: model.to_owned(), cameras: Some(model.to_owned()), ..InputOptions::default() };
+    open_scene(&options).unwrap()
+}
+
+/// All columns of every Gaussian at `frame`.
+pub(crate) fn state(source: &dyn FrameSource, frame: usize) -> Gaussians {
+    let ids: Vec<u32> = (0..source.info().count as u32).collect();
+    gather(source, &ids, frame, Columns::ALL).unwrap()
+}
+
+/// Every value of row `i`, column after column, as bits.
+pub(crate) fn bits(state: &Gaussians, i: usize) -> Vec<u32> {
+    let planes = |column: Columns| (0..state.column(column).width()).map(move |c| (column, c));
+    Columns::ALL.iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
+}
+
+/// A folder to write into, and the program to run in it.
+pub(crate) struct Workplace(TempDir);
+
+/// What a run left behind.
+pub(crate) struct Run {
+    pub(crate) code: i32,
+    pub(crate) stdout: String,
+    pub(crate) stderr: String,
+}
+
+impl Workplace {
+    pub(crate) fn new() -> Self {
+        Workplace(tempfile::tempdir().unwrap())
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    /// Runs the program with arguments separated by blanks; paths are relative to this folder, and
+    /// `{tiny}` is the tiny model.
+    pub(crate) fn run(&self, arguments: &str) -> Run {
+        let arguments = arguments.split_whitespace().map(|word| match word {
+            "{tiny}" => tiny(),
+            word => PathBuf::from(word),
+        });
+        let output =
+            Command::cargo_bin("splatsieve").unwrap().current_dir(self.0.path()).args(arguments).output().unwrap();
+        Run {
+            code: output.status.code().unwrap(),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+
+    /// Runs the program, which must succeed; gives its stdout.
+    pub(crate) fn done(&self, arguments: &str) -> String {
+        let run = self.run(arguments);
+        assert_eq!(run.code, 0, "{arguments}\n{}", run.stderr);
+        run.stdout
+    }
+
+    /// Runs a compression with `--json`; gives its summary.
+    pub(crate) fn summary(&self, arguments: &str) -> serde_json::Value {
+        serde_json::from_str(&self.done(&format!("compress --json {arguments}"))).unwrap()
+    }
+
+    /// Runs the program, which must fail with `code`, name every one of `parts` on stderr, print nothing
+    /// on stdout and leave this folder as it was.
+    pub(crate) fn refused(&self, code: i32, arguments: &str, parts: &[&str]) {
+        let before = files(self.0.path());
+        let run = self.run(arguments);
+        assert_eq!(run.code, code, "{arguments}\n{}{}", run.stdout, run.stderr);
+        assert_eq!(run.stdout, "", "{arguments}: data on stdout");
+        for part in parts {
+            assert!(run.stderr.contains(part), "{arguments}: {part:?} is not in {:?}", run.stderr);
+        }
+        let after = files(self.0.path());
+        assert!(before == after, "{arguments}: left {:?}, found {:?}", after.keys(), before.keys());
+    }
+
+    /// Writes an INRIA PLY.
+    pub(crate) fn ply(&self, name: &str, gaussians: &Gaussians) -> PathBuf {
+        let path = self.path(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        splatsieve::emit::ply::write_inria(gaussians, &[], &path).unwrap();
+        path
+    }
+}
+
+/// Every file below `folder` by its relative path, and its bytes; folders have none.
+pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    let mut pending = vec![folder.to_owned()];
+    while let Some(next) = pending.pop() {
+        for entry in fs::read_dir(&next).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.strip_prefix(folder).unwrap().to_owned();
+            if path.is_dir() {
+                pending.push(path);
+                found.insert(name, Vec::new());
+            } else {
+                found.insert(name, fs::read(path).unwrap());
+            }
+        }
+    }
+    found
+}
+
+/// [`files`] without the summary, the only output that may differ between runs.
+pub(crate) fn lasting_files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = files(folder);
+    found.retain(|name, _| !name.to_str().unwrap().ends_with("summary.json"));
+    found
+}
+
+/// A PLY of float properties: their names and the bytes of every row.
+pub(crate) struct PlyRows {
+    pub(crate) names: Vec<String>,
+    pub(crate) rows: Vec<Vec<u8>>,
+}
+
+impl PlyRows {
+    pub(crate) fn read(path: &Path) -> PlyRows {
+        let bytes = fs::read(path).unwrap();
+        let mark = b"end_header\n";
+        let body = bytes.windows(mark.len()).position(|window| window == mark).unwrap() + mark.len();
+        let header = std::str::from_utf8(&bytes[..body]).unwrap();
+        assert!(header.contains("format binary_little_endian 1.0"));
+        let names: Vec<String> =
+            header.lines().filter_map(|line| line.strip_prefix("property float ")).map(str::to_owned).collect();
+        let count = header.lines().find_map(|line| line.strip_prefix("element vertex ")).unwrap();
+        let rows: Vec<Vec<u8>> = bytes[body..].chunks_exact(4 * names.len()).map(<[u8]>::to_vec).collect();
+        assert_eq!(rows.len().to_string(), count);
+        assert_eq!(bytes.len(), body + 4 * names.len() * rows.len(), "bytes after the last row");
+        PlyRows { names, rows }
+    }
+
+    /// The value of property `name` in row `i`.
+    pub(crate) fn value(&self, i: usize, name: &str) -> f32 {
+        let at = 4 * self.names.iter().position(|found| found == name).unwrap();
+        f32::from_le_bytes(self.rows[i][at..at + 4].try_into().unwrap())
+    }
+}
+
+/// An index map: for every Gaussian of the input its place in the output, or −1.
+pub(crate) fn index_map(path: &Path) -> Vec<i64> {
+    let bytes = fs::read(path).unwrap();
+    npyz::NpyFile::new(&bytes[..]).unwrap().into_vec().unwrap()
+}
+
+/// Every array of an `.npz`, as f64.
+pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
+    let mut archive = npyz::npz::NpzArchive::open(path).unwrap();
+    let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
+    let mut read = |name: &str| -> Vec<f64> {
+        let file = archive.by_name(name).unwrap().unwrap();
+        match file.dtype().descr().as_str() {
+            "'<f4'" => file.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
+            "'<i4'" => file.into_vec::<i32>().unwrap().into_iter().map(f64::from).collect(),
+            "'<u4'" => file.into_vec::<u32>().unwrap().into_iter().map(f64::from).collect(),
+            "'<i8'" => file.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect(),
+            "'|b1'" => file.into_vec::<bool>().unwrap().into_iter().map(|value| f64::from(u8::from(value))).collect(),
+            _ => file.into_vec::<f64>().unwrap(),
+        }
+    };
+    names.iter().map(|name| (name.clone(), read(name))).collect()
+}
