@@ -7,19 +7,20 @@ use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
 
-/// Columns `want` of the Gaussians `ids` at `frame`; all other columns are zero.
+/// Columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
 pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns) -> Result<Gaussians> {
     let blocks: Vec<Gaussians> = ids
         .par_chunks(BLOCK)
         .map(|ids| {
-            let mut block = Gaussians::zeros(ids.len(), source.info().sh_degree);
+            let mut block = Gaussians::zeros(0, source.info().sh_degree);
             source.open(Ids::List(ids))?.read(frame, want, &mut block)?;
             Ok(block)
         })
         .collect::<Result<_>>()?;
-    let mut all = Gaussians::zeros(ids.len(), source.info().sh_degree);
+    let mut all = Gaussians::zeros(0, source.info().sh_degree);
     for column in want.iter() {
         let target = all.column_mut(column);
+        target.resize(ids.len());
         for c in 0..target.width() {
             for (to, block) in target.plane_mut(c).chunks_mut(BLOCK).zip(&blocks) {
                 to.copy_from_slice(block.column(column).plane(c));

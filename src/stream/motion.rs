@@ -30,7 +30,7 @@ pub fn measure_motion(
 
     let mut blocks: Vec<(Box<dyn BlockReader + '_>, Gaussians)> = ids
         .par_chunks(BLOCK)
-        .map(|ids| Ok((source.open(Ids::List(ids))?, Gaussians::zeros(ids.len(), info.sh_degree))))
+        .map(|ids| Ok((source.open(Ids::List(ids))?, Gaussians::zeros(0, info.sh_degree))))
         .collect::<Result<_>>()?;
     let mut motion = PairMotion::new(pairs, reference, scan.motion);
     let mut position = Column::zeros(3, ids.len());
