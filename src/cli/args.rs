@@ -60,9 +60,6 @@ pub(super) struct Input {
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
-    /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    pub(super) frames: Option<u32>,
 }
 
 /// From where to look.
@@ -72,6 +69,9 @@ pub(super) struct Cameras {
     /// data if cfg_args names it, else a virtual rig]
     #[arg(long, value_name = "PATH")]
     pub(super) cameras: Option<PathBuf>,
+    /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) frames: Option<u32>,
     /// Picture size where the cameras name none
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub(super) size: Option<(u32, u32)>,
@@ -295,7 +295,9 @@ fn parse_box(text: &str) -> Result<[f64; 6], String> {
         .collect::<Result<_, _>>()?;
     let corners: [f64; 6] =
         numbers.try_into().map_err(|n: Vec<f64>| format!("expected six numbers, found {}", n.len()))?;
-    match (0..3).find(|&axis| !(corners[axis] <= corners[axis + 3])) {
+    // A NaN is in no order.
+    let in_order = |axis: usize| corners[axis].partial_cmp(&corners[axis + 3]).is_some_and(|order| order.is_le());
+    match (0..3).find(|&axis| !in_order(axis)) {
         Some(axis) => Err(format!("axis {axis}: {} is not below {}", corners[axis], corners[axis + 3])),
         None => Ok(corners),
     }

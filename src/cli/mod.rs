@@ -34,7 +34,7 @@ pub fn main() -> ExitCode {
         // Whoever read our output has seen enough.
         Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("splatsieve: {error}");
+            tell(&format!("splatsieve: {error}"));
             ExitCode::from(if matches!(error, Error::Usage(_)) { 2 } else { 1 })
         }
     }
@@ -67,8 +67,9 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
             let input = input_options(args.input, Some(args.cameras));
-            let (scene, bytes) = container::pack(&input, &args.output, compression, args.overwrite)?;
-            let info = scene.input.source().info();
+            let (opened, bytes) = container::pack(&input, &args.output, compression, args.overwrite)?;
+            notes(&opened.notes);
+            let info = opened.input.source().info();
             print(&format!(
                 "{}: {} Gaussians x {} frames in {bytes} bytes\n",
                 args.output.display(),
@@ -95,7 +96,9 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Unpack(args) => {
             let input = input_options(args.input, Some(args.cameras));
-            let frames = container::unpack(&input, &args.output, args.overwrite)?;
+            let opened = container::unpack(&input, &args.output, args.overwrite)?;
+            notes(&opened.notes);
+            let frames = opened.input.source().info().times.len();
             print(&format!("{}: {frames} PLY files\n", args.output.display()))
         }
         Verb::Recover(args) => {
@@ -114,7 +117,7 @@ fn run(cli: Cli) -> Result<()> {
             let report = demo::run(args.gaussians as usize, args.frames as usize, recipe, output, args.overwrite)?;
             print(&report.text())?;
             if let Some(folder) = output {
-                eprintln!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display());
+                tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
             }
             Ok(())
         }
@@ -155,15 +158,11 @@ fn compress_options(args: Compress) -> Result<CompressOptions> {
 }
 
 fn input_options(input: Input, cameras: Option<Cameras>) -> InputOptions {
-    let mut options = InputOptions {
-        path: input.input,
-        iteration: input.iteration,
-        frames: input.frames.map(|frames| frames as usize),
-        ..InputOptions::default()
-    };
+    let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
     if let Some(cameras) = cameras {
         options.cameras = cameras.cameras;
         options.size = cameras.size;
+        options.frames = cameras.frames.map(|frames| frames as usize);
         options.split = match cameras.split {
             SplitArg::Train => Some(Split::Train),
             SplitArg::Test => Some(Split::Test),
@@ -175,8 +174,13 @@ fn input_options(input: Input, cameras: Option<Cameras>) -> InputOptions {
 
 fn notes(notes: &[String]) {
     for note in notes {
-        eprintln!("note: {note}");
+        tell(&format!("note: {note}"));
     }
+}
+
+/// Says something on stderr; nobody listening is no failure.
+fn tell(message: &str) {
+    let _ = writeln!(io::stderr(), "{message}");
 }
 
 fn json(value: &impl serde::Serialize) -> String {

@@ -221,7 +221,7 @@ fn raw_parameters_solved_from_a_state_lead_back_to_it() {
         let mut again = Gaussians::zeros(0, 3);
         deltas.apply(&solved, Columns::ALL, &mut again);
         for column in Columns::ALL.iter() {
-            for i in 0..raw.len() {
+            for (i, mask) in mask.iter().enumerate() {
                 let (got, expected) = (values(again.column(column), i), values(state.column(column), i));
                 for (got, expected) in got.into_iter().zip(expected) {
                     let tolerance = 1e-5 * (1.0 + expected.abs());
@@ -229,7 +229,7 @@ fn raw_parameters_solved_from_a_state_lead_back_to_it() {
                         (got - expected).abs() <= tolerance,
                         "{} of Gaussian {i}, mask {}: got {got}, expected {expected}, tolerance {tolerance}",
                         column.name(),
-                        mask[i]
+                        mask
                     );
                 }
             }

@@ -251,13 +251,18 @@ fn tidy(target: &Path) -> Result<()> {
     for entry in fs::read_dir(&parent).map_err(Error::io("list", &parent))? {
         let entry = entry.map_err(Error::io("list", &parent))?;
         let name = entry.file_name();
-        let Some(rest) = name.as_encoded_bytes().strip_prefix(prefix.as_encoded_bytes()) else { continue };
+        let (bytes, prefix) = (name.as_encoded_bytes(), prefix.as_encoded_bytes());
+        // A container on its way to a temporary name has a hidden name of its own, made of that name.
+        let nested = bytes.strip_prefix(b".").and_then(|inner| inner.strip_prefix(prefix));
+        let Some(rest) = bytes.strip_prefix(prefix).or(nested) else { continue };
         let Some((owner, suffix)) = std::str::from_utf8(rest).ok().and_then(|rest| rest.split_once('.')) else {
             continue;
         };
         let Some((process, number)) = owner.split_once('-') else { continue };
         let (Ok(process), Ok(_)) = (process.parse::<u32>(), number.parse::<u64>()) else { continue };
-        if !runs(process) && (suffix == WRITING || suffix == REPLACED) {
+        let writing =
+            suffix == WRITING || (nested.is_some() && suffix.starts_with(WRITING) && suffix.ends_with(".tmp"));
+        if !runs(process) && (writing || suffix == REPLACED) {
             left.push((entry.path(), suffix == REPLACED));
         }
     }

@@ -1,6 +1,5 @@
 //! A `gseq` container as a source of frames.
 
-use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
 use gseq::{Reader, TileBuffer, TileId};
@@ -8,9 +7,6 @@ use gseq::{Reader, TileBuffer, TileId};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo, sh_coefficients};
 use crate::pass::{BlockReader, FrameSource, Ids};
-
-/// Bytes of decoded tiles a reader keeps; one over more Gaussians decodes the others frame by frame.
-const KEPT_BYTES: usize = 256 << 20;
 
 /// An open container with all columns of a Gaussian model.
 pub struct Container {
@@ -115,17 +111,10 @@ impl FrameSource for Container {
                 _ => runs.push(Run { gaussian_block: tile, from, to, len: 1 }),
             }
         }
-        // Each tile is visited once per frame, in whatever order the Gaussians were asked for.
+        // Each tile is decoded once, in whatever order the Gaussians were asked for.
         runs.sort_by_key(|run| run.gaussian_block);
-        let kept = VecDeque::new();
-        Ok(Box::new(TileReader {
-            source: self,
-            len: ids.len(),
-            runs,
-            buffer: TileBuffer::default(),
-            kept,
-            kept_bytes: 0,
-        }))
+        let kept = self.places.iter().map(|_| Kept::default()).collect();
+        Ok(Box::new(TileReader { source: self, len: ids.len(), runs, buffer: TileBuffer::default(), kept }))
     }
 }
 
@@ -137,10 +126,13 @@ struct Run {
     len: usize,
 }
 
-/// A decoded tile.
+/// One column of a reader's Gaussians over one frame block.
+#[derive(Default)]
 struct Kept {
-    at: TileId,
-    constant: bool,
+    frame_block: Option<u32>,
+    /// Frames held: one if none of the tiles varies.
+    frames: usize,
+    /// `[frames, width, len]`
     values: Vec<f32>,
 }
 
@@ -149,59 +141,66 @@ struct TileReader<'a> {
     len: usize,
     runs: Vec<Run>,
     buffer: TileBuffer,
-    /// Oldest first.
-    kept: VecDeque<Kept>,
-    kept_bytes: usize,
+    /// By place in [`Container::places`]. At most 4 · width · frames of a block bytes per Gaussian, however
+    /// many frames there are.
+    kept: Vec<Kept>,
 }
 
 impl TileReader<'_> {
-    /// Place in `kept` of the tile, decoded now unless it was before.
-    fn tile(&mut self, at: TileId) -> Result<usize> {
-        if let Some(place) = self.kept.iter().position(|kept| kept.at == at) {
-            return Ok(place);
+    /// Fills the slot of column `index` with the frames of `frame_block`, unless it holds them.
+    fn keep(&mut self, index: usize, frame_block: u32) -> Result<()> {
+        let Container { reader, places, .. } = self.source;
+        let kept = &mut self.kept[index];
+        if kept.frame_block == Some(frame_block) {
+            return Ok(());
         }
-        let tile = self.source.reader.tile(at, &mut self.buffer)?;
-        let bytes = size_of_val(tile.values());
-        let mut values = Vec::new();
-        while self.kept_bytes + bytes > KEPT_BYTES
-            && let Some(oldest) = self.kept.pop_front()
-        {
-            self.kept_bytes -= size_of_val(&oldest.values[..]);
-            values = oldest.values;
+        kept.frame_block = None;
+        let column = places[index].1;
+        let width = reader.layout().columns[column as usize].width as usize;
+        kept.frames = 1;
+        for run in &self.runs {
+            let info = reader.tile_info(TileId { column, gaussian_block: run.gaussian_block, frame_block })?;
+            if !info.constant {
+                kept.frames = info.frames as usize;
+            }
         }
-        values.clear();
-        values.extend_from_slice(tile.values());
-        self.kept_bytes += bytes;
-        self.kept.push_back(Kept { at, constant: tile.is_constant(), values });
-        Ok(self.kept.len() - 1)
+        kept.values.resize(kept.frames * width * self.len, 0.0);
+        for runs in self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block) {
+            let at = TileId { column, gaussian_block: runs[0].gaussian_block, frame_block };
+            let tile = reader.tile(at, &mut self.buffer)?;
+            for (plane, to) in kept.values.chunks_exact_mut(self.len).enumerate() {
+                let from = tile.plane(plane / width, plane % width);
+                for run in runs {
+                    to[run.to..run.to + run.len].copy_from_slice(&from[run.from..run.from + run.len]);
+                }
+            }
+        }
+        kept.frame_block = Some(frame_block);
+        Ok(())
     }
 }
 
 impl BlockReader for TileReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let layout = self.source.reader.layout();
+        let frame_block = self.source.reader.layout().frame_block as usize;
         if frame >= self.source.info.times.len() {
             return Err(Error::usage(format!("{}: there is no frame {frame}", self.source.path.display())));
         }
-        let frame_block = (frame / layout.frame_block as usize) as u32;
-        let within = frame % layout.frame_block as usize;
-        let places: Vec<(Columns, u32)> =
-            self.source.places.iter().copied().filter(|&(column, _)| want.contains(column)).collect();
-        for (column, place) in places {
+        for index in 0..self.kept.len() {
+            let column = self.source.places[index].0;
+            if !want.contains(column) {
+                continue;
+            }
             let target = out.column_mut(column);
             target.resize(self.len);
-            let width = target.width();
-            for index in 0..self.runs.len() {
-                let gaussian_block = self.runs[index].gaussian_block;
-                let kept = self.tile(TileId { column: place, gaussian_block, frame_block })?;
-                let (run, tile) = (&self.runs[index], &self.kept[kept]);
-                let frame = if tile.constant { 0 } else { within };
-                let tile_len = layout.gaussian_range(gaussian_block).count();
-                for c in 0..width {
-                    let plane = &tile.values[(frame * width + c) * tile_len..][..tile_len];
-                    target.plane_mut(c)[run.to..run.to + run.len].copy_from_slice(&plane[run.from..run.from + run.len]);
-                }
+            if self.len == 0 {
+                continue;
             }
+            self.keep(index, (frame / frame_block) as u32)?;
+            let kept = &self.kept[index];
+            let frame = if kept.frames == 1 { 0 } else { frame % frame_block };
+            let size = target.planes().len();
+            target.planes_mut().copy_from_slice(&kept.values[frame * size..][..size]);
         }
         Ok(())
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use gseq::{Compression, Encoding, Reader, RecoverReport, TileId, VerifyReport};
 use serde::Serialize;
 
-use super::input::{Input, InputOptions, Scene, open_scene};
+use super::input::{Input, InputOptions, Opened, open_input};
 use super::output::{OutputKind, write_sequence};
 use super::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
@@ -16,36 +16,36 @@ use crate::error::{Error, Result};
 use crate::stream::Progress;
 
 /// Packs any input into a container; gives the input and the bytes written.
-pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: bool) -> Result<(Scene, u64)> {
+pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: bool) -> Result<(Opened, u64)> {
     check_target(output, Kind::File, &[&input.path], overwrite)?;
-    let scene = open_scene(input)?;
-    let source = scene.input.source();
+    let opened = open_input(input)?;
+    let source = opened.input.source();
     let staged = StagedFile::new(output, overwrite)?;
     let work = source.info().count as u64 * source.info().times.len() as u64;
     let progress = Progress::new("pack", "Gaussian frames", work);
-    let attributes = BTreeMap::from([("source_digest".to_owned(), scene.input.digest()?)]);
+    let attributes = BTreeMap::from([("source_digest".to_owned(), opened.input.digest()?)]);
     write_container(source, staged.path(), compression, attributes, |done| progress.advance(done))?;
     drop(progress);
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
-    Ok((scene, bytes))
+    Ok((opened, bytes))
 }
 
-/// Writes every frame of an input as a PLY file into the folder `output`; gives the number of frames.
-pub fn unpack(input: &InputOptions, output: &Path, overwrite: bool) -> Result<usize> {
+/// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
+pub fn unpack(input: &InputOptions, output: &Path, overwrite: bool) -> Result<Opened> {
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
-    let scene = open_scene(input)?;
-    let source = scene.input.source();
+    let opened = open_input(input)?;
+    let source = opened.input.source();
     let staged = StagedFolder::new(output, overwrite)?;
     write_sequence(source, OutputKind::PlySequence, staged.path())?;
     let marker = serde_json::json!({
         "tool": format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
-        "input": scene.input.summary(&scene.path)?,
+        "input": opened.input.summary(&input.path)?,
     });
     let path = staged.path().join(MARKER);
     fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
     staged.commit()?;
-    Ok(source.info().times.len())
+    Ok(opened)
 }
 
 /// Reads every byte of a container and checks it.
@@ -68,7 +68,7 @@ pub struct Info {
     /// The input.
     #[serde(flatten)]
     pub input: InputSummary,
-    /// Time stamps of first and last frame; none without frames.
+    /// Time stamps of first and last frame; none without frames, or where cameras choose them.
     pub times: Option<(f64, f64)>,
     /// Columns of a container.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -98,7 +98,7 @@ pub struct ColumnInfo {
     pub max: Option<f32>,
 }
 
-/// Looks at an input without reading its frames.
+/// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
 pub fn info(options: &InputOptions) -> Result<Info> {
     let input = Input::open(&options.path, options.iteration)?;
     let columns = match &input {
@@ -107,7 +107,11 @@ pub fn info(options: &InputOptions) -> Result<Info> {
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
-    Ok(Info { input: input.summary(&options.path)?, times, columns })
+    let mut summary = input.summary(&options.path)?;
+    if matches!(input, Input::Model(_)) {
+        summary.frames = None;
+    }
+    Ok(Info { input: summary, times, columns })
 }
 
 fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
@@ -158,8 +162,11 @@ impl Info {
             input.gaussians,
             input.sh_degree,
             match self.times {
-                Some((first, last)) => format!("{} frames from t = {first} to {last}", input.frames),
-                None => "continuous in time or without frames".to_owned(),
+                Some((first, last)) => format!("{} frames from t = {first} to {last}", input.frames.unwrap_or(0)),
+                None => match input.frames {
+                    Some(_) => "no frames".to_owned(),
+                    None => "continuous in time".to_owned(),
+                },
             },
             if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
             input.bytes,

@@ -56,12 +56,22 @@ pub struct Scene {
     pub notes: Vec<String>,
 }
 
-/// Opens an input and its cameras.
-pub fn open_scene(options: &InputOptions) -> Result<Scene> {
+/// An input with its frames, and the cameras if there are any.
+pub struct Opened {
+    /// The input.
+    pub input: Input,
+    /// Cameras given or found.
+    pub rig: Option<Rig>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Opens an input; cameras only say which frames it has.
+pub fn open_input(options: &InputOptions) -> Result<Opened> {
     let path = &options.path;
     let mut notes = Vec::new();
     let input = Input::open(path, options.iteration)?;
-    let camera_options = CameraOptions { size: options.size, frames: options.frames, ..CameraOptions::default() };
+    let camera_options = CameraOptions { size: options.size, frames: options.frames };
     let rig = match camera_path(options, &input) {
         Some(found) => Some(cameras::load(&found, &camera_options)?),
         None => None,
@@ -73,6 +83,9 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
                 None if !times.is_empty() => times,
                 given => {
                     let frames = given.unwrap_or(DEFAULT_FRAMES);
+                    if !(1..=MAX_FRAMES).contains(&frames) {
+                        return Err(Error::usage(format!("--frames: expected 1 to {MAX_FRAMES}, found {frames}")));
+                    }
                     if given.is_none() {
                         notes.push(format!("nothing names the model's frames: {frames} evenly spaced ones (--frames)"));
                     }
@@ -101,6 +114,18 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
         }
         input => input,
     };
+    let info = input.source().info();
+    if info.times.is_empty() && info.count > 0 {
+        let found = format!("none of {} Gaussians", info.count);
+        return Err(Error::input(path, "", "at least one frame", found));
+    }
+    Ok(Opened { input, rig, notes })
+}
+
+/// Opens an input and the cameras that look at it.
+pub fn open_scene(options: &InputOptions) -> Result<Scene> {
+    let Opened { input, rig, mut notes } = open_input(options)?;
+    let path = &options.path;
     let rig = match rig {
         Some(rig) => rig,
         None => {
@@ -110,7 +135,7 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
         }
     };
     let schedule = rig.schedule(&input.source().info().times, options.split)?;
-    if schedule.pairs() == 0 {
+    if schedule.pairs() == 0 && !input.source().info().times.is_empty() {
         return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
     }
     Ok(Scene { path: path.clone(), input, rig, schedule, notes })
@@ -118,6 +143,8 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 
 /// Frames of a model for which neither cameras nor the user name any.
 const DEFAULT_FRAMES: usize = 60;
+/// Most frames a model is evaluated at; each costs 8 bytes before any work.
+const MAX_FRAMES: usize = 1_000_000;
 
 fn camera_path(options: &InputOptions, input: &Input) -> Option<PathBuf> {
     options.cameras.clone().or_else(|| match input {
@@ -128,10 +155,10 @@ fn camera_path(options: &InputOptions, input: &Input) -> Option<PathBuf> {
 
 /// A rig around the robust middle of the first frame.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
-    let ids: Vec<u32> = (0..source.info().count as u32).collect();
     if source.info().times.is_empty() {
         return Ok(cameras::virtual_rig(DVec3::ZERO, 1.0));
     }
+    let ids: Vec<u32> = (0..source.info().count as u32).collect();
     let state = gather(source, &ids, 0, Columns::POSITION)?;
     let bounds = RobustBox::of(&state.position);
     Ok(cameras::virtual_rig(bounds.middle, bounds.extent()))
@@ -208,7 +235,7 @@ impl Input {
             kind: self.kind(),
             digest: self.digest()?,
             gaussians: info.count,
-            frames: info.times.len(),
+            frames: Some(info.times.len()),
             sh_degree: info.sh_degree,
             varying: info.varying.iter().map(Columns::name).collect(),
             bytes: self.bytes()?,

@@ -1,7 +1,8 @@
 //! What a run writes: the smaller model and, beside it, the recipe, the index map and the summary.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::{self, File};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use gseq::Compression;
@@ -103,8 +104,8 @@ pub fn check_output(path: &Path, kind: OutputKind, scene: &Scene, overwrite: boo
     Ok(())
 }
 
-/// Writes the result and what goes beside it; everything appears under its name at the end, the
-/// result last.
+/// Writes the result and what goes beside it; everything appears under its name at the end, a file
+/// before its companions and the summary, which says that all is there, last.
 pub fn write_result(
     scene: &Scene,
     scored: &Scored,
@@ -140,7 +141,7 @@ pub fn write_result(
         write_text(recipe.path(), &text)?;
         write_index_map(&map, index_map.path())?;
         write_text(marker.path(), &summary.json())?;
-        for file in [recipe, index_map, marker, staged] {
+        for file in [staged, recipe, index_map, marker] {
             file.commit()?;
         }
     }
@@ -255,8 +256,11 @@ impl Emission<'_> {
     }
 }
 
+/// Copies the bytes, not the permissions: a result of a read-only model can be replaced.
 fn copy(from: &Path, to: &Path) -> Result<()> {
-    fs::copy(from, to).map_err(Error::io("copy", from))?;
+    let mut source = File::open(from).map_err(Error::io("open", from))?;
+    let mut target = File::create(to).map_err(Error::io("create", to))?;
+    io::copy(&mut source, &mut target).map_err(Error::io("copy", from))?;
     Ok(())
 }
 

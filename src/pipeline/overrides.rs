@@ -32,9 +32,8 @@ pub fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
         })?;
         if from > to || to as usize >= count {
             return Err(Error::usage(format!(
-                "{origin}, line {}: expected ids from 0 to {}, found {line:?}",
-                number + 1,
-                count as i64 - 1
+                "{origin}, line {}: expected ids below {count}, the number of Gaussians, found {line:?}",
+                number + 1
             )));
         }
         ids.extend(from..=to);

@@ -28,8 +28,8 @@ pub struct CanonicalProxies {
 /// deltas at their leaders' canonical positions.
 ///
 /// A proxy placed at the mean is moved by the field there, not by its members' field. One that strays
-/// further than `max_drift` from its members goes back to its leader's canonical position; so does one
-/// for which no raw parameters exist, with all of its leader's parameters.
+/// further than `max_drift` from its members goes back to its leader's canonical position, its shape about
+/// the mean unchanged; so does one for which no raw parameters exist, with all of its leader's parameters.
 pub fn canonical_proxies(
     model: &ModelFolder,
     scored: &Scored,
@@ -55,15 +55,17 @@ pub fn canonical_proxies(
     if unsolved > 0 {
         notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
     }
-    let mut deviations = deviations(model, scored, sieved, &raw)?;
+    let mut placements = vec![merge.placement; leaders.len()];
+    let mut deviations = deviations(model, scored, sieved, &raw, &placements)?;
     let tolerance = merge.max_drift * merge.length_unit.in_scene_units(scored.extent);
     let strayed: Vec<usize> = (0..leaders.len()).filter(|&i| deviations[i] > tolerance).collect();
     if merge.placement == Placement::Mean && !strayed.is_empty() {
         for &proxy in &strayed {
             raw.position.set_row::<3>(proxy, of_leaders.position.row(proxy));
+            placements[proxy] = Placement::Leader;
         }
         notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
-        deviations = self::deviations(model, scored, sieved, &raw)?;
+        deviations = self::deviations(model, scored, sieved, &raw, &placements)?;
     }
     Ok(CanonicalProxies { raw, deviation: deviations.into_iter().reduce(f64::max), notes })
 }
@@ -107,9 +109,15 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
     unsolved.len()
 }
 
-/// For every proxy the largest change, over sampled frames, of its offset from the weighted mean of its
-/// members since the reference frame.
-fn deviations(model: &ModelFolder, scored: &Scored, sieved: &Sieved, raw: &Gaussians) -> Result<Vec<f64>> {
+/// For every proxy how far, at most over sampled frames, it is from where it should be: at the mean, from
+/// the weighted mean of its members; at the leader, from its offset to that mean at the reference frame.
+fn deviations(
+    model: &ModelFolder,
+    scored: &Scored,
+    sieved: &Sieved,
+    raw: &Gaussians,
+    placements: &[Placement],
+) -> Result<Vec<f64>> {
     let frames = model.info().times.len();
     let proxies = model.with_canonical(raw.clone());
     let places: Vec<u32> = (0..raw.len() as u32).collect();
@@ -133,7 +141,10 @@ fn deviations(model: &ModelFolder, scored: &Scored, sieved: &Sieved, raw: &Gauss
             })
             .collect())
     };
-    let reference = offsets(scored.reference_frame)?;
+    let mut reference = offsets(scored.reference_frame)?;
+    for (offset, _) in reference.iter_mut().zip(placements).filter(|(_, placement)| **placement == Placement::Mean) {
+        *offset = [0.0; 3];
+    }
     let mut largest = vec![0.0f64; raw.len()];
     for frame in sampled(frames) {
         for (largest, (now, then)) in largest.iter_mut().zip(offsets(frame)?.iter().zip(&reference)) {

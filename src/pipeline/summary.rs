@@ -48,8 +48,8 @@ pub struct InputSummary {
     pub digest: String,
     /// N.
     pub gaussians: usize,
-    /// T.
-    pub frames: usize,
+    /// T; none for a model whose frames nobody has chosen yet.
+    pub frames: Option<usize>,
     /// Degree of the spherical harmonics.
     pub sh_degree: usize,
     /// Columns that differ between frames.
@@ -229,7 +229,11 @@ impl Summary {
         let _ = writeln!(
             out,
             "{}: {}, {} Gaussians x {} frames, SH degree {}",
-            input.path, input.kind, input.gaussians, input.frames, input.sh_degree
+            input.path,
+            input.kind,
+            input.gaussians,
+            input.frames.unwrap_or(0),
+            input.sh_degree
         );
         let _ = writeln!(
             out,

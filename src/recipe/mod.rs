@@ -263,15 +263,17 @@ impl Recipe {
         let in_unit = |x: f64| (0.0..=1.0).contains(&x);
         let nonnegative = |x: f64| x >= 0.0;
         let finite = |x: f64| x.is_finite() && x >= 0.0;
+        // Sums of weighted norms stay finite, and 0 times a weight is 0.
+        let weight = |x: f64| (0.0..=1e6).contains(&x);
         let Merge { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } = self.merge;
         let mut checks = vec![
             ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
-            ("score.w_static", self.score.w_static, finite(self.score.w_static), "finite, 0 or more"),
-            ("score.w_dynamic", self.score.w_dynamic, finite(self.score.w_dynamic), "finite, 0 or more"),
-            ("score.lambda", self.score.lambda, finite(self.score.lambda), "finite, 0 or more"),
-            ("score.mu", self.score.mu, finite(self.score.mu), "finite, 0 or more"),
-            ("score.eta", self.score.eta, finite(self.score.eta), "finite, 0 or more"),
-            ("score.xi", self.score.xi, finite(self.score.xi), "finite, 0 or more"),
+            ("score.w_static", self.score.w_static, weight(self.score.w_static), "0 to 1e6"),
+            ("score.w_dynamic", self.score.w_dynamic, weight(self.score.w_dynamic), "0 to 1e6"),
+            ("score.lambda", self.score.lambda, weight(self.score.lambda), "0 to 1e6"),
+            ("score.mu", self.score.mu, weight(self.score.mu), "0 to 1e6"),
+            ("score.eta", self.score.eta, weight(self.score.eta), "0 to 1e6"),
+            ("score.xi", self.score.xi, weight(self.score.xi), "0 to 1e6"),
             ("score.norm_epsilon", self.score.norm_epsilon, finite(self.score.norm_epsilon), "finite, 0 or more"),
             ("select.keep_fraction", self.select.keep_fraction, in_unit(self.select.keep_fraction), "0 to 1"),
             ("select.tau_static", self.select.tau_static, finite(self.select.tau_static), "finite, 0 or more"),

@@ -3,7 +3,7 @@
 
 use std::mem::size_of;
 
-use crate::model::{Column, Columns, Flags, Gaussians};
+use crate::model::{self, Column, Columns, Flags, Gaussians};
 
 /// Largest ln(scale) that is taken at its word: e¹⁰⁰ scene units overflows nothing downstream and
 /// already covers every picture whole.
@@ -43,7 +43,7 @@ impl State {
         }
         if changed.contains(Columns::OPACITY) {
             for (opacity, &logit) in self.opacity.iter_mut().zip(gaussians.opacity_logit.plane(0)) {
-                *opacity = sigmoid(f64::from(logit));
+                *opacity = model::opacity(logit);
             }
         }
         if !(changed & (Columns::ROTATION | Columns::LOG_SCALE)).is_empty() {
@@ -81,10 +81,6 @@ impl State {
             + axes.iter().map(|plane| size_of_val(&plane[..])).sum::<usize>()
             + size_of_val(&flags[..])
     }
-}
-
-fn sigmoid(x: f64) -> f64 {
-    1.0 / (1.0 + (-x).exp())
 }
 
 /// Rows of the rotation of a wxyz quaternion of any length but zero. Dividing the quadratic form by
