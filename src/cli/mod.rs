@@ -72,7 +72,8 @@ fn run(cli: Cli) -> Result<()> {
             let output = args.output.clone();
             let rendered = render::render(&render_options(args))?;
             notes(&rendered.notes);
-            print(&format!("{}: {} pictures\n", output.display(), rendered.pictures))
+            let plural = if rendered.pictures == 1 { "" } else { "s" };
+            print(&format!("{}: {} picture{plural}\n", output.display(), rendered.pictures))
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;

@@ -153,3 +153,74 @@ impl Part {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::model::{Camera, Shot};
+
+    /// Shots of (view, camera, time, split).
+    fn rig(shots: &[(u32, u32, Option<f64>, Split)]) -> Rig {
+        let camera = |k: u32| Camera::look_at(DVec3::new(f64::from(k), -5.0, 1.0), DVec3::ZERO, 1.0, (8, 8));
+        let shot = |&(view, camera, time, split)| Shot { view, camera, time, split, image: None };
+        Rig {
+            cameras: (0..4).map(camera).collect(),
+            shots: shots.iter().map(shot).collect(),
+            background: None,
+            origin: "test.json".into(),
+        }
+    }
+
+    fn pairs(pictures: &[Picture]) -> Vec<(usize, u32)> {
+        pictures.iter().map(|picture| (picture.frame, picture.view)).collect()
+    }
+
+    #[test]
+    fn pictures_come_by_frame_then_view_whatever_the_file_says() {
+        let rig = rig(&[
+            (2, 0, Some(1.0), Split::Test),
+            (7, 1, None, Split::Test),
+            (1, 2, Some(0.0), Split::Test),
+            (5, 3, Some(0.5), Split::Train),
+        ]);
+        let times = [0.0, 0.5, 1.0];
+        assert_eq!(pairs(&pictures(&rig, &times, Part::HeldOut).unwrap()), [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]);
+        assert_eq!(pairs(&pictures(&rig, &times, Part::Split(Split::Train)).unwrap()), [(1, 5)]);
+        assert_eq!(pictures(&rig, &times, Part::All).unwrap().len(), 6);
+        assert_eq!(pairs(&[picture(&rig, &times, Part::All, 1, 5).unwrap()]), [(1, 5)]);
+    }
+
+    #[test]
+    fn cameras_that_hold_nothing_out_are_all_looked_at_unless_asked_not_to() {
+        let rig = rig(&[(0, 0, None, Split::Train)]);
+        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], Part::HeldOut).unwrap()), [(0, 0), (1, 0)]);
+        let message = pictures(&rig, &[0.0], Part::Split(Split::Test)).unwrap_err().to_string();
+        assert!(message.contains("--split"), "{message}");
+    }
+
+    #[test]
+    fn one_picture_in_two_files_is_one_and_two_of_one_name_are_refused() {
+        let same = rig(&[(3, 1, Some(0.0), Split::Train), (3, 1, Some(0.0), Split::Test)]);
+        assert_eq!(pairs(&pictures(&same, &[0.0], Part::All).unwrap()), [(0, 3)]);
+        let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
+        let message = pictures(&two, &[0.0], Part::All).unwrap_err().to_string();
+        assert!(message.contains("view 3 at frame 0") && message.contains("--split"), "{message}");
+    }
+
+    #[test]
+    fn thinned_frames_are_those_of_numpys_linspace() {
+        let every = |frames: usize| -> Vec<Picture> {
+            (0..frames).map(|frame| Picture { frame: 3 * frame, view: 0, camera: 0, shot: 0 }).collect()
+        };
+        let kept = |frames, count| pairs(&thin(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
+        // np.round(np.linspace(0, 59, 15)), np.round(np.linspace(0, 9, 3)) with 4.5 going to 4.
+        assert_eq!(kept(60, 15), [0, 4, 8, 13, 17, 21, 25, 30, 34, 38, 42, 46, 51, 55, 59]);
+        assert_eq!(kept(10, 3), [0, 4, 9]);
+        assert_eq!(kept(10, 1), [0]);
+        assert_eq!(kept(10, 0), [0]);
+        assert_eq!(kept(3, 3), [0, 1, 2]);
+        assert_eq!(kept(3, 99), [0, 1, 2]);
+    }
+}
