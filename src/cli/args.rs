@@ -13,6 +13,8 @@ Examples:
   splatsieve compress model --cameras data -o small --target-ratio 0.3
   splatsieve compress frames/ -o small.gseq --preset paper
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
+  splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
+  splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq";
 
 /// Shrinks trained dynamic Gaussian-splatting models, without retraining.
@@ -34,6 +36,10 @@ pub(super) enum Verb {
     Compress(Compress),
     /// Write the statistics and scores of every Gaussian as .npz or .csv
     Score(Score),
+    /// Render an input as its cameras see it, into PNG or float32 NPY files
+    Render(Render),
+    /// Compare the pictures of two models: PSNR, SSIM and the error of what moves
+    Evaluate(Evaluate),
     /// Pack any input into a .gseq container
     Pack(Pack),
     /// Say what an input holds
@@ -62,9 +68,9 @@ pub(super) struct Input {
     pub(super) iteration: Option<u32>,
 }
 
-/// From where to look.
+/// The file of the cameras.
 #[derive(Debug, Args)]
-pub(super) struct Cameras {
+pub(super) struct CameraFile {
     /// transforms*.json, cameras.json, poses_bounds.npy, or a folder with one [default: beside the model's
     /// data if cfg_args names it, else a virtual rig]
     #[arg(long, value_name = "PATH")]
@@ -75,6 +81,13 @@ pub(super) struct Cameras {
     /// Picture size where the cameras name none
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub(super) size: Option<(u32, u32)>,
+}
+
+/// From where to look.
+#[derive(Debug, Args)]
+pub(super) struct Cameras {
+    #[command(flatten)]
+    pub(super) file: CameraFile,
     /// Which of the cameras' pictures to score with
     #[arg(long, value_enum, default_value_t = SplitArg::Train)]
     pub(super) split: SplitArg,
@@ -173,6 +186,90 @@ pub(super) struct Score {
     pub(super) overwrite: bool,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
+}
+
+/// `render`
+#[derive(Debug, Args)]
+#[command(group(clap::ArgGroup::new("wanted").args(["frame", "all"]).required(true)))]
+pub(super) struct Render {
+    #[command(flatten)]
+    pub(super) input: Input,
+    #[command(flatten)]
+    pub(super) cameras: CameraFile,
+    /// Frame of the one picture to render, from 0
+    #[arg(long, value_name = "T", requires = "view")]
+    pub(super) frame: Option<u32>,
+    /// View of the one picture to render
+    #[arg(long, value_name = "V", requires = "frame")]
+    pub(super) view: Option<u32>,
+    /// Render every picture of the split, into a folder of tNNN_vNN files
+    #[arg(long)]
+    pub(super) all: bool,
+    /// Which of the cameras' pictures [default: with --all test, or all if none is held out; else all]
+    #[arg(long, value_enum)]
+    pub(super) split: Option<SplitArg>,
+    /// Format of the files of --all [default: png]
+    #[arg(long = "as", value_enum, value_name = "KIND", requires = "all")]
+    pub(super) format: Option<ImageKind>,
+    #[command(flatten)]
+    pub(super) background: Background,
+    /// NAME.png (8 bits, clamped) or NAME.npy (float32 [H, W, 3], not clamped); with --all a folder
+    #[arg(short, long, value_name = "PATH")]
+    pub(super) output: PathBuf,
+    /// Replace an earlier output
+    #[arg(long)]
+    pub(super) overwrite: bool,
+}
+
+/// Kinds of picture files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum ImageKind {
+    /// 8 bits per channel, clamped
+    Png,
+    /// float32 [H, W, 3], not clamped
+    Npy,
+}
+
+/// What is behind the scene.
+#[derive(Debug, Args)]
+pub(super) struct Background {
+    /// Colour behind the scene, each from 0 to 1 [default: the cameras' own, else the model's, else black]
+    #[arg(long, value_name = "R,G,B", value_parser = parse_colour)]
+    pub(super) background: Option<[f32; 3]>,
+}
+
+/// `evaluate`
+#[derive(Debug, Args)]
+pub(super) struct Evaluate {
+    /// The model before compression: whatever `compress` reads
+    pub(super) original: PathBuf,
+    /// The model after it, of any kind
+    pub(super) compressed: PathBuf,
+    /// Training iteration of the original, if a model folder [default: the largest]
+    #[arg(long, value_name = "K")]
+    pub(super) iteration: Option<u32>,
+    #[command(flatten)]
+    pub(super) cameras: CameraFile,
+    /// Which of the cameras' pictures [default: test, or all if none is held out]
+    #[arg(long, value_enum)]
+    pub(super) split: Option<SplitArg>,
+    /// Folder of photographs to compare both models with: tNNN_vNN.png, or named as the cameras name them
+    #[arg(long, value_name = "FOLDER")]
+    pub(super) ground_truth: Option<PathBuf>,
+    /// Compare at most this many frames, evenly from first to last [default: all]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) max_frames: Option<u32>,
+    #[command(flatten)]
+    pub(super) background: Background,
+    /// Write the scores of every picture
+    #[arg(long, value_name = "FILE")]
+    pub(super) csv: Option<PathBuf>,
+    /// Replace an earlier file
+    #[arg(long)]
+    pub(super) overwrite: bool,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
 }
 
 /// `pack`
@@ -286,6 +383,14 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
         (Ok(width @ 1..=65_535), Ok(height @ 1..=65_535)) => Ok((width, height)),
         _ => Err(expected()),
     }
+}
+
+fn parse_colour(text: &str) -> Result<[f32; 3], String> {
+    let channels: Vec<f32> = text
+        .split(',')
+        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
+        .collect::<Result<_, _>>()?;
+    channels.try_into().map_err(|c: Vec<f32>| format!("expected three numbers, found {}", c.len()))
 }
 
 fn parse_box(text: &str) -> Result<[f64; 6], String> {

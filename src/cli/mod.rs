@@ -9,14 +9,18 @@ use std::process::ExitCode;
 use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
+use crate::emit::image::ImageFormat;
 use crate::error::{Error, Result};
 use crate::model::Split;
 use crate::pipeline::compress::{CompressOptions, Only, Target, compress};
+use crate::pipeline::evaluate::EvaluateOptions;
 use crate::pipeline::input::InputOptions;
 use crate::pipeline::output::OutputKind;
-use crate::pipeline::{container, demo, score};
+use crate::pipeline::pictures::Part;
+use crate::pipeline::render::{RenderOptions, Wanted};
+use crate::pipeline::{container, demo, evaluate, render, score};
 use crate::recipe::preset_text;
-use args::{Cameras, Cli, Compress, Input, SplitArg, Verb};
+use args::{CameraFile, Cameras, Cli, Compress, Evaluate, ImageKind, Input, Render, SplitArg, Verb};
 use recipe_flags::RecipeFlags;
 
 /// Runs the program on the arguments of this process.
@@ -63,6 +67,18 @@ fn run(cli: Cli) -> Result<()> {
                 report.gaussians,
                 report.kept
             ))
+        }
+        Verb::Render(args) => {
+            let output = args.output.clone();
+            let rendered = render::render(&render_options(args))?;
+            notes(&rendered.notes);
+            let plural = if rendered.pictures == 1 { "" } else { "s" };
+            print(&format!("{}: {} picture{plural}\n", output.display(), rendered.pictures))
+        }
+        Verb::Evaluate(args) => {
+            let as_json = args.json;
+            let found = evaluate::evaluate(&evaluate_options(args))?;
+            print(&if as_json { json(&found) } else { found.text() })
         }
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
@@ -157,12 +173,54 @@ fn compress_options(args: Compress) -> Result<CompressOptions> {
     })
 }
 
+fn render_options(args: Render) -> RenderOptions {
+    let format = match args.format {
+        Some(ImageKind::Npy) => ImageFormat::Npy,
+        Some(ImageKind::Png) | None => ImageFormat::Png,
+    };
+    let (wanted, part) = match args.frame.zip(args.view) {
+        Some((frame, view)) => (Wanted::One { frame: frame as usize, view }, Part::All),
+        None => (Wanted::All(format), Part::HeldOut),
+    };
+    let mut input = input_options(args.input, None);
+    input.look_from(args.cameras);
+    RenderOptions {
+        input,
+        wanted,
+        part: args.split.map_or(part, part_of),
+        background: args.background.background,
+        output: args.output,
+        overwrite: args.overwrite,
+    }
+}
+
+fn evaluate_options(args: Evaluate) -> EvaluateOptions {
+    let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
+    original.look_from(args.cameras);
+    EvaluateOptions {
+        original,
+        compressed: args.compressed,
+        ground_truth: args.ground_truth,
+        part: args.split.map_or(Part::HeldOut, part_of),
+        max_frames: args.max_frames.map(|frames| frames as usize),
+        background: args.background.background,
+        csv: args.csv,
+        overwrite: args.overwrite,
+    }
+}
+
+fn part_of(split: SplitArg) -> Part {
+    match split {
+        SplitArg::Train => Part::Split(Split::Train),
+        SplitArg::Test => Part::Split(Split::Test),
+        SplitArg::All => Part::All,
+    }
+}
+
 fn input_options(input: Input, cameras: Option<Cameras>) -> InputOptions {
     let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
     if let Some(cameras) = cameras {
-        options.cameras = cameras.cameras;
-        options.size = cameras.size;
-        options.frames = cameras.frames.map(|frames| frames as usize);
+        options.look_from(cameras.file);
         options.split = match cameras.split {
             SplitArg::Train => Some(Split::Train),
             SplitArg::Test => Some(Split::Test),
@@ -170,6 +228,14 @@ fn input_options(input: Input, cameras: Option<Cameras>) -> InputOptions {
         };
     }
     options
+}
+
+impl InputOptions {
+    fn look_from(&mut self, file: CameraFile) {
+        self.cameras = file.cameras;
+        self.size = file.size;
+        self.frames = file.frames.map(|frames| frames as usize);
+    }
 }
 
 fn notes(notes: &[String]) {

@@ -1,8 +1,9 @@
-//! Sources: model folders, PLY files and sequences, containers, cameras.
+//! Sources: model folders, PLY files and sequences, containers, cameras, pictures.
 
 pub mod cameras;
 mod cfg_args;
 pub mod container;
+pub mod image;
 mod map;
 mod model_folder;
 pub mod ply;

@@ -119,19 +119,26 @@ impl Rig {
     /// [`Error::Usage`] when a picture was taken at no frame's time.
     pub fn schedule(&self, frame_times: &[f64], split: Option<Split>) -> Result<Schedule> {
         let mut frames = vec![Vec::new(); frame_times.len()];
-        let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };
         for shot in self.shots.iter().filter(|shot| split.is_none_or(|split| split == shot.split)) {
-            match shot.time {
+            match self.frame_of(shot, frame_times)? {
                 None => frames.iter_mut().for_each(|frame| frame.push((shot.view, shot.camera))),
-                Some(time) => {
-                    let frame = nearest(frame_times, time)
-                        .filter(|&frame| (frame_times[frame] - time).abs() <= tolerance)
-                        .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))?;
-                    frames[frame].push((shot.view, shot.camera));
-                }
+                Some(frame) => frames[frame].push((shot.view, shot.camera)),
             }
         }
         Ok(Schedule { cameras: self.cameras.clone(), frames })
+    }
+
+    /// The frame a picture of this rig shows, by the rule of [`Rig::schedule`]; none: every frame.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] when the picture was taken at no frame's time.
+    pub fn frame_of(&self, shot: &Shot, frame_times: &[f64]) -> Result<Option<usize>> {
+        let Some(time) = shot.time else { return Ok(None) };
+        let tolerance = TIME_TOLERANCE * if frame_times.len() > 1 { span(frame_times) } else { 1.0 };
+        nearest(frame_times, time)
+            .filter(|&frame| (frame_times[frame] - time).abs() <= tolerance)
+            .map(Some)
+            .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
     }
 
     fn no_such_frame(&self, view: u32, time: f64, frame_times: &[f64]) -> Error {

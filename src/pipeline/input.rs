@@ -243,7 +243,7 @@ impl Input {
     }
 
     /// Bytes of the files that grow with the Gaussians.
-    fn bytes(&self) -> Result<u64> {
+    pub fn bytes(&self) -> Result<u64> {
         let paths: Vec<&Path> = match self {
             Input::Model(model) => vec![&model.paths().point_cloud],
             Input::Frames(frames) => frames.paths().iter().map(PathBuf::as_path).collect(),

@@ -3,11 +3,15 @@
 pub mod compress;
 pub mod container;
 pub mod demo;
+pub mod evaluate;
+pub mod evaluation;
 pub mod input;
 pub mod merging;
 pub mod output;
 pub mod overrides;
+pub mod pictures;
 pub mod proxies;
+pub mod render;
 pub mod score;
 pub mod scored;
 pub mod summary;

@@ -1,0 +1,269 @@
+//! What compression cost: the renders of two models side by side, and beside photographs.
+//!
+//! Frames stream: at a time one state of either model, and per thread one picture of each. For the error
+//! of what moves, the last pictures of every view that is seen again stay: 12 bytes per pixel, two or,
+//! with ground truth, three pictures per view.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use hashbrown::{HashMap, HashSet};
+use rayon::prelude::*;
+
+use super::evaluation::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
+use super::input::{Input, InputOptions, Scene, open_scene};
+use super::pictures::{Part, Picture, background, for_each_batch, pictures, thin};
+use super::summary::CameraSummary;
+use crate::emit::atomic::{Kind, StagedFile, check_target};
+use crate::error::{Error, Result};
+use crate::ingest::image::read_png;
+use crate::metrics::{psnr, ssim, temporal_error};
+use crate::model::{Camera, Gaussians, Rig};
+use crate::pass::FrameSource;
+use crate::render::{Image, render};
+use crate::stream::Progress;
+
+/// What to compare.
+#[derive(Debug, Clone)]
+pub struct EvaluateOptions {
+    /// The model before compression and its cameras; of its split nothing is used.
+    pub original: InputOptions,
+    /// The model after it, of any kind.
+    pub compressed: PathBuf,
+    /// Folder of photographs.
+    pub ground_truth: Option<PathBuf>,
+    /// Part of the cameras' pictures to compare.
+    pub part: Part,
+    /// Compare at most this many frames, evenly; none: all.
+    pub max_frames: Option<usize>,
+    /// Red, green, blue in [0, 1]; none: see [`background`].
+    pub background: Option<[f32; 3]>,
+    /// File for the scores of every picture.
+    pub csv: Option<PathBuf>,
+    /// Replace an earlier file.
+    pub overwrite: bool,
+}
+
+/// Renders both models at the cameras' pictures and compares them.
+///
+/// # Errors
+/// Whatever is wrong with inputs, cameras, pictures or output; models whose frames are not the same.
+pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
+    if let Some(csv) = &options.csv {
+        let mut inputs = vec![options.original.path.as_path(), &options.compressed];
+        inputs.extend(options.original.cameras.as_deref());
+        inputs.extend(options.ground_truth.as_deref());
+        check_target(csv, Kind::File, &inputs, options.overwrite)?;
+    }
+    let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
+    let compressed = open_compressed(&options.compressed, &scene)?;
+    let background = background(options.background, &scene)?;
+    let times = &scene.input.source().info().times;
+    let mut chosen = pictures(&scene.rig, times, options.part)?;
+    if let Some(frames) = options.max_frames {
+        chosen = thin(chosen, frames);
+    }
+    let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, &chosen));
+    let job = Job {
+        sources: [scene.input.source(), compressed.source()],
+        cameras: &scene.rig.cameras,
+        background,
+        truth: truth.transpose()?,
+    };
+    let scores = job.scores(&chosen)?;
+
+    let ground_truth = options.ground_truth.as_deref().and_then(|folder| {
+        Some(TruthComparison {
+            folder: folder.display().to_string(),
+            compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
+            original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
+        })
+    });
+    let count = |input: &Input| input.source().info().count;
+    let evaluation = Evaluation {
+        tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        path: Both { original: scene.path.display().to_string(), compressed: options.compressed.display().to_string() },
+        count: Both { original: count(&scene.input), compressed: count(&compressed) },
+        bytes: Both { original: scene.input.bytes()?, compressed: compressed.bytes()? },
+        cameras: CameraSummary {
+            origin: scene.rig.origin.clone(),
+            cameras: chosen.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
+            pairs: chosen.len(),
+        },
+        background,
+        loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
+        ground_truth,
+        notes: scene.notes.clone(),
+        pictures: scores,
+    };
+    if let Some(csv) = &options.csv {
+        let staged = StagedFile::new(csv, options.overwrite)?;
+        fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
+        staged.commit()?;
+    }
+    Ok(evaluation)
+}
+
+/// Most that time stamps of the same frame may differ, in parts of the time span: files round them.
+const TIME_TOLERANCE: f64 = 1e-6;
+
+/// Opens the compressed model at the frames of the original.
+fn open_compressed(path: &Path, original: &Scene) -> Result<Input> {
+    let times = &original.input.source().info().times;
+    let input = match Input::open(path, None)? {
+        Input::Model(model) => Input::Model(model.with_times(times.clone())?),
+        Input::Frames(frames) if frames.info().times.len() == times.len() => {
+            Input::Frames(frames.with_times(times.clone())?)
+        }
+        input => input,
+    };
+    let found = &input.source().info().times;
+    let expected = |what: String| format!("{what}, as in {}", original.path.display());
+    if found.len() != times.len() {
+        let expected = expected(format!("{} frames", times.len()));
+        return Err(Error::input(path, "", expected, format!("{} frames", found.len()))
+            .hint("compare models of the same scene, with the cameras both were made for"));
+    }
+    let span = times.first().zip(times.last()).map_or(0.0, |(first, last)| last - first);
+    let tolerance = TIME_TOLERANCE * if times.len() > 1 { span } else { 1.0 };
+    match (0..times.len()).find(|&frame| (found[frame] - times[frame]).abs() > tolerance) {
+        Some(frame) => {
+            let expected = expected(format!("time {}", times[frame]));
+            Err(Error::input(path, format!("frame {frame}"), expected, found[frame].to_string())
+                .hint("compare models of the same scene, with the cameras both were made for"))
+        }
+        None => Ok(input),
+    }
+}
+
+/// Where the photographs are.
+struct GroundTruth {
+    /// By frame and view.
+    files: HashMap<(usize, u32), PathBuf>,
+}
+
+impl GroundTruth {
+    /// Finds the photograph of every picture: `tNNN_vNN.png`, else the file its camera names, by as
+    /// much of its path as leads to one inside `folder`.
+    fn find(folder: &Path, rig: &Rig, pictures: &[Picture]) -> Result<GroundTruth> {
+        if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
+            return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.display())));
+        }
+        let mut files = HashMap::new();
+        let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
+        for &picture in pictures {
+            let place = || format!("frame {}, view {}", picture.frame, picture.view);
+            let named = rig.shots[picture.shot].image.as_deref();
+            let numbered = folder.join(format!("{}.png", picture.name()));
+            let file = if numbered.is_file() {
+                numbered
+            } else {
+                named.and_then(|image| inside(folder, image)).ok_or_else(|| {
+                    let named = named.and_then(Path::file_name).map(|name| format!(" or {}", name.display()));
+                    let expected = format!("{}.png{}", picture.name(), named.unwrap_or_default());
+                    Error::input(folder, place(), expected, "no such file")
+                        .hint("--max-frames compares fewer frames, --split other pictures")
+                })?
+            };
+            // The names that a time-stamped rig gives its files are shared by all of its cameras.
+            if let Some(other) = takers.insert(file.clone(), picture) {
+                let found = format!("{}, as for frame {}, view {}", file.display(), other.frame, other.view);
+                return Err(Error::input(folder, place(), "a picture of its own", found)
+                    .hint("give the folder that the cameras' file paths start from"));
+            }
+            files.insert((picture.frame, picture.view), file);
+        }
+        Ok(GroundTruth { files })
+    }
+}
+
+/// The file inside `folder` that ends as `image` does, by the longest such end.
+fn inside(folder: &Path, image: &Path) -> Option<PathBuf> {
+    let parts: Vec<_> = image.components().collect();
+    let ends = (0..parts.len()).map(|start| parts[start..].iter().collect::<PathBuf>());
+    ends.filter(|end| end.is_relative()).map(|end| folder.join(end)).find(|file| file.is_file())
+}
+
+/// The pictures of one (frame, view).
+struct Taken {
+    original: Image,
+    compressed: Image,
+    truth: Option<Image>,
+}
+
+impl Taken {
+    /// Scores, with those of motion from the pictures `before` of the same view.
+    fn scores(&self, before: Option<&Taken>) -> (Score, Option<Both<Score>>) {
+        let size = |taken: &Taken| (taken.original.width, taken.original.height);
+        // A view whose camera changed may have another size, and nothing to be compared with.
+        let before = before.filter(|before| size(before) == size(self));
+        let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]));
+        let truth = self.truth.as_ref().map(|truth| {
+            let against = |image: fn(&Taken) -> &Image| {
+                score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])))
+            };
+            Both { original: against(|taken| &taken.original), compressed: against(|taken| &taken.compressed) }
+        });
+        (loss, truth)
+    }
+}
+
+/// How close `a` is to `b`, given the same two at the view's frame before.
+fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>) -> Score {
+    let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
+    Score { psnr: psnr(a, b), ssim: ssim(a, b), temporal }
+}
+
+/// Everything needed to make and compare pictures.
+struct Job<'a> {
+    /// Original, compressed.
+    sources: [&'a dyn FrameSource; 2],
+    cameras: &'a [Camera],
+    background: [f32; 3],
+    truth: Option<GroundTruth>,
+}
+
+impl Job<'_> {
+    fn scores(&self, pictures: &[Picture]) -> Result<Vec<PictureScores>> {
+        let times = &self.sources[0].info().times;
+        let mut last_frame: HashMap<u32, usize> = HashMap::new();
+        for picture in pictures {
+            last_frame.insert(picture.view, picture.frame);
+        }
+        let mut before: HashMap<u32, Taken> = HashMap::new();
+        let mut all = Vec::with_capacity(pictures.len());
+        let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
+        for_each_batch(self.sources, pictures, |states, batch| {
+            let taken: Vec<_> = batch
+                .par_iter()
+                .map(|picture| {
+                    let taken = self.take(picture, states)?;
+                    let scores = taken.scores(before.get(&picture.view));
+                    progress.advance(1);
+                    Ok((taken, scores))
+                })
+                .collect::<Result<_>>()?;
+            for (&Picture { frame, view, .. }, (taken, (loss, truth))) in batch.iter().zip(taken) {
+                all.push(PictureScores { frame, time: times[frame], view, loss, truth });
+                if last_frame.get(&view).is_some_and(|&last| last > frame) {
+                    before.insert(view, taken);
+                } else {
+                    before.remove(&view);
+                }
+            }
+            Ok(())
+        })?;
+        Ok(all)
+    }
+
+    fn take(&self, picture: &Picture, [original, compressed]: &[Gaussians; 2]) -> Result<Taken> {
+        let camera = &self.cameras[picture.camera];
+        let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
+        let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
+        Ok(Taken {
+            original: render(original, camera, self.background),
+            compressed: render(compressed, camera, self.background),
+            truth: file.map(read).transpose()?,
+        })
+    }
+}
