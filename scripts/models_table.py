@@ -4,8 +4,9 @@
     cargo build --release
     python3 scripts/models_table.py target/release/splatsieve DATA [PRESET ...]
 
-DATA/<name>/ is a model folder with its cameras inside. Every figure comes from the summaries the program
-writes; times and memory are those of this machine. Standard library only.
+DATA/<name>/ is a model folder with its cameras inside and, if there are any, held-out photographs in test/.
+Every figure comes from what the program prints; quality is that of 15 frames of every held-out view, times and
+memory are those of this machine. Standard library only.
 """
 
 import json
@@ -15,31 +16,42 @@ import tempfile
 from pathlib import Path
 
 
+def run(*command):
+    result = subprocess.run([str(part) for part in command], capture_output=True, text=True)
+    if result.returncode != 0:
+        sys.exit(f"{' '.join(map(str, command))}\n{result.stderr}")
+    return json.loads(result.stdout)
+
+
+def row(binary, model, preset, output):
+    summary = run(binary, "compress", model, "--cameras", model, "--preset", preset, "-o", output, "--json")
+    truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
+    quality = run(binary, "evaluate", model, output, "--cameras", model, *truth, "--max-frames", 15, "--json")
+    before, after = summary["input"]["gaussians"], summary["gaussians"]
+    size = f"{summary['input']['bytes'] / 1e6:.1f} → {summary['output_bytes'] / 1e6:.1f} MB"
+    seconds = sum(stage["seconds"] for stage in summary["stages"])
+    peak = max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"])
+    photos = "–"
+    if truth:
+        photos = f"{quality['ground_truth']['original']['psnr']:.2f} → {quality['ground_truth']['psnr']:.2f}"
+    return (
+        f"| {model.name} | {preset} | {before} → {after} ({100 * after / before:.0f}%) | {size} "
+        f"| {quality['psnr']:.1f} / {quality['ssim']:.4f} | {photos} | {seconds:.1f} s | {peak / 2**20:.0f} MiB |"
+    )
+
+
 def main():
     if len(sys.argv) < 3:
         print(__doc__)
         sys.exit(2)
     binary, data = sys.argv[1], Path(sys.argv[2])
     presets = sys.argv[3:] or ["default", "paper", "gentle", "strong"]
-    print("| model | preset | Gaussians | pruned to | merged to | point cloud | time | peak memory |")
+    print("| model | preset | Gaussians | point cloud | PSNR dB / SSIM to the original | PSNR dB to photographs | time | peak memory |")
     print("|---|---|---|---|---|---|---|---|")
     for model in sorted(path.parent for path in data.glob("*/cfg_args")):
         for preset in presets:
             with tempfile.TemporaryDirectory() as folder:
-                output = Path(folder) / "small"
-                command = [binary, "compress", model, "--cameras", model, "--preset", preset, "-o", output, "--json"]
-                result = subprocess.run(command, capture_output=True, text=True, check=True)
-            summary = json.loads(result.stdout)
-            before, after = summary["input"]["gaussians"], summary["gaussians"]
-            selected = next(stage for stage in summary["stages"] if stage["name"] == "select")["gaussians_out"]
-            seconds = sum(stage["seconds"] for stage in summary["stages"])
-            peak = max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"])
-            size = f"{summary['input']['bytes'] / 1e6:.1f} → {summary['output_bytes'] / 1e6:.1f} MB"
-            share = f"{after} ({100 * after / before:.0f}%)"
-            print(
-                f"| {model.name} | {preset} | {before} | {selected} | {share} | {size} "
-                f"| {seconds:.1f} s | {peak / 2**20:.0f} MiB |"
-            )
+                print(row(binary, model, preset, Path(folder) / "small"), flush=True)
 
 
 if __name__ == "__main__":
