@@ -4,11 +4,11 @@ use super::input::Scene;
 use super::summary::{FlagSummary, LeftOut, Stages, TermSummary};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Flags, Gaussians, Rows};
-use crate::recipe::{NonFinite, Recipe};
+use crate::recipe::{Coverage, NonFinite, Recipe};
 use crate::score::{Scores, score};
 use crate::select::{Overrides, Selection, select};
 use crate::stats::{RobustBox, ScanPlan, fill_anisotropy, snap};
-use crate::stream::{gather, scan};
+use crate::stream::{Sample, gather, scan, visible_contribution};
 
 /// A scene with statistics, scores and a selection for every Gaussian.
 pub struct Scored {
@@ -49,6 +49,19 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
         Ok::<_, Error>((scanned, info.count))
     })?;
     let mut rows = scanned.rows;
+    if looks(scene, recipe.scan.coverage) {
+        let sample = Sample::new(&scene.schedule, &recipe.scan);
+        let reads = sample.frames() as f64 / info.times.len().max(1) as f64;
+        stages.run("visible", info.count, reads, || {
+            let seen = visible_contribution(source, &sample, recipe.scan.pixel_stride)?;
+            (rows.c, rows.w) = (seen.coverage, seen.peak);
+            let odd: Vec<u32> = non_finite(&rows).collect();
+            for id in odd {
+                (rows.c[id as usize], rows.w[id as usize]) = (0.0, 0.0);
+            }
+            Ok::<_, Error>(((), info.count))
+        })?;
+    }
     let reference_frame = first_of_largest(&scanned.alive_per_frame);
     stages.run("score", info.count, 0.0, || {
         if recipe.scan.snap_noise {
@@ -83,6 +96,15 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
         let position_ulp = crate::stats::ulp(scanned.largest_coordinate);
         Ok((Scored { rows, scores, selection, protected, reference_frame, extent, position_ulp }, info.count))
     })
+}
+
+/// Whether C is visible contribution.
+fn looks(scene: &Scene, coverage: Coverage) -> bool {
+    match coverage {
+        Coverage::Auto => scene.has_cameras,
+        Coverage::Visible => true,
+        Coverage::Projected => false,
+    }
 }
 
 fn first_of_largest(counts: &[u32]) -> usize {
@@ -190,7 +212,7 @@ fn constant(column: Columns) -> &'static str {
 
 fn inactive(term: &str) -> &'static str {
     match term {
-        "C" => "grading by coverage",
+        "C" | "W" | "sqrt(C*W)" => "grading by coverage",
         "E" => "grading by anisotropy",
         "D" => "grading by motion",
         "kappa" => "grading by curvature",
