@@ -4,9 +4,9 @@ use super::input::Scene;
 use super::summary::{FlagSummary, LeftOut, Stages, TermSummary};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Flags, Gaussians, Rows};
-use crate::recipe::{Coverage, NonFinite, Recipe};
+use crate::recipe::{self, Coverage, NonFinite, Recipe, StaticTerm};
 use crate::score::{Scores, score};
-use crate::select::{Overrides, Selection, select};
+use crate::select::{Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, ScanPlan, fill_anisotropy, snap};
 use crate::stream::{Sample, gather, scan, visible_contribution};
 
@@ -20,6 +20,8 @@ pub struct Scored {
     pub selection: Selection,
     /// Ids that are to be kept as they are, unmerged; increasing.
     pub protected: Vec<u32>,
+    /// Ids that are to be dropped; increasing.
+    pub dropped: Vec<u32>,
     /// The frame with most Gaussians alive, ties to the first; 0 without frames.
     pub reference_frame: usize,
     /// Robust extent at the reference frame, scene units.
@@ -91,10 +93,13 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
             ids.dedup();
         }
         let scores = score(&rows, info.times.len(), &recipe.score);
-        let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop };
+        let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop.clone() };
         let selection = select(&scores, &recipe.select, &overrides)?;
         let position_ulp = crate::stats::ulp(scanned.largest_coordinate);
-        Ok((Scored { rows, scores, selection, protected, reference_frame, extent, position_ulp }, info.count))
+        Ok((
+            Scored { rows, scores, selection, protected, dropped: drop, reference_frame, extent, position_ulp },
+            info.count,
+        ))
     })
 }
 
@@ -150,6 +155,13 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
+    /// The ranking of the same rows, of `frames` frames, by another static term.
+    pub fn ranking_by(&self, term: StaticTerm, frames: usize, recipe: &Recipe) -> Result<Ranking> {
+        let scores = score(&self.rows, frames, &recipe::Score { static_term: term, ..recipe.score.clone() });
+        let overrides = Overrides { keep_ids: self.protected.clone(), drop_ids: self.dropped.clone() };
+        Ok(select(&scores, &recipe.select, &overrides)?.ranking)
+    }
+
     /// Percentiles of every term.
     pub fn terms(&self) -> Vec<TermSummary> {
         let summarise = |term: &crate::score::Term| TermSummary {

@@ -138,6 +138,7 @@ pub struct Select {
     pub tau_static: f64,
     pub tau_dynamic: f64,
     pub low_priority: LowPriority,
+    pub choose_by_views: bool,
 }
 
 /// What becomes of Gaussians outside stage 1.
