@@ -180,3 +180,64 @@ fn merged_source<'a>(
     let members = sieved.clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));
     Ok(Box::new(MergedSequence::new(scene.input.source(), &sieved.kept, members, &recipe.merge)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::demo;
+    use crate::emit::container::write_container;
+    use crate::ingest::container::Container;
+    use crate::model::Split;
+    use crate::pipeline::compress::Only;
+    use crate::pipeline::merging::sieve;
+    use crate::pipeline::scored::{UserOverrides, score_scene};
+
+    fn scene(folder: &std::path::Path) -> Scene {
+        let made = demo::Scene::new(1500, 6);
+        let path = folder.join("scene.gseq");
+        write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        let input = Input::Container(Container::open(&path).unwrap());
+        let rig = made.rig();
+        let schedule = rig.schedule(&input.source().info().times, Some(Split::Train)).unwrap();
+        Scene { path, input, rig, schedule, has_cameras: true, notes: Vec::new() }
+    }
+
+    /// Mean PSNR over the pictures that decide.
+    fn quality(scene: &Scene, scored: &Scored, recipe: &Recipe, sieved: &Sieved) -> f64 {
+        let alone = [Alternative { term: StaticTerm::Mean, sieved: sieved.clone() }];
+        mean_psnr(scene, scored, recipe, &alone, &sampled_pictures(scene)).unwrap()[0]
+    }
+
+    #[test]
+    fn what_is_chosen_has_the_same_count_and_is_never_worse_than_any_alternative() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let recipe = Recipe::preset("default").unwrap();
+        let stages = &mut Stages::default();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default(), stages).unwrap();
+        for target in [150, 600, 1200] {
+            let sieved = sieve(&scene, &scored, &recipe, Only::Both, Some(target), stages).unwrap();
+            let chosen = choose(&scene, &scored, &recipe, sieved.clone(), stages).unwrap();
+            assert_eq!(chosen.sieved.kept.len(), target);
+            let got = quality(&scene, &scored, &recipe, &chosen.sieved);
+            let by_c = Sieved::pruned(scored.ranking_by(StaticTerm::Mean, 6, &recipe).unwrap().take(target));
+            let own = Sieved::pruned(scored.selection.ranking.take(target));
+            for other in [sieved.clone(), by_c, own] {
+                let expected = quality(&scene, &scored, &recipe, &other);
+                assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
+            }
+            let lost = !sieved.clusters.is_empty() && chosen.sieved.clusters.is_empty();
+            assert_eq!(chosen.left_out.iter().any(|left| left.what == "merging"), lost);
+        }
+    }
+
+    #[test]
+    fn pictures_that_decide_are_spread_over_all_and_none_counts_twice() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let pictures = sampled_pictures(&scene);
+        assert_eq!(pictures.len(), PICTURES);
+        assert!(pictures.is_sorted() && pictures.windows(2).all(|pair| pair[0] != pair[1]));
+        assert_eq!((pictures[0].0, pictures[PICTURES - 1].0), (0, 5));
+    }
+}

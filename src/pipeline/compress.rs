@@ -10,7 +10,7 @@ use super::overrides::parse_ids;
 use super::scored::{Scored, UserOverrides, score_scene};
 use super::summary::{CameraSummary, LeftOut, Stages, Summary};
 use crate::error::{Error, Result};
-use crate::recipe::Recipe;
+use crate::recipe::{Coverage, Recipe};
 
 /// Which of pruning and merging to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -102,6 +102,10 @@ pub fn compress_scene(
 
     let mut left_out = scored.left_out(scene);
     left_out.extend(stages_left_out(options, recipe));
+    if recipe.scan.coverage == Coverage::Auto && !scene.has_cameras {
+        let why = "no cameras given or found: a virtual rig may see only what is in front of the scene".to_owned();
+        left_out.push(LeftOut { what: "visible coverage", why });
+    }
     left_out.extend(chosen.left_out);
     let mut notes = scene.notes.clone();
     notes.extend(selection_notes(&scored));
