@@ -178,7 +178,8 @@ pub(super) struct Score {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// rows.npz (arrays D kappa V life C E vis static_score dynamic_score score keep) or rows.csv
+    /// rows.npz (arrays D kappa V life C E vis static_score dynamic_score score keep; W with visible
+    /// coverage) or rows.csv
     #[arg(short, long, value_name = "FILE")]
     pub(super) output: PathBuf,
     /// Replace an earlier output

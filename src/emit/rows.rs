@@ -16,14 +16,11 @@ use zip::{CompressionMethod, DateTime};
 use crate::error::{Error, Result};
 use crate::model::Rows;
 
-/// The columns in order, as both formats name them.
-const NAMES: [&str; 11] =
-    ["D", "kappa", "V", "life", "C", "E", "vis", "static_score", "dynamic_score", "score", "keep"];
-
 /// Everything known of N Gaussians after selection; every slice has N entries.
 #[derive(Debug, Clone, Copy)]
 pub struct RowTable<'a> {
-    /// Statistics: `D`, `kappa`, `V`, `C`, `E`, `vis` (f64), `life` in frames (u32).
+    /// Statistics: `D`, `kappa`, `V`, `C`, `E`, `vis` (f64), `life` in frames (u32); last of all columns `W`
+    /// (f64), where there is one.
     pub rows: &'a Rows,
     /// S_static.
     pub static_score: &'a [f64],
@@ -75,26 +72,30 @@ impl RowTable<'_> {
         self.csv_into(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
     }
 
-    /// The columns in the order of [`NAMES`].
-    fn columns(&self) -> [Values<'_>; NAMES.len()] {
-        let Rows { d, kappa, v, life, c, e, vis, .. } = self.rows;
-        [
-            Values::F64(d),
-            Values::F64(kappa),
-            Values::F64(v),
-            Values::U32(life),
-            Values::F64(c),
-            Values::F64(e),
-            Values::F64(vis),
-            Values::F64(self.static_score),
-            Values::F64(self.dynamic_score),
-            Values::F64(self.score),
-            Values::Bool(self.keep),
-        ]
+    /// The columns in order, as both formats name them.
+    fn columns(&self) -> Vec<(&'static str, Values<'_>)> {
+        let Rows { d, kappa, v, life, c, w, e, vis, flags: _ } = self.rows;
+        let mut columns = vec![
+            ("D", Values::F64(d)),
+            ("kappa", Values::F64(kappa)),
+            ("V", Values::F64(v)),
+            ("life", Values::U32(life)),
+            ("C", Values::F64(c)),
+            ("E", Values::F64(e)),
+            ("vis", Values::F64(vis)),
+            ("static_score", Values::F64(self.static_score)),
+            ("dynamic_score", Values::F64(self.dynamic_score)),
+            ("score", Values::F64(self.score)),
+            ("keep", Values::Bool(self.keep)),
+        ];
+        if !w.is_empty() {
+            columns.push(("W", Values::F64(w)));
+        }
+        columns
     }
 
     fn check_lengths(&self) -> Result<()> {
-        match NAMES.iter().zip(self.columns()).find(|(_, values)| values.len() != self.rows.len()) {
+        match self.columns().into_iter().find(|(_, values)| values.len() != self.rows.len()) {
             None => Ok(()),
             Some((name, values)) => {
                 let (len, rows) = (values.len(), self.rows.len());
@@ -111,7 +112,7 @@ impl RowTable<'_> {
             .compression_method(CompressionMethod::Stored)
             .last_modified_time(DateTime::default())
             .large_file(large);
-        for (name, values) in NAMES.into_iter().zip(self.columns()) {
+        for (name, values) in self.columns() {
             match values {
                 Values::F64(values) => add(&mut archive, name, options, values)?,
                 Values::U32(values) => add(&mut archive, name, options, values)?,
@@ -122,11 +123,15 @@ impl RowTable<'_> {
     }
 
     fn csv_into(&self, out: &mut impl Write) -> io::Result<()> {
-        writeln!(out, "id,{}", NAMES.join(","))?;
         let columns = self.columns();
+        write!(out, "id")?;
+        for (name, _) in &columns {
+            write!(out, ",{name}")?;
+        }
+        writeln!(out)?;
         for id in 0..self.rows.len() {
             write!(out, "{id}")?;
-            for column in columns {
+            for (_, column) in &columns {
                 match column {
                     Values::F64(values) => write!(out, ",{:?}", values[id])?,
                     Values::U32(values) => write!(out, ",{}", values[id])?,
@@ -165,6 +170,7 @@ mod tests {
             v: ramp(1.0 / 3.0),
             life: vec![0, 7, u32::MAX],
             c: ramp(4.0),
+            w: ramp(0.2),
             e: vec![1.0, 1e12, f64::INFINITY],
             vis: ramp(0.3),
             flags: vec![Flags::default(); N],
@@ -185,10 +191,10 @@ mod tests {
             table.write_npz(&b).unwrap();
             assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(&b).unwrap());
             let mut archive = npyz::npz::NpzArchive::open(&a).unwrap();
-            assert_eq!(archive.array_names().count(), NAMES.len());
+            assert_eq!(archive.array_names().count(), table.columns().len());
             let stamp = archive.zip_archive().by_name("D.npy").unwrap().last_modified();
             assert_eq!((stamp.year(), stamp.month(), stamp.day()), (1980, 1, 1));
-            for (name, values) in NAMES.into_iter().zip(table.columns()) {
+            for (name, values) in table.columns() {
                 let array = archive.by_name(name).unwrap().unwrap();
                 assert_eq!(array.shape(), [N as u64], "{name}");
                 match values {
@@ -212,11 +218,11 @@ mod tests {
             let text = std::fs::read_to_string(&path).unwrap();
             let mut lines = text.lines();
             let header = lines.next().unwrap();
-            assert_eq!(header, "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep");
+            assert_eq!(header, "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W");
             for (id, line) in lines.enumerate() {
                 let cells: Vec<&str> = line.split(',').collect();
                 assert_eq!(cells[0], id.to_string());
-                for (cell, column) in cells[1..].iter().zip(table.columns()) {
+                for (cell, (_, column)) in cells[1..].iter().zip(table.columns()) {
                     match column {
                         Values::F64(values) => {
                             let read: f64 = cell.parse().unwrap();
@@ -233,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_column_of_another_length_is_named() {
-        let rows = rows();
+        let rows = Rows { w: Vec::new(), ..rows() };
         let table = RowTable {
             rows: &rows,
             static_score: &[0.0; N],

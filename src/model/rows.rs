@@ -20,7 +20,7 @@ impl Flags {
     }
 }
 
-/// Statistics of N Gaussians; every array has N entries.
+/// Statistics of N Gaussians; every array has N entries, but for a `w` that is empty.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Rows {
     /// D, trajectory magnitude: root mean square step, scene units per frame.
@@ -31,8 +31,11 @@ pub struct Rows {
     pub v: Vec<f64>,
     /// Life span in frames.
     pub life: Vec<u32>,
-    /// C, mean projected (or visible) coverage, pixels.
+    /// C, mean projected or visible coverage, pixels.
     pub c: Vec<f64>,
+    /// W, largest alpha · transmittance of any pixel of any picture, in [0, 0.99]; empty where C is
+    /// projected coverage.
+    pub w: Vec<f64>,
     /// E, anisotropy: largest over smallest canonical scale.
     pub e: Vec<f64>,
     /// Fraction of (frame, view) pairs in which the Gaussian is alive and touches the image.
@@ -59,6 +62,7 @@ impl Rows {
         self.v.append(&mut next.v);
         self.life.append(&mut next.life);
         self.c.append(&mut next.c);
+        self.w.append(&mut next.w);
         self.e.append(&mut next.e);
         self.vis.append(&mut next.vis);
         self.flags.append(&mut next.flags);

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::choose::{Chosen, choose};
 use super::input::{InputOptions, Scene, open_scene};
 use super::merging::sieve;
 use super::output::{OutputKind, check_output, write_result};
@@ -9,7 +10,7 @@ use super::overrides::parse_ids;
 use super::scored::{Scored, UserOverrides, score_scene};
 use super::summary::{CameraSummary, LeftOut, Stages, Summary};
 use crate::error::{Error, Result};
-use crate::recipe::Recipe;
+use crate::recipe::{Coverage, Recipe};
 
 /// Which of pruning and merging to do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -93,11 +94,22 @@ pub fn compress_scene(
     let input = scene.input.summary(&scene.path)?;
     let scored = score_scene(scene, recipe, &user, &mut stages)?;
     let sieved = sieve(scene, &scored, recipe, options.only, target, &mut stages)?;
+    let chosen = match recipe.select.choose_by_views && options.only != Only::Merge {
+        true => choose(scene, &scored, recipe, sieved, &mut stages)?,
+        false => Chosen { sieved, left_out: Vec::new(), notes: Vec::new() },
+    };
+    let sieved = chosen.sieved;
 
     let mut left_out = scored.left_out(scene);
     left_out.extend(stages_left_out(options, recipe));
+    if recipe.scan.coverage == Coverage::Auto && !scene.has_cameras {
+        let why = "no cameras given or found: a virtual rig may see only what is in front of the scene".to_owned();
+        left_out.push(LeftOut { what: "visible coverage", why });
+    }
+    left_out.extend(chosen.left_out);
     let mut notes = scene.notes.clone();
     notes.extend(selection_notes(&scored));
+    notes.extend(chosen.notes);
     let mut summary = Summary {
         tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
         input,

@@ -54,7 +54,7 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Res
 
     let input = Input::Container(Container::open(&packed)?);
     let schedule = rig.schedule(&input.source().info().times, Some(Split::Train))?;
-    let scene = Scene { path: PathBuf::from("scene.gseq"), input, rig, schedule, notes: Vec::new() };
+    let scene = Scene { path: PathBuf::from("scene.gseq"), input, rig, schedule, has_cameras: true, notes: Vec::new() };
     let options = CompressOptions {
         input: InputOptions::default(),
         output: folder.join("compressed.gseq"),

@@ -52,6 +52,8 @@ pub struct Scene {
     pub rig: Rig,
     /// The cameras of the chosen split, frame by frame.
     pub schedule: Schedule,
+    /// Whether the cameras were given or found; else they are a virtual rig.
+    pub has_cameras: bool,
     /// Things a person should know.
     pub notes: Vec<String>,
 }
@@ -126,6 +128,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     let Opened { input, rig, mut notes } = open_input(options)?;
     let path = &options.path;
+    let has_cameras = rig.is_some();
     let rig = match rig {
         Some(rig) => rig,
         None => {
@@ -138,7 +141,7 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
     if schedule.pairs() == 0 && !input.source().info().times.is_empty() {
         return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
     }
-    Ok(Scene { path: path.clone(), input, rig, schedule, notes })
+    Ok(Scene { path: path.clone(), input, rig, schedule, has_cameras, notes })
 }
 
 /// Frames of a model for which neither cameras nor the user name any.

@@ -40,6 +40,11 @@ pub struct Sieved {
 }
 
 impl Sieved {
+    /// The Gaussians `kept` (increasing) as they are.
+    pub fn pruned(kept: Vec<u32>) -> Self {
+        Sieved { kept, clusters: Vec::new(), proxies: Gaussians::default(), summary: None }
+    }
+
     /// For every Gaussian of an input of `count` its place in the output, if it has one.
     pub fn index_map(&self, count: usize) -> Vec<Option<u32>> {
         let mut map = vec![None; count];
@@ -80,7 +85,7 @@ pub fn sieve(
     };
     if !merges {
         let kept = stages.run("select", count, 0.0, || Ok::<_, Error>((ranking.take(survivors), survivors)))?;
-        return Ok(Sieved { kept, clusters: Vec::new(), proxies: Gaussians::default(), summary: None });
+        return Ok(Sieved::pruned(kept));
     }
     let mut job = stages.run("select", count, 0.0, || {
         Ok::<_, Error>((Job::new(scene, scored, recipe, ranking.take(survivors))?, survivors))

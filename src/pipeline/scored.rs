@@ -4,11 +4,11 @@ use super::input::Scene;
 use super::summary::{FlagSummary, LeftOut, Stages, TermSummary};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Flags, Gaussians, Rows};
-use crate::recipe::{NonFinite, Recipe};
+use crate::recipe::{self, Coverage, NonFinite, Recipe, StaticTerm};
 use crate::score::{Scores, score};
-use crate::select::{Overrides, Selection, select};
+use crate::select::{Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, ScanPlan, fill_anisotropy, snap};
-use crate::stream::{gather, scan};
+use crate::stream::{Sample, gather, scan, visible_contribution};
 
 /// A scene with statistics, scores and a selection for every Gaussian.
 pub struct Scored {
@@ -20,6 +20,8 @@ pub struct Scored {
     pub selection: Selection,
     /// Ids that are to be kept as they are, unmerged; increasing.
     pub protected: Vec<u32>,
+    /// Ids that are to be dropped; increasing.
+    pub dropped: Vec<u32>,
     /// The frame with most Gaussians alive, ties to the first; 0 without frames.
     pub reference_frame: usize,
     /// Robust extent at the reference frame, scene units.
@@ -49,6 +51,19 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
         Ok::<_, Error>((scanned, info.count))
     })?;
     let mut rows = scanned.rows;
+    if looks(scene, recipe.scan.coverage) {
+        let sample = Sample::new(&scene.schedule, &recipe.scan);
+        let reads = sample.frames() as f64 / info.times.len().max(1) as f64;
+        stages.run("visible", info.count, reads, || {
+            let seen = visible_contribution(source, &sample, recipe.scan.pixel_stride)?;
+            (rows.c, rows.w) = (seen.coverage, seen.peak);
+            let odd: Vec<u32> = non_finite(&rows).collect();
+            for id in odd {
+                (rows.c[id as usize], rows.w[id as usize]) = (0.0, 0.0);
+            }
+            Ok::<_, Error>(((), info.count))
+        })?;
+    }
     let reference_frame = first_of_largest(&scanned.alive_per_frame);
     stages.run("score", info.count, 0.0, || {
         if recipe.scan.snap_noise {
@@ -78,11 +93,23 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
             ids.dedup();
         }
         let scores = score(&rows, info.times.len(), &recipe.score);
-        let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop };
+        let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop.clone() };
         let selection = select(&scores, &recipe.select, &overrides)?;
         let position_ulp = crate::stats::ulp(scanned.largest_coordinate);
-        Ok((Scored { rows, scores, selection, protected, reference_frame, extent, position_ulp }, info.count))
+        Ok((
+            Scored { rows, scores, selection, protected, dropped: drop, reference_frame, extent, position_ulp },
+            info.count,
+        ))
     })
+}
+
+/// Whether C is visible contribution.
+fn looks(scene: &Scene, coverage: Coverage) -> bool {
+    match coverage {
+        Coverage::Auto => scene.has_cameras,
+        Coverage::Visible => true,
+        Coverage::Projected => false,
+    }
 }
 
 fn first_of_largest(counts: &[u32]) -> usize {
@@ -128,6 +155,13 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
+    /// The ranking of the same rows, of `frames` frames, by another static term.
+    pub fn ranking_by(&self, term: StaticTerm, frames: usize, recipe: &Recipe) -> Result<Ranking> {
+        let scores = score(&self.rows, frames, &recipe::Score { static_term: term, ..recipe.score.clone() });
+        let overrides = Overrides { keep_ids: self.protected.clone(), drop_ids: self.dropped.clone() };
+        Ok(select(&scores, &recipe.select, &overrides)?.ranking)
+    }
+
     /// Percentiles of every term.
     pub fn terms(&self) -> Vec<TermSummary> {
         let summarise = |term: &crate::score::Term| TermSummary {
@@ -190,7 +224,7 @@ fn constant(column: Columns) -> &'static str {
 
 fn inactive(term: &str) -> &'static str {
     match term {
-        "C" => "grading by coverage",
+        "C" | "W" | "sqrt(C*W)" => "grading by coverage",
         "E" => "grading by anisotropy",
         "D" => "grading by motion",
         "kappa" => "grading by curvature",

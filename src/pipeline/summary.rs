@@ -14,7 +14,7 @@ use crate::select::Counts;
 /// One stage of a run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Stage {
-    /// Its name: read, scan, score, select, merge, emit.
+    /// Its name: read, scan, visible, score, select, merge, choose, emit.
     pub name: &'static str,
     /// Gaussians that entered it.
     pub gaussians_in: usize,
@@ -72,7 +72,7 @@ pub struct CameraSummary {
 /// A term of the scores.
 #[derive(Debug, Clone, Serialize)]
 pub struct TermSummary {
-    /// C, E, D, kappa, V, Life, S_static or S_dynamic.
+    /// C, W, sqrt(C*W), E, D, kappa, V, Life, S_static or S_dynamic.
     pub name: &'static str,
     /// 1st percentile.
     pub p1: f64,

@@ -5,6 +5,8 @@
 
 mod parameters;
 
+use std::num::NonZeroU32;
+
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
@@ -45,6 +47,9 @@ pub struct Scan {
     pub motion: Motion,
     pub snap_noise: bool,
     pub coverage: Coverage,
+    pub pixel_stride: NonZeroU32,
+    pub view_stride: NonZeroU32,
+    pub frame_stride: NonZeroU32,
     pub non_finite: NonFinite,
 }
 
@@ -62,6 +67,11 @@ pub enum Motion {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Coverage {
+    /// [`Coverage::Visible`] through cameras of the scene's own, else [`Coverage::Projected`]: a virtual
+    /// rig may stand behind walls that no real picture shows.
+    Auto,
+    /// Σ alpha · transmittance over pixels.
+    Visible,
     /// Area of the projected 3σ ellipse inside the image × opacity.
     Projected,
 }
@@ -83,6 +93,7 @@ pub enum NonFinite {
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct Score {
+    pub static_term: StaticTerm,
     pub w_static: f64,
     pub w_dynamic: f64,
     pub lambda: f64,
@@ -94,6 +105,18 @@ pub struct Score {
     pub norm_epsilon: f64,
     pub clip_norm: bool,
     pub exact_percentiles: bool,
+}
+
+/// What S_static starts from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StaticTerm {
+    /// C.
+    Mean,
+    /// W.
+    Peak,
+    /// √(C·W).
+    Geometric,
 }
 
 /// What E measures.
@@ -115,6 +138,7 @@ pub struct Select {
     pub tau_static: f64,
     pub tau_dynamic: f64,
     pub low_priority: LowPriority,
+    pub choose_by_views: bool,
 }
 
 /// What becomes of Gaussians outside stage 1.
@@ -277,7 +301,7 @@ impl Recipe {
             ("score.norm_epsilon", self.score.norm_epsilon, finite(self.score.norm_epsilon), "finite, 0 or more"),
             ("select.keep_fraction", self.select.keep_fraction, in_unit(self.select.keep_fraction), "0 to 1"),
             ("select.tau_static", self.select.tau_static, finite(self.select.tau_static), "finite, 0 or more"),
-            ("select.tau_dynamic", self.select.tau_dynamic, finite(self.select.tau_dynamic), "finite, 0 or more"),
+            ("select.tau_dynamic", self.select.tau_dynamic, nonnegative(self.select.tau_dynamic), "0 or more"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
             ("merge.max_color_difference", max_color_difference, nonnegative(max_color_difference), "0 or more"),
             ("merge.motion_noise", motion_noise, finite(motion_noise), "finite, 0 or more"),

@@ -11,12 +11,12 @@ pub use norm::Norm;
 pub use sketch::FloatSketch;
 
 use crate::model::{Flags, Rows};
-use crate::recipe;
+use crate::recipe::{self, StaticTerm};
 
 /// Scores of N Gaussians; every array has N entries, all finite.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scores {
-    /// S_static = norm(C) + λ·norm(E).
+    /// S_static = norm(C) + λ·norm(E), with W or √(C·W) for C as the recipe says.
     pub static_score: Vec<f64>,
     /// S_dynamic = norm(D) + μ·norm(κ) + η·norm(V) + ξ·norm(Life).
     pub dynamic_score: Vec<f64>,
@@ -26,7 +26,7 @@ pub struct Scores {
     pub static_norm: Vec<f64>,
     /// norm(S_dynamic), for stage 2.
     pub dynamic_norm: Vec<f64>,
-    /// What every term was normalised by, in the order C, E, D, kappa, V, Life, S_static, S_dynamic;
+    /// What every term was normalised by, in the order C (or W, sqrt(C*W)), E, D, kappa, V, Life, S_static, S_dynamic;
     /// terms of weight 0 were not computed and are missing.
     pub terms: Vec<Term>,
 }
@@ -34,7 +34,7 @@ pub struct Scores {
 /// How a term was normalised.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Term {
-    /// C, E, D, kappa, V, Life, S_static or S_dynamic.
+    /// C, W, sqrt(C*W), E, D, kappa, V, Life, S_static or S_dynamic.
     pub name: &'static str,
     /// Its percentiles.
     pub norm: Norm,
@@ -51,7 +51,13 @@ pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
 
     let mut sum = Summation { counts: &counts, recipe, terms: Vec::new() };
     let mut static_score = vec![0.0; rows.len()];
-    sum.add(&mut static_score, "C", 1.0, |i| rows.c[i]);
+    match recipe.static_term {
+        StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, "W", 1.0, |i| rows.w[i]),
+        StaticTerm::Geometric if !rows.w.is_empty() => {
+            sum.add(&mut static_score, "sqrt(C*W)", 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
+        }
+        _ => sum.add(&mut static_score, "C", 1.0, |i| rows.c[i]),
+    }
     sum.add(&mut static_score, "E", recipe.lambda, |i| rows.e[i]);
     let mut dynamic_score = vec![0.0; rows.len()];
     sum.add(&mut dynamic_score, "D", 1.0, |i| rows.d[i] * motion_weight(i));
@@ -106,6 +112,7 @@ mod tests {
             v: ramp(1e-3),
             life: (0..n as u32).collect(),
             c: ramp(3.0),
+            w: Vec::new(),
             e: ramp(2.0),
             vis: ramp(0.0),
             flags: vec![Flags::default(); n],
@@ -154,6 +161,7 @@ mod tests {
             v: vec![0.0; 200],
             life: vec![0; 200],
             c: vec![0.0; 200],
+            w: Vec::new(),
             e: vec![0.0; 200],
             vis: vec![0.0; 200],
             flags: vec![Flags(Flags::NON_FINITE); 200],

@@ -123,6 +123,7 @@ impl<'a> BlockScan<'a> {
             v: self.life.variance(),
             life: life.to_vec(),
             c: self.coverage.iter().map(|&sum| sum as f64 * resolution / pairs).collect(),
+            w: Vec::new(),
             e: vec![0.0; life.len()],
             vis: self.touched.iter().map(|&count| f64::from(count) / pairs).collect(),
             flags: self.state.flags,

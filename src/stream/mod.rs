@@ -1,11 +1,13 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
+mod contribution;
 mod gather;
 mod merged;
 mod motion;
 mod progress;
 mod scan;
 
+pub use contribution::{Sample, Seen, visible_contribution};
 pub use gather::gather;
 pub use merged::MergedSequence;
 pub use motion::measure_motion;

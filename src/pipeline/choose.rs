@@ -1,0 +1,243 @@
+//! Letting pictures choose: the alternatives at one count, rendered beside the original.
+//!
+//! No rule wins everywhere: √(C·W) ranks better than C while much is kept, worse when little is, and
+//! merging pays on some scenes only (METHOD section 6: "let scoring views choose among rules").
+//! Memory: the states of the original and of the alternatives at one frame.
+
+use super::input::{Input, Scene};
+use super::merging::{Cluster, Sieved};
+use super::proxies::{canonical_cloud, canonical_proxies};
+use super::scored::Scored;
+use super::summary::{LeftOut, Stages};
+use crate::error::{Error, Result};
+use crate::metrics::psnr;
+use crate::model::{Columns, Gaussians};
+use crate::pass::FrameSource;
+use crate::recipe::{Recipe, StaticTerm};
+use crate::render::render;
+use crate::stream::{MergedSequence, gather};
+
+/// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
+/// alternatives usually do from one another.
+const PICTURES: usize = 24;
+
+/// The result that was chosen, and what the summary says of the others.
+pub struct Chosen {
+    /// The best alternative.
+    pub sieved: Sieved,
+    /// Stages that did not pay.
+    pub left_out: Vec<LeftOut>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// One way to keep the same number of Gaussians.
+struct Alternative {
+    term: StaticTerm,
+    sieved: Sieved,
+}
+
+/// Compares `sieved` with the first Gaussians of the recipe's ranking and of those by C and √(C·W), as
+/// many as it has, by mean PSNR against the original on scoring pictures; keeps the best, of equals the
+/// one without merging and with the recipe's own ranking.
+///
+/// Without visible contributions there is nothing to compare by: `sieved` is kept.
+pub fn choose(scene: &Scene, scored: &Scored, recipe: &Recipe, sieved: Sieved, stages: &mut Stages) -> Result<Chosen> {
+    let count = sieved.kept.len();
+    let own = recipe.score.static_term;
+    let mut alternatives = Vec::new();
+    if !scored.rows.w.is_empty() && count > 0 {
+        alternatives = alternatives_to(scene, scored, recipe, count)?;
+    }
+    if sieved.clusters.is_empty() {
+        // It is the prefix of its ranking already.
+        alternatives.retain(|other| other.sieved.kept != sieved.kept);
+        if !alternatives.is_empty() {
+            alternatives.insert(0, Alternative { term: own, sieved: sieved.clone() });
+        }
+    } else if !alternatives.is_empty() {
+        alternatives.push(Alternative { term: own, sieved: sieved.clone() });
+    }
+    if alternatives.is_empty() {
+        return Ok(Chosen { sieved, left_out: Vec::new(), notes: Vec::new() });
+    }
+    let pictures = sampled_pictures(scene);
+    let reads = pictures.len() as f64 / scene.schedule.frames.len().max(1) as f64;
+    let found = stages.run("choose", count, reads, || {
+        Ok::<_, Error>((mean_psnr(scene, scored, recipe, &alternatives, &pictures)?, count))
+    })?;
+    // Strictly greater: of equals the first.
+    let best = (0..found.len()).fold(0, |best, i| if found[i] > found[best] { i } else { best });
+    let Alternative { term, sieved: kept } = alternatives.swap_remove(best);
+    let mut chosen = Chosen { sieved: kept, left_out: Vec::new(), notes: Vec::new() };
+    if term != own {
+        let (better, worse) = (found[best], found[0]);
+        chosen.notes.push(format!(
+            "ranked by {} for {}: at {count} Gaussians scoring pictures keep {better:.2} dB, not {worse:.2}",
+            name(term),
+            name(own)
+        ));
+    }
+    let merged = !sieved.clusters.is_empty();
+    if merged && best + 1 < found.len() {
+        let (with, without) = (found[found.len() - 1], found[best]);
+        chosen.left_out.push(LeftOut {
+            what: "merging",
+            why: format!(
+                "at the same {count} Gaussians scoring pictures keep {without:.2} dB without it, {with:.2} with it"
+            ),
+        });
+    }
+    Ok(chosen)
+}
+
+fn name(term: StaticTerm) -> &'static str {
+    match term {
+        StaticTerm::Mean => "C",
+        StaticTerm::Peak => "W",
+        StaticTerm::Geometric => "sqrt(C*W)",
+    }
+}
+
+/// The first `count` of the recipe's ranking, then of the others, none twice.
+fn alternatives_to(scene: &Scene, scored: &Scored, recipe: &Recipe, count: usize) -> Result<Vec<Alternative>> {
+    let own = recipe.score.static_term;
+    let frames = scene.input.source().info().times.len();
+    let mut found: Vec<Alternative> = Vec::new();
+    for term in [own, StaticTerm::Mean, StaticTerm::Geometric] {
+        let kept = match term == own {
+            true => scored.selection.ranking.take(count),
+            false => scored.ranking_by(term, frames, recipe)?.take(count),
+        };
+        if found.iter().all(|other| other.sieved.kept != kept) {
+            found.push(Alternative { term, sieved: Sieved::pruned(kept) });
+        }
+    }
+    Ok(found)
+}
+
+/// At most [`PICTURES`] (frame, camera) pairs, spread evenly over all that are scored.
+fn sampled_pictures(scene: &Scene) -> Vec<(usize, u32)> {
+    let frames = scene.schedule.frames.iter().enumerate();
+    let all: Vec<(usize, u32)> =
+        frames.flat_map(|(frame, views)| views.iter().map(move |&(_, camera)| (frame, camera))).collect();
+    let count = all.len().min(PICTURES);
+    (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect()
+}
+
+/// Mean PSNR of every alternative against the original over `pictures`, dB.
+fn mean_psnr(
+    scene: &Scene,
+    scored: &Scored,
+    recipe: &Recipe,
+    alternatives: &[Alternative],
+    pictures: &[(usize, u32)],
+) -> Result<Vec<f64>> {
+    let source = scene.input.source();
+    let background = scene.rig.background.unwrap_or_default();
+    let all: Vec<u32> = (0..source.info().count as u32).collect();
+    let results: Vec<Option<Box<dyn FrameSource + '_>>> = alternatives
+        .iter()
+        .map(|other| match other.sieved.clusters.is_empty() {
+            true => Ok(None),
+            false => merged_source(scene, scored, recipe, &other.sieved).map(Some),
+        })
+        .collect::<Result<_>>()?;
+    let mut sums = vec![0.0; alternatives.len()];
+    for of_frame in pictures.chunk_by(|a, b| a.0 == b.0) {
+        let frame = of_frame[0].0;
+        let original = gather(source, &all, frame, Columns::ALL)?;
+        let states: Vec<Gaussians> = alternatives
+            .iter()
+            .zip(&results)
+            .map(|(other, result)| match result {
+                None => Ok(original.pick(&other.sieved.kept)),
+                Some(result) => gather(&**result, &all[..other.sieved.kept.len()], frame, Columns::ALL),
+            })
+            .collect::<Result<_>>()?;
+        for &(_, camera) in of_frame {
+            let camera = &scene.schedule.cameras[camera as usize];
+            let expected = render(&original, camera, background);
+            for (sum, state) in sums.iter_mut().zip(&states) {
+                *sum += psnr(&render(state, camera, background), &expected);
+            }
+        }
+    }
+    Ok(sums.into_iter().map(|sum| sum / pictures.len().max(1) as f64).collect())
+}
+
+/// The frames of a result with proxies, as it would be written.
+fn merged_source<'a>(
+    scene: &'a Scene,
+    scored: &Scored,
+    recipe: &Recipe,
+    sieved: &'a Sieved,
+) -> Result<Box<dyn FrameSource + 'a>> {
+    if let Input::Model(model) = &scene.input {
+        let found = canonical_proxies(model, scored, sieved, &recipe.merge)?;
+        return Ok(Box::new(model.with_canonical(canonical_cloud(model, sieved, &found.raw))));
+    }
+    let members = sieved.clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));
+    Ok(Box::new(MergedSequence::new(scene.input.source(), &sieved.kept, members, &recipe.merge)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::demo;
+    use crate::emit::container::write_container;
+    use crate::ingest::container::Container;
+    use crate::model::Split;
+    use crate::pipeline::compress::Only;
+    use crate::pipeline::merging::sieve;
+    use crate::pipeline::scored::{UserOverrides, score_scene};
+
+    fn scene(folder: &std::path::Path) -> Scene {
+        let made = demo::Scene::new(1500, 6);
+        let path = folder.join("scene.gseq");
+        write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        let input = Input::Container(Container::open(&path).unwrap());
+        let rig = made.rig();
+        let schedule = rig.schedule(&input.source().info().times, Some(Split::Train)).unwrap();
+        Scene { path, input, rig, schedule, has_cameras: true, notes: Vec::new() }
+    }
+
+    /// Mean PSNR over the pictures that decide.
+    fn quality(scene: &Scene, scored: &Scored, recipe: &Recipe, sieved: &Sieved) -> f64 {
+        let alone = [Alternative { term: StaticTerm::Mean, sieved: sieved.clone() }];
+        mean_psnr(scene, scored, recipe, &alone, &sampled_pictures(scene)).unwrap()[0]
+    }
+
+    #[test]
+    fn what_is_chosen_has_the_same_count_and_is_never_worse_than_any_alternative() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let recipe = Recipe::preset("default").unwrap();
+        let stages = &mut Stages::default();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default(), stages).unwrap();
+        for target in [150, 600, 1200] {
+            let sieved = sieve(&scene, &scored, &recipe, Only::Both, Some(target), stages).unwrap();
+            let chosen = choose(&scene, &scored, &recipe, sieved.clone(), stages).unwrap();
+            assert_eq!(chosen.sieved.kept.len(), target);
+            let got = quality(&scene, &scored, &recipe, &chosen.sieved);
+            let by_c = Sieved::pruned(scored.ranking_by(StaticTerm::Mean, 6, &recipe).unwrap().take(target));
+            let own = Sieved::pruned(scored.selection.ranking.take(target));
+            for other in [sieved.clone(), by_c, own] {
+                let expected = quality(&scene, &scored, &recipe, &other);
+                assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
+            }
+            let lost = !sieved.clusters.is_empty() && chosen.sieved.clusters.is_empty();
+            assert_eq!(chosen.left_out.iter().any(|left| left.what == "merging"), lost);
+        }
+    }
+
+    #[test]
+    fn pictures_that_decide_are_spread_over_all_and_none_counts_twice() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let pictures = sampled_pictures(&scene);
+        assert_eq!(pictures.len(), PICTURES);
+        assert!(pictures.is_sorted() && pictures.windows(2).all(|pair| pair[0] != pair[1]));
+        assert_eq!((pictures[0].0, pictures[PICTURES - 1].0), (0, 5));
+    }
+}

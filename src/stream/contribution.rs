@@ -1,0 +1,316 @@
+//! Visible contribution: what every Gaussian adds to the scored pictures, occlusion included.
+//!
+//! In: a source, its cameras frame by frame, which pictures to look at. Out: C `visible` and W (METHOD
+//! section 1). Frame-major, for occlusion needs all Gaussians of a frame at once: a frame is read once,
+//! by blocks on all threads, then its pictures run on all threads. Sums of integers and maxima: the same
+//! bits whatever the order, the threads and the batches.
+
+use std::num::NonZeroU32;
+use std::sync::{Mutex, PoisonError};
+
+use rayon::prelude::*;
+
+use super::{BLOCK, Progress};
+use crate::error::{Error, Result};
+use crate::model::{Camera, Columns, Gaussians, Schedule};
+use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::recipe;
+use crate::render::{Contribution, Renderer};
+
+/// What contributions depend on: all but colour.
+const GEOMETRY: Columns = Columns::ALL.without(Columns::SH);
+
+/// Pictures of a batch for each thread: enough that the last ones to finish cost little.
+const PICTURES_PER_THREAD: usize = 4;
+
+/// Pictures to look at: frames in order, each with the cameras of its pictures, at least one.
+#[derive(Debug, Clone)]
+pub struct Sample<'a>(Vec<(usize, Vec<&'a Camera>)>);
+
+impl<'a> Sample<'a> {
+    /// What the strides of `scan` leave of `schedule`: of the frames that have pictures the first and
+    /// every `frame_stride`-th, of the pictures of each every `view_stride`-th, from one that moves on
+    /// from frame to frame, so that all views take their turns.
+    pub fn new(schedule: &'a Schedule, scan: &recipe::Scan) -> Self {
+        let view_stride = scan.view_stride.get() as usize;
+        let with_pictures = schedule.frames.iter().enumerate().filter(|(_, views)| !views.is_empty());
+        let sampled = with_pictures.step_by(scan.frame_stride.get() as usize).enumerate();
+        let taken = sampled.map(|(turn, (frame, views))| {
+            let views = views.iter().skip(turn % view_stride).step_by(view_stride);
+            (frame, views.map(|&(_, camera)| &schedule.cameras[camera as usize]).collect::<Vec<_>>())
+        });
+        Sample(taken.filter(|(_, cameras)| !cameras.is_empty()).collect())
+    }
+
+    /// Number of pictures.
+    pub fn pictures(&self) -> usize {
+        self.0.iter().map(|(_, cameras)| cameras.len()).sum()
+    }
+
+    /// Number of frames.
+    pub fn frames(&self) -> usize {
+        self.0.len()
+    }
+}
+
+/// What was seen of N Gaussians.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Seen {
+    /// `[N]`, C: Σ alpha · transmittance per picture, pixels; a sampled pixel stands for stride² of them.
+    pub coverage: Vec<f64>,
+    /// `[N]`, W: largest alpha · transmittance of any pixel looked at, in [0, 0.99].
+    pub peak: Vec<f64>,
+}
+
+/// Looks at every `pixel_stride`-th pixel each way of the pictures of `sample`.
+///
+/// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
+/// pictures at all give zeros.
+///
+/// Memory per Gaussian: its reader; 44 bytes for a block's state and for each frame of a batch (frames
+/// with 4 × threads pictures between them); per thread 12 bytes of sums and a picture's buffers
+/// ([`crate::render`]). Nothing grows with frames or views.
+pub fn visible_contribution(source: &dyn FrameSource, sample: &Sample<'_>, pixel_stride: NonZeroU32) -> Result<Seen> {
+    let info = source.info();
+    let pictures = sample.pictures();
+    let progress = Progress::new("visible", "pictures", pictures as u64);
+    let mut blocks: Vec<(Box<dyn BlockReader + '_>, Gaussians)> = (0..info.count.div_ceil(BLOCK))
+        .into_par_iter()
+        .map(|block| {
+            let range = block * BLOCK..info.count.min((block + 1) * BLOCK);
+            let state = Gaussians::zeros(range.len(), 0);
+            Ok((source.open(Ids::Range(range))?, state))
+        })
+        .collect::<Result<_>>()?;
+
+    // One per thread at most: a picture runs on the thread that took its worker.
+    let workers: Mutex<Vec<(Renderer, Contribution)>> = Mutex::default();
+    let mut states: Vec<Gaussians> = Vec::new();
+    for batch in batches(&sample.0, PICTURES_PER_THREAD * rayon::current_num_threads()) {
+        for (slot, &(frame, _)) in batch.iter().enumerate() {
+            let want = if slot < states.len() { info.varying & GEOMETRY } else { GEOMETRY };
+            if slot == states.len() {
+                states.push(Gaussians::zeros(info.count, 0));
+            }
+            read_frame(&mut blocks, frame, want, &mut states[slot])?;
+        }
+        let jobs: Vec<(&Gaussians, &Camera)> = batch
+            .iter()
+            .zip(&states)
+            .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
+            .collect();
+        jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
+            let free = workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+            let mut worker = free.unwrap_or_else(|| (Renderer::new(), Contribution::new(info.count)));
+            worker.0.contribution(state, camera, pixel_stride, &mut worker.1);
+            workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
+            progress.advance(1);
+        });
+    }
+    let mut sum = Contribution::new(info.count);
+    for (_, of_thread) in workers.into_inner().unwrap_or_else(PoisonError::into_inner) {
+        sum.merge(&of_thread);
+    }
+    let per_pixel = f64::from(pixel_stride.get()).powi(2);
+    let coverage = (0..info.count).map(|i| sum.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+    Ok(Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() })
+}
+
+/// Runs of frames with at least `pictures` pictures between them, the last one perhaps fewer.
+fn batches<'a, T>(mut frames: &'a [(usize, Vec<T>)], pictures: usize) -> impl Iterator<Item = &'a [(usize, Vec<T>)]> {
+    std::iter::from_fn(move || {
+        let mut held = 0;
+        let enough = frames.iter().position(|(_, cameras)| {
+            held += cameras.len();
+            held >= pictures
+        });
+        let (batch, rest) = frames.split_at(enough.map_or(frames.len(), |last| last + 1));
+        frames = rest;
+        (!batch.is_empty()).then_some(batch)
+    })
+}
+
+/// Reads the columns `want` of all blocks at `frame` into `state`.
+fn read_frame(
+    blocks: &mut [(Box<dyn BlockReader + '_>, Gaussians)],
+    frame: usize,
+    want: Columns,
+    state: &mut Gaussians,
+) -> Result<()> {
+    if want.is_empty() {
+        return Ok(());
+    }
+    blocks.par_iter_mut().try_for_each(|(reader, block)| reader.read(frame, want, block))?;
+    for column in want.iter() {
+        let target = state.column_mut(column);
+        for c in 0..target.width() {
+            for (to, (_, block)) in target.plane_mut(c).chunks_mut(BLOCK).zip(&*blocks) {
+                to.copy_from_slice(block.column(column).plane(c));
+            }
+        }
+    }
+    Ok::<_, Error>(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::demo::Scene;
+    use crate::model::{Flags, Rig, Rows, SequenceInfo, Split};
+    use crate::recipe::Recipe;
+    use crate::select::{Overrides, select};
+    use crate::{render, score};
+
+    fn strides(pixel: u32, view: u32, frame: u32) -> recipe::Scan {
+        let [pixel_stride, view_stride, frame_stride] = [pixel, view, frame].map(|n| NonZeroU32::new(n).unwrap());
+        recipe::Scan { pixel_stride, view_stride, frame_stride, ..Recipe::preset("default").unwrap().scan }
+    }
+
+    fn on_threads<R: Send>(threads: usize, work: impl FnOnce() -> R + Send) -> R {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
+    }
+
+    #[test]
+    fn contributions_are_the_bits_of_a_plain_loop_over_pictures_whatever_the_threads() {
+        let scene = Scene::new(2500, 7);
+        let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
+        for (pixel, view, frame) in [(1, 1, 1), (3, 2, 2)] {
+            let scan = strides(pixel, view, frame);
+            let mut plain = Contribution::new(2500);
+            let mut pictures = 0;
+            for (turn, t) in (0..7).step_by(frame as usize).enumerate() {
+                let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
+                scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::ALL, &mut state).unwrap();
+                for &(_, camera) in schedule.frames[t].iter().skip(turn % view as usize).step_by(view as usize) {
+                    let camera = &schedule.cameras[camera as usize];
+                    render::contribution(&state, camera, scan.pixel_stride, &mut plain);
+                    pictures += 1;
+                }
+            }
+            let sample = Sample::new(&schedule, &scan);
+            assert_eq!((sample.pictures(), sample.frames()), (pictures, 7usize.div_ceil(frame as usize)));
+            for threads in [1, 2, 5] {
+                let seen = on_threads(threads, || visible_contribution(&scene, &sample, scan.pixel_stride)).unwrap();
+                for i in 0..2500 {
+                    let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
+                    assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
+                    assert_eq!(seen.peak[i], f64::from(plain.max[i]), "W of {i} on {threads} threads");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_sampled_pixel_stands_for_all_it_skips() {
+        let scene = Scene::new(1200, 3);
+        let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
+        let total = |pixel| {
+            let scan = strides(pixel, 1, 1);
+            let seen = visible_contribution(&scene, &Sample::new(&schedule, &scan), scan.pixel_stride).unwrap();
+            seen.coverage.iter().sum::<f64>()
+        };
+        let (all, third) = (total(1), total(3));
+        assert!((third / all - 1.0).abs() < 0.02, "got {third}, expected about {all}");
+    }
+
+    #[test]
+    fn strides_leave_every_view_its_turn_and_never_no_picture() {
+        let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
+        let views = |from: u32, to: u32| (from..to).map(|view| (view, view)).collect::<Vec<_>>();
+        // The first frame has no picture in this split.
+        let frames = vec![vec![], views(0, 3), views(0, 3), vec![], views(0, 3), views(0, 3)];
+        let schedule = Schedule { cameras: (0..3).map(|_| camera.clone()).collect(), frames };
+        let index = |camera: &&Camera| schedule.cameras.iter().position(|c| std::ptr::eq(c, *camera)).unwrap();
+        let taken = |view, frame| -> Vec<(usize, Vec<usize>)> {
+            let sample = Sample::new(&schedule, &strides(1, view, frame));
+            sample.0.iter().map(|(t, cameras)| (*t, cameras.iter().map(index).collect())).collect()
+        };
+        assert_eq!(taken(3, 1), [(1, vec![0]), (2, vec![1]), (4, vec![2]), (5, vec![0])]);
+        assert_eq!(taken(2, 2), [(1, vec![0, 2]), (4, vec![1])]);
+        assert_eq!(taken(100, 100), [(1, vec![0])]);
+    }
+
+    /// One state for ever.
+    struct Still(Gaussians, SequenceInfo);
+
+    impl FrameSource for Still {
+        fn info(&self) -> &SequenceInfo {
+            &self.1
+        }
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(Picked(self.0.pick(&ids.iter().map(|id| id as u32).collect::<Vec<_>>()))))
+        }
+    }
+
+    struct Picked(Gaussians);
+
+    impl BlockReader for Picked {
+        fn read(&mut self, _: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            want.iter().for_each(|column| *out.column_mut(column) = self.0.column(column).clone());
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_wholly_occluded_gaussian_has_no_visible_coverage_and_is_pruned_first() {
+        // Bright and large behind four opaque walls; before them one that is hardly there.
+        const HIDDEN: usize = 5;
+        const FAINT: usize = 0;
+        let count = 40;
+        let mut state = Gaussians::zeros(count, 0);
+        for i in 0..count {
+            let (y, size, logit) = match i {
+                FAINT => (-1.0, -4.0, -4.0f32),
+                HIDDEN => (3.0, -1.0, 6.0),
+                1..5 => (0.1 * i as f32, 4.0, 12.0),
+                _ => (-1.0, -2.0, 0.0),
+            };
+            state.position.set_row(i, [0.02 * i as f32 - 0.4, y, 0.0]);
+            state.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+            state.log_scale.set_row(i, [size, if size > 0.0 { -5.0 } else { size }, size]);
+            state.opacity_logit.set_row(i, [logit]);
+        }
+        let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Columns::NONE };
+        let rig = Rig {
+            cameras: vec![Camera::look_at(glam::DVec3::new(0.0, -4.0, 0.0), glam::DVec3::ZERO, 1.0, (64, 48))],
+            shots: vec![crate::model::Shot { view: 0, camera: 0, time: None, split: Split::Train, image: None }],
+            background: None,
+            origin: "test".into(),
+        };
+        let schedule = rig.schedule(&info.times, None).unwrap();
+        let recipe = Recipe::preset("default").unwrap();
+        let sample = Sample::new(&schedule, &recipe.scan);
+        let seen = visible_contribution(&Still(state, info), &sample, recipe.scan.pixel_stride).unwrap();
+        assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
+        assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
+
+        let zeros = || vec![0.0; count];
+        let rows = Rows {
+            d: zeros(),
+            kappa: zeros(),
+            v: zeros(),
+            life: vec![2; count],
+            c: seen.coverage,
+            w: seen.peak,
+            e: zeros(),
+            vis: vec![1.0; count],
+            flags: vec![Flags::default(); count],
+        };
+        let scores = score::score(&rows, 2, &recipe.score);
+        let selection = select(&scores, &recipe.select, &Overrides::default()).unwrap();
+        let unseen: Vec<bool> = selection.ranking.order().iter().map(|&id| rows.c[id as usize] == 0.0).collect();
+        assert!(unseen.is_sorted() && unseen.iter().filter(|&&unseen| unseen).count() < 5, "{unseen:?}");
+    }
+
+    #[test]
+    fn nothing_to_see_gives_zeros() {
+        let scene = Scene::new(300, 2);
+        let schedule = Schedule { cameras: Vec::new(), frames: vec![Vec::new(); 2] };
+        let seen = visible_contribution(&scene, &Sample::new(&schedule, &strides(1, 1, 1)), NonZeroU32::MIN).unwrap();
+        assert_eq!(seen, Seen { coverage: vec![0.0; 300], peak: vec![0.0; 300] });
+        let none = Still(Gaussians::zeros(0, 0), SequenceInfo { count: 0, ..scene.info().clone() });
+        let schedule = scene.rig().schedule(&scene.info().times, None).unwrap();
+        let seen = visible_contribution(&none, &Sample::new(&schedule, &strides(1, 1, 1)), NonZeroU32::MIN).unwrap();
+        assert!(seen.coverage.is_empty() && seen.peak.is_empty());
+    }
+}
