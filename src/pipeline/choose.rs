@@ -15,6 +15,7 @@ use crate::model::{Columns, Gaussians};
 use crate::pass::FrameSource;
 use crate::recipe::{Recipe, StaticTerm};
 use crate::render::render;
+use crate::select::Ranking;
 use crate::stream::{MergedSequence, gather};
 
 /// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
@@ -39,10 +40,18 @@ struct Alternative {
 
 /// Compares `sieved` with the first Gaussians of the recipe's ranking and of those by C and √(C·W), as
 /// many as it has, by mean PSNR against the original on scoring pictures; keeps the best, of equals the
-/// one without merging and with the recipe's own ranking.
+/// one without merging and with the recipe's own ranking. Where merging loses and no `target` asks for
+/// that count, the recipe's own number of survivors stays.
 ///
 /// Without visible contributions there is nothing to compare by: `sieved` is kept.
-pub fn choose(scene: &Scene, scored: &Scored, recipe: &Recipe, sieved: Sieved, stages: &mut Stages) -> Result<Chosen> {
+pub fn choose(
+    scene: &Scene,
+    scored: &Scored,
+    recipe: &Recipe,
+    sieved: Sieved,
+    target: Option<usize>,
+    stages: &mut Stages,
+) -> Result<Chosen> {
     let count = sieved.kept.len();
     let own = recipe.score.static_term;
     let mut alternatives = Vec::new();
@@ -88,7 +97,19 @@ pub fn choose(scene: &Scene, scored: &Scored, recipe: &Recipe, sieved: Sieved, s
             ),
         });
     }
+    if merged && chosen.sieved.clusters.is_empty() && target.is_none() {
+        let survivors = scored.selection.counts.kept;
+        chosen.sieved = Sieved::pruned(ranking_by(scene, scored, recipe, term)?.take(survivors));
+    }
     Ok(chosen)
+}
+
+/// The ranking by a static term.
+fn ranking_by(scene: &Scene, scored: &Scored, recipe: &Recipe, term: StaticTerm) -> Result<Ranking> {
+    match term == recipe.score.static_term {
+        true => Ok(scored.selection.ranking.clone()),
+        false => scored.ranking_by(term, scene.input.source().info().times.len(), recipe),
+    }
 }
 
 fn name(term: StaticTerm) -> &'static str {
@@ -102,13 +123,9 @@ fn name(term: StaticTerm) -> &'static str {
 /// The first `count` of the recipe's ranking, then of the others, none twice.
 fn alternatives_to(scene: &Scene, scored: &Scored, recipe: &Recipe, count: usize) -> Result<Vec<Alternative>> {
     let own = recipe.score.static_term;
-    let frames = scene.input.source().info().times.len();
     let mut found: Vec<Alternative> = Vec::new();
     for term in [own, StaticTerm::Mean, StaticTerm::Geometric] {
-        let kept = match term == own {
-            true => scored.selection.ranking.take(count),
-            false => scored.ranking_by(term, frames, recipe)?.take(count),
-        };
+        let kept = ranking_by(scene, scored, recipe, term)?.take(count);
         if found.iter().all(|other| other.sieved.kept != kept) {
             found.push(Alternative { term, sieved: Sieved::pruned(kept) });
         }
@@ -217,7 +234,7 @@ mod tests {
         let scored = score_scene(&scene, &recipe, &UserOverrides::default(), stages).unwrap();
         for target in [150, 600, 1200] {
             let sieved = sieve(&scene, &scored, &recipe, Only::Both, Some(target), stages).unwrap();
-            let chosen = choose(&scene, &scored, &recipe, sieved.clone(), stages).unwrap();
+            let chosen = choose(&scene, &scored, &recipe, sieved.clone(), Some(target), stages).unwrap();
             assert_eq!(chosen.sieved.kept.len(), target);
             let got = quality(&scene, &scored, &recipe, &chosen.sieved);
             let by_c = Sieved::pruned(scored.ranking_by(StaticTerm::Mean, 6, &recipe).unwrap().take(target));
@@ -229,6 +246,23 @@ mod tests {
             let lost = !sieved.clusters.is_empty() && chosen.sieved.clusters.is_empty();
             assert_eq!(chosen.left_out.iter().any(|left| left.what == "merging"), lost);
         }
+    }
+
+    #[test]
+    fn without_a_target_merging_that_does_not_pay_leaves_every_survivor_of_pruning() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        // Nothing is pruned, so that what is never seen is there to be dropped instead of merging the rest.
+        let mut recipe = Recipe::preset("default").unwrap();
+        recipe.select.tau_static = 0.0;
+        recipe.merge.max_color_difference = f64::INFINITY;
+        let stages = &mut Stages::default();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default(), stages).unwrap();
+        let sieved = sieve(&scene, &scored, &recipe, Only::Both, None, stages).unwrap();
+        let survivors = scored.selection.counts.kept;
+        assert!(sieved.kept.len() < survivors, "nothing merged");
+        let chosen = choose(&scene, &scored, &recipe, sieved, None, stages).unwrap();
+        assert_eq!((chosen.sieved.kept.len(), chosen.left_out.len()), (survivors, 1));
     }
 
     #[test]

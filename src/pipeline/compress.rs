@@ -95,7 +95,7 @@ pub fn compress_scene(
     let scored = score_scene(scene, recipe, &user, &mut stages)?;
     let sieved = sieve(scene, &scored, recipe, options.only, target, &mut stages)?;
     let chosen = match recipe.select.choose_by_views && options.only != Only::Merge {
-        true => choose(scene, &scored, recipe, sieved, &mut stages)?,
+        true => choose(scene, &scored, recipe, sieved, target, &mut stages)?,
         false => Chosen { sieved, left_out: Vec::new(), notes: Vec::new() },
     };
     let sieved = chosen.sieved;

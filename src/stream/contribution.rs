@@ -117,7 +117,7 @@ pub fn visible_contribution(source: &dyn FrameSource, sample: &Sample<'_>, pixel
 }
 
 /// Runs of frames with at least `pictures` pictures between them, the last one perhaps fewer.
-fn batches<'a, T>(mut frames: &'a [(usize, Vec<T>)], pictures: usize) -> impl Iterator<Item = &'a [(usize, Vec<T>)]> {
+fn batches<T>(mut frames: &[(usize, Vec<T>)], pictures: usize) -> impl Iterator<Item = &[(usize, Vec<T>)]> {
     std::iter::from_fn(move || {
         let mut held = 0;
         let enough = frames.iter().position(|(_, cameras)| {
