@@ -376,7 +376,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_piped() {
         assert_eq!(run.stderr, "", "{arguments}");
     }
     let rows = fs::read_to_string(workplace.path("rows.csv")).unwrap();
-    assert_eq!(rows.lines().next().unwrap(), "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep");
+    assert_eq!(rows.lines().next().unwrap(), "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W");
     assert_eq!(rows.lines().count(), 301);
     // Nobody has chosen the frames of a model that is continuous in time.
     for (arguments, frames) in [

@@ -34,7 +34,9 @@ fn cloud(model: &Path) -> std::path::PathBuf {
 fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &str, frames: &[usize]) {
     let name = format!("out_{preset}");
     let (input, output) = (model.display().to_string(), workplace.path(&name));
-    let summary = workplace.summary(&format!("{input} --cameras {input} --split test -o {name} --preset {preset}"));
+    let summary = workplace.summary(&format!(
+        "{input} --cameras {input} --split test -o {name} --preset {preset} --choose-by-views=false"
+    ));
     let map = index_map(&output.join("index_map.npy"));
     let members = members(&map);
     let (before, after) = (PlyRows::read(&cloud(model)), PlyRows::read(&cloud(&output)));

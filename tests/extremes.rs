@@ -130,9 +130,8 @@ fn movers_around_one_percent_are_kept_whatever_their_number() {
             }
             workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
         }
-        // Exact percentiles: default's dynamic threshold is 1, and the middle of a sketch's bucket may lie above
-        // the value that all movers share.
-        let default = "--preset default --tau-static 0.99 --exact-percentiles";
+        // Exact percentiles: the middle of a sketch's bucket may lie above the value that all movers share.
+        let default = "--preset default --tau-static 0.99 --tau-dynamic 1 --exact-percentiles";
         for request in ["--preset paper --target-count 20", default] {
             workplace.done(&format!("compress frames -o out --overwrite --prune-only {request}"));
             let map = index_map(&workplace.path("out/index_map.npy"));
@@ -207,12 +206,14 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
         let (before, after) = (PlyRows::read(&odd), PlyRows::read(&workplace.path("kept.ply")));
         assert!(place >= 0 && after.rows[place as usize] == before.rows[7], "{what}");
 
-        // The percentiles are those of the other 99, from the same camera.
+        // The percentiles are those of the other 99, from the same camera. Of projected coverage: what is visible
+        // of the others depends on what stands before them.
         fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
         let others: Vec<u32> = (0..100).filter(|&i| i != 7).collect();
         workplace.ply("others.ply", &odd_cloud.pick(&others));
-        let [found, expected] = ["odd.ply --non-finite keep", "others.ply"]
-            .map(|request| workplace.summary(&format!("{request} --cameras cameras.json --dry-run -o x.ply")));
+        let [found, expected] = ["odd.ply --non-finite keep", "others.ply"].map(|request| {
+            workplace.summary(&format!("{request} --coverage projected --cameras cameras.json --dry-run -o x.ply"))
+        });
         assert_eq!(found["terms"], expected["terms"], "{what}");
     }
 }

@@ -3,7 +3,7 @@
 
 mod scene;
 
-use scene::{scene, tiny};
+use scene::{by_formula, scene, tiny};
 use splatsieve::model::Rows;
 use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
 use splatsieve::pipeline::summary::Stages;
@@ -112,9 +112,9 @@ fn agrees(mut recipe: Recipe) -> usize {
 
 #[test]
 fn presets_score_and_keep_as_method_says() {
-    assert_eq!(agrees(Recipe::preset("paper").unwrap()), 240);
+    assert_eq!(agrees(by_formula("paper")), 240);
     for preset in ["default", "gentle", "strong"] {
-        let kept = agrees(Recipe::preset(preset).unwrap());
+        let kept = agrees(by_formula(preset));
         assert!((100..N).contains(&kept), "{preset}: {kept} kept");
     }
 }
@@ -136,7 +136,7 @@ fn every_parameter_of_the_scores_and_stages_acts_as_method_says() {
         let counts: Vec<usize> = edits
             .iter()
             .map(|edit| {
-                let mut recipe = Recipe::preset(preset).unwrap();
+                let mut recipe = by_formula(preset);
                 edit(&mut recipe);
                 agrees(recipe)
             })
@@ -150,7 +150,7 @@ fn every_parameter_of_the_scores_and_stages_acts_as_method_says() {
 #[test]
 fn sketched_percentiles_move_few_decisions() {
     for preset in ["paper", "default"] {
-        let mut recipe = Recipe::preset(preset).unwrap();
+        let mut recipe = by_formula(preset);
         (recipe.select.tau_static, recipe.select.tau_dynamic) = (0.2, 0.3);
         let sketched = scored(&recipe).selection.keep;
         recipe.score.exact_percentiles = true;
@@ -164,7 +164,7 @@ fn sketched_percentiles_move_few_decisions() {
 #[test]
 fn smaller_targets_keep_a_part_of_what_larger_ones_keep() {
     for preset in ["paper", "default"] {
-        let selection = scored(&Recipe::preset(preset).unwrap()).selection;
+        let selection = scored(&by_formula(preset)).selection;
         let own: Vec<u32> = (0..N as u32).filter(|&i| selection.keep[i as usize]).collect();
         assert_eq!(selection.ranking.take(own.len()), own, "the recipe's own count gives the recipe's own set");
         let mut larger = selection.ranking.take(N);
