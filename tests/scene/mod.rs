@@ -199,7 +199,7 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
 }
 
 /// A preset that scores by projected coverage and leaves no choice to renders: what the formulas decide alone.
-pub fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
+pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
     use splatsieve::recipe::{Coverage, Recipe, StaticTerm};
     let mut recipe = Recipe::preset(preset).unwrap();
     recipe.scan.coverage = Coverage::Projected;
