@@ -20,6 +20,7 @@ pub mod neighbors;
 pub mod proxy;
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use crate::model::{Columns, Gaussians};
 use crate::recipe;
@@ -61,7 +62,7 @@ pub struct Merged {
 }
 
 /// What one pass did.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct PassCounts {
     /// Nodes with more neighbours within ε than were looked at.
     pub truncated: usize,

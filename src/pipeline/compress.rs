@@ -120,7 +120,7 @@ pub fn compress_scene(
         },
         gaussians: sieved.kept.len(),
         output_bytes: None,
-        selection: scored.selection.counts.into(),
+        selection: scored.selection.counts,
         terms: scored.terms(),
         flags: scored.flags(),
         merge: sieved.summary.clone(),

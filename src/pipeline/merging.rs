@@ -5,7 +5,7 @@ use hashbrown::HashMap;
 use super::compress::Only;
 use super::input::Scene;
 use super::scored::Scored;
-use super::summary::{MergePassSummary, MergeSummary, Stages};
+use super::summary::{MergeSummary, Stages};
 use crate::error::{Error, Result};
 use crate::merge::motion::PairMeasure;
 use crate::merge::proxy::{Importance, weights};
@@ -227,7 +227,7 @@ impl<'a> Job<'a> {
             proxies: clusters.len(),
             members: clusters.iter().map(|cluster| cluster.members.len()).sum(),
             opacity: self.recipe.merge.opacity,
-            passes: merged.passes.iter().map(MergePassSummary::from).collect(),
+            passes: merged.passes.clone(),
             deviation: None,
         };
         Sieved { proxies: merged.states.pick(&grouped), kept, clusters, summary: Some(summary) }

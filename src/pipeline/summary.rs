@@ -99,33 +99,6 @@ pub struct FlagSummary {
     pub never_in_view: usize,
 }
 
-/// Gaussians at each step of selection, as [`crate::select::Counts`] explains them.
-#[derive(Debug, Clone, Serialize)]
-#[expect(missing_docs, reason = "`Counts` documents each")]
-pub struct SelectionSummary {
-    pub candidates: usize,
-    pub rescued: usize,
-    pub pruned_by_stage_1: usize,
-    pub pruned_by_stage_2: usize,
-    pub forced_keep: usize,
-    pub forced_drop: usize,
-    pub kept: usize,
-}
-
-impl From<Counts> for SelectionSummary {
-    fn from(counts: Counts) -> Self {
-        SelectionSummary {
-            candidates: counts.candidates,
-            rescued: counts.rescued,
-            pruned_by_stage_1: counts.pruned_by_stage_1,
-            pruned_by_stage_2: counts.pruned_by_stage_2,
-            forced_keep: counts.forced_keep,
-            forced_drop: counts.forced_drop,
-            kept: counts.kept,
-        }
-    }
-}
-
 /// What merging did.
 #[derive(Debug, Clone, Serialize)]
 pub struct MergeSummary {
@@ -138,40 +111,10 @@ pub struct MergeSummary {
     /// Rule by which a proxy's opacity was made.
     pub opacity: ProxyOpacity,
     /// One entry per pass.
-    pub passes: Vec<MergePassSummary>,
+    pub passes: Vec<PassCounts>,
     /// Furthest that a proxy strays from its place among its members over sampled frames, scene units;
     /// none without a deformation field.
     pub deviation: Option<f64>,
-}
-
-/// What one merge pass did.
-#[derive(Debug, Clone, Default, Serialize)]
-pub struct MergePassSummary {
-    /// Nodes with more neighbours in reach than were looked at.
-    pub truncated: usize,
-    /// Pairs that passed the tests of space and colour.
-    pub candidates: usize,
-    /// Of those, pairs that passed the test of motion too.
-    pub passing: usize,
-    /// Gaussians that joined a leader.
-    pub joins: usize,
-    /// Parallel rounds of the greedy rule.
-    pub rounds: usize,
-    /// Whether the greedy rule was finished sequentially.
-    pub sequential: bool,
-}
-
-impl From<&PassCounts> for MergePassSummary {
-    fn from(counts: &PassCounts) -> Self {
-        MergePassSummary {
-            truncated: counts.truncated,
-            candidates: counts.candidates,
-            passing: counts.passing,
-            joins: counts.joins,
-            rounds: counts.rounds,
-            sequential: counts.sequential,
-        }
-    }
 }
 
 /// A run from input to output.
@@ -188,7 +131,7 @@ pub struct Summary {
     /// Bytes of the output's point cloud or container; none for a dry run.
     pub output_bytes: Option<u64>,
     /// Stages 1 and 2.
-    pub selection: SelectionSummary,
+    pub selection: Counts,
     /// Everything in order.
     pub stages: Vec<Stage>,
     /// Percentiles of every term.

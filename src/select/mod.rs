@@ -10,6 +10,8 @@ mod ranking;
 pub use hash::hash_id;
 pub use ranking::Ranking;
 
+use serde::Serialize;
+
 use crate::error::{Error, Result};
 use crate::recipe::{LowPriority, Select};
 use crate::score::Scores;
@@ -36,7 +38,7 @@ pub struct Selection {
 
 /// Gaussians at each stage. Before overrides: total = candidates + outside, and
 /// kept = candidates − pruned by stage 2 + rescued.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct Counts {
     /// N.
     pub total: usize,
