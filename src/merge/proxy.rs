@@ -124,17 +124,7 @@ pub fn merge_groups(
     states: &Gaussians,
     merge: &recipe::Merge,
 ) -> Gaussians {
-    let mut out = Gaussians::default();
-    for column in Columns::ALL.iter() {
-        *out.column_mut(column) = crate::model::Column::zeros(states.column(column).width(), groups.len());
-    }
-    for (c, column) in Columns::ALL.iter().map(|column| (states.column(column), column)) {
-        for plane in 0..c.width() {
-            let from = c.plane(plane);
-            let to = out.column_mut(column).plane_mut(plane);
-            to.par_iter_mut().zip(groups.leaders()).for_each(|(to, &leader)| *to = from[leader as usize]);
-        }
-    }
+    let mut out = states.pick(groups.leaders());
     let clusters: Vec<usize> = (0..groups.len()).filter(|&group| groups.members(group).len() > 1).collect();
     for batch in clusters.chunks(BATCH) {
         let proxies: Vec<ProxyState> = batch
