@@ -16,3 +16,4 @@ pub mod render;
 pub mod score;
 pub mod scored;
 pub mod summary;
+pub mod trade_off;
