@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::RecipeFlags;
+use crate::pipeline::sweep::Method;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -14,6 +15,7 @@ Examples:
   splatsieve compress frames/ -o small.gseq --preset paper
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
+  splatsieve sweep model --cameras data -o curves        every method at every size
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq";
 
@@ -40,6 +42,8 @@ pub(super) enum Verb {
     Render(Render),
     /// Compare the pictures of two models: PSNR, SSIM and the error of what moves
     Evaluate(Evaluate),
+    /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
+    Sweep(Sweep),
     /// Pack any input into a .gseq container
     Pack(Pack),
     /// Say what an input holds
@@ -266,6 +270,37 @@ pub(super) struct Evaluate {
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
     /// Replace an earlier file
+    #[arg(long)]
+    pub(super) overwrite: bool,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+/// `sweep`
+#[derive(Debug, Args)]
+pub(super) struct Sweep {
+    #[command(flatten)]
+    pub(super) input: Input,
+    #[command(flatten)]
+    pub(super) cameras: CameraFile,
+    /// Methods to compare: `default` and `paper`, the presets; `paper-prune`, `paper-merge`, the paper's ablations;
+    /// prunings by `visible` contribution, `projected` coverage, `opacity` or `scale` alone, and at `random`
+    #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
+          value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
+    pub(super) methods: Vec<String>,
+    /// Fractions of the Gaussians to keep
+    #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_values_t = [0.8, 0.6, 0.4, 0.2, 0.1])]
+    pub(super) fractions: Vec<f64>,
+    /// Compare on at most this many frames, evenly from first to last
+    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) max_frames: u32,
+    #[command(flatten)]
+    pub(super) background: Background,
+    /// Folder to write sweep.json and sweep.csv into
+    #[arg(short, long, value_name = "FOLDER")]
+    pub(super) output: PathBuf,
+    /// Replace an earlier output
     #[arg(long)]
     pub(super) overwrite: bool,
     /// Print JSON

@@ -18,9 +18,10 @@ use crate::pipeline::input::InputOptions;
 use crate::pipeline::output::OutputKind;
 use crate::pipeline::pictures::Part;
 use crate::pipeline::render::{RenderOptions, Wanted};
-use crate::pipeline::{container, demo, evaluate, render, score};
+use crate::pipeline::sweep::{Method, SweepOptions};
+use crate::pipeline::{container, demo, evaluate, render, score, sweep};
 use crate::recipe::preset_text;
-use args::{CameraFile, Cameras, Cli, Compress, Evaluate, ImageKind, Input, Render, SplitArg, Verb};
+use args::{CameraFile, Cameras, Cli, Compress, Evaluate, ImageKind, Input, Render, SplitArg, Sweep, Verb};
 use recipe_flags::RecipeFlags;
 
 /// Runs the program on the arguments of this process.
@@ -79,6 +80,11 @@ fn run(cli: Cli) -> Result<()> {
             let as_json = args.json;
             let found = evaluate::evaluate(&evaluate_options(args))?;
             print(&if as_json { json(&found) } else { found.text() })
+        }
+        Verb::Sweep(args) => {
+            let as_json = args.json;
+            let found = sweep::sweep(&sweep_options(args))?;
+            print(&if as_json { found.json() } else { found.text() })
         }
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
@@ -205,6 +211,21 @@ fn evaluate_options(args: Evaluate) -> EvaluateOptions {
         max_frames: args.max_frames.map(|frames| frames as usize),
         background: args.background.background,
         csv: args.csv,
+        overwrite: args.overwrite,
+    }
+}
+
+fn sweep_options(args: Sweep) -> SweepOptions {
+    let mut input = input_options(args.input, None);
+    input.look_from(args.cameras);
+    let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
+    SweepOptions {
+        input,
+        methods: args.methods.iter().filter_map(named).collect(),
+        fractions: args.fractions,
+        max_frames: Some(args.max_frames as usize),
+        background: args.background.background,
+        output: args.output,
         overwrite: args.overwrite,
     }
 }

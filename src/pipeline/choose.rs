@@ -191,7 +191,7 @@ fn merged_source<'a>(
     sieved: &'a Sieved,
 ) -> Result<Box<dyn FrameSource + 'a>> {
     if let Input::Model(model) = &scene.input {
-        let found = canonical_proxies(model, scored, sieved, &recipe.merge)?;
+        let found = canonical_proxies(model, scored.reference, sieved, &recipe.merge)?;
         return Ok(Box::new(model.with_canonical(canonical_cloud(model, sieved, &found.raw))));
     }
     let members = sieved.clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));

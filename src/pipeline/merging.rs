@@ -163,10 +163,10 @@ impl<'a> Job<'a> {
         let source = scene.input.source();
         let states = match source.info().times.is_empty() {
             true => Gaussians::zeros(pool.len(), source.info().sh_degree),
-            false => gather(source, &pool, scored.reference_frame, Columns::ALL)?,
+            false => gather(source, &pool, scored.reference.frame, Columns::ALL)?,
         };
         let mut merge = recipe.merge.clone();
-        let unit = merge.length_unit.in_scene_units(scored.extent);
+        let unit = merge.length_unit.in_scene_units(scored.reference.extent);
         merge.motion_noise = merge.motion_noise.max(2.0 * scored.position_ulp / unit);
         Ok(Job { scene, scored, recipe, merge, pool, states, measured: HashMap::new() })
     }
@@ -199,7 +199,7 @@ impl<'a> Job<'a> {
                 visibility: &visibility,
                 hash: &hash,
                 mergeable: &mergeable,
-                extent: scored.extent,
+                extent: scored.reference.extent,
             },
             &self.merge,
             limit,
@@ -223,7 +223,7 @@ impl<'a> Job<'a> {
             })
             .collect();
         let summary = MergeSummary {
-            reference_frame: self.scored.reference_frame,
+            reference_frame: self.scored.reference.frame,
             proxies: clusters.len(),
             members: clusters.iter().map(|cluster| cluster.members.len()).sum(),
             opacity: self.recipe.merge.opacity,

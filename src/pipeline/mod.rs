@@ -1,5 +1,6 @@
 //! The order of the passes: what each verb does from input to output.
 
+pub mod baseline;
 pub mod choose;
 pub mod compress;
 pub mod container;
@@ -16,4 +17,5 @@ pub mod render;
 pub mod score;
 pub mod scored;
 pub mod summary;
+pub mod sweep;
 pub mod trade_off;

@@ -12,7 +12,7 @@ use super::compress::CompressOptions;
 use super::input::{Input, Scene};
 use super::merging::{Cluster, Sieved};
 use super::proxies::{canonical_cloud, canonical_proxies};
-use super::scored::Scored;
+use super::scored::{Reference, Scored};
 use super::summary::{Stages, Summary};
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
 use crate::emit::container::write_container;
@@ -23,7 +23,7 @@ use crate::ingest::ply::Ply;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
-use crate::recipe::Recipe;
+use crate::recipe::{Merge, Recipe};
 use crate::stream::{MergedSequence, Progress, gather};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
@@ -119,7 +119,7 @@ pub fn write_result(
     let kept = sieved.kept.len();
     // Sequences are baked from a result that holds each of its frames: one more read of the kept.
     let reads = if matches!(kind, OutputKind::Gseq | OutputKind::PlySequence) { 1.0 } else { 0.0 };
-    let job = Emission { scene, scored, sieved, recipe: &options.recipe };
+    let job = Emission { input: &scene.input, reference: scored.reference, sieved, merge: &options.recipe.merge };
     let text = recipe_text(&options.recipe, &summary.input.digest);
     let map = sieved.index_map(summary.input.gaussians);
     if kind.is_folder() {
@@ -148,6 +148,17 @@ pub fn write_result(
     Ok(summary)
 }
 
+/// Writes the Gaussians `kept` (increasing) of an input as a result of `kind`, without anything beside it;
+/// gives the bytes that grow with them.
+pub fn write_kept(input: &Input, kept: Vec<u32>, merge: &Merge, kind: OutputKind, path: &Path) -> Result<u64> {
+    let job = Emission { input, reference: Reference::default(), sieved: &Sieved::pruned(kept), merge };
+    if kind.is_folder() {
+        fs::create_dir(path).map_err(Error::io("create", path))?;
+    }
+    job.write(kind, path)?;
+    if kind.is_folder() { point_bytes(path) } else { file_bytes(path) }
+}
+
 fn write_text(path: &Path, text: &str) -> Result<()> {
     fs::write(path, text).map_err(Error::io("write", path))
 }
@@ -172,10 +183,10 @@ fn point_bytes(folder: &Path) -> Result<u64> {
 
 /// The result, about to be written.
 struct Emission<'a> {
-    scene: &'a Scene,
-    scored: &'a Scored,
+    input: &'a Input,
+    reference: Reference,
     sieved: &'a Sieved,
-    recipe: &'a Recipe,
+    merge: &'a Merge,
 }
 
 impl Emission<'_> {
@@ -183,8 +194,8 @@ impl Emission<'_> {
     /// that a proxy strays from its members.
     fn write(&self, kind: OutputKind, path: &Path) -> Result<(Vec<String>, Option<f64>)> {
         let Sieved { kept, clusters, .. } = self.sieved;
-        if let Input::Model(model) = &self.scene.input {
-            let found = canonical_proxies(model, self.scored, self.sieved, &self.recipe.merge)?;
+        if let Input::Model(model) = self.input {
+            let found = canonical_proxies(model, self.reference, self.sieved, self.merge)?;
             let mut notes = found.notes;
             match kind {
                 OutputKind::Model => {
@@ -210,8 +221,8 @@ impl Emission<'_> {
             return Ok((notes, found.deviation));
         }
         let members = clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));
-        let result = MergedSequence::new(self.scene.input.source(), kept, members, &self.recipe.merge);
-        match &self.scene.input {
+        let result = MergedSequence::new(self.input.source(), kept, members, self.merge);
+        match self.input {
             Input::Frames(frames) if kind != OutputKind::Gseq => self.write_like_frames(frames, &result, kind, path)?,
             _ => write_sequence(&result, kind, path)?,
         }

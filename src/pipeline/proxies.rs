@@ -2,7 +2,7 @@
 //! the merged one (METHOD section 5, "Motion").
 
 use super::merging::Sieved;
-use super::scored::Scored;
+use super::scored::Reference;
 use crate::deform::Deltas;
 use crate::error::Result;
 use crate::ingest::ModelFolder;
@@ -32,7 +32,7 @@ pub struct CanonicalProxies {
 /// the mean unchanged; so does one for which no raw parameters exist, with all of its leader's parameters.
 pub fn canonical_proxies(
     model: &ModelFolder,
-    scored: &Scored,
+    reference: Reference,
     sieved: &Sieved,
     merge: &Merge,
 ) -> Result<CanonicalProxies> {
@@ -44,7 +44,7 @@ pub fn canonical_proxies(
         return Ok(CanonicalProxies { raw, deviation: None, notes });
     }
     let info = model.info();
-    let deltas = model.deltas_at(&of_leaders.position, info.times[scored.reference_frame])?;
+    let deltas = model.deltas_at(&of_leaders.position, info.times[reference.frame])?;
     // At the leader, the canonical position is the leader's to the bit, and so is the path.
     let solved = match merge.placement {
         Placement::Mean => Columns::ALL,
@@ -56,8 +56,8 @@ pub fn canonical_proxies(
         notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
     }
     let mut placements = vec![merge.placement; leaders.len()];
-    let mut deviations = deviations(model, scored, sieved, &raw, &placements)?;
-    let tolerance = merge.max_drift * merge.length_unit.in_scene_units(scored.extent);
+    let mut deviations = deviations(model, reference, sieved, &raw, &placements)?;
+    let tolerance = merge.max_drift * merge.length_unit.in_scene_units(reference.extent);
     let strayed: Vec<usize> = (0..leaders.len()).filter(|&i| deviations[i] > tolerance).collect();
     if merge.placement == Placement::Mean && !strayed.is_empty() {
         for &proxy in &strayed {
@@ -65,7 +65,7 @@ pub fn canonical_proxies(
             placements[proxy] = Placement::Leader;
         }
         notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
-        deviations = self::deviations(model, scored, sieved, &raw, &placements)?;
+        deviations = self::deviations(model, reference, sieved, &raw, &placements)?;
     }
     Ok(CanonicalProxies { raw, deviation: deviations.into_iter().reduce(f64::max), notes })
 }
@@ -113,7 +113,7 @@ fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
 /// the weighted mean of its members; at the leader, from its offset to that mean at the reference frame.
 fn deviations(
     model: &ModelFolder,
-    scored: &Scored,
+    reference: Reference,
     sieved: &Sieved,
     raw: &Gaussians,
     placements: &[Placement],
@@ -141,13 +141,13 @@ fn deviations(
             })
             .collect())
     };
-    let mut reference = offsets(scored.reference_frame)?;
-    for (offset, _) in reference.iter_mut().zip(placements).filter(|(_, placement)| **placement == Placement::Mean) {
+    let mut wanted = offsets(reference.frame)?;
+    for (offset, _) in wanted.iter_mut().zip(placements).filter(|(_, placement)| **placement == Placement::Mean) {
         *offset = [0.0; 3];
     }
     let mut largest = vec![0.0f64; raw.len()];
     for frame in sampled(frames) {
-        for (largest, (now, then)) in largest.iter_mut().zip(offsets(frame)?.iter().zip(&reference)) {
+        for (largest, (now, then)) in largest.iter_mut().zip(offsets(frame)?.iter().zip(&wanted)) {
             let change = (0..3).map(|axis| (now[axis] - then[axis]).powi(2)).sum::<f64>().sqrt();
             *largest = largest.max(change);
         }

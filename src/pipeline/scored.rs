@@ -22,12 +22,19 @@ pub struct Scored {
     pub protected: Vec<u32>,
     /// Ids that are to be dropped; increasing.
     pub dropped: Vec<u32>,
-    /// The frame with most Gaussians alive, ties to the first; 0 without frames.
-    pub reference_frame: usize,
-    /// Robust extent at the reference frame, scene units.
-    pub extent: f64,
+    /// Where Gaussians are compared with one another.
+    pub reference: Reference,
     /// Distance between f32 values at the scene's largest coordinate: the noise floor of a position.
     pub position_ulp: f64,
+}
+
+/// The frame at which Gaussians are compared, and the scale of the scene there.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Reference {
+    /// The frame with most Gaussians alive, ties to the first; 0 without frames.
+    pub frame: usize,
+    /// Robust extent of the positions there, scene units.
+    pub extent: f64,
 }
 
 /// What the user knows better, before ids are resolved.
@@ -95,11 +102,9 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
         let scores = score(&rows, info.times.len(), &recipe.score);
         let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop.clone() };
         let selection = select(&scores, &recipe.select, &overrides)?;
+        let reference = Reference { frame: reference_frame, extent };
         let position_ulp = crate::stats::ulp(scanned.largest_coordinate);
-        Ok((
-            Scored { rows, scores, selection, protected, dropped: drop, reference_frame, extent, position_ulp },
-            info.count,
-        ))
+        Ok((Scored { rows, scores, selection, protected, dropped: drop, reference, position_ulp }, info.count))
     })
 }
 

@@ -1,6 +1,8 @@
 //! What a sweep found, for people and for programs: quality, size, time and memory of every method at
 //! every kept fraction.
 
+use std::fmt::Write as _;
+
 use serde::{Deserialize, Serialize};
 
 /// Every point of a sweep, and what they share.
@@ -49,4 +51,74 @@ pub struct Point {
     pub seconds: f64,
     /// Largest resident memory while compressing; none where the system does not tell.
     pub peak_memory_bytes: Option<u64>,
+}
+
+impl TradeOff {
+    /// As JSON, for programs.
+    pub fn json(&self) -> String {
+        let mut text = serde_json::to_string_pretty(self).expect("plain data");
+        text.push('\n');
+        text
+    }
+
+    /// One line per point under a line of names; a value that does not exist is empty.
+    pub fn csv(&self) -> String {
+        let mut out = String::from("method,asked,count,fraction,bytes,psnr,ssim,temporal,seconds,peak_memory_bytes\n");
+        for point in &self.points {
+            let Point { method, count, bytes, psnr, ssim, seconds, .. } = point;
+            let fraction = self.fraction(point);
+            let (asked, temporal) = (text(point.asked), text(point.temporal));
+            let memory = text(point.peak_memory_bytes);
+            // Writing to a String cannot fail.
+            let _ = writeln!(
+                out,
+                "{method},{asked},{count},{fraction},{bytes},{psnr},{ssim},{temporal},{seconds},{memory}"
+            );
+        }
+        out
+    }
+
+    /// A table for a person.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let _ = writeln!(
+            out,
+            "{}: {} Gaussians, compared on {} pictures: {}",
+            self.path, self.gaussians, self.pictures, self.cameras
+        );
+        let _ = writeln!(
+            out,
+            "  {:<12} {:>9} {:>6} {:>12} {:>8} {:>8} {:>9} {:>8} {:>9}",
+            "method", "Gaussians", "kept", "bytes", "PSNR dB", "SSIM", "temporal", "time", "memory"
+        );
+        for point in &self.points {
+            let temporal = point.temporal.map_or("-".to_owned(), |error| format!("{error:.5}"));
+            let memory = point.peak_memory_bytes.map_or("-".to_owned(), |bytes| format!("{} MiB", bytes >> 20));
+            let _ = writeln!(
+                out,
+                "  {:<12} {:>9} {:>5.1}% {:>12} {:>8.2} {:>8.5} {temporal:>9} {:>6.2} s {memory:>9}{}",
+                point.method,
+                point.count,
+                100.0 * self.fraction(point),
+                point.bytes,
+                point.psnr,
+                point.ssim,
+                point.seconds,
+                if point.asked.is_none() { "  (its own choice)" } else { "" }
+            );
+        }
+        for note in &self.notes {
+            let _ = writeln!(out, "  note: {note}");
+        }
+        out
+    }
+
+    /// Part of the Gaussians that a point keeps; 1 of none.
+    pub fn fraction(&self, point: &Point) -> f64 {
+        if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
+    }
+}
+
+fn text(value: Option<impl ToString>) -> String {
+    value.map_or(String::new(), |value| value.to_string())
 }
