@@ -1,15 +1,18 @@
-"""Records PSNR and SSIM of small pictures as PyTorch computes them, for tests/metrics_recorded.rs.
+"""Records PSNR, SSIM and FLIP of small pictures, for tests/metrics_recorded.rs.
 
     python scripts/record_metrics.py tests/fixtures/metrics
 
 Writes a.npy and b.npy (float32 [pictures, 37, 53, 3], values partly outside [0, 1]) and expected.json with
-one PSNR and SSIM per picture, computed in float64 by 2-D convolution, and the versions that made them.
+per picture one PSNR and SSIM, computed in float64 by 2-D convolution with PyTorch, and one FLIP of 8-bit pictures,
+computed by its authors' package (flip-evaluator), and the versions that made them.
 """
 
+import importlib.metadata
 import json
 import pathlib
 import sys
 
+import flip_evaluator
 import numpy as np
 import torch
 import torch.nn.functional as functional
@@ -39,6 +42,12 @@ def psnr(a, b):
     return -10 * torch.log10(((a - b) ** 2).mean()).item()
 
 
+def flip(a, b):
+    """Mean of the error map, `b` the reference, at the default distance of 67 pixels per degree."""
+    a, b = (np.float32(np.round(p.clip(0, 1) * 255) / 255) for p in (a, b))
+    return float(flip_evaluator.evaluate(b, a, "LDR", inputsRGB=True, applyMagma=False)[1])
+
+
 def main():
     folder = pathlib.Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
@@ -51,11 +60,14 @@ def main():
     b = (a + np.array([0.002, 0.02, 0.1, 0.6])[:, None, None, None] * noise).astype(np.float32)
     np.save(folder / "a.npy", a)
     np.save(folder / "b.npy", b)
-    expected = {"numpy": np.__version__, "torch": torch.__version__, "psnr": [], "ssim": []}
+    expected = {"numpy": np.__version__, "torch": torch.__version__}
+    expected["flip-evaluator"] = importlib.metadata.version("flip-evaluator")
+    expected |= {"psnr": [], "ssim": [], "flip": []}
     for one, other in zip(a, b):
         pair = [torch.from_numpy(p).double().clamp(0, 1).permute(2, 0, 1).contiguous() for p in (one, other)]
         expected["psnr"].append(psnr(*pair))
         expected["ssim"].append(ssim(*pair))
+        expected["flip"].append(flip(one, other))
     (folder / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
 
 

@@ -228,6 +228,29 @@ fn evaluation_is_the_mean_over_the_rendered_pictures() {
 }
 
 #[test]
+fn flip_is_computed_where_it_is_asked_for_and_changes_nothing_else() {
+    let folder = scene();
+    let line = "evaluate scene.gseq smaller.gseq --cameras cameras.json --max-frames 2 --json --csv";
+    let without: Value = serde_json::from_str(&done(folder.path(), &format!("{line} without.csv"))).unwrap();
+    let mut with: Value = serde_json::from_str(&done(folder.path(), &format!("{line} with.csv --flip"))).unwrap();
+    let header = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap().lines().next().unwrap().to_owned();
+    assert_eq!(header("without.csv"), "frame,view,time,psnr,ssim,temporal");
+    assert_eq!(header("with.csv"), "frame,view,time,psnr,ssim,temporal,flip");
+    let overall = with.as_object_mut().unwrap().remove("flip").unwrap().as_f64().unwrap();
+    assert!(overall > 0.0 && overall < 1.0, "{overall}");
+    let mut sum = 0.0;
+    for of in ["per_view", "per_frame"] {
+        for row in with[of].as_array_mut().unwrap() {
+            let value = row.as_object_mut().unwrap().remove("flip").unwrap().as_f64().unwrap();
+            sum += if of == "per_view" { value / 3.0 } else { 0.0 };
+        }
+    }
+    // Every view is seen as often.
+    assert!((sum - overall).abs() < 1e-12, "views mean {sum}, overall {overall}");
+    assert_eq!(with, without);
+}
+
+#[test]
 fn a_model_loses_nothing_against_itself() {
     let folder = scene();
     let line = "evaluate scene.gseq scene.gseq --cameras cameras.json --split all --max-frames 2 --json";

@@ -40,7 +40,7 @@ pub(super) enum Verb {
     Score(Score),
     /// Render an input as its cameras see it, into PNG or float32 NPY files
     Render(Render),
-    /// Compare the pictures of two models: PSNR, SSIM and the error of what moves
+    /// Compare the pictures of two models: PSNR, SSIM, FLIP and the error of what moves
     Evaluate(Evaluate),
     /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
     Sweep(Sweep),
@@ -266,6 +266,9 @@ pub(super) struct Evaluate {
     pub(super) max_frames: Option<u32>,
     #[command(flatten)]
     pub(super) background: Background,
+    /// Compute FLIP too, the difference a person would see; takes some times longer
+    #[arg(long)]
+    pub(super) flip: bool,
     /// Write the scores of every picture
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,

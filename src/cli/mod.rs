@@ -210,6 +210,7 @@ fn evaluate_options(args: Evaluate) -> EvaluateOptions {
         part: args.split.map_or(Part::HeldOut, part_of),
         max_frames: args.max_frames.map(|frames| frames as usize),
         background: args.background.background,
+        flip: args.flip,
         csv: args.csv,
         overwrite: args.overwrite,
     }

@@ -1,10 +1,12 @@
-//! How close pictures are to one another: PSNR, SSIM, and the error of what moves.
+//! How close pictures are to one another: PSNR, SSIM, FLIP, and the error of what moves.
 //!
 //! Data in: pairs of [`Image`]s of one size. Data out: one f64 per pair. Values are clamped to [0, 1]
 //! first, as a screen does, and everything is summed in f64. Memory: for SSIM 40 bytes per pixel.
 
+mod flip;
 mod ssim;
 
+pub use flip::flip;
 pub use ssim::ssim;
 
 use crate::render::Image;

@@ -17,7 +17,7 @@ use super::summary::CameraSummary;
 use crate::emit::atomic::{Kind, StagedFile, check_target};
 use crate::error::{Error, Result};
 use crate::ingest::image::read_png;
-use crate::metrics::{psnr, ssim, temporal_error};
+use crate::metrics::{flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Rig};
 use crate::pass::FrameSource;
 use crate::render::{Image, render};
@@ -38,6 +38,8 @@ pub struct EvaluateOptions {
     pub max_frames: Option<usize>,
     /// Red, green, blue in [0, 1]; none: see [`background`].
     pub background: Option<[f32; 3]>,
+    /// Whether to compute FLIP too, which takes longer than all else.
+    pub flip: bool,
     /// File for the scores of every picture.
     pub csv: Option<PathBuf>,
     /// Replace an earlier file.
@@ -68,6 +70,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
         sources: [scene.input.source(), compressed.source()],
         cameras: &scene.rig.cameras,
         background,
+        flip: options.flip,
         truth: truth.transpose()?,
     };
     let scores = job.scores(&chosen)?;
@@ -193,14 +196,14 @@ struct Taken {
 
 impl Taken {
     /// Scores, with those of motion from the pictures `before` of the same view.
-    fn scores(&self, before: Option<&Taken>) -> (Score, Option<Both<Score>>) {
+    fn scores(&self, before: Option<&Taken>, with_flip: bool) -> (Score, Option<Both<Score>>) {
         let size = |taken: &Taken| (taken.original.width, taken.original.height);
         // A view whose camera changed may have another size, and nothing to be compared with.
         let before = before.filter(|before| size(before) == size(self));
-        let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]));
+        let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]), with_flip);
         let truth = self.truth.as_ref().map(|truth| {
             let against = |image: fn(&Taken) -> &Image| {
-                score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])))
+                score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
             };
             Both { original: against(|taken| &taken.original), compressed: against(|taken| &taken.compressed) }
         });
@@ -209,9 +212,9 @@ impl Taken {
 }
 
 /// How close `a` is to `b`, given the same two at the view's frame before.
-fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>) -> Score {
+fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> Score {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
-    Score { psnr: psnr(a, b), ssim: ssim(a, b), temporal }
+    Score { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
 }
 
 /// Everything needed to make and compare pictures.
@@ -220,6 +223,7 @@ struct Job<'a> {
     sources: [&'a dyn FrameSource; 2],
     cameras: &'a [Camera],
     background: [f32; 3],
+    flip: bool,
     truth: Option<GroundTruth>,
 }
 
@@ -238,7 +242,7 @@ impl Job<'_> {
                 .par_iter()
                 .map(|picture| {
                     let taken = self.take(picture, states)?;
-                    let scores = taken.scores(before.get(&picture.view));
+                    let scores = taken.scores(before.get(&picture.view), self.flip);
                     progress.advance(1);
                     Ok((taken, scores))
                 })

@@ -28,6 +28,8 @@ pub struct Score {
     pub ssim: f64,
     /// [`crate::metrics::temporal_error`] from the view's picture before; none of its first.
     pub temporal: Option<f64>,
+    /// [`crate::metrics::flip`], where it is asked for.
+    pub flip: Option<f64>,
 }
 
 /// The scores of one (frame, view).
@@ -56,6 +58,9 @@ pub struct Means {
     pub ssim: f64,
     /// Mean temporal error of those pictures that have one; none if no view is seen twice.
     pub temporal: Option<f64>,
+    /// Mean FLIP, where it is asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flip: Option<f64>,
 }
 
 /// Means over the pictures of one view.
@@ -137,12 +142,16 @@ impl Means {
     fn of(scores: &[Score]) -> Means {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let all = |value: fn(&Score) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
-        let temporal: Vec<f64> = scores.iter().filter_map(|score| score.temporal).collect();
+        let given = |value: fn(&Score) -> Option<f64>| {
+            let values: Vec<f64> = scores.iter().filter_map(value).collect();
+            (!values.is_empty()).then(|| mean(&values))
+        };
         Means {
             pairs: scores.len(),
             psnr: all(|score| score.psnr),
             ssim: all(|score| score.ssim),
-            temporal: (!temporal.is_empty()).then(|| mean(&temporal)),
+            temporal: given(|score| score.temporal),
+            flip: given(|score| score.flip),
         }
     }
 }
@@ -185,10 +194,13 @@ impl Evaluation {
         );
         let frames = self.loss.per_frame.len();
         let _ = writeln!(out, "{} pictures of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
-        let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}", "", "PSNR dB", "SSIM", "temporal");
+        let with_flip = self.loss.overall.flip.is_some();
+        let flip = if with_flip { "     FLIP" } else { "" };
+        let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");
         let mut line = |what: &str, means: &Means| {
             let temporal = means.temporal.map_or("-".to_owned(), |error| format!("{error:.6}"));
-            let _ = writeln!(out, "  {what:<38} {:>8.3} {:>8.5} {temporal:>10}", means.psnr, means.ssim);
+            let flip = means.flip.map_or(String::new(), |error| format!(" {error:>8.5}"));
+            let _ = writeln!(out, "  {what:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
         };
         line("compressed against original", &self.loss.overall);
         if let Some(truth) = &self.ground_truth {
@@ -209,16 +221,24 @@ impl Evaluation {
 
     /// One line per picture under a line of names; a value that does not exist is empty.
     pub fn csv(&self) -> String {
-        let mut out = String::from("frame,view,time,psnr,ssim,temporal");
-        if self.ground_truth.is_some() {
-            out += ",psnr_gt,ssim_gt,temporal_gt,psnr_gt_original,ssim_gt_original,temporal_gt_original";
+        let mut out = String::from("frame,view,time");
+        let with_flip = self.loss.overall.flip.is_some();
+        let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };
+        for with in compared {
+            let _ = write!(out, ",psnr{with},ssim{with},temporal{with}");
+            if with_flip {
+                let _ = write!(out, ",flip{with}");
+            }
         }
         for picture in &self.pictures {
             let _ = write!(out, "\n{},{},{}", picture.frame, picture.view, picture.time);
             let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
             for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
-                let temporal = score.temporal.map_or(String::new(), |error| error.to_string());
-                let _ = write!(out, ",{},{},{temporal}", score.psnr, score.ssim);
+                let given = |error: Option<f64>| error.map_or(String::new(), |error| error.to_string());
+                let _ = write!(out, ",{},{},{}", score.psnr, score.ssim, given(score.temporal));
+                if with_flip {
+                    let _ = write!(out, ",{}", given(score.flip));
+                }
             }
         }
         out.push('\n');
@@ -231,7 +251,7 @@ mod tests {
     use super::*;
 
     fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> PictureScores {
-        let loss = Score { psnr, ssim: psnr / 100.0, temporal };
+        let loss = Score { psnr, ssim: psnr / 100.0, temporal, flip: None };
         PictureScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
     }
 
@@ -245,7 +265,7 @@ mod tests {
             picture(3, 1, 10.0, Some(0.75)),
         ];
         let found = Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap();
-        assert_eq!(found.overall, Means { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5) });
+        assert_eq!(found.overall, Means { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
         let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
         assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
         let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();

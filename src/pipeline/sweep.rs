@@ -262,6 +262,7 @@ fn measure(
         part: Part::HeldOut,
         max_frames: options.max_frames,
         background: options.background,
+        flip: false,
         csv: None,
         overwrite: false,
     })?;

@@ -1,0 +1,75 @@
+#!/usr/bin/env python3
+"""Sweeps every model below a folder and prints Markdown tables of quality at equal count.
+
+    cargo build --release
+    python3 scripts/sweep_table.py target/release/splatsieve DATA CURVES
+
+DATA/<name>/ is a model folder with its cameras inside, DATA/static/<name>.ply a model without cameras. Results go
+to CURVES/<name>/; a model whose CURVES/<name>/sweep.json is there already is not swept again. Below the
+tables stands where `default` is more than 0.05 dB below another method, and where `visible` is not above
+`projected`: it is expected to say "nowhere" twice. Standard library only.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+FRACTIONS = ["0.8", "0.6", "0.4", "0.2", "0.1"]
+
+
+def sweep(binary, source, output):
+    found = output / "sweep.json"
+    if not found.exists():
+        # A static model has no cameras: a virtual rig looks at it.
+        cameras = ["--cameras", str(source)] if source.is_dir() else []
+        command = [binary, "sweep", str(source), *cameras, "--fractions", ",".join(FRACTIONS), "-o", str(output)]
+        result = subprocess.run(command, capture_output=True, text=True)
+        if result.returncode != 0:
+            sys.exit(f"{' '.join(command)}\n{result.stderr}")
+    return json.loads(found.read_text())
+
+
+def table(name, found):
+    by_method = {}
+    for point in found["points"]:
+        if point["asked"] is not None:
+            by_method.setdefault(point["method"], {})[point["asked"]] = point
+    print(f"| {name} | " + " | ".join(f"{float(f):.0%}" for f in FRACTIONS) + " | s at 40% | MiB |")
+    print("|---" * (len(FRACTIONS) + 3) + "|")
+    for method, points in by_method.items():
+        cells = [f"{points[float(f)]['psnr']:.1f}" if float(f) in points else "–" for f in FRACTIONS]
+        at = points.get(0.4)
+        memory = [point["peak_memory_bytes"] for point in points.values() if point["peak_memory_bytes"]]
+        seconds = f"{at['seconds']:.1f}" if at else "–"
+        print(f"| {method} | {' | '.join(cells)} | {seconds} | {max(memory, default=0) / 2**20:.0f} |")
+    print(flush=True)
+    return by_method
+
+
+def main():
+    if len(sys.argv) != 4:
+        print(__doc__)
+        sys.exit(2)
+    binary, data, curves = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
+    curves.mkdir(parents=True, exist_ok=True)
+    sources = {path.parent.name: path.parent for path in sorted(data.glob("*/cfg_args"))}
+    sources |= {path.stem: path for path in sorted(data.glob("static/*.ply"))}
+    below, beaten = [], []
+    for name, source in sources.items():
+        by_method = table(name, sweep(binary, source, curves / name))
+        for method, points in by_method.items():
+            for fraction, point in points.items():
+                ours = by_method["default"][fraction]["psnr"]
+                if ours < point["psnr"] - 0.05:
+                    below.append(f"{name} at {fraction}: {ours:.2f} dB, {method} {point['psnr']:.2f}")
+        for fraction, point in by_method["visible"].items():
+            projected = by_method["projected"][fraction]["psnr"]
+            if point["psnr"] <= projected:
+                beaten.append(f"{name} at {fraction}: {point['psnr']:.2f} dB, projected {projected:.2f}")
+    print("`default` more than 0.05 dB below another method:", "; ".join(below) or "nowhere")
+    print("`visible` not above `projected`:", "; ".join(beaten) or "nowhere")
+
+
+if __name__ == "__main__":
+    main()
