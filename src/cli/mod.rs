@@ -20,7 +20,8 @@ use crate::pipeline::pictures::Part;
 use crate::pipeline::render::{RenderOptions, Wanted};
 use crate::pipeline::{container, demo, evaluate, render, score};
 use crate::recipe::preset_text;
-use args::{CameraFile, Cameras, Cli, Compress, Evaluate, ImageKind, Input, Render, SplitArg, Verb};
+use crate::report::{self, ReportOptions};
+use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Render, SideBySide, SplitArg, Verb};
 use recipe_flags::RecipeFlags;
 
 /// Runs the program on the arguments of this process.
@@ -77,8 +78,20 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
-            let found = evaluate::evaluate(&evaluate_options(args))?;
+            let options = EvaluateOptions { csv: args.csv, overwrite: args.overwrite, ..evaluate_options(args.models) };
+            let found = evaluate::evaluate(&options)?;
             print(&if as_json { json(&found) } else { found.text() })
+        }
+        Verb::Report(args) => {
+            let page = args.output.join(report::PAGE);
+            let found = report::report(&ReportOptions {
+                evaluate: evaluate_options(args.models),
+                sweep: args.sweep,
+                output: args.output,
+                overwrite: args.overwrite,
+            })?;
+            notes(&found.notes);
+            print(&format!("{}\n{}\n", found.verdict, page.display()))
         }
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
@@ -194,7 +207,7 @@ fn render_options(args: Render) -> RenderOptions {
     }
 }
 
-fn evaluate_options(args: Evaluate) -> EvaluateOptions {
+fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.look_from(args.cameras);
     EvaluateOptions {
@@ -204,8 +217,8 @@ fn evaluate_options(args: Evaluate) -> EvaluateOptions {
         part: args.split.map_or(Part::HeldOut, part_of),
         max_frames: args.max_frames.map(|frames| frames as usize),
         background: args.background.background,
-        csv: args.csv,
-        overwrite: args.overwrite,
+        csv: None,
+        overwrite: false,
     }
 }
 
