@@ -13,8 +13,8 @@ use super::html::{escape, figure};
 pub const STYLE: &str = include_str!("chart.css");
 
 /// Size of a chart in its own units, which are about a pixel.
-const WIDTH: f64 = 640.0;
-const HEIGHT: f64 = 300.0;
+const WIDTH: f64 = 480.0;
+const HEIGHT: f64 = 270.0;
 const LEFT: f64 = 62.0;
 const RIGHT: f64 = 14.0;
 const BOTTOM: f64 = 44.0;

@@ -152,7 +152,7 @@ pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Ta
         found.error += error;
         // Forward differences; at the far borders there are none.
         let step = |of: &[f64]| {
-            let along = if (i + 1) % width == 0 { 0.0 } else { of[i + 1] - of[i] };
+            let along = if (i + 1).is_multiple_of(width) { 0.0 } else { of[i + 1] - of[i] };
             let down = if i + width >= of.len() { 0.0 } else { of[i + width] - of[i] };
             [along, down]
         };

@@ -38,7 +38,7 @@ pub(super) fn count(value: usize) -> String {
     let digits = value.to_string();
     let mut out = String::new();
     for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i) % 3 == 0 {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
             out.push('\u{202f}');
         }
         out.push(digit);
@@ -57,7 +57,7 @@ pub(super) fn bytes(value: u64) -> String {
     }
 }
 
-/// `part` of `whole` in percent; of nothing all.
+/// `part` of `whole` in percent; of nothing all. A part too small for a digit is not called none.
 pub(super) fn percent(part: f64, whole: f64) -> String {
     let share = if whole > 0.0 { 100.0 * part / whole } else { 100.0 };
     match share {

@@ -213,8 +213,8 @@ fn figure_of(caption: &str, svg: &str) -> String {
 fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
     let mut out = format!(
         "<p class=\"note\">Where a kind of Gaussian is seen is known for every pixel: the share of its colour that comes \
-         from them. A mode is flagged where the picture errs there by less than {VISIBLE_DB} dB and at least {APART_DB} dB \
-         worse than elsewhere, and {} or more of their coverage was dropped or merged.</p>\n<div class=\"modes\">\n",
+         from them. A mode is flagged if the PSNR there is below {VISIBLE_DB} dB and at least {APART_DB} dB below that \
+         elsewhere, and {} or more of their coverage was dropped or merged.</p>\n<div class=\"modes\">\n",
         percent(LOST, 1.0)
     );
     for (number, mode) in modes.iter().enumerate() {
@@ -317,7 +317,7 @@ fn score_histograms(report: &Report) -> String {
             "Which Gaussians went is not known: there is no index map beside the compressed model that fits.",
         );
     };
-    let mut out = String::from("<div class=\"charts three\">\n");
+    let mut out = String::from("<div class=\"charts\">\n");
     for of in histograms {
         out += &figure_of(&format!("{}: {}", of.name, of.meaning), &histogram(of));
     }

@@ -8,6 +8,9 @@ use crate::pipeline::trade_off::{Point, TradeOff};
 /// What a chart is about, and its SVG.
 pub type Chart = (&'static str, String);
 
+/// A coordinate of a point, if it is known.
+type Value<'a> = &'a dyn Fn(&Point) -> Option<f64>;
+
 /// Every curve of a sweep, a series per method in the order of its points.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let whole = found.gaussians.max(1) as f64;
@@ -20,7 +23,7 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let memory = |point: &Point| point.peak_memory_bytes.map(|bytes| bytes as f64 / (1 << 20) as f64);
     let linear = |label: &str| Axis { label: label.to_owned(), ..Axis::default() };
     let log = |label: &str| Axis { label: label.to_owned(), log: true, from_zero: false };
-    let plot = |title: &'static str, x: Axis, y: Axis, of: [&dyn Fn(&Point) -> Option<f64>; 2], joined: bool| {
+    let plot = |title: &'static str, x: Axis, y: Axis, of: [Value<'_>; 2], joined: bool| {
         let series = methods(found)
             .into_iter()
             .map(|(name, points)| {

@@ -82,10 +82,11 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
 
 /// Part of the coverage that Gaussians of each kind have, and of that the part whose fate `is_lost` says.
 pub fn shares(rows: &Rows, traits: &[Traits], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
-    let total: f64 = rows.c.iter().sum();
+    // An empty sum is −0, which would be shown.
+    let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
     std::array::from_fn(|kind| {
         let of = |wanted: &dyn Fn(usize) -> bool| -> f64 {
-            (0..rows.len()).filter(|&i| traits[i][kind] && wanted(i)).map(|i| rows.c[i]).sum()
+            (0..rows.len()).filter(|&i| traits[i][kind] && wanted(i)).fold(0.0, |sum, i| sum + rows.c[i])
         };
         let own = of(&|_| true);
         let part = |of: f64, whole: f64| if whole > 0.0 { of / whole } else { 0.0 };
