@@ -237,7 +237,7 @@ fn described(kind: Kind) -> (&'static str, String) {
             "fast, non-rigid motion",
             format!(
                 "Gaussians that move by {}% of the scene extent per frame or more (root mean square), while the \
-                 distance to half of their {NEIGHBOURS} nearest neighbours changes by {}% of it or more",
+                 distance to half of their {NEIGHBOURS} nearest neighbours changes by {}% or more",
                 100.0 * FAST,
                 100.0 * NON_RIGID
             ),
@@ -305,3 +305,6 @@ pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
 pub fn crop_psnr(taken: &Taken, corner: (u32, u32)) -> f64 {
     psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
 }
+
+#[cfg(test)]
+mod tests;

@@ -17,9 +17,11 @@ use crate::stream::gather;
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
 /// scene and 500 pixels across, a pixel per frame.
 pub const FAST: f64 = 2e-3;
-/// Root mean square change of the distance to half of its neighbours from which motion is not rigid, as
-/// part of the extent.
-pub const NON_RIGID: f64 = 5e-3;
+/// Root mean square change of the distance to half of its neighbours, as part of that distance, from which
+/// motion is not rigid.
+pub const NON_RIGID: f64 = 0.05;
+/// Distances below this part of the extent count as it: nobody sees neighbours so near change places.
+const NEAREST: f64 = 1e-3;
 /// Neighbours whose distance is followed.
 pub const NEIGHBOURS: usize = 8;
 /// Longest over second scale from which a Gaussian is thin.
@@ -68,8 +70,8 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     let reference = gather(source, &all, scored.reference_frame, Columns::POSITION | Columns::LOG_SCALE)?;
     let fast: Vec<u32> =
         all.iter().copied().filter(|&i| visible(i as usize) && rows.d[i as usize] >= FAST * extent).collect();
-    for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames)?) {
-        found[id as usize][Kind::Motion as usize] = bent >= NON_RIGID * extent;
+    for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
+        found[id as usize][Kind::Motion as usize] = bent >= NON_RIGID;
     }
     let recoloured = colour_change(source, &all, &frames, alpha_min)?;
     for i in (0..rows.len()).filter(|&i| visible(i)) {
@@ -106,15 +108,16 @@ fn samples(frames: usize) -> Vec<usize> {
 }
 
 /// How much the surroundings of the Gaussians `ids` change shape: for each the lower median, over its
-/// nearest visible neighbours at the reference frame, of the root mean square change of distance, scene
-/// units. A rigid motion, rotations included, changes none; the median leaves out neighbours that belong
-/// to another thing.
+/// nearest visible neighbours at the reference frame, of the root mean square change of distance as part
+/// of that distance (of `nearest`, if that is more). A rigid motion, rotations included, changes none; the
+/// median leaves out neighbours that belong to another thing.
 fn bending(
     source: &dyn FrameSource,
     reference: &Gaussians,
     ids: &[u32],
     visible: impl Fn(usize) -> bool,
     frames: &[usize],
+    nearest: f64,
 ) -> Result<Vec<f64>> {
     if ids.is_empty() {
         return Ok(Vec::new());
@@ -142,7 +145,8 @@ fn bending(
         let now = gather(source, &followed, frame, Columns::POSITION)?.position;
         sums.par_iter_mut().zip(&pairs).for_each(|(sums, (i, near))| {
             for (sum, &j) in sums.iter_mut().zip(near) {
-                *sum += (distance(&now, *i, j) - distance(&start, *i, j)).powi(2);
+                let before = distance(&start, *i, j);
+                *sum += ((distance(&now, *i, j) - before) / before.max(nearest)).powi(2);
             }
         });
     }
