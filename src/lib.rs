@@ -8,7 +8,7 @@
 //! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
-//! | L4 | [`pipeline`] | the order of the passes |
+//! | L4 | [`pipeline`], [`report`] | the order of the passes; the page about their result |
 //! | L5 | [`cli`] | arguments and exit codes |
 
 pub mod cli;
@@ -24,6 +24,7 @@ pub mod pass;
 pub mod pipeline;
 pub mod recipe;
 pub mod render;
+pub mod report;
 pub mod score;
 pub mod select;
 pub mod stats;

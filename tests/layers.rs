@@ -8,7 +8,7 @@ const LAYERS: [&[&str]; 5] = [
     &["error", "model", "pass", "recipe"],
     &["deform", "stats", "score", "select", "merge", "render", "metrics"],
     &["ingest", "stream", "emit", "demo"],
-    &["pipeline"],
+    &["pipeline", "report"],
     &["cli"],
 ];
 

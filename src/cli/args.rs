@@ -16,6 +16,7 @@ Examples:
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
   splatsieve sweep model --cameras data -o curves        every method at every size
+  splatsieve report model small --cameras data -o report  the same as a page to look at
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq";
 
@@ -44,6 +45,8 @@ pub(super) enum Verb {
     Evaluate(Evaluate),
     /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
     Sweep(Sweep),
+    /// Write a page that shows what compression cost: pictures, curves, failure modes
+    Report(Report),
     /// Pack any input into a .gseq container
     Pack(Pack),
     /// Say what an input holds
@@ -243,9 +246,9 @@ pub(super) struct Background {
     pub(super) background: Option<[f32; 3]>,
 }
 
-/// `evaluate`
+/// Two models, and the pictures to compare them on.
 #[derive(Debug, Args)]
-pub(super) struct Evaluate {
+pub(super) struct SideBySide {
     /// The model before compression: whatever `compress` reads
     pub(super) original: PathBuf,
     /// The model after it, of any kind
@@ -269,6 +272,29 @@ pub(super) struct Evaluate {
     /// Compute FLIP too, the difference a person would see; takes some times longer
     #[arg(long)]
     pub(super) flip: bool,
+}
+
+/// `report`
+#[derive(Debug, Args)]
+pub(super) struct Report {
+    #[command(flatten)]
+    pub(super) models: SideBySide,
+    /// The sweep.json that `sweep` wrote, for its curves
+    #[arg(long, value_name = "FILE")]
+    pub(super) sweep: Option<PathBuf>,
+    /// Folder to write report.html into, and all it shows as JSON and CSV
+    #[arg(short, long, value_name = "FOLDER")]
+    pub(super) output: PathBuf,
+    /// Replace an earlier report
+    #[arg(long)]
+    pub(super) overwrite: bool,
+}
+
+/// `evaluate`
+#[derive(Debug, Args)]
+pub(super) struct Evaluate {
+    #[command(flatten)]
+    pub(super) models: SideBySide,
     /// Write the scores of every picture
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,

@@ -21,7 +21,8 @@ use crate::pipeline::render::{RenderOptions, Wanted};
 use crate::pipeline::sweep::{Method, SweepOptions};
 use crate::pipeline::{container, demo, evaluate, render, score, sweep};
 use crate::recipe::preset_text;
-use args::{CameraFile, Cameras, Cli, Compress, Evaluate, ImageKind, Input, Render, SplitArg, Sweep, Verb};
+use crate::report::{self, ReportOptions};
+use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Render, SideBySide, SplitArg, Sweep, Verb};
 use recipe_flags::RecipeFlags;
 
 /// Runs the program on the arguments of this process.
@@ -78,13 +79,25 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
-            let found = evaluate::evaluate(&evaluate_options(args))?;
+            let options = EvaluateOptions { csv: args.csv, overwrite: args.overwrite, ..evaluate_options(args.models) };
+            let found = evaluate::evaluate(&options)?;
             print(&if as_json { json(&found) } else { found.text() })
         }
         Verb::Sweep(args) => {
             let as_json = args.json;
             let found = sweep::sweep(&sweep_options(args))?;
             print(&if as_json { found.json() } else { found.text() })
+        }
+        Verb::Report(args) => {
+            let page = args.output.join(report::PAGE);
+            let found = report::report(&ReportOptions {
+                evaluate: evaluate_options(args.models),
+                sweep: args.sweep,
+                output: args.output,
+                overwrite: args.overwrite,
+            })?;
+            notes(&found.notes);
+            print(&format!("{}\n{}\n", found.verdict, page.display()))
         }
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
@@ -200,7 +213,7 @@ fn render_options(args: Render) -> RenderOptions {
     }
 }
 
-fn evaluate_options(args: Evaluate) -> EvaluateOptions {
+fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.look_from(args.cameras);
     EvaluateOptions {
@@ -211,8 +224,8 @@ fn evaluate_options(args: Evaluate) -> EvaluateOptions {
         max_frames: args.max_frames.map(|frames| frames as usize),
         background: args.background.background,
         flip: args.flip,
-        csv: args.csv,
-        overwrite: args.overwrite,
+        csv: None,
+        overwrite: false,
     }
 }
 

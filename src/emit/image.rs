@@ -52,6 +52,16 @@ pub fn write_image(image: &Image, format: ImageFormat, path: &Path) -> Result<()
     written.and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
+/// The PNG of `image`, 8 bits per channel, clamped.
+///
+/// # Errors
+/// A picture without pixels, which the format does not know.
+pub fn png_bytes(image: &Image) -> io::Result<Vec<u8>> {
+    let mut out = Vec::new();
+    write_png(&mut out, image)?;
+    Ok(out)
+}
+
 fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);

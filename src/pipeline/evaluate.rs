@@ -52,59 +52,191 @@ pub struct EvaluateOptions {
 /// Whatever is wrong with inputs, cameras, pictures or output; models whose frames are not the same.
 pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
-        let mut inputs = vec![options.original.path.as_path(), &options.compressed];
-        inputs.extend(options.original.cameras.as_deref());
-        inputs.extend(options.ground_truth.as_deref());
-        check_target(csv, Kind::File, &inputs, options.overwrite)?;
+        check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
     }
-    let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
-    let compressed = open_compressed(&options.compressed, &scene)?;
-    let background = background(options.background, &scene)?;
-    let times = &scene.input.source().info().times;
-    let mut chosen = pictures(&scene.rig, times, options.part)?;
-    if let Some(frames) = options.max_frames {
-        chosen = thin(chosen, frames);
-    }
-    let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, &chosen));
-    let job = Job {
-        sources: [scene.input.source(), compressed.source()],
-        cameras: &scene.rig.cameras,
-        background,
-        flip: options.flip,
-        truth: truth.transpose()?,
-    };
-    let scores = job.scores(&chosen)?;
-
-    let ground_truth = options.ground_truth.as_deref().and_then(|folder| {
-        Some(TruthComparison {
-            folder: folder.display().to_string(),
-            compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
-            original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
-        })
-    });
-    let count = |input: &Input| input.source().info().count;
-    let evaluation = Evaluation {
-        tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
-        path: Both { original: scene.path.display().to_string(), compressed: options.compressed.display().to_string() },
-        count: Both { original: count(&scene.input), compressed: count(&compressed) },
-        bytes: Both { original: scene.input.bytes()?, compressed: compressed.bytes()? },
-        cameras: CameraSummary {
-            origin: scene.rig.origin.clone(),
-            cameras: chosen.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
-            pairs: chosen.len(),
-        },
-        background,
-        loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
-        ground_truth,
-        notes: scene.notes.clone(),
-        pictures: scores,
-    };
+    let (evaluation, _) = SideBySide::open(options)?.evaluate(|_, _, _| ())?;
     if let Some(csv) = &options.csv {
         let staged = StagedFile::new(csv, options.overwrite)?;
         fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
         staged.commit()?;
     }
     Ok(evaluation)
+}
+
+impl EvaluateOptions {
+    /// Every path that is read.
+    pub fn inputs(&self) -> Vec<&Path> {
+        let mut inputs = vec![self.original.path.as_path(), &self.compressed];
+        inputs.extend(self.original.cameras.as_deref());
+        inputs.extend(self.ground_truth.as_deref());
+        inputs
+    }
+}
+
+/// Two open models, and the pictures to compare them on.
+pub struct SideBySide {
+    /// The original and its cameras, those of every split.
+    pub scene: Scene,
+    compressed: Input,
+    compressed_path: PathBuf,
+    background: [f32; 3],
+    flip: bool,
+    pictures: Vec<Picture>,
+    truth_folder: Option<PathBuf>,
+    truth: Option<GroundTruth>,
+}
+
+impl SideBySide {
+    /// Opens both models and finds every picture; of `options` the files to write are not looked at.
+    ///
+    /// # Errors
+    /// Whatever is wrong with inputs, cameras or the folder of photographs; models whose frames are not
+    /// the same.
+    pub fn open(options: &EvaluateOptions) -> Result<SideBySide> {
+        let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
+        let compressed = open_compressed(&options.compressed, &scene)?;
+        let background = background(options.background, &scene)?;
+        let times = &scene.input.source().info().times;
+        let mut chosen = pictures(&scene.rig, times, options.part)?;
+        if let Some(frames) = options.max_frames {
+            chosen = thin(chosen, frames);
+        }
+        let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, &chosen));
+        Ok(SideBySide {
+            truth: truth.transpose()?,
+            truth_folder: options.ground_truth.clone(),
+            compressed_path: options.compressed.clone(),
+            pictures: chosen,
+            scene,
+            compressed,
+            background,
+            flip: options.flip,
+        })
+    }
+
+    /// Compares all pictures; `observe` sees each of them too, with the original's state, from any thread.
+    /// Gives what it made of them in the order of [`Evaluation::pictures`].
+    ///
+    /// # Errors
+    /// A source or a photograph that cannot be read.
+    pub fn evaluate<O: Send>(
+        &self,
+        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+    ) -> Result<(Evaluation, Vec<O>)> {
+        let (scores, observed) = self.scores(observe)?;
+        let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
+            Some(TruthComparison {
+                folder: folder.display().to_string(),
+                compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
+                original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
+            })
+        });
+        let scene = &self.scene;
+        let count = |input: &Input| input.source().info().count;
+        let path =
+            Both { original: scene.path.display().to_string(), compressed: self.compressed_path.display().to_string() };
+        let evaluation = Evaluation {
+            tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+            path,
+            count: Both { original: count(&scene.input), compressed: count(&self.compressed) },
+            bytes: Both { original: scene.input.bytes()?, compressed: self.compressed.bytes()? },
+            cameras: CameraSummary {
+                origin: scene.rig.origin.clone(),
+                cameras: self.pictures.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
+                pairs: self.pictures.len(),
+            },
+            background: self.background,
+            loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
+            ground_truth,
+            notes: scene.notes.clone(),
+            pictures: scores,
+        };
+        Ok((evaluation, observed))
+    }
+
+    /// Makes the pictures numbered `places` among [`Evaluation::pictures`] again (to keep all of them would
+    /// take memory that grows with frames and views), each with the original's state.
+    ///
+    /// # Errors
+    /// A source or a photograph that cannot be read.
+    pub fn again<O>(
+        &self,
+        places: &[usize],
+        mut see: impl FnMut(usize, &Gaussians, &Camera, Taken) -> O,
+    ) -> Result<Vec<O>> {
+        let mut places = places.to_vec();
+        places.sort_unstable();
+        places.dedup();
+        let chosen: Vec<Picture> = places.iter().map(|&place| self.pictures[place]).collect();
+        let mut found = Vec::with_capacity(chosen.len());
+        for_each_batch(self.sources(), &chosen, |states, batch| {
+            for picture in batch {
+                let taken = self.take(picture, states)?;
+                found.push(see(places[found.len()], &states[0], &self.scene.rig.cameras[picture.camera], taken));
+            }
+            Ok(())
+        })?;
+        Ok(found)
+    }
+
+    /// Gaussians of the compressed model.
+    pub fn compressed_count(&self) -> usize {
+        self.compressed.source().info().count
+    }
+
+    fn sources(&self) -> [&dyn FrameSource; 2] {
+        [self.scene.input.source(), self.compressed.source()]
+    }
+
+    fn scores<O: Send>(
+        &self,
+        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+    ) -> Result<(Vec<PictureScores>, Vec<O>)> {
+        let pictures = &self.pictures;
+        let times = &self.scene.input.source().info().times;
+        let mut last_frame: HashMap<u32, usize> = HashMap::new();
+        for picture in pictures {
+            last_frame.insert(picture.view, picture.frame);
+        }
+        let mut before: HashMap<u32, Taken> = HashMap::new();
+        let mut all = Vec::with_capacity(pictures.len());
+        let mut observed = Vec::with_capacity(pictures.len());
+        let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
+        for_each_batch(self.sources(), pictures, |states, batch| {
+            let taken: Vec<_> = batch
+                .par_iter()
+                .map(|picture| {
+                    let taken = self.take(picture, states)?;
+                    let scores = taken.scores(before.get(&picture.view), self.flip);
+                    let seen = observe(&states[0], &self.scene.rig.cameras[picture.camera], &taken);
+                    progress.advance(1);
+                    Ok((taken, scores, seen))
+                })
+                .collect::<Result<_>>()?;
+            for (&Picture { frame, view, .. }, (taken, (loss, truth), seen)) in batch.iter().zip(taken) {
+                all.push(PictureScores { frame, time: times[frame], view, loss, truth });
+                observed.push(seen);
+                if last_frame.get(&view).is_some_and(|&last| last > frame) {
+                    before.insert(view, taken);
+                } else {
+                    before.remove(&view);
+                }
+            }
+            Ok(())
+        })?;
+        Ok((all, observed))
+    }
+
+    fn take(&self, picture: &Picture, [original, compressed]: &[Gaussians; 2]) -> Result<Taken> {
+        let camera = &self.scene.rig.cameras[picture.camera];
+        let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
+        let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
+        Ok(Taken {
+            original: render(original, camera, self.background),
+            compressed: render(compressed, camera, self.background),
+            truth: file.map(read).transpose()?,
+        })
+    }
 }
 
 /// Most that time stamps of the same frame may differ, in parts of the time span: files round them.
@@ -187,11 +319,14 @@ fn inside(folder: &Path, image: &Path) -> Option<PathBuf> {
     ends.filter(|end| end.is_relative()).map(|end| folder.join(end)).find(|file| file.is_file())
 }
 
-/// The pictures of one (frame, view).
-struct Taken {
-    original: Image,
-    compressed: Image,
-    truth: Option<Image>,
+/// The pictures of one (frame, view), all of one size.
+pub struct Taken {
+    /// Render of the original.
+    pub original: Image,
+    /// Render of the compressed model.
+    pub compressed: Image,
+    /// The photograph, where there are any.
+    pub truth: Option<Image>,
 }
 
 impl Taken {
@@ -215,59 +350,4 @@ impl Taken {
 fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> Score {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
     Score { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
-}
-
-/// Everything needed to make and compare pictures.
-struct Job<'a> {
-    /// Original, compressed.
-    sources: [&'a dyn FrameSource; 2],
-    cameras: &'a [Camera],
-    background: [f32; 3],
-    flip: bool,
-    truth: Option<GroundTruth>,
-}
-
-impl Job<'_> {
-    fn scores(&self, pictures: &[Picture]) -> Result<Vec<PictureScores>> {
-        let times = &self.sources[0].info().times;
-        let mut last_frame: HashMap<u32, usize> = HashMap::new();
-        for picture in pictures {
-            last_frame.insert(picture.view, picture.frame);
-        }
-        let mut before: HashMap<u32, Taken> = HashMap::new();
-        let mut all = Vec::with_capacity(pictures.len());
-        let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
-        for_each_batch(self.sources, pictures, |states, batch| {
-            let taken: Vec<_> = batch
-                .par_iter()
-                .map(|picture| {
-                    let taken = self.take(picture, states)?;
-                    let scores = taken.scores(before.get(&picture.view), self.flip);
-                    progress.advance(1);
-                    Ok((taken, scores))
-                })
-                .collect::<Result<_>>()?;
-            for (&Picture { frame, view, .. }, (taken, (loss, truth))) in batch.iter().zip(taken) {
-                all.push(PictureScores { frame, time: times[frame], view, loss, truth });
-                if last_frame.get(&view).is_some_and(|&last| last > frame) {
-                    before.insert(view, taken);
-                } else {
-                    before.remove(&view);
-                }
-            }
-            Ok(())
-        })?;
-        Ok(all)
-    }
-
-    fn take(&self, picture: &Picture, [original, compressed]: &[Gaussians; 2]) -> Result<Taken> {
-        let camera = &self.cameras[picture.camera];
-        let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
-        let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
-        Ok(Taken {
-            original: render(original, camera, self.background),
-            compressed: render(compressed, camera, self.background),
-            truth: file.map(read).transpose()?,
-        })
-    }
 }

@@ -20,7 +20,7 @@ pub struct Both<T> {
 }
 
 /// How close two pictures are.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Score {
     /// [`crate::metrics::psnr`], dB.
     pub psnr: f64,
@@ -33,7 +33,7 @@ pub struct Score {
 }
 
 /// The scores of one (frame, view).
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PictureScores {
     /// Frame of the sequence.
     pub frame: usize,
@@ -44,6 +44,7 @@ pub struct PictureScores {
     /// Compressed against original.
     pub loss: Score,
     /// Each against the ground truth, where that is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub truth: Option<Both<Score>>,
 }
 

@@ -76,9 +76,10 @@ impl OutputKind {
     }
 }
 
-/// Files beside every result.
-const RECIPE: &str = "recipe.toml";
-const INDEX_MAP: &str = "index_map.npy";
+/// File beside every result: all parameters it was made with.
+pub const RECIPE: &str = "recipe.toml";
+/// File beside every result: where each Gaussian of the input went.
+pub const INDEX_MAP: &str = "index_map.npy";
 
 /// Path of a file beside the result: inside a folder, next to a file and named after it.
 pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {

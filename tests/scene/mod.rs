@@ -4,6 +4,7 @@
 #![allow(dead_code, reason = "every test crate compiles this module and uses a part of it")]
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -71,12 +72,15 @@ impl Workplace {
     /// Runs the program with arguments separated by blanks; paths are relative to this folder, and
     /// `{tiny}` is the tiny model.
     pub(crate) fn run(&self, arguments: &str) -> Run {
-        let arguments = arguments.split_whitespace().map(|word| match word {
+        self.run_words(arguments.split_whitespace().map(|word| match word {
             "{tiny}" => tiny(),
             word => PathBuf::from(word),
-        });
-        let output =
-            Command::cargo_bin("splatsieve").unwrap().current_dir(self.0.path()).args(arguments).output().unwrap();
+        }))
+    }
+
+    /// Runs the program with these arguments, which may hold blanks.
+    pub(crate) fn run_words(&self, words: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Run {
+        let output = Command::cargo_bin("splatsieve").unwrap().current_dir(self.0.path()).args(words).output().unwrap();
         Run {
             code: output.status.code().unwrap(),
             stdout: String::from_utf8(output.stdout).unwrap(),

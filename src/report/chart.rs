@@ -1,0 +1,412 @@
+//! Charts: from data to SVG, as text to be put into a page.
+//!
+//! Data in: numbers and names. Data out: one `<svg>` element that takes its colours from [`STYLE`] and
+//! its text from the page around it. Nothing is drawn for values that are not finite. Series differ by
+//! shape and dash as well as by colour, and the colours are those of Okabe and Ito ("Color Universal
+//! Design", 2008), which colour-blind people tell apart.
+
+use std::fmt::Write as _;
+
+use super::html::{escape, figure};
+
+/// CSS that a page with charts must hold once.
+pub const STYLE: &str = include_str!("chart.css");
+
+/// Size of a chart in its own units, which are about a pixel.
+const WIDTH: f64 = 480.0;
+const HEIGHT: f64 = 270.0;
+const LEFT: f64 = 62.0;
+const RIGHT: f64 = 14.0;
+const BOTTOM: f64 = 44.0;
+/// Height of a line of the legend, and about how wide one of its letters is.
+const LINE: f64 = 18.0;
+const LETTER: f64 = 6.6;
+/// Colours, shapes and dashes that [`STYLE`] and this file know.
+const LOOKS: usize = 8;
+
+/// A direction of a plot.
+#[derive(Debug, Clone, Default)]
+pub struct Axis {
+    /// What it measures, with the unit.
+    pub label: String,
+    /// Whether equal steps are equal ratios; values that are not positive are then left out.
+    pub log: bool,
+    /// Whether it must reach 0.
+    pub from_zero: bool,
+}
+
+/// Points with a name.
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// For the legend; without one it is not listed.
+    pub name: String,
+    /// (x, y), joined in this order.
+    pub points: Vec<(f64, f64)>,
+    /// Whether a line joins the points.
+    pub joined: bool,
+}
+
+/// Series over two axes.
+#[derive(Debug, Clone, Default)]
+pub struct Plot {
+    /// What it shows, for those who do not see it.
+    pub title: String,
+    /// Along.
+    pub x: Axis,
+    /// Up.
+    pub y: Axis,
+    /// In the order of the legend.
+    pub series: Vec<Series>,
+}
+
+/// One value per name, as horizontal bars from 0.
+#[derive(Debug, Clone, Default)]
+pub struct Bars {
+    /// What it shows.
+    pub title: String,
+    /// What the values measure, with the unit.
+    pub label: String,
+    /// From the top.
+    pub bars: Vec<(String, f64)>,
+}
+
+/// Counts per bin, one group on the other.
+#[derive(Debug, Clone, Default)]
+pub struct Stack {
+    /// What it shows.
+    pub title: String,
+    /// The values that the bins part.
+    pub x: Axis,
+    /// One more than there are bins, increasing.
+    pub edges: Vec<f64>,
+    /// Groups from the bottom, each with a count per bin.
+    pub groups: Vec<(String, Vec<usize>)>,
+}
+
+/// An axis with its range, and where on the picture it lies.
+struct Scale {
+    log: bool,
+    low: f64,
+    high: f64,
+    from: f64,
+    to: f64,
+}
+
+impl Scale {
+    /// Covers `values` with a little room, from pixel `from` to pixel `to`.
+    fn of(axis: &Axis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<Scale> {
+        let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
+        let (mut low, mut high) =
+            values.filter(fits).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
+        if low > high {
+            return None;
+        }
+        if axis.from_zero && !axis.log {
+            (low, high) = (low.min(0.0), high.max(0.0));
+        }
+        if axis.log {
+            (low, high) = (low.log10(), high.log10());
+        }
+        if high - low < 1e-12 * high.abs().max(1e-9) {
+            let room = if axis.log { 0.3 } else { 0.05 * high.abs().max(1e-9) };
+            (low, high) = (low - room, high + room);
+        }
+        let room = 0.04 * (high - low);
+        let flat = axis.from_zero && !axis.log;
+        Some(Scale {
+            log: axis.log,
+            low: if flat && low == 0.0 { low } else { low - room },
+            high: if flat && high == 0.0 { high } else { high + room },
+            from,
+            to,
+        })
+    }
+
+    /// Pixel of a value; none if it cannot be shown.
+    fn at(&self, value: f64) -> Option<f64> {
+        let value = if self.log { value.log10() } else { value };
+        let at = self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from);
+        at.is_finite().then_some(at)
+    }
+
+    /// Round values inside the range.
+    fn ticks(&self) -> Vec<f64> {
+        if self.log {
+            let decades = (self.low.floor() as i32)..=(self.high.ceil() as i32);
+            let few = self.high - self.low < 2.0;
+            let step = ((self.high - self.low) / 6.0).ceil().max(1.0) as i32;
+            return decades
+                .filter(|power| few || power.rem_euclid(step) == 0)
+                .flat_map(|power| {
+                    let factors: &[f64] = if few { &[1.0, 2.0, 5.0] } else { &[1.0] };
+                    factors.iter().map(move |factor| factor * 10f64.powi(power))
+                })
+                .filter(|tick| (self.low..=self.high).contains(&tick.log10()))
+                .collect();
+        }
+        let rough = (self.high - self.low) / 5.0;
+        let power = 10f64.powf(rough.log10().floor());
+        let step = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|&s| s >= rough);
+        let step = step.unwrap_or(10.0 * power);
+        let first = (self.low / step).ceil() as i64;
+        let last = (self.high / step).floor() as i64;
+        (first..=last).map(|k| k as f64 * step).collect()
+    }
+}
+
+impl Plot {
+    /// The chart.
+    pub fn svg(&self) -> String {
+        let names: Vec<&str> = self.series.iter().map(|series| series.name.as_str()).collect();
+        let mut out = Drawing::new(&self.title, &names, HEIGHT);
+        let points = || self.series.iter().flat_map(|series| series.points.iter().copied());
+        let x = Scale::of(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
+        let y = Scale::of(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
+        let (Some(x), Some(y)) = (x, y) else { return out.empty() };
+        out.axes(&x, &y, &self.x.label, &self.y.label);
+        for (number, series) in self.series.iter().enumerate() {
+            let look = number % LOOKS;
+            let places: Vec<_> = series.points.iter().filter_map(|&(a, b)| Some((x.at(a)?, y.at(b)?, a, b))).collect();
+            if series.joined && places.len() > 1 {
+                let line: Vec<String> = places.iter().map(|p| format!("{:.1},{:.1}", p.0, p.1)).collect();
+                out.push(&format!("<polyline class=\"line s{look}\" points=\"{}\"/>", line.join(" ")));
+            }
+            for (px, py, a, b) in places {
+                let tip = format!("{} {}, {}", series.name, figure(a), figure(b));
+                out.mark(look, px, py, tip.trim_start());
+            }
+        }
+        out.finish()
+    }
+}
+
+impl Bars {
+    /// The chart, as high as it needs to be.
+    pub fn svg(&self) -> String {
+        const ROW: f64 = 24.0;
+        let height = ROW * self.bars.len() as f64 + BOTTOM + 8.0;
+        let mut out = Drawing::new(&self.title, &[], height);
+        let longest = self.bars.iter().map(|bar| bar.0.chars().count()).max().unwrap_or(0) as f64;
+        let left = (longest * LETTER + 14.0).max(LEFT);
+        let axis = Axis { from_zero: true, ..Axis::default() };
+        let values = self.bars.iter().map(|bar| bar.1);
+        let Some(x) = Scale::of(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
+        out.x_axis(&x, &self.label, [8.0, height - BOTTOM]);
+        for (row, (name, value)) in self.bars.iter().enumerate() {
+            let (Some(start), Some(end)) = (x.at(0.0), x.at(*value)) else { continue };
+            let y = 8.0 + ROW * row as f64;
+            let middle = y + 0.5 * ROW + 4.0;
+            out.push(&format!(
+                "<text class=\"end\" x=\"{:.1}\" y=\"{middle:.1}\">{}</text>\
+                 <rect class=\"area s0\" x=\"{start:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\"/>\
+                 <text x=\"{:.1}\" y=\"{middle:.1}\">{}</text>",
+                left - 8.0,
+                escape(name),
+                y + 4.0,
+                (end - start).max(0.0),
+                ROW - 8.0,
+                end + 6.0,
+                figure(*value),
+            ));
+        }
+        out.finish()
+    }
+}
+
+impl Stack {
+    /// The chart.
+    pub fn svg(&self) -> String {
+        let names: Vec<&str> = self.groups.iter().map(|group| group.0.as_str()).collect();
+        let mut out = Drawing::new(&self.title, &names, HEIGHT);
+        let bins = self.edges.len().saturating_sub(1);
+        let count = |group: &(String, Vec<usize>), bin: usize| group.1.get(bin).copied().unwrap_or(0);
+        let total = |bin| self.groups.iter().map(|group| count(group, bin)).sum::<usize>() as f64;
+        let up = Axis { from_zero: true, ..Axis::default() };
+        let x = Scale::of(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
+        let y = Scale::of(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
+        let (Some(x), Some(y)) = (x, y) else { return out.empty() };
+        out.axes(&x, &y, &self.x.label, "Gaussians");
+        for bin in 0..bins {
+            let (low, high) = (self.edges[bin], self.edges[bin + 1]);
+            let (Some(left), Some(right)) = (x.at(low), x.at(high)) else { continue };
+            let mut below = 0;
+            for (number, group) in self.groups.iter().enumerate() {
+                let here = count(group, bin);
+                let (Some(bottom), Some(top)) = (y.at(below as f64), y.at((below + here) as f64)) else { continue };
+                below += here;
+                if here > 0 {
+                    out.push(&format!(
+                        "<rect class=\"area s{}\" x=\"{left:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
+                         <title>{}: {here} from {} to {}</title></rect>",
+                        number % LOOKS,
+                        (right - left - 0.6).max(0.4),
+                        bottom - top,
+                        escape(&group.0),
+                        figure(low),
+                        figure(high),
+                    ));
+                }
+            }
+        }
+        out.finish()
+    }
+}
+
+/// An SVG being written.
+struct Drawing {
+    text: String,
+    height: f64,
+    /// Where the plot begins, below the legend.
+    top: f64,
+}
+
+impl Drawing {
+    fn new(title: &str, legend: &[&str], height: f64) -> Drawing {
+        let title = escape(title);
+        let mut out = Drawing {
+            text: format!("<svg class=\"chart\" viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" aria-label=\"{title}\">"),
+            height,
+            top: 10.0,
+        };
+        let (mut x, mut y) = (LEFT, 14.0);
+        for (number, name) in legend.iter().enumerate().filter(|(_, name)| !name.is_empty()) {
+            let wide = name.chars().count() as f64 * LETTER + 34.0;
+            if x + wide > WIDTH && x > LEFT {
+                (x, y) = (LEFT, y + LINE);
+            }
+            out.mark(number % LOOKS, x + 6.0, y - 4.0, name);
+            out.push(&format!("<text x=\"{:.1}\" y=\"{y:.1}\">{}</text>", x + 16.0, escape(name)));
+            x += wide;
+            out.top = y + 12.0;
+        }
+        out
+    }
+
+    fn push(&mut self, element: &str) {
+        self.text.push_str(element);
+    }
+
+    /// A point in the shape of its series.
+    fn mark(&mut self, look: usize, x: f64, y: f64, tip: &str) {
+        let shape = match look % 4 {
+            0 => format!("<circle class=\"mark s{look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
+            1 => format!(
+                "<rect class=\"mark s{look}\" x=\"{:.1}\" y=\"{:.1}\" width=\"6.4\" height=\"6.4\">",
+                x - 3.2,
+                y - 3.2
+            ),
+            2 => format!("<path class=\"mark s{look}\" d=\"M{x:.1} {:.1}l4.2 7.4h-8.4z\">", y - 4.6),
+            _ => format!("<path class=\"mark s{look}\" d=\"M{x:.1} {:.1}l4.6 4.6l-4.6 4.6l-4.6 -4.6z\">", y - 4.6),
+        };
+        let close = match look % 4 {
+            0 => "</circle>",
+            1 => "</rect>",
+            _ => "</path>",
+        };
+        let _ = write!(self.text, "{shape}<title>{}</title>{close}", escape(tip));
+    }
+
+    fn axes(&mut self, x: &Scale, y: &Scale, x_label: &str, y_label: &str) {
+        let bottom = HEIGHT - BOTTOM;
+        for tick in y.ticks() {
+            let Some(at) = y.at(tick) else { continue };
+            let _ = write!(
+                self.text,
+                "<path class=\"grid\" d=\"M{LEFT} {at:.1}H{:.1}\"/><text class=\"end\" x=\"{:.1}\" y=\"{:.1}\">{}</text>",
+                WIDTH - RIGHT,
+                LEFT - 7.0,
+                at + 4.0,
+                figure(tick)
+            );
+        }
+        let middle = 0.5 * (bottom + self.top);
+        let _ = write!(
+            self.text,
+            "<text class=\"middle\" transform=\"translate(14 {middle:.1}) rotate(-90)\">{}</text>",
+            escape(y_label)
+        );
+        self.x_axis(x, x_label, [self.top, bottom]);
+    }
+
+    /// Ticks, grid and label of a horizontal axis over rows from `top` to `bottom`.
+    fn x_axis(&mut self, x: &Scale, label: &str, [top, bottom]: [f64; 2]) {
+        for tick in x.ticks() {
+            let Some(at) = x.at(tick) else { continue };
+            let _ = write!(
+                self.text,
+                "<path class=\"grid\" d=\"M{at:.1} {top:.1}V{bottom:.1}\"/>\
+                 <text class=\"middle\" x=\"{at:.1}\" y=\"{:.1}\">{}</text>",
+                bottom + 16.0,
+                figure(tick)
+            );
+        }
+        let _ = write!(
+            self.text,
+            "<path class=\"axis\" d=\"M{:.1} {bottom:.1}H{:.1}\"/><text class=\"middle\" x=\"{:.1}\" y=\"{:.1}\">{}</text>",
+            x.from,
+            x.to,
+            0.5 * (x.from + x.to),
+            bottom + 34.0,
+            escape(label)
+        );
+    }
+
+    fn empty(mut self) -> String {
+        let middle = 0.5 * self.height;
+        self.push(&format!("<text class=\"middle\" x=\"{}\" y=\"{middle}\">nothing to show</text>", 0.5 * WIDTH));
+        self.finish()
+    }
+
+    fn finish(mut self) -> String {
+        self.push("</svg>");
+        self.text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plot(points: &[(f64, f64)]) -> Plot {
+        let series = Series { name: "<b>".into(), points: points.to_vec(), joined: true };
+        Plot { title: "t".into(), series: vec![series], ..Plot::default() }
+    }
+
+    #[test]
+    fn what_is_not_finite_is_left_out_and_nothing_at_all_is_said() {
+        let svg = plot(&[(0.0, 1.0), (1.0, f64::NAN), (2.0, f64::INFINITY), (3.0, 2.0)]).svg();
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+        assert_eq!(svg.matches("<circle").count(), 1 + 2, "the legend's and one per point");
+        assert!(plot(&[(f64::NAN, 1.0)]).svg().contains("nothing to show"));
+        assert!(Bars::default().svg().contains("nothing to show"));
+        assert!(Stack::default().svg().contains("nothing to show"));
+    }
+
+    #[test]
+    fn names_cannot_become_elements() {
+        assert!(!plot(&[(0.0, 1.0)]).svg().contains("<b>"));
+    }
+
+    #[test]
+    fn ticks_are_round_and_inside() {
+        for (low, high) in [(0.0, 1.0), (-3.0, 17.0), (48.2, 48.9), (1e-7, 3e-7), (0.0, 5e9)] {
+            let scale = Scale { log: false, low, high, from: 0.0, to: 100.0 };
+            let ticks = scale.ticks();
+            assert!((2..=12).contains(&ticks.len()), "{low} to {high}: {ticks:?}");
+            assert!(ticks.iter().all(|&tick| tick >= low - 1e-9 * high && tick <= high * (1.0 + 1e-9)));
+        }
+        let log = Scale { log: true, low: -7.0, high: 2.0, from: 0.0, to: 100.0 };
+        assert!((3..=8).contains(&log.ticks().len()), "{:?}", log.ticks());
+    }
+
+    #[test]
+    fn higher_values_lie_higher_and_bins_stand_on_one_another() {
+        let axis = Axis { from_zero: true, ..Axis::default() };
+        let scale = Scale::of(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
+        assert_eq!(scale.at(0.0), Some(200.0));
+        assert!(scale.at(4.0) < scale.at(1.0));
+        let groups = vec![("kept".to_owned(), vec![3, 0]), ("dropped".to_owned(), vec![1, 2])];
+        let svg = Stack { edges: vec![0.0, 1.0, 2.0], groups, ..Stack::default() }.svg();
+        assert_eq!(svg.matches("class=\"area").count(), 3, "an empty bin has no bar");
+    }
+}

@@ -1,0 +1,310 @@
+//! Looking for the failure modes that the paper names, in the pictures.
+//!
+//! In: what kinds of Gaussian there are ([`super::traits`]), and both models' pictures. Out: per kind
+//! how much larger the error is where it is seen, where that is worst, and a verdict. Where a kind is
+//! seen is known exactly: the original is rendered once more with colours that say the kind, which gives
+//! for every pixel the share w of it that such Gaussians have.
+//!
+//! The failure cases are those of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models",
+//! section 4.5. Memory: per thread one more picture, and the original's state without its colours.
+
+use serde::Serialize;
+
+use super::traits::{Kind, Traits};
+use crate::metrics::{PSNR_CAP_DB, psnr};
+use crate::model::{Camera, Column, Gaussians, SH_C0};
+use crate::pipeline::evaluate::Taken;
+use crate::render::{Image, render};
+
+/// PSNR below which an error can be seen: one part in a hundred, root mean square.
+pub const VISIBLE_DB: f64 = 40.0;
+/// How much worse than elsewhere it must be: 3 dB are twice the squared error.
+pub const APART_DB: f64 = 3.0;
+/// Part of the pixels that a kind must have for its error to mean anything.
+pub const SHOWN: f64 = 1e-3;
+/// Part of a kind's coverage that must have been dropped or merged for the loss to be its own.
+pub const LOST: f64 = 0.01;
+/// Side of the square shown of the worst place, pixels.
+pub const CROP: u32 = 64;
+
+/// Error sums of one picture, in f64 over pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Observed {
+    /// By [`Kind::ALL`].
+    kinds: [Sums; 3],
+    /// Σ e², e² the mean over channels of the squared difference.
+    error: f64,
+    pixels: f64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Sums {
+    /// Σ w.
+    weight: f64,
+    /// Σ w e².
+    error: f64,
+    /// Σ w ∇c·∇o and Σ w ∇o·∇o, of the brightness of the compressed and the original picture.
+    kept_detail: f64,
+    detail: f64,
+}
+
+/// What a search for one failure mode came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// The scene has nothing it could happen to.
+    Absent,
+    /// The scene has such Gaussians, but they make up too little of any picture to be judged.
+    Unseen,
+    /// Nothing of the kind was dropped or merged.
+    Untouched,
+    /// The pictures err no more there than they should.
+    Passed,
+    /// The pictures err visibly there, and much more than elsewhere.
+    Flagged,
+}
+
+/// The place in a picture where a failure is worst.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Worst {
+    /// Index into the evaluation's pictures.
+    #[serde(skip)]
+    pub place: usize,
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// View number.
+    pub view: u32,
+    /// PSNR of that picture where the kind is seen, dB.
+    pub psnr: f64,
+}
+
+/// One failure mode, looked for.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FailureMode {
+    /// Its name.
+    pub name: &'static str,
+    /// Which Gaussians it happens to.
+    pub happens_to: String,
+    /// What came of it.
+    pub verdict: Verdict,
+    /// Gaussians of the original that are of the kind.
+    pub gaussians: usize,
+    /// Of these, dropped and merged ones; none without an index map.
+    pub dropped: Option<usize>,
+    /// Of these, merged ones.
+    pub merged: Option<usize>,
+    /// Part of the scene's coverage that is theirs.
+    pub coverage: f64,
+    /// Part of their coverage that was dropped or merged; none without an index map.
+    pub coverage_lost: Option<f64>,
+    /// Part of all pixels that is theirs.
+    pub shown: f64,
+    /// PSNR over what is theirs, dB; none where nothing is.
+    pub psnr_there: Option<f64>,
+    /// PSNR over the rest, dB.
+    pub psnr_elsewhere: Option<f64>,
+    /// Part of the original's brightness gradients there that the compressed pictures do not follow; below
+    /// 0 where they exaggerate.
+    pub detail_lost: Option<f64>,
+    /// The picture in which it is worst.
+    pub worst: Option<Worst>,
+}
+
+/// What is known of a kind's Gaussians before any picture is made.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Members {
+    /// How many there are.
+    pub count: usize,
+    /// Dropped and merged ones, where that is known.
+    pub fates: Option<(usize, usize)>,
+    /// Part of the scene's coverage that is theirs, and the part of that which was dropped or merged.
+    pub shares: (f64, f64),
+}
+
+/// For every pixel the share of each kind, as red, green and blue.
+pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -> Image {
+    let mut sh = Column::zeros(3, state.len());
+    for (i, traits) in traits.iter().enumerate() {
+        // Colour is 0.5 + SH_C0 · coefficient.
+        sh.set_row(i, traits.map(|of| ((f64::from(u8::from(of)) - 0.5) / SH_C0) as f32));
+    }
+    let marked = Gaussians {
+        position: state.position.clone(),
+        rotation: state.rotation.clone(),
+        log_scale: state.log_scale.clone(),
+        opacity_logit: state.opacity_logit.clone(),
+        sh,
+    };
+    render(&marked, camera, [0.0; 3])
+}
+
+/// What one picture shows of each kind.
+///
+/// # Panics
+/// If the sizes differ.
+pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Taken) -> Observed {
+    let shares = shares_of_pixels(state, traits, camera);
+    let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let mut found = Observed { pixels: (width * height) as f64, ..Observed::default() };
+    let error = squared_error(&taken.original, &taken.compressed);
+    for (i, (error, shares)) in error.iter().zip(shares.data.chunks_exact(3)).enumerate() {
+        found.error += error;
+        // Forward differences; at the far borders there are none.
+        let step = |of: &[f64]| {
+            let along = if (i + 1).is_multiple_of(width) { 0.0 } else { of[i + 1] - of[i] };
+            let down = if i + width >= of.len() { 0.0 } else { of[i + width] - of[i] };
+            [along, down]
+        };
+        let (o, c) = (step(&original), step(&compressed));
+        for (sums, &share) in found.kinds.iter_mut().zip(shares) {
+            let w = f64::from(share);
+            sums.weight += w;
+            sums.error += w * error;
+            sums.kept_detail += w * (c[0] * o[0] + c[1] * o[1]);
+            sums.detail += w * (o[0] * o[0] + o[1] * o[1]);
+        }
+    }
+    found
+}
+
+/// Per pixel the mean over channels of the squared difference, clamped to what a screen shows.
+pub fn squared_error(a: &Image, b: &Image) -> Vec<f64> {
+    let shown = |v: f32| f64::from(v.clamp(0.0, 1.0));
+    let square = |(a, b): (&f32, &f32)| (shown(*a) - shown(*b)).powi(2);
+    let pixels = a.data.chunks_exact(3).zip(b.data.chunks_exact(3));
+    pixels.map(|(a, b)| a.iter().zip(b).map(square).sum::<f64>() / 3.0).collect()
+}
+
+fn brightness(image: &Image) -> Vec<f64> {
+    image.data.chunks_exact(3).map(|p| p.iter().map(|&v| f64::from(v.clamp(0.0, 1.0))).sum::<f64>() / 3.0).collect()
+}
+
+/// Judges one kind by the pictures `seen`, whose (frame, view) are `names`.
+pub fn judge(kind: Kind, members: Members, seen: &[Observed], names: &[(usize, u32)]) -> FailureMode {
+    let (name, happens_to) = described(kind);
+    let at = kind as usize;
+    let sum = |value: fn(&Sums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
+    let (weight, error) = (sum(|s| s.weight), sum(|s| s.error));
+    let pixels: f64 = seen.iter().map(|of| of.pixels).sum();
+    let all_error: f64 = seen.iter().map(|of| of.error).sum();
+    let shown = if pixels > 0.0 { weight / pixels } else { 0.0 };
+    let psnr_there = db(error, weight);
+    let psnr_elsewhere = db((all_error - error).max(0.0), pixels - weight);
+    let detail = sum(|s| s.detail);
+    let worst = (0..seen.len())
+        .filter(|&place| seen[place].kinds[at].weight >= SHOWN * seen[place].pixels)
+        .filter_map(|place| Some((place, db(seen[place].kinds[at].error, seen[place].kinds[at].weight)?)))
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .map(|(place, psnr)| Worst { place, frame: names[place].0, view: names[place].1, psnr });
+    let lost = members.fates.is_some().then_some(members.shares.1);
+    let apart = psnr_there
+        .zip(psnr_elsewhere)
+        .is_some_and(|(there, elsewhere)| there < VISIBLE_DB && there <= elsewhere - APART_DB);
+    let verdict = if members.count == 0 {
+        Verdict::Absent
+    } else if worst.is_none() {
+        Verdict::Unseen
+    } else if lost.is_some_and(|lost| lost < LOST) {
+        Verdict::Untouched
+    } else if apart {
+        Verdict::Flagged
+    } else {
+        Verdict::Passed
+    };
+    FailureMode {
+        name,
+        happens_to,
+        verdict,
+        gaussians: members.count,
+        dropped: members.fates.map(|fates| fates.0),
+        merged: members.fates.map(|fates| fates.1),
+        coverage: members.shares.0,
+        coverage_lost: lost,
+        shown,
+        psnr_there,
+        psnr_elsewhere,
+        detail_lost: (detail > 0.0).then(|| 1.0 - sum(|s| s.kept_detail) / detail),
+        worst,
+    }
+}
+
+/// The mode's name, and the Gaussians it happens to.
+fn described(kind: Kind) -> (&'static str, String) {
+    use super::traits::{COLOUR_CHANGE, FAST, NEIGHBOURS, NON_RIGID, OPACITY_CHANGE, STILL, THIN};
+    match kind {
+        Kind::Motion => (
+            "fast, non-rigid motion",
+            format!(
+                "Gaussians that move by {}% of the scene extent per frame or more (root mean square), while the \
+                 distance to half of their {NEIGHBOURS} nearest neighbours changes by {}% or more",
+                100.0 * FAST,
+                100.0 * NON_RIGID
+            ),
+        ),
+        Kind::Thin => ("thin structures", format!("Gaussians {THIN} times as long as wide or more")),
+        Kind::Appearance => (
+            "fine changes of appearance",
+            format!(
+                "Gaussians that stand still (up to {}% of the extent per frame) while their opacity varies by {} or \
+                 their colour by {} (standard deviation) or more",
+                100.0 * STILL,
+                OPACITY_CHANGE,
+                COLOUR_CHANGE
+            ),
+        ),
+    }
+}
+
+/// PSNR of a weighted sum of squared errors; none without weight.
+fn db(error: f64, weight: f64) -> Option<f64> {
+    (weight > 0.0).then(|| (-10.0 * (error / weight).log10()).min(PSNR_CAP_DB))
+}
+
+/// Corner of the square of [`CROP`] pixels, or less in a smaller picture, that holds most of the error
+/// that is a kind's: Σ w e². Of equals the first by rows.
+pub fn worst_corner(taken: &Taken, shares: &Image, kind: Kind) -> (u32, u32) {
+    let (width, height) = (taken.original.width as usize, taken.original.height as usize);
+    let (across, down) = ((CROP as usize).min(width), (CROP as usize).min(height));
+    // sums[y][x] over the rectangle above and left of (x, y).
+    let stride = width + 1;
+    let mut sums = vec![0.0; stride * (height + 1)];
+    let error = squared_error(&taken.original, &taken.compressed);
+    for y in 0..height {
+        let mut row = 0.0;
+        for x in 0..width {
+            let i = y * width + x;
+            row += f64::from(shares.data[3 * i + kind as usize]) * error[i];
+            sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row;
+        }
+    }
+    let mut best = (f64::NEG_INFINITY, (0, 0));
+    for y in 0..=height - down {
+        for x in 0..=width - across {
+            let (low, high) = (y * stride, (y + down) * stride);
+            let inside = sums[high + x + across] - sums[high + x] - sums[low + x + across] + sums[low + x];
+            if inside > best.0 {
+                best = (inside, (x as u32, y as u32));
+            }
+        }
+    }
+    best.1
+}
+
+/// Part of a picture, from `corner`, [`CROP`] pixels each way or up to the border.
+pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
+    let (width, height) = (CROP.min(image.width - left), CROP.min(image.height - top));
+    let row = |y: u32| {
+        let start = 3 * (y as usize * image.width as usize + left as usize);
+        &image.data[start..start + 3 * width as usize]
+    };
+    Image { width, height, data: (top..top + height).flat_map(row).copied().collect() }
+}
+
+/// PSNR of the part of both pictures that [`crop`] gives, dB.
+pub fn crop_psnr(taken: &Taken, corner: (u32, u32)) -> f64 {
+    psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,185 @@
+//! Every mode fires on a scene that was hurt that way, and on none that was hurt another way.
+
+use glam::DVec3;
+
+use super::*;
+use crate::demo::{Family, Scene};
+use crate::emit::container::write_container;
+use crate::ingest::container::Container;
+use crate::model::Split;
+use crate::pass::FrameSource;
+use crate::pipeline::evaluate::Taken;
+use crate::pipeline::input::Input;
+use crate::pipeline::scored::{Scored, UserOverrides, score_scene};
+use crate::pipeline::summary::Stages;
+use crate::recipe::Recipe;
+use crate::report::traits::{shares, traits};
+use crate::stream::gather;
+
+/// The demo scene with its scores and traits.
+struct Looked {
+    made: Scene,
+    scored: Scored,
+    traits: Vec<Traits>,
+    _folder: tempfile::TempDir,
+}
+
+fn looked() -> Looked {
+    let folder = tempfile::tempdir().unwrap();
+    let made = Scene::new(3000, 12);
+    let path = folder.path().join("scene.gseq");
+    write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+    let input = Input::Container(Container::open(&path).unwrap());
+    let rig = made.rig();
+    let schedule = rig.schedule(&made.info().times, Some(Split::Train)).unwrap();
+    let scene = crate::pipeline::input::Scene { path, input, rig, schedule, has_cameras: true, notes: Vec::new() };
+    let recipe = Recipe::preset("default").unwrap();
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
+    let traits = traits(scene.input.source(), &scored, recipe.scan.alpha_min).unwrap();
+    Looked { made, scored, traits, _folder: folder }
+}
+
+impl Looked {
+    /// Part of the visible members of a family that have a trait.
+    fn part(&self, family: Family, kind: Kind) -> f64 {
+        let members: Vec<usize> = self.made.members(family).filter(|&i| self.scored.rows.c[i] > 0.0).collect();
+        let with = members.iter().filter(|&&i| self.traits[i][kind as usize]).count();
+        with as f64 / members.len().max(1) as f64
+    }
+
+    /// The verdicts on a result that lacks the Gaussians `lost`.
+    fn without(&self, lost: impl Fn(usize) -> bool) -> [FailureMode; 3] {
+        let rig = self.made.rig();
+        let all: Vec<u32> = (0..self.traits.len() as u32).collect();
+        let left: Vec<u32> = all.iter().copied().filter(|&i| !lost(i as usize)).collect();
+        let (mut seen, mut names) = (Vec::new(), Vec::new());
+        for frame in (0..self.made.info().times.len()).step_by(3) {
+            let state = gather(&self.made, &all, frame, crate::model::Columns::ALL).unwrap();
+            for view in [1usize, 2, 4] {
+                let camera = &rig.cameras[view];
+                let taken = Taken {
+                    original: render(&state, camera, [0.0; 3]),
+                    compressed: render(&state.pick(&left), camera, [0.0; 3]),
+                    truth: None,
+                };
+                seen.push(observe(&state, &self.traits, camera, &taken));
+                names.push((frame, view as u32));
+            }
+        }
+        let shares = shares(&self.scored.rows, &self.traits, &lost);
+        Kind::ALL.map(|kind| {
+            let of = |wanted: bool| {
+                (0..self.traits.len()).filter(|&i| self.traits[i][kind as usize] && (!wanted || lost(i))).count()
+            };
+            let members = Members { count: of(false), fates: Some((of(true), 0)), shares: shares[kind as usize] };
+            judge(kind, members, &seen, &names)
+        })
+    }
+}
+
+#[test]
+fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
+    let scene = looked();
+    assert!(scene.part(Family::Cloth, Kind::Motion) > 0.3, "got {}", scene.part(Family::Cloth, Kind::Motion));
+    assert!(scene.part(Family::Egg, Kind::Motion) < 0.15, "a rigid motion: {}", scene.part(Family::Egg, Kind::Motion));
+    assert_eq!(scene.part(Family::Wire, Kind::Thin), 1.0);
+    assert!(scene.part(Family::Fading, Kind::Appearance) > 0.9);
+    for family in [Family::Wall, Family::Double] {
+        for kind in Kind::ALL {
+            assert_eq!(scene.part(family, kind), 0.0, "{} {kind:?}", family.name());
+        }
+    }
+    let buried = scene.made.members(Family::Buried);
+    assert!(scene.traits[buried].iter().all(|of| *of == [false; 3]), "what is never seen is of no kind");
+}
+
+#[test]
+fn each_mode_is_flagged_where_its_own_kind_is_lost_and_only_there() {
+    let scene = looked();
+    for (number, kind) in Kind::ALL.into_iter().enumerate() {
+        let found = scene.without(|i| scene.traits[i][number]);
+        let at = &found[number];
+        assert_eq!(at.verdict, Verdict::Flagged, "{kind:?}: {at:?}");
+        assert_eq!(at.dropped, Some(at.gaussians));
+        assert!(at.worst.unwrap().psnr <= at.psnr_there.unwrap(), "{kind:?}: the worst is not better than the mean");
+        assert!(at.detail_lost.unwrap() > 0.1, "{kind:?}: {at:?}");
+        for (other, of) in found.iter().enumerate().filter(|(other, _)| *other != number) {
+            assert_ne!(of.verdict, Verdict::Flagged, "{kind:?} lost: {:?} {of:?}", Kind::ALL[other]);
+        }
+    }
+}
+
+#[test]
+fn losing_what_is_of_no_kind_flags_nothing() {
+    let scene = looked();
+    // Every third wall Gaussian: a large and visible loss.
+    let found = scene.without(|i| scene.traits[i] == [false; 3] && i % 3 == 0);
+    assert!(found.iter().all(|of| of.verdict == Verdict::Untouched), "{found:?}");
+    assert!(found[1].psnr_elsewhere.unwrap() < VISIBLE_DB, "the loss is not visible: {found:?}");
+    let nothing = scene.without(|_| false);
+    assert!(nothing.iter().all(|of| of.verdict == Verdict::Untouched && of.psnr_there == Some(PSNR_CAP_DB)));
+}
+
+fn sums(weight: f64, error: f64) -> Observed {
+    let one = Sums { weight, error, kept_detail: weight, detail: weight };
+    Observed { kinds: [one, Sums::default(), Sums::default()], error: 2.0 * error, pixels: 1e4 }
+}
+
+#[test]
+fn verdicts_follow_the_stated_thresholds() {
+    let verdict = |members: Members, observed: Observed| judge(Kind::Motion, members, &[observed], &[(3, 7)]).verdict;
+    let lost = Members { count: 5, fates: Some((5, 0)), shares: (0.1, 0.5) };
+    // 100 pixels of 10,000 with a squared error of 0.01 each: 20 dB; elsewhere 40 dB.
+    assert_eq!(verdict(lost, sums(100.0, 1.0)), Verdict::Flagged);
+    assert_eq!(verdict(Members { count: 0, ..lost }, sums(0.0, 0.0)), Verdict::Absent);
+    assert_eq!(verdict(lost, sums(9.9, 0.1)), Verdict::Unseen, "under a thousandth of the pixels");
+    assert_eq!(verdict(Members { shares: (0.1, 0.009), ..lost }, sums(100.0, 1.0)), Verdict::Untouched);
+    assert_eq!(verdict(lost, sums(100.0, 0.009)), Verdict::Passed, "40.5 dB cannot be seen");
+    assert_eq!(verdict(lost, sums(4000.0, 40.0)), Verdict::Passed, "20 dB against 21.8 is not apart");
+    // Without an index map the pictures alone decide.
+    assert_eq!(verdict(Members { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
+    let found = judge(Kind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
+    assert_eq!(found.psnr_there, Some(20.0));
+    assert_eq!(found.worst.map(|worst| (worst.frame, worst.view)), Some((3, 7)));
+    assert_eq!(judge(Kind::Thin, Members::default(), &[], &[]).verdict, Verdict::Absent);
+}
+
+#[test]
+fn shares_of_pixels_are_those_of_the_gaussians_seen_there() {
+    let mut state = Gaussians::zeros(2, 0);
+    for (i, y) in [0.0f32, 2.0].into_iter().enumerate() {
+        state.position.set_row(i, [0.0, y, 0.0]);
+        state.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+        state.log_scale.set_row(i, [0.0; 3]);
+    }
+    // The nearer one lets half through.
+    state.opacity_logit.set_row(1, [12.0]);
+    let camera = Camera::look_at(DVec3::new(0.0, -6.0, 0.0), DVec3::ZERO, 0.6, (33, 33));
+    let shares = shares_of_pixels(&state, &[[true, false, false], [false, true, false]], &camera);
+    let middle = &shares.data[3 * (16 * 33 + 16)..][..3];
+    for (got, expected) in middle.iter().zip([0.5, 0.5 * 0.99, 0.0]) {
+        assert!((got - expected).abs() < 0.02, "got {middle:?}");
+    }
+}
+
+#[test]
+fn the_worst_square_is_where_the_kinds_error_is() {
+    let image = |value: f32| Image { width: 100, height: 90, data: vec![value; 27_000] };
+    let mut taken = Taken { original: image(0.5), compressed: image(0.5), truth: None };
+    let mut shares = image(0.0);
+    let mut mark = |x: usize, y: usize, error: f32, share: f32| {
+        let at = 3 * (y * 100 + x);
+        taken.compressed.data[at] += error;
+        shares.data[at + Kind::Thin as usize] = share;
+    };
+    // A larger error that is not the kind's, and the kind's own, at the lower right border.
+    mark(2, 3, 0.5, 0.0);
+    mark(99, 89, 0.2, 1.0);
+    let (left, top) = worst_corner(&taken, &shares, Kind::Thin);
+    assert_eq!((left, top), (36, 26), "the first square that holds the last pixel");
+    let part = crop(&taken.compressed, (left, top));
+    assert_eq!((part.width, part.height), (CROP, CROP));
+    assert!((part.data[3 * (63 * 64 + 63)] - 0.7).abs() < 1e-6);
+    let small = Image { width: 5, height: 4, data: vec![0.0; 60] };
+    assert_eq!((crop(&small, (0, 0)).width, crop(&small, (0, 0)).height), (5, 4));
+}

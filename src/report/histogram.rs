@@ -1,0 +1,173 @@
+//! How the scores of what was kept, merged and dropped are spread.
+//!
+//! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins are equal in ratio
+//! over the positive values, for scores span many powers of ten; what is 0 is counted apart.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::run::Fate;
+use crate::model::Rows;
+use crate::score::Scores;
+
+/// Bins of a histogram.
+const BINS: usize = 40;
+/// Smallest value with a bin of its own, as a part of the largest.
+const DEEPEST: f64 = 1e-8;
+
+/// Counts by fate.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct ByFate<T> {
+    /// Of those in the result as they were.
+    pub kept: T,
+    /// Of those in a proxy.
+    pub merged: T,
+    /// Of those that are gone.
+    pub dropped: T,
+}
+
+impl<T> ByFate<T> {
+    /// The one of a fate.
+    pub fn of(&mut self, fate: Fate) -> &mut T {
+        match fate {
+            Fate::Kept => &mut self.kept,
+            Fate::Merged => &mut self.merged,
+            Fate::Dropped => &mut self.dropped,
+        }
+    }
+}
+
+/// One score over all Gaussians.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Histogram {
+    /// S, S_static, S_dynamic, C, W, D, kappa, V, Life or Vis.
+    pub name: &'static str,
+    /// What it measures, with the unit.
+    pub meaning: &'static str,
+    /// One more than there are bins, increasing; empty if no value is positive.
+    pub edges: Vec<f64>,
+    /// Counts per bin; of a bin its lower edge is in it, of the last both; the first also holds what is
+    /// positive and below.
+    pub bins: ByFate<Vec<usize>>,
+    /// Values of 0 or below, or not finite.
+    pub zero: ByFate<usize>,
+}
+
+/// The histograms of everything that was scored.
+pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
+    let life: Vec<f64> = rows.life.iter().map(|&life| f64::from(life) / frames.max(1) as f64).collect();
+    let all: [(&'static str, &'static str, &[f64]); 10] = [
+        ("S", "the whole score", &scores.score),
+        ("S_static", "the static score", &scores.static_score),
+        ("S_dynamic", "the dynamic score", &scores.dynamic_score),
+        ("C", "mean coverage, pixels", &rows.c),
+        ("W", "largest share of a pixel", &rows.w),
+        ("D", "root mean square step, scene units per frame", &rows.d),
+        ("kappa", "mean curvature of the path, scene units per frame²", &rows.kappa),
+        ("V", "variance of the opacity", &rows.v),
+        ("Life", "part of the frames it lives in", &life),
+        ("Vis", "part of the pictures it touches", &rows.vis),
+    ];
+    // Without visible coverage there is no W.
+    all.into_iter()
+        .filter(|(_, _, values)| values.len() == fates.len() && !fates.is_empty())
+        .map(|(name, meaning, values)| Histogram::of(name, meaning, values, fates))
+        .collect()
+}
+
+impl Histogram {
+    /// Of `values`, one per fate.
+    fn of(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
+        let positive = |v: &f64| *v > 0.0 && v.is_finite();
+        let (mut low, high) = values
+            .iter()
+            .copied()
+            .filter(positive)
+            .fold((f64::INFINITY, 0.0f64), |(low, high), v| (low.min(v), high.max(v)));
+        low = low.max(high * DEEPEST);
+        let bins = if high == 0.0 {
+            0
+        } else if low == high {
+            1
+        } else {
+            BINS
+        };
+        let step = (high / low).ln() / bins.max(1) as f64;
+        let edges = match bins {
+            0 => Vec::new(),
+            1 => vec![low / 1.1, high * 1.1],
+            _ => (0..=bins).map(|k| if k == bins { high } else { low * (step * k as f64).exp() }).collect(),
+        };
+        let empty = || vec![0; bins];
+        let mut found = Histogram {
+            name,
+            meaning,
+            edges,
+            bins: ByFate { kept: empty(), merged: empty(), dropped: empty() },
+            zero: ByFate::default(),
+        };
+        for (value, &fate) in values.iter().zip(fates) {
+            if !positive(value) {
+                *found.zero.of(fate) += 1;
+                continue;
+            }
+            // Not by the logarithm, whose rounding could put an edge into the bin below.
+            let bin = found.edges.partition_point(|edge| edge <= value).clamp(1, bins) - 1;
+            found.bins.of(fate)[bin] += 1;
+        }
+        found
+    }
+}
+
+/// One line per bin, and one for the zeros of each score.
+pub fn csv(histograms: &[Histogram]) -> String {
+    let mut out = String::from("score,from,to,kept,merged,dropped\n");
+    for of in histograms {
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "{},0,0,{},{},{}", of.name, of.zero.kept, of.zero.merged, of.zero.dropped);
+        for (bin, edges) in of.edges.windows(2).enumerate() {
+            let ByFate { kept, merged, dropped } = &of.bins;
+            let _ =
+                writeln!(out, "{},{},{},{},{},{}", of.name, edges[0], edges[1], kept[bin], merged[bin], dropped[bin]);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_gaussian_is_counted_once_in_the_bin_that_holds_it() {
+        let values: Vec<f64> = (0..1000).map(|i| if i % 7 == 0 { 0.0 } else { 1.01f64.powi(i) }).collect();
+        let fates: Vec<Fate> = (0..1000).map(|i| [Fate::Kept, Fate::Merged, Fate::Dropped][(i % 3) as usize]).collect();
+        let found = Histogram::of("S", "", &values, &fates);
+        for (fate, bins, zero) in [
+            (Fate::Kept, &found.bins.kept, found.zero.kept),
+            (Fate::Merged, &found.bins.merged, found.zero.merged),
+            (Fate::Dropped, &found.bins.dropped, found.zero.dropped),
+        ] {
+            let of: Vec<f64> = values.iter().zip(&fates).filter(|(_, f)| **f == fate).map(|(v, _)| *v).collect();
+            assert_eq!(zero, of.iter().filter(|v| **v == 0.0).count());
+            for (bin, edges) in found.edges.windows(2).enumerate() {
+                let last = bin + 2 == found.edges.len();
+                let inside = |v: &&f64| **v >= edges[0] && (**v < edges[1] || (last && **v == edges[1]));
+                assert_eq!(bins[bin], of.iter().filter(inside).count(), "{fate:?}, bin {bin}");
+            }
+        }
+    }
+
+    #[test]
+    fn one_value_has_one_bin_and_none_has_none() {
+        let found = Histogram::of("V", "", &[2.0, 2.0, f64::NAN], &[Fate::Kept; 3]);
+        assert_eq!((found.bins.kept.clone(), found.zero.kept), (vec![2], 1));
+        assert!(found.edges[0] < 2.0 && found.edges[1] > 2.0);
+        let found = Histogram::of("V", "", &[0.0; 3], &[Fate::Dropped; 3]);
+        assert_eq!((found.edges.len(), found.zero.dropped), (0, 3));
+        let far = Histogram::of("D", "", &[1e-300, 1.0], &[Fate::Kept; 2]);
+        assert_eq!(far.bins.kept.iter().sum::<usize>(), 2);
+        assert_eq!(far.bins.kept[0], 1, "what is far below is in the first bin");
+    }
+}

@@ -1,0 +1,101 @@
+//! Words and numbers as a page shows them.
+
+/// `text` with everything escaped that could end a text or an attribute in quotes.
+pub(super) fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            _ => out.push(letter),
+        }
+    }
+    out
+}
+
+/// A number in at most four significant digits, without needless zeros: for ticks and bars.
+pub(super) fn figure(value: f64) -> String {
+    let size = value.abs();
+    if value == 0.0 || !value.is_finite() {
+        return if value == 0.0 { "0".to_owned() } else { "–".to_owned() };
+    }
+    if !(1e-3..1e6).contains(&size) {
+        return format!("{value:.1e}").replace(".0e", "e");
+    }
+    let decimals = (3 - size.log10().floor() as i32).max(0) as usize;
+    let text = format!("{value:.decimals$}");
+    match text.contains('.') {
+        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
+        false => text,
+    }
+}
+
+/// A whole number with its thousands apart.
+pub(super) fn count(value: usize) -> String {
+    let digits = value.to_string();
+    let mut out = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push('\u{202f}');
+        }
+        out.push(digit);
+    }
+    out
+}
+
+/// Bytes in the decimal unit that suits them.
+pub(super) fn bytes(value: u64) -> String {
+    let value = value as f64;
+    match value {
+        1e9.. => format!("{:.2} GB", value / 1e9),
+        1e6.. => format!("{:.2} MB", value / 1e6),
+        1e3.. => format!("{:.1} kB", value / 1e3),
+        _ => format!("{value} bytes"),
+    }
+}
+
+/// `part` of `whole` in percent; of nothing all. A part too small for a digit is not called none.
+pub(super) fn percent(part: f64, whole: f64) -> String {
+    let share = if whole > 0.0 { 100.0 * part / whole } else { 100.0 };
+    match share {
+        0.0 | 10.0.. => format!("{share:.0}%"),
+        0.1.. => format!("{share:.1}%"),
+        _ => "under 0.1%".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_text_can_leave_its_place() {
+        let escaped = escape("<script>alert(\"x\")</script> & 'y'");
+        assert!(!escaped.contains(['<', '>', '"', '\'']), "{escaped}");
+        assert_eq!(escape("a&b"), "a&amp;b");
+    }
+
+    #[test]
+    fn figures_are_short() {
+        let cases = [
+            (0.0, "0"),
+            (48.912, "48.91"),
+            (0.05, "0.05"),
+            (1234.5, "1234"),
+            (20.0, "20"),
+            (1e-7, "1e-7"),
+            (2.5e9, "2.5e9"),
+            (-0.25, "-0.25"),
+            (f64::NAN, "–"),
+        ];
+        for (value, expected) in cases {
+            assert_eq!(figure(value), expected, "{value}");
+        }
+        assert_eq!(count(1_234_567).replace('\u{202f}', " "), "1 234 567");
+        assert_eq!([bytes(999), bytes(5_180_514)], ["999 bytes", "5.18 MB"]);
+        assert_eq!([percent(1.0, 2.0), percent(1.0, 3000.0), percent(0.0, 0.0)], ["50%", "under 0.1%", "100%"]);
+    }
+}

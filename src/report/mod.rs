@@ -1,0 +1,263 @@
+//! A page that a person opens: what compression did to a model, and what it cost.
+//!
+//! Data in: two models, their cameras, and what `compress` left beside its result. Data out: a folder
+//! with `report.html`, which needs nothing but a browser, and everything it shows as JSON and CSV. Reads
+//! as a pipeline: `run` (what compress left), `traits` (which Gaussians are at risk), the evaluation with
+//! `failure` looking on, `histogram`, `shown` (pictures), `page` with `chart` and `html`.
+//!
+//! Memory: that of an evaluation and of scoring, one after the other, and the page.
+
+pub mod chart;
+pub mod failure;
+pub mod histogram;
+mod html;
+mod page;
+pub mod run;
+pub mod shown;
+mod tables;
+pub mod trade_off;
+pub mod traits;
+mod verdict;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::emit::atomic::{Kind as TargetKind, MARKER, StagedFolder, check_target};
+use crate::error::{Error, Result};
+use crate::model::{Schedule, Split};
+use crate::pipeline::evaluate::{EvaluateOptions, SideBySide};
+use crate::pipeline::evaluation::{Evaluation, PictureScores};
+use crate::pipeline::input::Scene;
+use crate::pipeline::scored::{Scored, UserOverrides, score_scene};
+use crate::pipeline::summary::Stages;
+use crate::pipeline::trade_off::TradeOff;
+use crate::recipe::{NonFinite, Recipe};
+use failure::{FailureMode, Members, judge, observe};
+use histogram::{Histogram, histograms};
+use run::{Fate, Run};
+use shown::{Choice, Shown, choices, show};
+use traits::{Kind, Traits, shares, traits};
+
+/// The page's name in the folder.
+pub const PAGE: &str = "report.html";
+
+/// What to report on.
+#[derive(Debug, Clone)]
+pub struct ReportOptions {
+    /// The models and the pictures to compare them on; its files to write are not looked at.
+    pub evaluate: EvaluateOptions,
+    /// What `sweep` wrote.
+    pub sweep: Option<PathBuf>,
+    /// Folder to write.
+    pub output: PathBuf,
+    /// Replace an earlier report.
+    pub overwrite: bool,
+}
+
+/// Everything the page shows, as data.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// Program and version.
+    pub tool: String,
+    /// The result in a sentence or two.
+    pub verdict: String,
+    /// Means overall, by view and by frame.
+    pub evaluation: Evaluation,
+    /// The scores of every picture.
+    pub pictures: Vec<PictureScores>,
+    /// Pictures that the page shows.
+    pub shown: Vec<Choice>,
+    /// The failure modes, by [`Kind::ALL`].
+    pub failure_modes: Vec<FailureMode>,
+    /// The scores of what was kept, merged and dropped; none where that is not known.
+    pub histograms: Option<Vec<Histogram>>,
+    /// The run's `summary.json` as it stands.
+    pub run: Option<serde_json::Value>,
+    /// What was not found beside the result, and why.
+    pub missing: Vec<String>,
+    /// A sweep over the original.
+    pub trade_off: Option<TradeOff>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Part of both models' pictures where a failure mode is worst.
+#[derive(Debug, Clone, PartialEq)]
+struct Close {
+    /// Index into the failure modes.
+    mode: usize,
+    /// Its upper left pixel.
+    corner: (u32, u32),
+    /// PSNR inside, dB.
+    psnr: f64,
+    /// Data URIs: original, compressed.
+    images: [String; 2],
+}
+
+/// Compares two models and writes the report.
+///
+/// # Errors
+/// Whatever is wrong with inputs, cameras, pictures, sweep or output. Nothing is left behind then.
+pub fn report(options: &ReportOptions) -> Result<Report> {
+    let mut inputs = options.evaluate.inputs();
+    inputs.extend(options.sweep.as_deref());
+    check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
+    let trade_off = options.sweep.as_deref().map(read_sweep).transpose()?;
+    let mut side = SideBySide::open(&options.evaluate)?;
+    let info = side.scene.input.source().info();
+    let (count, frames) = (info.count, info.times.len());
+    let run = Run::beside(&options.evaluate.compressed, count, side.compressed_count());
+    let mut notes = notes_on(&run, &side.scene)?;
+
+    let recipe = recipe_to_look_with(&run)?;
+    side.scene.schedule = scored_pictures(&side.scene, &run)?;
+    let scored = score_scene(&side.scene, &recipe, &UserOverrides::default(), &mut Stages::default())?;
+    let traits = traits(side.scene.input.source(), &scored, recipe.scan.alpha_min)?;
+    let members = members(&scored, &traits, run.fates.as_deref());
+    let (evaluation, seen) = side.evaluate(|state, camera, taken| observe(state, &traits, camera, taken))?;
+    let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
+    let failure_modes: Vec<FailureMode> =
+        Kind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
+    let choices = choices(&evaluation);
+    let (shown, close) = look_again(&side, &choices, &failure_modes, &traits)?;
+
+    notes.extend(evaluation.notes.iter().cloned());
+    let report = Report {
+        tool: evaluation.tool.clone(),
+        verdict: verdict::verdict(&evaluation, &failure_modes),
+        pictures: evaluation.pictures.clone(),
+        evaluation,
+        shown: choices,
+        failure_modes,
+        histograms: run.fates.as_deref().map(|fates| histograms(&scored.rows, &scored.scores, frames, fates)),
+        missing: run.missing.clone(),
+        run: run.summary.as_ref().map(|(_, whole)| whole.clone()),
+        trade_off,
+        notes,
+    };
+    write(options, &report, &page::page(&report, &run, &shown, &close), &run)?;
+    Ok(report)
+}
+
+fn read_sweep(path: &Path) -> Result<TradeOff> {
+    let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
+    serde_json::from_str(&text).map_err(|error| {
+        Error::input(path, format!("line {}", error.line()), "what `splatsieve sweep` wrote", error.to_string())
+            .hint("splatsieve sweep ORIGINAL --cameras F -o FOLDER writes sweep.json")
+    })
+}
+
+/// What beside the result does not fit these two models.
+fn notes_on(run: &Run, scene: &Scene) -> Result<Vec<String>> {
+    let Some((summary, _)) = &run.summary else { return Ok(Vec::new()) };
+    let digest = scene.input.digest()?;
+    Ok(match summary.input.digest == digest {
+        true => Vec::new(),
+        false => vec![format!(
+            "the summary beside the result is of an original with digest {}, this one has {digest}",
+            summary.input.digest
+        )],
+    })
+}
+
+/// The recipe of the result, else the usual one. The report looks at what is there: values that are not
+/// finite do not stop it.
+fn recipe_to_look_with(run: &Run) -> Result<Recipe> {
+    let mut recipe = match &run.recipe {
+        Some(recipe) => recipe.clone(),
+        None => Recipe::preset("default")?,
+    };
+    recipe.scan.non_finite = NonFinite::Keep;
+    Ok(recipe)
+}
+
+/// The pictures that the run scored with: the split that has as many as its summary says, else those of
+/// training, else all.
+fn scored_pictures(scene: &Scene, run: &Run) -> Result<Schedule> {
+    let times = &scene.input.source().info().times;
+    let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
+    let mut first = None;
+    for split in [Some(Split::Train), None, Some(Split::Test)] {
+        let schedule = scene.rig.schedule(times, split)?;
+        if schedule.pairs() == 0 {
+            continue;
+        }
+        if wanted.is_none_or(|wanted| wanted == schedule.pairs()) {
+            return Ok(schedule);
+        }
+        first.get_or_insert(schedule);
+    }
+    first.map_or_else(|| scene.rig.schedule(times, None), Ok)
+}
+
+/// How many Gaussians of each kind there are, and what became of them.
+fn members(scored: &Scored, traits: &[Traits], fates: Option<&[Fate]>) -> [Members; 3] {
+    let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
+    let shares = shares(&scored.rows, traits, |i| fate(i) != Fate::Kept);
+    std::array::from_fn(|kind| {
+        let with = |wanted: Fate| (0..traits.len()).filter(|&i| traits[i][kind] && fate(i) == wanted).count();
+        Members {
+            count: traits.iter().filter(|of| of[kind]).count(),
+            fates: fates.map(|_| (with(Fate::Dropped), with(Fate::Merged))),
+            shares: shares[kind],
+        }
+    })
+}
+
+/// Makes the pictures of the page, and of the failure modes' worst ones the worst part.
+fn look_again(
+    side: &SideBySide,
+    choices: &[Choice],
+    modes: &[FailureMode],
+    traits: &[Traits],
+) -> Result<(Vec<Shown>, Vec<Close>)> {
+    let worst = || modes.iter().enumerate().filter_map(|(mode, of)| Some((mode, of.worst?.place)));
+    let places: Vec<usize> = choices.iter().map(|choice| choice.place).chain(worst().map(|(_, place)| place)).collect();
+    let (mut shown, mut close) = (Vec::new(), Vec::new());
+    let made = side.again(&places, |place, state, camera, taken| {
+        for choice in choices.iter().filter(|choice| choice.place == place) {
+            shown.push(show(choice, &taken)?);
+        }
+        for (mode, _) in worst().filter(|&(_, at)| at == place) {
+            let shares = failure::shares_of_pixels(state, traits, camera);
+            let corner = failure::worst_corner(&taken, &shares, Kind::ALL[mode]);
+            let part = |image| shown::data_uri(&failure::crop(image, corner));
+            let images = [part(&taken.original)?, part(&taken.compressed)?];
+            close.push(Close { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
+        }
+        Ok(())
+    })?;
+    made.into_iter().collect::<Result<()>>()?;
+    // As chosen: pictures come back by frame.
+    shown.sort_by_key(|shown| choices.iter().position(|choice| choice.place == shown.choice.place));
+    Ok((shown, close))
+}
+
+fn write(options: &ReportOptions, report: &Report, page: &str, run: &Run) -> Result<()> {
+    let staged = StagedFolder::new(&options.output, options.overwrite)?;
+    let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");
+    json.push('\n');
+    let marker = serde_json::json!({
+        "tool": report.tool,
+        "original": report.evaluation.path.original,
+        "compressed": report.evaluation.path.compressed,
+        "verdict": report.verdict,
+    });
+    let mut files = vec![
+        (PAGE, page.to_owned()),
+        ("report.json", json),
+        ("pictures.csv", report.evaluation.csv()),
+        ("failure_modes.csv", tables::failure_modes(&report.failure_modes)),
+        (MARKER, format!("{marker:#}\n")),
+    ];
+    files.extend(report.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
+    files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(of))));
+    files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", tables::trade_off(of))));
+    for (name, text) in files {
+        let path = staged.path().join(name);
+        fs::write(&path, text).map_err(Error::io("write", &path))?;
+    }
+    staged.commit()
+}

@@ -1,0 +1,418 @@
+//! The page: one HTML file that needs no network.
+//!
+//! Everything that comes from files or paths passes through [`escape`]; the content policy in its head
+//! lets a browser load nothing but what is inside.
+
+use super::chart::{self, Axis, Bars, Plot, Series, Stack};
+use super::failure::{APART_DB, FailureMode, LOST, VISIBLE_DB, Verdict};
+use super::histogram::Histogram;
+use super::html::{bytes, count, escape, figure, percent};
+use super::run::{Run, Summary};
+use super::shown::Shown;
+use super::{Close, Report, trade_off};
+use crate::pipeline::evaluation::{Comparison, FrameMeans, Means, ViewMeans};
+
+const STYLE: &str = include_str!("page.css");
+const SCRIPT: &str = include_str!("page.js");
+
+/// Puts the page together.
+pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close]) -> String {
+    let title = format!("{} – what compression cost", file_name(&report.evaluation.path.compressed));
+    let mut out = format!(
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; \
+         style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <title>{}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<main>\n",
+        escape(&title),
+        chart::STYLE,
+    );
+    let sections = [
+        ("", header(report)),
+        ("Compare", compare(shown)),
+        ("Where it is lost", by_frame_and_view(report)),
+        ("Known failure modes", failure_modes(&report.failure_modes, close)),
+        ("Run", stages(run)),
+        ("Scores of what was kept and dropped", score_histograms(report)),
+        ("Left out, and notes", left_out(report, run)),
+        ("Trade-off", sweep(report)),
+        ("Data", data(report, run)),
+    ];
+    for (heading, body) in sections {
+        match heading {
+            "" => out += &format!("<header>\n{body}</header>\n"),
+            _ => out += &format!("<section>\n<h2>{heading}</h2>\n{body}</section>\n"),
+        }
+    }
+    out += &format!("</main>\n<script>\n{SCRIPT}</script>\n</body>\n</html>\n");
+    out
+}
+
+fn file_name(path: &str) -> &str {
+    let name = path.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or("");
+    if name.is_empty() { path } else { name }
+}
+
+fn header(report: &Report) -> String {
+    let found = &report.evaluation;
+    let card = |label: &str, value: String, more: String| {
+        format!("<div class=\"card\"><b>{value}</b><span>{label}</span><small>{more}</small></div>\n")
+    };
+    let from = |before: String, part: f64, whole: f64| format!("of {before} · {}", percent(part, whole));
+    let (counts, sizes) = (found.count, found.bytes);
+    let worst =
+        |value: fn(&Means) -> f64| found.loss.per_frame.iter().map(|of| value(&of.means)).fold(f64::INFINITY, f64::min);
+    let mut out = format!(
+        "<p class=\"paths\">{} → {}</p>\n<h1>What compression cost</h1>\n<p class=\"verdict\">{}</p>\n<div class=\"cards\">\n",
+        escape(&found.path.original),
+        escape(&found.path.compressed),
+        escape(&report.verdict)
+    );
+    out += &card(
+        "Gaussians",
+        count(counts.compressed),
+        from(count(counts.original), counts.compressed as f64, counts.original as f64),
+    );
+    out += &card(
+        "size",
+        bytes(sizes.compressed),
+        from(bytes(sizes.original), sizes.compressed as f64, sizes.original as f64),
+    );
+    let mean = found.loss.overall;
+    out += &card("PSNR to the original", db(mean.psnr), format!("worst frame {}", db(worst(|m| m.psnr))));
+    out += &card("SSIM to the original", format!("{:.4}", mean.ssim), format!("worst frame {:.4}", worst(|m| m.ssim)));
+    if let Some(temporal) = mean.temporal {
+        out += &card("temporal error", figure(temporal), "of frame-to-frame differences".to_owned());
+    }
+    if let Some(truth) = &found.ground_truth {
+        let (after, before) = (truth.compressed.overall, truth.original.overall);
+        out += &card("PSNR to the photographs", db(after.psnr), format!("the original {}", db(before.psnr)));
+        out +=
+            &card("SSIM to the photographs", format!("{:.4}", after.ssim), format!("the original {:.4}", before.ssim));
+    }
+    out += &format!(
+        "</div>\n<p class=\"note\">{} pictures of {} frames, {} cameras: {}. PSNR has peak 1 and is averaged over \
+         pictures; the temporal error is the root mean square of what frame-to-frame differences differ by.</p>\n",
+        count(found.cameras.pairs),
+        found.loss.per_frame.len(),
+        found.cameras.cameras,
+        escape(&found.cameras.origin)
+    );
+    out
+}
+
+fn db(value: f64) -> String {
+    format!("{value:.2} dB")
+}
+
+/// The slider: all images lie on one another, and which two are seen is a matter of classes.
+fn compare(shown: &[Shown]) -> String {
+    let mut out = String::from("<div class=\"bar\" role=\"group\" aria-label=\"picture\">\n");
+    for (number, picture) in shown.iter().enumerate() {
+        let choice = &picture.choice;
+        out += &format!(
+            "<button type=\"button\" data-show=\"{number}\" aria-pressed=\"{}\">{}<small>frame {}, view {} · {}</small></button>\n",
+            number == 0,
+            escape(&choice.why.join(", ")),
+            choice.frame,
+            choice.view,
+            db(choice.psnr)
+        );
+    }
+    out += "</div>\n<div class=\"bar sides\">\n";
+    for (side, other) in [("left", "original"), ("right", "compressed")] {
+        out += &format!("<label>{side} <select data-side=\"{side}\">");
+        for (name, _) in shown.first().map_or(&[][..], |picture| &picture.images[..]) {
+            let selected = if *name == other { " selected" } else { "" };
+            out += &format!("<option value=\"{name}\"{selected}>{name}</option>");
+        }
+        out += "</select></label>\n";
+    }
+    out += "</div>\n<div id=\"stage\" style=\"--cut: 50%\">\n";
+    for (number, picture) in shown.iter().enumerate() {
+        let (width, height) = picture.size;
+        let active = if number == 0 { " active" } else { "" };
+        out += &format!(
+            "<div class=\"picture{active}\" data-picture=\"{number}\" style=\"--ratio: {width} / {height}\">\n"
+        );
+        for (name, uri) in &picture.images {
+            let side = match *name {
+                "original" => " class=\"left\"",
+                "compressed" => " class=\"right\"",
+                _ => "",
+            };
+            out += &format!("<img data-kind=\"{name}\"{side} alt=\"{name}\" draggable=\"false\" src=\"{uri}\">\n");
+        }
+        let shrunk = match picture.shrunk {
+            1 => String::new(),
+            by => format!("; shown at 1/{by} of its size"),
+        };
+        out += &format!(
+            "<p class=\"caption\" hidden>frame {}, view {}: PSNR {}, SSIM {:.4}; the difference is {} times as bright as it \
+             is{shrunk}</p>\n</div>\n",
+            picture.choice.frame,
+            picture.choice.view,
+            db(picture.choice.psnr),
+            picture.choice.ssim,
+            picture.factor
+        );
+    }
+    out += "<span class=\"tag tag-left\"></span><span class=\"tag tag-right\"></span><i id=\"handle\"></i>\n</div>\n\
+            <input id=\"cut\" type=\"range\" min=\"0\" max=\"100\" step=\"0.5\" value=\"50\" \
+            aria-label=\"how much of the left picture is seen\">\n<p class=\"note\" id=\"caption\"></p>\n";
+    out
+}
+
+fn by_frame_and_view(report: &Report) -> String {
+    let found = &report.evaluation;
+    let against: Vec<(&str, &Comparison)> = [("compressed to original", Some(&found.loss))]
+        .into_iter()
+        .chain(found.ground_truth.iter().flat_map(|truth| {
+            [("compressed to photographs", Some(&truth.compressed)), ("original to photographs", Some(&truth.original))]
+        }))
+        .filter_map(|(name, of)| Some((name, of?)))
+        .collect();
+    let frames = |value: &dyn Fn(&Means) -> Option<f64>, label: &str, title: &str| {
+        let point = |of: &FrameMeans| Some((of.frame as f64, value(&of.means)?));
+        let series = against.iter().map(|(name, of)| Series {
+            name: (*name).to_owned(),
+            points: of.per_frame.iter().filter_map(point).collect(),
+            joined: true,
+        });
+        let axis = |label: &str| Axis { label: label.to_owned(), ..Axis::default() };
+        Plot { title: title.to_owned(), x: axis("frame"), y: axis(label), series: series.collect() }.svg()
+    };
+    let views = |of: &Comparison, title: &str| {
+        let bar = |view: &ViewMeans| (format!("view {}", view.view), view.means.psnr);
+        let mut bars: Vec<(String, f64)> = of.per_view.iter().map(bar).collect();
+        bars.sort_by(|a, b| a.1.total_cmp(&b.1));
+        let hidden = bars.len().saturating_sub(MOST_VIEWS);
+        bars.truncate(MOST_VIEWS);
+        let more =
+            if hidden > 0 { format!(" (the {MOST_VIEWS} worst of {})", hidden + MOST_VIEWS) } else { String::new() };
+        Bars { title: title.to_owned(), label: format!("PSNR, dB{more}"), bars }.svg()
+    };
+    let mut out = String::from("<div class=\"charts\">\n");
+    out += &figure_of("PSNR over frames", &frames(&|m| Some(m.psnr), "PSNR, dB", "PSNR over frames"));
+    out += &figure_of("PSNR by view, compressed to original", &views(&found.loss, "PSNR by view"));
+    out += &figure_of("SSIM over frames", &frames(&|m| Some(m.ssim), "SSIM", "SSIM over frames"));
+    if found.loss.overall.temporal.is_some() {
+        out +=
+            &figure_of("Temporal error over frames", &frames(&|m| m.temporal, "error", "Temporal error over frames"));
+    }
+    out + "</div>\n"
+}
+
+/// Views that bars are drawn for, the worst.
+const MOST_VIEWS: usize = 16;
+
+fn figure_of(caption: &str, svg: &str) -> String {
+    format!("<figure><figcaption>{}</figcaption>{svg}</figure>\n", escape(caption))
+}
+
+fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
+    let mut out = format!(
+        "<p class=\"note\">Where a kind of Gaussian is seen is known for every pixel: the share of its colour that comes \
+         from them. A mode is flagged if the PSNR there is below {VISIBLE_DB} dB and at least {APART_DB} dB below that \
+         elsewhere, and {} or more of their coverage was dropped or merged.</p>\n<div class=\"modes\">\n",
+        percent(LOST, 1.0)
+    );
+    for (number, mode) in modes.iter().enumerate() {
+        let (class, word) = match mode.verdict {
+            Verdict::Absent => ("none", "not in this scene"),
+            Verdict::Unseen => ("none", "hardly in any picture"),
+            Verdict::Untouched => ("good", "nothing lost"),
+            Verdict::Passed => ("good", "does not show"),
+            Verdict::Flagged => ("bad", "shows"),
+        };
+        out += &format!(
+            "<article class=\"{class}\"><h3>{} <em>{word}</em></h3>\n<p>{}.</p>\n<table>\n",
+            capitalised(mode.name),
+            escape(&mode.happens_to)
+        );
+        let mut row = |name: &str, value: Option<String>| {
+            if let Some(value) = value {
+                out += &format!("<tr><th>{name}</th><td>{value}</td></tr>\n");
+            }
+        };
+        row("Gaussians", Some(count(mode.gaussians)));
+        if mode.gaussians > 0 {
+            let of = |part: Option<usize>| {
+                part.map(|n| format!("{} ({})", count(n), percent(n as f64, mode.gaussians as f64)))
+            };
+            row("dropped", of(mode.dropped));
+            row("merged", of(mode.merged));
+            row("part of the scene's coverage", Some(percent(mode.coverage, 1.0)));
+            row("of that dropped or merged", mode.coverage_lost.map(|lost| percent(lost, 1.0)));
+            row("part of all pixels", Some(percent(mode.shown, 1.0)));
+            row("PSNR there", mode.psnr_there.map(db));
+            row("PSNR elsewhere", mode.psnr_elsewhere.map(db));
+            row(
+                "edges there that are lost",
+                mode.detail_lost.map(|lost| if lost <= 0.0 { "none".into() } else { percent(lost, 1.0) }),
+            );
+            row("worst", mode.worst.map(|w| format!("frame {}, view {}: {}", w.frame, w.view, db(w.psnr))));
+        }
+        out += "</table>\n";
+        if let Some(close) = close.iter().find(|close| close.mode == number) {
+            let [original, compressed] = &close.images;
+            out += &format!(
+                "<div class=\"close\"><img alt=\"original\" src=\"{original}\"><img alt=\"compressed\" src=\"{compressed}\"></div>\n\
+                 <p class=\"note\">original and compressed where most of the error is, from pixel {}, {}: {}</p>\n",
+                close.corner.0,
+                close.corner.1,
+                db(close.psnr)
+            );
+        }
+        out += "</article>\n";
+    }
+    out + "</div>\n"
+}
+
+fn capitalised(text: &str) -> String {
+    let mut letters = text.chars();
+    letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
+}
+
+fn absent(what: &str) -> String {
+    format!("<p class=\"note\">{what}</p>\n")
+}
+
+fn stages(run: &Run) -> String {
+    let Some((summary, _)) = &run.summary else {
+        return absent(
+            "There is no summary of a run beside the compressed model; <code>splatsieve compress</code> writes one.",
+        );
+    };
+    let mut out = String::from(
+        "<table class=\"wide\">\n<tr><th>stage</th><th>Gaussians in</th><th>out</th><th>time</th><th>peak memory so far</th></tr>\n",
+    );
+    for stage in &summary.stages {
+        let memory = stage.peak_memory_bytes.map_or("–".to_owned(), |of| format!("{:.0} MiB", of as f64 / 1048576.0));
+        out += &format!(
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{:.2} s</td><td>{memory}</td></tr>\n",
+            escape(&stage.name),
+            count(stage.gaussians_in),
+            count(stage.gaussians_out),
+            stage.seconds
+        );
+    }
+    let total: f64 = summary.stages.iter().map(|stage| stage.seconds).sum();
+    out += &format!("<tr><th>together</th><td></td><td></td><th>{total:.2} s</th><td></td></tr>\n</table>\n");
+    out += "<div class=\"charts\">\n";
+    out += &figure_of("Time per stage", &stage_bars(summary, "seconds", |stage| Some(stage.seconds)));
+    let mib = |stage: &super::run::Stage| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
+    out += &figure_of("Largest memory up to the end of each stage", &stage_bars(summary, "MiB", mib));
+    out + "</div>\n"
+}
+
+fn stage_bars(summary: &Summary, label: &str, value: impl Fn(&super::run::Stage) -> Option<f64>) -> String {
+    let bars = summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
+    Bars { title: format!("{label} per stage"), label: label.to_owned(), bars }.svg()
+}
+
+fn score_histograms(report: &Report) -> String {
+    let Some(histograms) = &report.histograms else {
+        return absent(
+            "Which Gaussians went is not known: there is no index map beside the compressed model that fits.",
+        );
+    };
+    let mut out = String::from("<div class=\"charts\">\n");
+    for of in histograms {
+        out += &figure_of(&format!("{}: {}", of.name, of.meaning), &histogram(of));
+    }
+    out + "</div>\n"
+}
+
+fn histogram(of: &Histogram) -> String {
+    let with = |name: &str, zero: usize, bins: &[usize]| {
+        let more = if zero > 0 { format!(" (and {} at 0)", count(zero)) } else { String::new() };
+        (format!("{name}{more}"), bins.to_vec())
+    };
+    Stack {
+        title: format!("{} of kept, dropped and merged Gaussians", of.name),
+        x: Axis { label: of.name.to_owned(), log: true, from_zero: false },
+        edges: of.edges.clone(),
+        groups: vec![
+            with("kept", of.zero.kept, &of.bins.kept),
+            with("dropped", of.zero.dropped, &of.bins.dropped),
+            with("merged", of.zero.merged, &of.bins.merged),
+        ],
+    }
+    .svg()
+}
+
+fn left_out(report: &Report, run: &Run) -> String {
+    let mut out = String::new();
+    if let Some((summary, _)) = &run.summary {
+        let mut rows: Vec<[String; 2]> =
+            summary.left_out.iter().map(|left| [escape(&left.what), escape(&left.why)]).collect();
+        if rows.is_empty() {
+            rows.push(["nothing".to_owned(), "every stage and term had something to do".to_owned()]);
+        }
+        out += "<table class=\"wide words\">\n<tr><th>left out</th><th>why</th></tr>\n";
+        for [what, why] in rows {
+            out += &format!("<tr><td>{what}</td><td>{why}</td></tr>\n");
+        }
+        out += "</table>\n<table class=\"wide\">\n<tr><th>term of the scores</th><th>1st percentile</th><th>99th</th><th></th></tr>\n";
+        for term in &summary.terms {
+            let grades = if term.active { "grades" } else { "only splits" };
+            out += &format!(
+                "<tr><td>{}</td><td>{}</td><td>{}</td><td>{grades}</td></tr>\n",
+                escape(&term.name),
+                figure(term.p1),
+                figure(term.p99)
+            );
+        }
+        out += "</table>\n";
+    }
+    let mut notes: Vec<&String> = report.notes.iter().collect();
+    notes.extend(run.summary.iter().flat_map(|(summary, _)| &summary.notes));
+    notes.extend(&report.missing);
+    if !notes.is_empty() {
+        let items: Vec<String> = notes.iter().map(|note| format!("<li>{}</li>", escape(note))).collect();
+        out += &format!("<ul class=\"note\">{}</ul>\n", items.join("\n"));
+    }
+    if out.is_empty() { absent("Nothing is known of the run.") } else { out }
+}
+
+fn sweep(report: &Report) -> String {
+    let Some(found) = &report.trade_off else {
+        return absent(&format!(
+            "Curves of quality against size, time and memory come from a sweep: \
+             <code>splatsieve sweep {} --cameras F -o sweep</code>, then this report with \
+             <code>--sweep sweep/sweep.json</code>.",
+            escape(&report.evaluation.path.original)
+        ));
+    };
+    let mut out = format!(
+        "<p class=\"note\">{}: {} Gaussians, {}; {} pictures, {} threads.</p>\n<div class=\"charts\">\n",
+        escape(&found.path),
+        count(found.gaussians),
+        bytes(found.bytes),
+        found.pictures,
+        found.threads
+    );
+    for (caption, svg) in trade_off::charts(found) {
+        out += &figure_of(caption, &svg);
+    }
+    out += "</div>\n";
+    let items: Vec<String> = found.notes.iter().map(|note| format!("<li>{}</li>", escape(note))).collect();
+    if !items.is_empty() {
+        out += &format!("<ul class=\"note\">{}</ul>\n", items.join("\n"));
+    }
+    out
+}
+
+fn data(report: &Report, run: &Run) -> String {
+    let mut names = vec!["report.json", "pictures.csv", "failure_modes.csv"];
+    names.extend(report.histograms.as_ref().map(|_| "histograms.csv"));
+    names.extend(run.summary.as_ref().map(|_| "stages.csv"));
+    names.extend(report.trade_off.as_ref().map(|_| "trade_off.csv"));
+    let links: Vec<String> = names.iter().map(|name| format!("<a href=\"{name}\">{name}</a>")).collect();
+    format!(
+        "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
+        links.join(", "),
+        escape(&report.tool)
+    )
+}

@@ -1,0 +1,203 @@
+//! What `compress` left beside its result: the summary, the recipe, the index map.
+//!
+//! In: the path of the result. Out: as much of the three as is there and fits the models; for the rest
+//! the reason, for the page to give. Memory: 8 bytes per Gaussian.
+
+use std::fs::{self, File};
+use std::io::BufReader;
+use std::path::Path;
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use crate::emit::atomic::MARKER;
+use crate::pipeline::output::{INDEX_MAP, RECIPE, beside};
+use crate::recipe::Recipe;
+
+/// What became of a Gaussian of the original.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fate {
+    /// It is in the result as it was.
+    Kept,
+    /// It went into a proxy with others.
+    Merged,
+    /// It is gone.
+    Dropped,
+}
+
+/// A stage of the run, as its summary tells it.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Stage {
+    /// Its name.
+    pub name: String,
+    /// Gaussians that entered it.
+    pub gaussians_in: usize,
+    /// Gaussians that left it.
+    pub gaussians_out: usize,
+    /// Wall-clock time.
+    pub seconds: f64,
+    /// Largest resident memory up to its end, where the system told.
+    pub peak_memory_bytes: Option<u64>,
+}
+
+/// Something the scene did not need.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct LeftOut {
+    /// What was not done.
+    pub what: String,
+    /// Why not.
+    pub why: String,
+}
+
+/// Percentiles of a term of the scores.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Term {
+    /// Its name.
+    pub name: String,
+    /// 1st percentile.
+    pub p1: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Whether they differ.
+    pub active: bool,
+}
+
+/// The original, as the summary names it.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct OfInput {
+    /// Hash over its bytes.
+    pub digest: String,
+}
+
+/// The pictures that were scored.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct OfCameras {
+    /// (frame, view) pairs.
+    pub pairs: usize,
+}
+
+/// What this report reads of a `summary.json`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Summary {
+    /// The original.
+    pub input: OfInput,
+    /// Where it was looked at from.
+    pub cameras: OfCameras,
+    /// Everything in order.
+    pub stages: Vec<Stage>,
+    /// Percentiles.
+    pub terms: Vec<Term>,
+    /// What the scene did not need.
+    pub left_out: Vec<LeftOut>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// What was found beside a result.
+#[derive(Debug, Default)]
+pub struct Run {
+    /// The summary, and all of it as it stands in its file.
+    pub summary: Option<(Summary, Value)>,
+    /// The parameters.
+    pub recipe: Option<Recipe>,
+    /// What became of every Gaussian of the original.
+    pub fates: Option<Vec<Fate>>,
+    /// For each of the three that is missing the reason.
+    pub missing: Vec<String>,
+}
+
+impl Run {
+    /// Looks beside `result`, made of `original` Gaussians into `compressed`.
+    ///
+    /// A file that is absent or does not fit is no failure: any two models can be compared.
+    pub fn beside(result: &Path, original: usize, compressed: usize) -> Run {
+        let is_folder = result.is_dir();
+        let mut run = Run::default();
+        let take = |name: &str| beside(result, is_folder, name);
+        let (summary, recipe, map) = (take(MARKER), take(RECIPE), take(INDEX_MAP));
+        match read_summary(&summary) {
+            Ok(found) => run.summary = Some(found),
+            Err(why) => run.missing.push(format!("{}: {why}", summary.display())),
+        }
+        match read_recipe(&recipe) {
+            Ok(found) => run.recipe = Some(found),
+            Err(why) => run.missing.push(format!("{}: {why}", recipe.display())),
+        }
+        match read_fates(&map, original, compressed) {
+            Ok(found) => run.fates = Some(found),
+            Err(why) => run.missing.push(format!("{}: {why}", map.display())),
+        }
+        run
+    }
+}
+
+fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
+    let text = fs::read_to_string(path).map_err(|e| e.to_string())?;
+    let whole: Value = serde_json::from_str(&text).map_err(|e| e.to_string())?;
+    let summary = Summary::deserialize(&whole).map_err(|e| format!("not a summary of compress: {e}"))?;
+    Ok((summary, whole))
+}
+
+fn read_recipe(path: &Path) -> Result<Recipe, String> {
+    let text = fs::read_to_string(path).map_err(|e| e.to_string())?;
+    Recipe::from_toml(&text, "default")
+}
+
+fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fate>, String> {
+    let file = File::open(path).map_err(|e| e.to_string())?;
+    let array = npyz::NpyFile::new(BufReader::new(file)).map_err(|e| e.to_string())?;
+    // Before anything is allocated by a length that the file claims.
+    if array.shape() != [original as u64] {
+        return Err(format!("expected an array of the original's {original} Gaussians, found {:?}", array.shape()));
+    }
+    let map: Vec<i64> = array.into_vec().map_err(|e| e.to_string())?;
+    fates(&map, compressed)
+}
+
+/// From an index map into a result of `compressed` Gaussians: shared places are merged ones.
+fn fates(map: &[i64], compressed: usize) -> Result<Vec<Fate>, String> {
+    let mut sharers = vec![0u32; compressed];
+    for (id, &place) in map.iter().enumerate().filter(|(_, place)| **place != -1) {
+        let sharer = usize::try_from(place).ok().and_then(|place| sharers.get_mut(place));
+        *sharer.ok_or(format!("Gaussian {id}: expected -1 or a place below {compressed}, found {place}"))? += 1;
+    }
+    Ok(map
+        .iter()
+        .map(|&place| match place {
+            -1 => Fate::Dropped,
+            place if sharers[place as usize] > 1 => Fate::Merged,
+            _ => Fate::Kept,
+        })
+        .collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::emit::index_map::write_index_map;
+
+    #[test]
+    fn gaussians_that_share_a_place_are_merged() {
+        use Fate::{Dropped, Kept, Merged};
+        assert_eq!(fates(&[0, -1, 1, 0, 2], 3).unwrap(), [Merged, Dropped, Kept, Merged, Kept]);
+        assert!(fates(&[0, 3], 3).unwrap_err().contains("Gaussian 1"));
+        assert!(fates(&[-2], 3).unwrap_err().contains("-2"));
+    }
+
+    #[test]
+    fn what_is_absent_or_of_another_scene_is_named_and_no_failure() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = Run::beside(folder.path(), 4, 2);
+        assert!(run.summary.is_none() && run.recipe.is_none() && run.fates.is_none());
+        assert_eq!(run.missing.len(), 3);
+        write_index_map(&[Some(0), None, Some(1)], &folder.path().join(INDEX_MAP)).unwrap();
+        fs::write(folder.path().join(MARKER), "{\"tool\": \"splatsieve\"}").unwrap();
+        fs::write(folder.path().join(RECIPE), "[select]\nkeep_fraction = 7.0").unwrap();
+        let run = Run::beside(folder.path(), 4, 2);
+        assert!(run.fates.is_none() && run.summary.is_none() && run.recipe.is_none());
+        for part in ["original's 4 Gaussians, found [3]", "not a summary of compress", "keep_fraction"] {
+            assert!(run.missing.iter().any(|why| why.contains(part)), "{part}: {:?}", run.missing);
+        }
+        assert!(Run::beside(folder.path(), 3, 2).fates.is_some());
+    }
+}

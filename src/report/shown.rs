@@ -1,0 +1,212 @@
+//! Pictures in the page: which ones, what of them, and as what.
+//!
+//! In: the scores of all pictures, then the chosen ones again. Out: PNG files as data URIs. A page holds
+//! at most [`CHOSEN`] pictures of at most [`MAX_PIXELS`] pixels, so that it stays at a few megabytes.
+
+use std::io;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use serde::Serialize;
+
+use crate::emit::image::png_bytes;
+use crate::error::{Error, Result};
+use crate::pipeline::evaluate::Taken;
+use crate::pipeline::evaluation::{Evaluation, Score};
+use crate::render::Image;
+
+/// Pictures to look at: the worst, that of the worst view, of the worst frame, and the median.
+pub const CHOSEN: usize = 4;
+/// A picture of more pixels is shown smaller; three or four of each are 1.5 bytes a pixel in base64.
+const MAX_PIXELS: u64 = 160_000;
+/// Differences are made brighter until this part of their values is still not clipped.
+const UNCLIPPED: f64 = 0.999;
+/// The most that differences are made brighter: one step of 255 is then a quarter of the range.
+const MAX_FACTOR: u32 = 64;
+
+/// A picture chosen to be looked at.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Choice {
+    /// Why: "worst picture", "median picture", ...
+    pub why: Vec<String>,
+    /// Index into the evaluation's pictures.
+    #[serde(skip)]
+    pub place: usize,
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// View number.
+    pub view: u32,
+    /// PSNR of compressed against original, dB.
+    pub psnr: f64,
+    /// SSIM of the same.
+    pub ssim: f64,
+}
+
+/// The pictures worth looking at, the worst first; one that is several of them comes once.
+pub fn choices(found: &Evaluation) -> Vec<Choice> {
+    let pictures = &found.pictures;
+    let lowest = |places: &mut dyn Iterator<Item = usize>| -> Option<usize> {
+        places.min_by(|&a, &b| pictures[a].loss.psnr.total_cmp(&pictures[b].loss.psnr))
+    };
+    let mut by_psnr: Vec<usize> = (0..pictures.len()).collect();
+    by_psnr.sort_by(|&a, &b| pictures[a].loss.psnr.total_cmp(&pictures[b].loss.psnr));
+    let view = found.loss.per_view.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.view);
+    let frame = found.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr)).map(|of| of.frame);
+    let of_view = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].view) == view));
+    let of_frame = lowest(&mut (0..pictures.len()).filter(|&i| Some(pictures[i].frame) == frame));
+    let wanted = [
+        ("worst picture", by_psnr.first().copied()),
+        ("worst view", of_view),
+        ("worst frame", of_frame),
+        ("median picture", by_psnr.get(by_psnr.len().saturating_sub(1) / 2).copied()),
+    ];
+    let mut chosen: Vec<Choice> = Vec::new();
+    for (why, place) in wanted {
+        let Some(place) = place else { continue };
+        if let Some(same) = chosen.iter_mut().find(|choice| choice.place == place) {
+            same.why.push(why.to_owned());
+            continue;
+        }
+        let of = &pictures[place];
+        let Score { psnr, ssim, .. } = of.loss;
+        chosen.push(Choice { why: vec![why.to_owned()], place, frame: of.frame, view: of.view, psnr, ssim });
+    }
+    chosen
+}
+
+/// A chosen picture, ready for the page.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Shown {
+    /// Which it is.
+    pub choice: Choice,
+    /// What it shows and its data URI: original, compressed, difference and, if there is one, photograph.
+    pub images: Vec<(&'static str, String)>,
+    /// Pixels across and down, as shown.
+    pub size: (u32, u32),
+    /// Pixels of the picture, each way, that one shown pixel stands for.
+    pub shrunk: u32,
+    /// By how much the difference was made brighter.
+    pub factor: u32,
+}
+
+/// Prepares a chosen picture.
+///
+/// # Errors
+/// A picture without pixels, which PNG does not know.
+pub fn show(choice: &Choice, taken: &Taken) -> Result<Shown> {
+    let shrunk = shrinkage(&taken.original);
+    let difference = difference(&taken.compressed, &taken.original);
+    let factor = brightening(&difference);
+    let bright = Image { data: difference.data.iter().map(|v| v * factor as f32).collect(), ..difference };
+    let mut images = Vec::new();
+    for (name, image) in [
+        ("original", Some(&taken.original)),
+        ("compressed", Some(&taken.compressed)),
+        ("difference", Some(&bright)),
+        ("photograph", taken.truth.as_ref()),
+    ] {
+        if let Some(image) = image {
+            images.push((name, data_uri(&shrink(image, shrunk))?));
+        }
+    }
+    let size = (taken.original.width.div_ceil(shrunk), taken.original.height.div_ceil(shrunk));
+    Ok(Shown { choice: choice.clone(), images, size, shrunk, factor })
+}
+
+/// A picture as a PNG inside a URI.
+///
+/// # Errors
+/// A picture without pixels.
+pub fn data_uri(image: &Image) -> Result<String> {
+    let bytes = png_bytes(image).map_err(|e: io::Error| Error::usage(format!("a picture cannot be shown: {e}")))?;
+    Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
+}
+
+/// |a − b| of what a screen shows, per channel.
+fn difference(a: &Image, b: &Image) -> Image {
+    let shown = |v: f32| v.clamp(0.0, 1.0);
+    let data = a.data.iter().zip(&b.data).map(|(&a, &b)| (shown(a) - shown(b)).abs()).collect();
+    Image { width: a.width, height: a.height, data }
+}
+
+/// The largest power of two, up to [`MAX_FACTOR`], that clips no more than it may.
+fn brightening(difference: &Image) -> u32 {
+    let mut values = difference.data.clone();
+    if values.is_empty() {
+        return 1;
+    }
+    let rank = ((values.len() - 1) as f64 * UNCLIPPED) as usize;
+    let high = *values.select_nth_unstable_by(rank, f32::total_cmp).1;
+    let mut factor = 1;
+    while factor < MAX_FACTOR && 2.0 * factor as f32 * high <= 1.0 {
+        factor *= 2;
+    }
+    factor
+}
+
+/// Pixels each way that become one, so that what is left is few enough.
+fn shrinkage(image: &Image) -> u32 {
+    let pixels = |by: u32| u64::from(image.width.div_ceil(by)) * u64::from(image.height.div_ceil(by));
+    (1..).find(|&by| pixels(by) <= MAX_PIXELS).unwrap_or(1)
+}
+
+/// Means over squares of `by` pixels, those at the far borders perhaps smaller.
+fn shrink(image: &Image, by: u32) -> Image {
+    if by == 1 {
+        return image.clone();
+    }
+    let (width, height) = (image.width.div_ceil(by), image.height.div_ceil(by));
+    let mut data = Vec::with_capacity(3 * (width * height) as usize);
+    for y in 0..height {
+        for x in 0..width {
+            let (rows, columns) = (y * by..image.height.min((y + 1) * by), x * by..image.width.min((x + 1) * by));
+            let count = (rows.len() * columns.len()) as f32;
+            for channel in 0..3 {
+                let at = |(y, x): (u32, u32)| {
+                    image.data[3 * (y as usize * image.width as usize + x as usize) + channel].clamp(0.0, 1.0)
+                };
+                let all = rows.clone().flat_map(|y| columns.clone().map(move |x| (y, x)));
+                data.push(all.map(at).sum::<f32>() / count);
+            }
+        }
+    }
+    Image { width, height, data }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(width: u32, height: u32, value: impl Fn(usize) -> f32) -> Image {
+        Image { width, height, data: (0..(3 * width * height) as usize).map(value).collect() }
+    }
+
+    #[test]
+    fn shrinking_keeps_the_mean_and_fits() {
+        let large = image(1352, 1014, |i| (i % 256) as f32 / 255.0);
+        let by = shrinkage(&large);
+        let small = shrink(&large, by);
+        assert_eq!((by, small.width, small.height), (3, 451, 338));
+        assert!(u64::from(small.width * small.height) <= MAX_PIXELS);
+        let mean = |image: &Image| image.data.iter().map(|&v| f64::from(v)).sum::<f64>() / image.data.len() as f64;
+        assert!((mean(&small) - mean(&large)).abs() < 1e-3);
+        assert_eq!(shrinkage(&image(320, 256, |_| 0.0)), 1);
+    }
+
+    #[test]
+    fn differences_are_brightened_until_they_clip() {
+        let (a, b) = (image(8, 8, |_| 0.5), image(8, 8, |i| 0.5 + 0.1 * (i % 2) as f32));
+        assert_eq!(brightening(&difference(&a, &b)), 8, "0.1 fits eight times, not sixteen");
+        assert_eq!(brightening(&difference(&a, &a)), MAX_FACTOR);
+        assert_eq!(brightening(&difference(&a, &image(8, 8, |_| -9.0))), 2);
+    }
+
+    #[test]
+    fn a_uri_holds_the_picture() {
+        let uri = data_uri(&image(5, 4, |i| i as f32 / 60.0)).unwrap();
+        let bytes = STANDARD.decode(uri.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
+        let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+        assert_eq!((reader.info().width, reader.info().height), (5, 4));
+        assert!(data_uri(&image(0, 0, |_| 0.0)).is_err());
+    }
+}

@@ -1,0 +1,194 @@
+//! Which Gaussians of the original are of the kinds that compression is known to hurt.
+//!
+//! In: the original's frames and its rows of statistics. Out: for every Gaussian a [`Traits`] set.
+//! The kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
+//! Models", section 4.5; the paper gives no measures for them, those here are this project's.
+//! Memory: 24 bytes per Gaussian where colours vary, 130 per fast one.
+
+use rayon::prelude::*;
+
+use crate::error::Result;
+use crate::merge::neighbors::{PointIndex, Search};
+use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
+use crate::pass::FrameSource;
+use crate::pipeline::scored::Scored;
+use crate::stream::gather;
+
+/// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
+/// scene and 500 pixels across, a pixel per frame.
+pub const FAST: f64 = 2e-3;
+/// Root mean square change of the distance to half of its neighbours, as part of that distance, from which
+/// motion is not rigid.
+pub const NON_RIGID: f64 = 0.05;
+/// Distances below this part of the extent count as it: nobody sees neighbours so near change places.
+const NEAREST: f64 = 1e-3;
+/// Neighbours whose distance is followed.
+pub const NEIGHBOURS: usize = 8;
+/// Longest over second scale from which a Gaussian is thin.
+pub const THIN: f64 = 5.0;
+/// D up to which a Gaussian stands still, as part of the extent per frame.
+pub const STILL: f64 = 5e-4;
+/// Standard deviation over its life of a still Gaussian's opacity from which its appearance changes.
+pub const OPACITY_CHANGE: f64 = 0.05;
+/// The same of its base colour, root mean square over the channels: five of 255 steps.
+pub const COLOUR_CHANGE: f64 = 0.02;
+/// Frames at which distances and colours are sampled, evenly.
+pub const SAMPLES: usize = 24;
+
+/// Kinds of Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Fast, and moving otherwise than its neighbours.
+    Motion,
+    /// Much longer than wide.
+    Thin,
+    /// Still, and changing in opacity or colour.
+    Appearance,
+}
+
+impl Kind {
+    /// Every kind, in the paper's order; a kind's place here is that of its numbers everywhere.
+    pub const ALL: [Kind; 3] = [Kind::Motion, Kind::Thin, Kind::Appearance];
+}
+
+/// The kinds one Gaussian is of, by [`Kind::ALL`].
+pub type Traits = [bool; 3];
+
+/// The traits of every Gaussian that is ever visible; of the others none.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Result<Vec<Traits>> {
+    let (rows, extent) = (&scored.rows, scored.reference.extent);
+    let mut found = vec![[false; 3]; rows.len()];
+    let frames = samples(source.info().times.len());
+    if rows.is_empty() || frames.is_empty() {
+        return Ok(found);
+    }
+    let visible = |i: usize| rows.life[i] > 0 && rows.c[i] > 0.0;
+    let all: Vec<u32> = (0..rows.len() as u32).collect();
+    let reference = gather(source, &all, scored.reference.frame, Columns::POSITION | Columns::LOG_SCALE)?;
+    let fast: Vec<u32> =
+        all.iter().copied().filter(|&i| visible(i as usize) && rows.d[i as usize] >= FAST * extent).collect();
+    for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
+        found[id as usize][Kind::Motion as usize] = bent >= NON_RIGID;
+    }
+    let recoloured = colour_change(source, &all, &frames, alpha_min)?;
+    for i in (0..rows.len()).filter(|&i| visible(i)) {
+        found[i][Kind::Thin as usize] = is_thin(reference.log_scale.row(i));
+        found[i][Kind::Appearance as usize] = rows.d[i] <= STILL * extent
+            && (rows.v[i].sqrt() >= OPACITY_CHANGE || recoloured.get(i).is_some_and(|&c| c >= COLOUR_CHANGE));
+    }
+    Ok(found)
+}
+
+/// Part of the coverage that Gaussians of each kind have, and of that the part whose fate `is_lost` says.
+pub fn shares(rows: &Rows, traits: &[Traits], is_lost: impl Fn(usize) -> bool) -> [(f64, f64); 3] {
+    // An empty sum is −0, which would be shown.
+    let total: f64 = rows.c.iter().fold(0.0, |sum, c| sum + c);
+    std::array::from_fn(|kind| {
+        let of = |wanted: &dyn Fn(usize) -> bool| -> f64 {
+            (0..rows.len()).filter(|&i| traits[i][kind] && wanted(i)).fold(0.0, |sum, i| sum + rows.c[i])
+        };
+        let own = of(&|_| true);
+        let part = |of: f64, whole: f64| if whole > 0.0 { of / whole } else { 0.0 };
+        (part(own, total), part(of(&is_lost), own))
+    })
+}
+
+fn is_thin(mut log_scale: [f32; 3]) -> bool {
+    log_scale.sort_unstable_by(f32::total_cmp);
+    f64::from(log_scale[2]) - f64::from(log_scale[1]) >= THIN.ln()
+}
+
+/// At most [`SAMPLES`] of `frames` frames, evenly from first to last.
+fn samples(frames: usize) -> Vec<usize> {
+    let count = frames.min(SAMPLES);
+    (0..count).map(|k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) }).collect()
+}
+
+/// How much the surroundings of the Gaussians `ids` change shape: for each the lower median, over its
+/// nearest visible neighbours at the reference frame, of the root mean square change of distance as part
+/// of that distance (of `nearest`, if that is more). A rigid motion, rotations included, changes none; the
+/// median leaves out neighbours that belong to another thing.
+fn bending(
+    source: &dyn FrameSource,
+    reference: &Gaussians,
+    ids: &[u32],
+    visible: impl Fn(usize) -> bool,
+    frames: &[usize],
+    nearest: f64,
+) -> Result<Vec<f64>> {
+    if ids.is_empty() {
+        return Ok(Vec::new());
+    }
+    let index = PointIndex::new(&reference.position, visible);
+    let near: Vec<Vec<u32>> = ids
+        .par_iter()
+        .map_init(Search::default, |search, &id| {
+            index.nearest(id, reference.position.row(id as usize), NEIGHBOURS, f64::INFINITY, search).0.collect()
+        })
+        .collect();
+    let mut followed: Vec<u32> = near.iter().flatten().chain(ids).copied().collect();
+    followed.sort_unstable();
+    followed.dedup();
+    let place = |id: u32| followed.binary_search(&id).unwrap_or_default();
+    let pairs: Vec<(usize, Vec<usize>)> =
+        ids.iter().zip(&near).map(|(&id, near)| (place(id), near.iter().map(|&j| place(j)).collect())).collect();
+    let start = reference.position.pick(&followed);
+    let mut sums: Vec<Vec<f64>> = near.iter().map(|near| vec![0.0; near.len()]).collect();
+    let distance = |p: &crate::model::Column, i: usize, j: usize| -> f64 {
+        let (a, b) = (p.row::<3>(i), p.row::<3>(j));
+        (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum::<f64>().sqrt()
+    };
+    for &frame in frames {
+        let now = gather(source, &followed, frame, Columns::POSITION)?.position;
+        sums.par_iter_mut().zip(&pairs).for_each(|(sums, (i, near))| {
+            for (sum, &j) in sums.iter_mut().zip(near) {
+                let before = distance(&start, *i, j);
+                *sum += ((distance(&now, *i, j) - before) / before.max(nearest)).powi(2);
+            }
+        });
+    }
+    Ok(sums
+        .into_iter()
+        .map(|mut sums| {
+            sums.sort_unstable_by(f64::total_cmp);
+            let median = sums.get(sums.len().saturating_sub(1) / 2).copied().unwrap_or(0.0);
+            (median / frames.len() as f64).sqrt()
+        })
+        .collect())
+}
+
+/// Standard deviation of every Gaussian's base colour over the sampled frames it lives in; empty where
+/// colours are constant.
+fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
+    if !source.info().varying.contains(Columns::SH) {
+        return Ok(Vec::new());
+    }
+    // From the first living frame's colour: sums of small differences lose no digits.
+    let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
+    let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
+    for &frame in frames {
+        let now = gather(source, all, frame, Columns::SH | Columns::OPACITY)?;
+        for (i, (n, sum, squares)) in sums.iter_mut().enumerate() {
+            if opacity(now.opacity_logit.row::<1>(i)[0]) < alpha_min {
+                continue;
+            }
+            let colour = now.sh.row::<3>(i).map(|c| SH_C0 * f64::from(c));
+            let start = first[i].get_or_insert(colour);
+            *n += 1;
+            for c in 0..3 {
+                let away = colour[c] - start[c];
+                sum[c] += away;
+                squares[c] += away * away;
+            }
+        }
+    }
+    let deviation = |&(n, sum, squares): &(u32, [f64; 3], [f64; 3])| {
+        let n = f64::from(n.max(1));
+        let variance = |c: usize| (squares[c] / n - (sum[c] / n).powi(2)).max(0.0);
+        ((0..3).map(variance).sum::<f64>() / 3.0).sqrt()
+    };
+    Ok(sums.iter().map(deviation).collect())
+}

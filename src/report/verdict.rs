@@ -1,0 +1,54 @@
+//! The result in a sentence or two.
+
+use super::failure::{FailureMode, Verdict};
+use super::html::percent;
+use crate::pipeline::evaluation::Evaluation;
+
+/// Mean PSNR, dB, from which a loss is called by the words beside it. From 50 dB on, the root mean square
+/// error is less than one step of 255; at 40 dB it is under three; below 30, eight or more.
+const WORDS: [(f64, &str); 5] = [
+    (50.0, "differs from the original by less than a screen can show"),
+    (40.0, "looks like the original"),
+    (33.0, "differs from the original visibly, side by side"),
+    (27.0, "differs from the original at a glance"),
+    (f64::NEG_INFINITY, "no longer looks like the original"),
+];
+
+/// Says how much smaller the model is, how much of it is seen, and which failure modes are.
+pub(super) fn verdict(found: &Evaluation, modes: &[FailureMode]) -> String {
+    let mean = found.loss.overall;
+    let of = |part: u64, whole: u64| percent(part as f64, whole as f64);
+    let words =
+        WORDS.iter().find(|(from, _)| mean.psnr >= *from).map_or("cannot be compared with the original", |w| w.1);
+    let mut text = format!(
+        "With {} of the Gaussians and {} of the bytes, the model {words} ({:.1} dB on average over {} picture{}",
+        of(found.count.compressed as u64, found.count.original as u64),
+        of(found.bytes.compressed, found.bytes.original),
+        mean.psnr,
+        mean.pairs,
+        if mean.pairs == 1 { "" } else { "s" },
+    );
+    let worst = found.pictures.iter().min_by(|a, b| a.loss.psnr.total_cmp(&b.loss.psnr));
+    if let Some(worst) = worst.filter(|_| mean.pairs > 1) {
+        text += &format!(", {:.1} dB in the worst, frame {} of view {}", worst.loss.psnr, worst.frame, worst.view);
+    }
+    text += ").";
+    if let Some(truth) = &found.ground_truth {
+        let lost = truth.original.overall.psnr - truth.compressed.overall.psnr;
+        text += &match lost {
+            0.005.. => format!(" Against the photographs it is {lost:.2} dB worse than the original."),
+            ..-0.005 => format!(" Against the photographs it is {:.2} dB better than the original.", -lost),
+            _ => " Against the photographs it is as good as the original.".to_owned(),
+        };
+    }
+    let flagged: Vec<&str> =
+        modes.iter().filter(|mode| mode.verdict == Verdict::Flagged).map(|mode| mode.name).collect();
+    text += &match flagged.split_last() {
+        None => " None of the failure modes looked for shows.".to_owned(),
+        Some((last, [])) => format!(" Look at its {last}: it suffers more than the rest."),
+        Some((last, others)) => {
+            format!(" Look at its {} and {last}: they suffer more than the rest.", others.join(", "))
+        }
+    };
+    text
+}

@@ -1,0 +1,166 @@
+//! A headless Chromium, driven through its debugging pipe: real mouse, real keys, and every request,
+//! console message and exception seen. See the Chrome DevTools Protocol.
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+const NAMES: [&str; 5] =
+    ["chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
+/// A browser that says nothing for so long is stuck.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// The browser to use: `SPLATSIEVE_BROWSER`, else one that is installed; else none, with a note.
+pub(crate) fn installed() -> Option<PathBuf> {
+    if let Some(given) = std::env::var_os("SPLATSIEVE_BROWSER") {
+        return Some(PathBuf::from(given));
+    }
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let found = NAMES.iter().flat_map(|name| std::env::split_paths(&path).map(move |folder| folder.join(name)));
+    let found = found.into_iter().find(|file| file.is_file());
+    if found.is_none() {
+        eprintln!("skipped: no Chromium is installed (apt-get install chromium-headless-shell)");
+    }
+    found
+}
+
+/// A browser with one page.
+pub(crate) struct Browser {
+    process: Child,
+    to: File,
+    from: Receiver<Value>,
+    session: String,
+    last: u64,
+    /// What the browser told without being asked, in order.
+    pub(crate) events: Vec<Value>,
+    _home: TempDir,
+}
+
+impl Browser {
+    /// Starts `program` with an empty page of 1100 × 900 pixels.
+    pub(crate) fn start(program: &Path) -> Browser {
+        let home = tempfile::tempdir().unwrap();
+        let pipes = ["to", "from"].map(|name| home.path().join(name));
+        assert!(Command::new("mkfifo").args(&pipes).status().unwrap().success());
+        let mut shell = Command::new("sh");
+        // The browser expects its pipe as descriptors 3 and 4.
+        shell.arg("-c").arg("exec \"$@\" 3<\"$TO\" 4>\"$FROM\"").arg("sh").arg(program);
+        shell.args(["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run"]);
+        shell.arg("--window-size=1100,900").arg(format!("--user-data-dir={}", home.path().display()));
+        shell.env("TO", &pipes[0]).env("FROM", &pipes[1]).env("HOME", home.path());
+        let process = shell.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let to = File::options().write(true).open(&pipes[0]).unwrap();
+        let mut replies = BufReader::new(File::open(&pipes[1]).unwrap());
+        let (send, from) = channel();
+        std::thread::spawn(move || {
+            let mut message = Vec::new();
+            while replies.read_until(0, &mut message).is_ok_and(|read| read > 0) {
+                message.pop();
+                let _ = send.send(serde_json::from_slice(&message).unwrap_or_default());
+                message.clear();
+            }
+        });
+        let mut browser =
+            Browser { process, to, from, session: String::new(), last: 0, events: Vec::new(), _home: home };
+        let target = browser.ask("Target.createTarget", json!({ "url": "about:blank" }));
+        let attach = json!({ "targetId": target["targetId"], "flatten": true });
+        let session = browser.ask("Target.attachToTarget", attach);
+        browser.session = session["sessionId"].as_str().unwrap().to_owned();
+        for domain in ["Page", "Runtime", "Log", "Network"] {
+            browser.ask(&format!("{domain}.enable"), json!({}));
+        }
+        browser
+    }
+
+    /// Sends a command and waits for its result.
+    pub(crate) fn ask(&mut self, method: &str, parameters: Value) -> Value {
+        self.last += 1;
+        let mut message = json!({ "id": self.last, "method": method, "params": parameters });
+        if !self.session.is_empty() {
+            message["sessionId"] = json!(self.session);
+        }
+        let mut bytes = message.to_string().into_bytes();
+        bytes.push(0);
+        self.to.write_all(&bytes).unwrap();
+        loop {
+            let reply = self.from.recv_timeout(PATIENCE).unwrap_or_else(|e| panic!("{method}: the browser {e}"));
+            if reply["id"] == self.last {
+                assert!(reply.get("error").is_none(), "{method}: {}", reply["error"]);
+                return reply["result"].clone();
+            }
+            self.events.push(reply);
+        }
+    }
+
+    /// Opens a file and waits until all of it is loaded.
+    pub(crate) fn open(&mut self, page: &Path) {
+        let page = fs::canonicalize(page).unwrap();
+        self.ask("Page.navigate", json!({ "url": format!("file://{}", page.display()) }));
+        while !self.events.iter().any(|event| event["method"] == "Page.loadEventFired") {
+            let event = self.from.recv_timeout(PATIENCE).expect("the page never finished loading");
+            self.events.push(event);
+        }
+    }
+
+    /// The value of an expression in the page; of a promise what it comes to.
+    pub(crate) fn value(&mut self, expression: &str) -> Value {
+        let parameters = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
+        let found = self.ask("Runtime.evaluate", parameters);
+        assert!(found.get("exceptionDetails").is_none(), "{expression}: {}", found["exceptionDetails"]);
+        found["result"]["value"].clone()
+    }
+
+    /// Presses the mouse at the first point, moves it over the others and lets go at the last.
+    pub(crate) fn drag(&mut self, points: &[[f64; 2]]) {
+        let mut send = |kind: &str, [x, y]: [f64; 2], buttons: u32| {
+            let event = json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": 1 });
+            self.ask("Input.dispatchMouseEvent", event);
+        };
+        send("mousePressed", points[0], 1);
+        for &point in &points[1..] {
+            send("mouseMoved", point, 1);
+        }
+        send("mouseReleased", points[points.len() - 1], 0);
+    }
+
+    /// Presses and lets go of a key that writes nothing.
+    pub(crate) fn key(&mut self, name: &str, code: u32) {
+        for kind in ["rawKeyDown", "keyUp"] {
+            let event = json!({ "type": kind, "key": name, "code": name, "windowsVirtualKeyCode": code });
+            self.ask("Input.dispatchKeyEvent", event);
+        }
+    }
+
+    /// Everything that a page without faults and without needs does not do: exceptions, messages, and
+    /// requests for anything but itself and what it holds.
+    pub(crate) fn complaints(&self) -> Vec<String> {
+        let complaint = |event: &Value| {
+            let about = &event["params"];
+            match event["method"].as_str()? {
+                "Runtime.exceptionThrown" => Some(format!("exception: {}", about["exceptionDetails"])),
+                "Runtime.consoleAPICalled" => Some(format!("console: {}", about["args"])),
+                "Log.entryAdded" => Some(format!("log: {}", about["entry"]["text"])),
+                "Network.requestWillBeSent" => {
+                    let url = about["request"]["url"].as_str()?;
+                    let itself = about["type"] == "Document" && url.starts_with("file://");
+                    (!itself && !url.starts_with("data:")).then(|| format!("request: {url}"))
+                }
+                _ => None,
+            }
+        };
+        self.events.iter().filter_map(complaint).collect()
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}

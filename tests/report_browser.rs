@@ -1,0 +1,109 @@
+//! The report as a person meets it: opened in a real browser, its slider dragged, its pictures chosen.
+#![cfg(unix)]
+
+mod browser;
+mod scene;
+
+use std::fs;
+
+use browser::Browser;
+use scene::Workplace;
+use serde_json::json;
+
+/// The line from the left picture to the right one, percent of the stage, as the page is drawn.
+const CUT: &str = "(() => {
+    const clip = getComputedStyle(document.querySelector('.picture.active img.right')).clipPath;
+    return parseFloat(clip.match(/inset\\(.* ([\\d.]+)%\\)/)[1]);
+})()";
+
+#[test]
+fn the_page_asks_for_nothing_and_its_slider_and_choices_work() {
+    let Some(program) = browser::installed() else { return };
+    let at = Workplace::new();
+    at.done("demo -o d --gaussians 1500 --frames 5");
+    // A name that would run if it were not escaped.
+    let name = "<img src=x onerror=window.ran=1>\"'&.gseq";
+    fs::copy(at.path("d/compressed.gseq"), at.path(name)).unwrap();
+    let photographs = "render d/scene.gseq --cameras d/cameras.json --all -o photographs";
+    at.done(photographs);
+    let report = |compressed: &str, folder: &str| {
+        let words = ["report", "d/scene.gseq", compressed, "--cameras", "d/cameras.json"];
+        let run = at.run_words(words.into_iter().chain(["--ground-truth", "photographs", "-o", folder]));
+        assert_eq!(run.code, 0, "{}", run.stderr);
+    };
+    report("d/compressed.gseq", "report");
+    report(name, "odd");
+
+    for folder in ["report", "odd"] {
+        let mut page = Browser::start(&program);
+        page.open(&at.path(folder).join("report.html"));
+        assert_eq!(page.complaints(), Vec::<String>::new(), "{folder}");
+        let images = page.value("Promise.all([...document.images].map(i => i.decode().then(() => i.naturalWidth)))");
+        let widths = images.as_array().unwrap();
+        assert!(widths.len() > 8 && widths.iter().all(|width| width.as_u64() > Some(0)), "{widths:?}");
+        assert_eq!(page.value("typeof window.ran"), json!("undefined"), "{folder}: a path ran");
+        assert!(page.value("document.querySelector('.paths').textContent").as_str().unwrap().contains("→"));
+    }
+
+    let mut page = Browser::start(&program);
+    page.open(&at.path("report/report.html"));
+    assert_eq!(page.value(CUT).as_f64(), Some(50.0));
+    page.value("document.getElementById('stage').scrollIntoView({ block: 'center' })");
+    let stage = page
+        .value("(b => [b.left, b.top, b.width, b.height])(document.getElementById('stage').getBoundingClientRect())");
+    let [left, top, width, height]: [f64; 4] = serde_json::from_value(stage).unwrap();
+    let point = |part: f64| [left + part * width, top + 0.5 * height];
+    page.drag(&[point(0.5), point(0.4), point(0.2)]);
+    let dragged = page.value(CUT).as_f64().unwrap();
+    assert!((dragged - 20.0).abs() < 0.6, "dragged to 20%, the cut is at {dragged}%");
+    assert_eq!(page.value("document.getElementById('handle').offsetLeft > 0"), json!(true));
+    // Past the border it stops at it; let go, it stays.
+    page.drag(&[point(0.2), point(1.0), [left + 1.2 * width, top + 5.0]]);
+    assert_eq!(page.value(CUT).as_f64(), Some(100.0));
+
+    page.value("document.getElementById('cut').focus()");
+    for _ in 0..4 {
+        page.key("ArrowLeft", 37);
+    }
+    assert_eq!(page.value(CUT).as_f64(), Some(98.0), "four steps of half a percent by key");
+    page.key("Home", 36);
+    assert_eq!(page.value(CUT).as_f64(), Some(0.0));
+
+    let active = "[...document.querySelectorAll('.picture')].findIndex(p => p.classList.contains('active'))";
+    assert_eq!(page.value(active), json!(0));
+    let caption = page.value("document.getElementById('caption').textContent");
+    let buttons = page.value("document.querySelectorAll('[data-show]').length").as_u64().unwrap();
+    assert!(buttons >= 2, "a choice of {buttons} pictures is none");
+    let button = page.value(
+        "(b => { b.scrollIntoView({ block: 'center' }); const r = b.getBoundingClientRect(); return [r.x + 9, r.y + 9]; })\
+         (document.querySelectorAll('[data-show]')[1])",
+    );
+    page.drag(&[serde_json::from_value(button).unwrap()]);
+    assert_eq!(page.value(active), json!(1));
+    assert_ne!(page.value("document.getElementById('caption').textContent"), caption);
+
+    let shown = "[...document.querySelectorAll('.picture.active img')]\
+                 .filter(i => getComputedStyle(i).visibility === 'visible').map(i => i.dataset.kind)";
+    assert_eq!(page.value(shown), json!(["original", "compressed"]));
+    let select = "(s => { s.value = 'difference'; s.dispatchEvent(new Event('change')); })\
+                  (document.querySelector('[data-side=right]'))";
+    page.value(select);
+    assert_eq!(page.value(shown), json!(["original", "difference"]));
+    page.value(&select.replace("right", "left").replace("difference", "photograph"));
+    assert_eq!(page.value(shown), json!(["difference", "photograph"]));
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[test]
+fn a_page_that_fails_or_asks_for_something_would_be_seen() {
+    let Some(program) = browser::installed() else { return };
+    let at = Workplace::new();
+    let bad = "<!doctype html><img src=\"http://127.0.0.1:9/x.png\"><script>console.log(1); nothing.there;</script>";
+    fs::write(at.path("bad.html"), bad).unwrap();
+    let mut page = Browser::start(&program);
+    page.open(&at.path("bad.html"));
+    let complaints = page.complaints().join("\n");
+    for part in ["request: http://127.0.0.1:9/x.png", "console: ", "exception: "] {
+        assert!(complaints.contains(part), "{part} is not in {complaints}");
+    }
+}
