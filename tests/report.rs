@@ -93,7 +93,7 @@ fn the_page_is_well_formed_holds_all_it_needs_and_is_light() {
         assert!(!page.contains(outside), "the page holds {outside:?}");
     }
     assert!(page.contains("default-src 'none'"));
-    for part in ["Error by run time", "Error by memory", "S_static", "Time per stage", "Left out", "Thin structures"] {
+    for part in ["Error by run time", "Error by memory", "S_static", "Time per stage", "left out", "Thin structures"] {
         assert!(page.contains(part), "{part} is missing");
     }
     assert!(!page.contains("<i>odd") && !page.contains("<b>points"), "text of a file became elements");

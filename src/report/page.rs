@@ -34,14 +34,17 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
         ("Known failure modes", failure_modes(&report.failure_modes, close)),
         ("Run", stages(run)),
         ("Scores of what was kept and dropped", score_histograms(report)),
-        ("Left out, and notes", left_out(report, run)),
+        ("Notes and what was left out", left_out(report, run)),
         ("Trade-off", sweep(report)),
         ("Data", data(report, run)),
     ];
     for (heading, body) in sections {
         match heading {
             "" => out += &format!("<header>\n{body}</header>\n"),
-            _ => out += &format!("<section>\n<h2>{heading}</h2>\n{body}</section>\n"),
+            _ => {
+                let id = heading.split(' ').next().unwrap_or(heading).to_lowercase();
+                out += &format!("<section id=\"{id}\">\n<h2>{heading}</h2>\n{body}</section>\n");
+            }
         }
     }
     out += &format!("</main>\n<script>\n{SCRIPT}</script>\n</body>\n</html>\n");
