@@ -34,14 +34,17 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
         ("Known failure modes", failure_modes(&report.failure_modes, close)),
         ("Run", stages(run)),
         ("Scores of what was kept and dropped", score_histograms(report)),
-        ("Left out, and notes", left_out(report, run)),
+        ("Notes and what was left out", left_out(report, run)),
         ("Trade-off", sweep(report)),
         ("Data", data(report, run)),
     ];
     for (heading, body) in sections {
         match heading {
             "" => out += &format!("<header>\n{body}</header>\n"),
-            _ => out += &format!("<section>\n<h2>{heading}</h2>\n{body}</section>\n"),
+            _ => {
+                let id = heading.split(' ').next().unwrap_or(heading).to_lowercase();
+                out += &format!("<section id=\"{id}\">\n<h2>{heading}</h2>\n{body}</section>\n");
+            }
         }
     }
     out += &format!("</main>\n<script>\n{SCRIPT}</script>\n</body>\n</html>\n");
@@ -86,9 +89,8 @@ fn header(report: &Report) -> String {
     }
     if let Some(truth) = &found.ground_truth {
         let (after, before) = (truth.compressed.overall, truth.original.overall);
-        out += &card("PSNR to the photographs", db(after.psnr), format!("the original {}", db(before.psnr)));
-        out +=
-            &card("SSIM to the photographs", format!("{:.4}", after.ssim), format!("the original {:.4}", before.ssim));
+        out += &card("PSNR to photographs", db(after.psnr), format!("the original {}", db(before.psnr)));
+        out += &card("SSIM to photographs", format!("{:.4}", after.ssim), format!("the original {:.4}", before.ssim));
     }
     out += &format!(
         "</div>\n<p class=\"note\">{} pictures of {} frames, {} cameras: {}. PSNR has peak 1 and is averaged over \
@@ -215,7 +217,7 @@ fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
         "<p class=\"note\">Where a kind of Gaussian is seen is known for every pixel: the share of its colour that comes \
          from them. A mode is flagged if the PSNR there is below {VISIBLE_DB} dB and at least {APART_DB} dB below that \
          elsewhere, and {} or more of their coverage was dropped or merged.</p>\n<div class=\"modes\">\n",
-        percent(LOST, 1.0)
+        format_args!("{}%", figure(100.0 * LOST))
     );
     for (number, mode) in modes.iter().enumerate() {
         let (class, word) = match mode.verdict {

@@ -5,12 +5,12 @@ use super::html::percent;
 use crate::pipeline::evaluation::Evaluation;
 
 /// Mean PSNR, dB, from which a loss is called by the words beside it. From 50 dB on, the root mean square
-/// error is less than one step of 255; at 40 dB it is under three; below 30, eight or more.
+/// error is less than one step of 255; at 40 dB under three, at 30 eight, at 24 sixteen.
 const WORDS: [(f64, &str); 5] = [
     (50.0, "differs from the original by less than a screen can show"),
     (40.0, "looks like the original"),
-    (33.0, "differs from the original visibly, side by side"),
-    (27.0, "differs from the original at a glance"),
+    (30.0, "differs from the original visibly, side by side"),
+    (24.0, "differs from the original at a glance"),
     (f64::NEG_INFINITY, "no longer looks like the original"),
 ];
 

@@ -1,0 +1,98 @@
+#!/usr/bin/env python3
+"""LPIPS between two folders of pictures of the same names, as JSON: per picture, and the mean.
+
+    splatsieve render model --cameras data --all -o before/
+    splatsieve render small --cameras data --all -o after/
+    python3 scripts/lpips.py before after [--net alex|vgg|squeeze]
+
+Needs the packages lpips, torchvision and pillow (pip install lpips torchvision pillow) and, once, the network's
+weights, which torchvision downloads; without the internet put them where the message says. Pictures are taken as
+they are, 8 bits per channel, scaled to [-1, 1]. Lower is closer; 0 is equal. Zhang et al., "The Unreasonable
+Effectiveness of Deep Features as a Perceptual Metric", 2018.
+"""
+
+# This folder is on the path of its own scripts, and this script bears the name of the package it needs.
+import sys
+
+if sys.path and not getattr(sys.flags, "safe_path", False):
+    sys.path.pop(0)
+
+import argparse
+import json
+import os
+import warnings
+from pathlib import Path
+
+
+def stop(message):
+    sys.exit(f"lpips.py: {message}")
+
+
+def metric(net):
+    """The LPIPS network `net`, or an end that says what it lacks."""
+    try:
+        import torch
+        import torchvision  # noqa: F401, the package lpips takes its networks from it
+        import lpips
+    except ImportError as error:
+        stop(f"cannot import {error.name}\n  pip install lpips torchvision pillow")
+    # The package speaks to torchvision in an older way, which that remarks on.
+    warnings.filterwarnings("ignore", module="torchvision")
+    try:
+        return lpips.LPIPS(net=net, verbose=False).eval()
+    except OSError as error:
+        folder = os.path.join(torch.hub.get_dir(), "checkpoints")
+        stop(
+            f"no weights of the network {net}: {error}\n"
+            f"  torchvision looks for its file in {folder} and downloads it otherwise; fetch it elsewhere and put it there"
+        )
+
+
+def pairs(before, after):
+    """Names of the pictures in both folders, which must be the same."""
+    names = []
+    for folder in (before, after):
+        if not folder.is_dir():
+            stop(f"{folder}: expected a folder of PNG pictures")
+        names.append({path.name for path in folder.glob("*.png")})
+    if not names[0]:
+        stop(f"{before}: expected PNG pictures, found none")
+    odd = sorted(names[0] ^ names[1])
+    if odd:
+        stop(f"{before} and {after}: expected pictures of the same names, found {odd[0]} in one only ({len(odd)} such)")
+    return sorted(names[0])
+
+
+def read(path):
+    """The picture as a tensor [1, 3, height, width] in [-1, 1]."""
+    import numpy
+    import torch
+    from PIL import Image
+
+    pixels = numpy.asarray(Image.open(path).convert("RGB"), dtype=numpy.float32)
+    return torch.from_numpy(pixels / 127.5 - 1.0).permute(2, 0, 1)[None]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", type=Path)
+    parser.add_argument("after", type=Path)
+    parser.add_argument("--net", choices=["alex", "vgg", "squeeze"], default="alex")
+    arguments = parser.parse_args()
+    names = pairs(arguments.before, arguments.after)
+    network = metric(arguments.net)
+    import torch
+
+    found = {}
+    with torch.no_grad():
+        for name in names:
+            a, b = read(arguments.before / name), read(arguments.after / name)
+            if a.shape != b.shape:
+                stop(f"{name}: expected pictures of one size, found {tuple(a.shape[2:])} and {tuple(b.shape[2:])}")
+            found[name] = network(a, b).item()
+    mean = sum(found.values()) / len(found)
+    print(json.dumps({"metric": "lpips", "net": arguments.net, "mean": mean, "pictures": found}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,25 @@
+#!/bin/sh
+# Makes docs/report.png, the README's picture: the slider of a report on a strongly compressed model.
+#
+#     cargo build --release
+#     scripts/report_picture.sh target/release/splatsieve DATA/room2_dynerf docs/report.png
+#
+# DATA/<name> is a model folder with its cameras inside. Needs Chromium (apt-get install chromium-headless-shell),
+# or another one named in SPLATSIEVE_BROWSER.
+set -eu
+if [ $# -ne 3 ]; then
+    sed -n '2,8s/^# \{0,1\}//p' "$0" >&2
+    exit 2
+fi
+splatsieve=$1 model=$2 picture=$3
+browser=${SPLATSIEVE_BROWSER:-chromium-headless-shell}
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+
+"$splatsieve" compress "$model" --cameras "$model" --preset strong -o "$folder/small"
+"$splatsieve" report "$model" "$folder/small" --cameras "$model" --max-frames 3 -o "$folder/report"
+# At the section's anchor the window shows the slider alone.
+"$browser" --headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=760,690 \
+    --screenshot="$folder/report.png" "file://$folder/report/report.html#compare"
+mkdir -p "$(dirname "$picture")"
+mv "$folder/report.png" "$picture"
