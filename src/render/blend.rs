@@ -135,14 +135,18 @@ impl Ink for Weights<'_> {
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, [sum, max]: [V; 2], pair: usize) {
-        let (mut sums, mut maxima) = ([0.0; LANES], [0.0; LANES]);
-        sum.store(&mut sums);
+        let mut maxima = [0.0; LANES];
         max.store(&mut maxima);
-        self.pairs[pair] = Weight {
-            sum: ((sums[0] + sums[4]) + (sums[2] + sums[6])) + ((sums[1] + sums[5]) + (sums[3] + sums[7])),
-            max: maxima.into_iter().fold(0.0, f32::max),
-        };
+        self.pairs[pair] = Weight { sum: lane_sum(sum), max: maxima.into_iter().fold(0.0, f32::max) };
     }
+}
+
+/// Sum of all lanes, in a fixed order.
+#[inline(always)]
+pub(super) fn lane_sum<V: Lanes>(lanes: V) -> f32 {
+    let mut x = [0.0; LANES];
+    lanes.store(&mut x);
+    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 
 /// The instructions to blend with; all give the same bits.

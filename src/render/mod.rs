@@ -2,7 +2,7 @@
 //!
 //! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend`
 //! (pixels). Data in: [`Gaussians`] in stored encoding and a [`Camera`]. Data out: an [`Image`], or the
-//! [`Contribution`] of every Gaussian. Memory: 80 bytes per visible Gaussian and 4 (for contributions 12)
+//! [`Contribution`] of every Gaussian, or a [`Sight`], the picture as a linear map from colours. Memory: 80 bytes per visible Gaussian and 4 (for contributions 12)
 //! per pair of a Gaussian and a 16×16 tile it can change.
 //!
 //! Every convention is that of the original CUDA rasteriser (Kerbl et al., "3D Gaussian Splatting", 2023),
@@ -16,12 +16,14 @@ mod colour;
 mod contribution;
 mod lanes;
 mod project;
+mod sight;
 
 use std::num::NonZeroU32;
 
 use rayon::prelude::*;
 
 pub use contribution::Contribution;
+pub use sight::{Pull, Sight};
 
 use crate::model::{Camera, Gaussians};
 use bin::Bins;
