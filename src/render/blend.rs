@@ -81,8 +81,9 @@ pub(super) trait Ink {
     type Drop<V: Lanes>: Copy;
     /// The next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Drop<V>;
-    /// Its weights in one group of pixels.
-    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, weight: V) -> Self::Drop<V>;
+    /// Its weights in one group of pixels, and the transmittance left behind it, never 0; where the weight
+    /// is 0, that may be negative.
+    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, weight: V, left: V) -> Self::Drop<V>;
     /// The splat, `pair` of the tile, is done.
     fn end<V: Lanes>(&mut self, drop: Self::Drop<V>, pair: usize);
 }
@@ -99,7 +100,7 @@ impl Ink for Colour {
         [V::splat(splat.colour[0]), V::splat(splat.colour[1]), V::splat(splat.colour[2])]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, weight: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
         for (plane, colour) in self.planes.iter_mut().zip(colour) {
             V::load(&plane[group]).add(colour.mul(weight)).store(&mut plane[group]);
         }
@@ -130,7 +131,7 @@ impl Ink for Weights<'_> {
         [V::splat(0.0); 2]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, weight: V) -> [V; 2] {
+    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, weight: V, _: V) -> [V; 2] {
         [sum.add(weight), max.max(weight)]
     }
     #[inline(always)]
@@ -244,7 +245,7 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
             if left.signs() == (1 << LANES) - 1 {
                 live &= !(1 << group);
             }
-            drop = ink.add::<V>(drop, group, weight);
+            drop = ink.add::<V>(drop, group, weight, left);
         }
         ink.end::<V>(drop, pair);
         if live == 0 {

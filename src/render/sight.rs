@@ -140,7 +140,7 @@ impl Ink for Change<'_> {
         std::array::from_fn(|c| V::splat(if splat.colour[c] > 0.0 { change[c] } else { 0.0 }))
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, change: [V; 3], group: usize, weight: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, change: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
         for (plane, change) in self.planes.iter_mut().zip(change) {
             V::load(&plane[group]).add(change.mul(weight)).store(&mut plane[group]);
         }
@@ -163,7 +163,7 @@ impl Ink for Weighed<'_> {
         [V::splat(0.0); 3]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, sums: [V; 3], group: usize, weight: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, sums: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
         std::array::from_fn(|c| sums[c].add(weight.mul(V::load(&self.planes[c][group]))))
     }
     #[inline(always)]
@@ -184,7 +184,7 @@ impl Ink for Power<'_> {
         V::splat(0.0)
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, sum: V, _: usize, weight: V) -> V {
+    fn add<V: Lanes>(&mut self, sum: V, _: usize, weight: V, _: V) -> V {
         sum.add(weight.mul(weight))
     }
     #[inline(always)]
