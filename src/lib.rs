@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
 //! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
-//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`] | pure mathematics: slices in, values out |
+//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`refit`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
 //! | L4 | [`pipeline`], [`report`] | the order of the passes; the page about their result |
 //! | L5 | [`cli`] | arguments and exit codes |
@@ -23,6 +23,7 @@ pub mod model;
 pub mod pass;
 pub mod pipeline;
 pub mod recipe;
+pub mod refit;
 pub mod render;
 pub mod report;
 pub mod score;

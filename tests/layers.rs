@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 /// Modules of each layer, from the vocabulary up.
 const LAYERS: [&[&str]; 5] = [
     &["error", "model", "pass", "recipe"],
-    &["deform", "stats", "score", "select", "merge", "render", "metrics"],
+    &["deform", "stats", "score", "select", "merge", "render", "refit", "metrics"],
     &["ingest", "stream", "emit", "demo"],
     &["pipeline", "report"],
     &["cli"],

@@ -8,21 +8,23 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use crate::error::{Error, Result};
-use crate::ingest::ply::{Encoding, Plane, Ply, Property, Scalar};
+use crate::ingest::ply::{Encoding, Plane, Ply, Property, Scalar, read_plane};
 use crate::model::{Columns, Gaussians, sh_coefficients};
 
 /// One row of a smaller PLY.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutRow {
     /// The Gaussian of the template whose row is copied: itself, or the leader of its cluster.
     pub source: u32,
     /// The proxy whose columns replace those of the row, if any.
     pub proxy: Option<u32>,
+    /// What is added to its `f_dc_0..2`; zeros leave them their bytes.
+    pub recolor: [f32; 3],
 }
 
 /// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):
-/// only the count changes. A row without a proxy is the template's, byte for byte. A row with one is the
-/// template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of its
+/// only the count changes. A row without a proxy is the template's, byte for byte but for a change of its
+/// base colour. A row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of its
 /// property (integers: nearest, saturated); normals and further properties stay the leader's. A
 /// template without `scale_2` has no place for a proxy's third scale: order axes largest first.
 ///
@@ -41,15 +43,13 @@ pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, path: &P
         let mut changed = Vec::new();
         for row in rows {
             let source = template.row(row.source as usize);
-            match row.proxy {
-                None => out.write_all(source)?,
-                Some(proxy) => {
-                    changed.clear();
-                    changed.extend_from_slice(source);
-                    replace(&mut changed, template, proxies, proxy as usize);
-                    out.write_all(&changed)?;
-                }
+            changed.clear();
+            changed.extend_from_slice(source);
+            if let Some(proxy) = row.proxy {
+                replace(&mut changed, template, proxies, proxy as usize);
             }
+            recolor(&mut changed, template, row.recolor);
+            out.write_all(&changed)?;
         }
         out.write_all(template.tail())
     })
@@ -137,6 +137,18 @@ fn replace(row: &mut [u8], template: &Ply, proxies: &Gaussians, proxy: usize) {
             if let Plane::Property(property) = plane {
                 put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);
             }
+        }
+    }
+}
+
+/// Adds to the base colour in the bytes of a row.
+fn recolor(row: &mut [u8], template: &Ply, by: [f32; 3]) {
+    let big_endian = template.header().encoding == Encoding::BigEndian;
+    for (plane, by) in template.layout().planes(Columns::SH).iter().zip(by) {
+        if let (Plane::Property(property), true) = (plane, by != 0.0) {
+            let mut value = [0.0];
+            read_plane(row, &[0], property, big_endian, &mut value);
+            put(row, property, big_endian, value[0] + by);
         }
     }
 }

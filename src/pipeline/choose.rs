@@ -1,13 +1,14 @@
 //! Letting pictures choose: the alternatives at one count, rendered beside the original.
 //!
-//! No rule wins everywhere: √(C·W) ranks better than C while much is kept, worse when little is, and
-//! merging pays on some scenes only (METHOD section 6: "let scoring views choose among rules").
+//! No rule wins everywhere, and merging pays on some scenes only (METHOD section 6: "let scoring views choose
+//! among rules").
 //! Memory: the states of the original and of the alternatives at one frame.
 
-use super::input::{Input, Scene};
-use super::merging::{Cluster, Sieved};
-use super::proxies::{canonical_cloud, canonical_proxies};
-use super::scored::Scored;
+use super::input::Scene;
+use super::merging::Sieved;
+use super::pictures::{background, spread};
+use super::result::result_frames;
+use super::scored::{Scored, name};
 use super::summary::{LeftOut, Stages};
 use crate::error::{Error, Result};
 use crate::metrics::psnr;
@@ -16,7 +17,7 @@ use crate::pass::FrameSource;
 use crate::recipe::{Recipe, StaticTerm};
 use crate::render::render;
 use crate::select::Ranking;
-use crate::stream::{MergedSequence, gather};
+use crate::stream::gather;
 
 /// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
 /// alternatives usually do from one another.
@@ -34,7 +35,8 @@ pub struct Chosen {
 
 /// One way to keep the same number of Gaussians.
 struct Alternative {
-    term: StaticTerm,
+    /// What its Gaussians were ranked by.
+    rule: &'static str,
     sieved: Sieved,
 }
 
@@ -53,7 +55,7 @@ pub fn choose(
     stages: &mut Stages,
 ) -> Result<Chosen> {
     let count = sieved.kept.len();
-    let own = recipe.score.static_term;
+    let own = scored.ranked_by;
     let mut alternatives = Vec::new();
     if !scored.rows.w.is_empty() && count > 0 {
         alternatives = alternatives_to(scene, scored, recipe, count)?;
@@ -62,29 +64,27 @@ pub fn choose(
         // It is the prefix of its ranking already.
         alternatives.retain(|other| other.sieved.kept != sieved.kept);
         if !alternatives.is_empty() {
-            alternatives.insert(0, Alternative { term: own, sieved: sieved.clone() });
+            alternatives.insert(0, Alternative { rule: own, sieved: sieved.clone() });
         }
     } else if !alternatives.is_empty() {
-        alternatives.push(Alternative { term: own, sieved: sieved.clone() });
+        alternatives.push(Alternative { rule: own, sieved: sieved.clone() });
     }
     if alternatives.is_empty() {
         return Ok(Chosen { sieved, left_out: Vec::new(), notes: Vec::new() });
     }
-    let pictures = sampled_pictures(scene);
+    let pictures = spread(&scene.schedule, PICTURES);
     let reads = pictures.len() as f64 / scene.schedule.frames.len().max(1) as f64;
     let found = stages.run("choose", count, reads, || {
         Ok::<_, Error>((mean_psnr(scene, scored, recipe, &alternatives, &pictures)?, count))
     })?;
     // Strictly greater: of equals the first.
     let best = (0..found.len()).fold(0, |best, i| if found[i] > found[best] { i } else { best });
-    let Alternative { term, sieved: kept } = alternatives.swap_remove(best);
+    let Alternative { rule, sieved: kept } = alternatives.swap_remove(best);
     let mut chosen = Chosen { sieved: kept, left_out: Vec::new(), notes: Vec::new() };
-    if term != own {
+    if rule != own {
         let (better, worse) = (found[best], found[0]);
         chosen.notes.push(format!(
-            "ranked by {} for {}: at {count} Gaussians scoring pictures keep {better:.2} dB, not {worse:.2}",
-            name(term),
-            name(own)
+            "ranked by {rule} for {own}: at {count} Gaussians scoring pictures keep {better:.2} dB, not {worse:.2}"
         ));
     }
     let merged = !sieved.clusters.is_empty();
@@ -99,47 +99,32 @@ pub fn choose(
     }
     if merged && chosen.sieved.clusters.is_empty() && target.is_none() {
         let survivors = scored.selection.counts.kept;
-        chosen.sieved = Sieved::pruned(ranking_by(scene, scored, recipe, term)?.take(survivors));
+        let ranking = rankings(scene, scored, recipe)?.into_iter().find(|(other, _)| *other == rule);
+        chosen.sieved = Sieved::pruned(ranking.map_or(scored.ranking.take(survivors), |found| found.1.take(survivors)));
     }
     Ok(chosen)
 }
 
-/// The ranking by a static term.
-fn ranking_by(scene: &Scene, scored: &Scored, recipe: &Recipe, term: StaticTerm) -> Result<Ranking> {
-    match term == recipe.score.static_term {
-        true => Ok(scored.selection.ranking.clone()),
-        false => scored.ranking_by(term, scene.input.source().info().times.len(), recipe),
-    }
-}
-
-fn name(term: StaticTerm) -> &'static str {
-    match term {
-        StaticTerm::Mean => "C",
-        StaticTerm::Peak => "W",
-        StaticTerm::Geometric => "sqrt(C*W)",
-    }
-}
-
-/// The first `count` of the recipe's ranking, then of the others, none twice.
-fn alternatives_to(scene: &Scene, scored: &Scored, recipe: &Recipe, count: usize) -> Result<Vec<Alternative>> {
-    let own = recipe.score.static_term;
-    let mut found: Vec<Alternative> = Vec::new();
-    for term in [own, StaticTerm::Mean, StaticTerm::Geometric] {
-        let kept = ranking_by(scene, scored, recipe, term)?.take(count);
-        if found.iter().all(|other| other.sieved.kept != kept) {
-            found.push(Alternative { term, sieved: Sieved::pruned(kept) });
-        }
+/// The rankings to compare, the recipe's own first, with what they go by.
+fn rankings(scene: &Scene, scored: &Scored, recipe: &Recipe) -> Result<Vec<(&'static str, Ranking)>> {
+    let frames = scene.input.source().info().times.len();
+    let mut found = vec![(scored.ranked_by, scored.ranking.clone())];
+    for term in [StaticTerm::Mean, StaticTerm::Geometric] {
+        found.push((name(term), scored.ranking_by(term, frames, recipe)?));
     }
     Ok(found)
 }
 
-/// At most [`PICTURES`] (frame, camera) pairs, spread evenly over all that are scored.
-fn sampled_pictures(scene: &Scene) -> Vec<(usize, u32)> {
-    let frames = scene.schedule.frames.iter().enumerate();
-    let all: Vec<(usize, u32)> =
-        frames.flat_map(|(frame, views)| views.iter().map(move |&(_, camera)| (frame, camera))).collect();
-    let count = all.len().min(PICTURES);
-    (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect()
+/// The first `count` of every ranking, none twice.
+fn alternatives_to(scene: &Scene, scored: &Scored, recipe: &Recipe, count: usize) -> Result<Vec<Alternative>> {
+    let mut found: Vec<Alternative> = Vec::new();
+    for (rule, ranking) in rankings(scene, scored, recipe)? {
+        let kept = ranking.take(count);
+        if found.iter().all(|other| other.sieved.kept != kept) {
+            found.push(Alternative { rule, sieved: Sieved::pruned(kept) });
+        }
+    }
+    Ok(found)
 }
 
 /// Mean PSNR of every alternative against the original over `pictures`, dB.
@@ -151,13 +136,13 @@ fn mean_psnr(
     pictures: &[(usize, u32)],
 ) -> Result<Vec<f64>> {
     let source = scene.input.source();
-    let background = scene.rig.background.unwrap_or_default();
+    let background = background(None, scene)?;
     let all: Vec<u32> = (0..source.info().count as u32).collect();
     let results: Vec<Option<Box<dyn FrameSource + '_>>> = alternatives
         .iter()
         .map(|other| match other.sieved.clusters.is_empty() {
             true => Ok(None),
-            false => merged_source(scene, scored, recipe, &other.sieved).map(Some),
+            false => result_frames(&scene.input, scored.reference, &recipe.merge, &other.sieved).map(Some),
         })
         .collect::<Result<_>>()?;
     let mut sums = vec![0.0; alternatives.len()];
@@ -183,33 +168,20 @@ fn mean_psnr(
     Ok(sums.into_iter().map(|sum| sum / pictures.len().max(1) as f64).collect())
 }
 
-/// The frames of a result with proxies, as it would be written.
-fn merged_source<'a>(
-    scene: &'a Scene,
-    scored: &Scored,
-    recipe: &Recipe,
-    sieved: &'a Sieved,
-) -> Result<Box<dyn FrameSource + 'a>> {
-    if let Input::Model(model) = &scene.input {
-        let found = canonical_proxies(model, scored.reference, sieved, &recipe.merge)?;
-        return Ok(Box::new(model.with_canonical(canonical_cloud(model, sieved, &found.raw))));
-    }
-    let members = sieved.clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));
-    Ok(Box::new(MergedSequence::new(scene.input.source(), &sieved.kept, members, &recipe.merge)))
-}
-
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::demo;
     use crate::emit::container::write_container;
     use crate::ingest::container::Container;
     use crate::model::Split;
     use crate::pipeline::compress::Only;
+    use crate::pipeline::input::Input;
     use crate::pipeline::merging::sieve;
     use crate::pipeline::scored::{UserOverrides, score_scene};
 
-    fn scene(folder: &std::path::Path) -> Scene {
+    /// A small dynamic scene with its cameras.
+    pub(in crate::pipeline) fn scene(folder: &std::path::Path) -> Scene {
         let made = demo::Scene::new(1500, 6);
         let path = folder.join("scene.gseq");
         write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
@@ -221,8 +193,8 @@ mod tests {
 
     /// Mean PSNR over the pictures that decide.
     fn quality(scene: &Scene, scored: &Scored, recipe: &Recipe, sieved: &Sieved) -> f64 {
-        let alone = [Alternative { term: StaticTerm::Mean, sieved: sieved.clone() }];
-        mean_psnr(scene, scored, recipe, &alone, &sampled_pictures(scene)).unwrap()[0]
+        let alone = [Alternative { rule: "C", sieved: sieved.clone() }];
+        mean_psnr(scene, scored, recipe, &alone, &spread(&scene.schedule, PICTURES)).unwrap()[0]
     }
 
     #[test]
@@ -238,7 +210,7 @@ mod tests {
             assert_eq!(chosen.sieved.kept.len(), target);
             let got = quality(&scene, &scored, &recipe, &chosen.sieved);
             let by_c = Sieved::pruned(scored.ranking_by(StaticTerm::Mean, 6, &recipe).unwrap().take(target));
-            let own = Sieved::pruned(scored.selection.ranking.take(target));
+            let own = Sieved::pruned(scored.ranking.take(target));
             for other in [sieved.clone(), by_c, own] {
                 let expected = quality(&scene, &scored, &recipe, &other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
@@ -269,7 +241,7 @@ mod tests {
     fn pictures_that_decide_are_spread_over_all_and_none_counts_twice() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        let pictures = sampled_pictures(&scene);
+        let pictures = spread(&scene.schedule, PICTURES);
         assert_eq!(pictures.len(), PICTURES);
         assert!(pictures.is_sorted() && pictures.windows(2).all(|pair| pair[0] != pair[1]));
         assert_eq!((pictures[0].0, pictures[PICTURES - 1].0), (0, 5));

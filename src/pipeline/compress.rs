@@ -7,6 +7,8 @@ use super::input::{InputOptions, Scene, open_scene};
 use super::merging::sieve;
 use super::output::{OutputKind, check_output, write_result};
 use super::overrides::parse_ids;
+use super::refit::refit;
+use super::rounds::rank_in_rounds;
 use super::scored::{Scored, UserOverrides, score_scene};
 use super::summary::{CameraSummary, LeftOut, Stages, Summary};
 use crate::error::{Error, Result};
@@ -92,13 +94,19 @@ pub fn compress_scene(
         keep_box: options.keep_box,
     };
     let input = scene.input.summary(&scene.path)?;
-    let scored = score_scene(scene, recipe, &user, &mut stages)?;
+    let mut scored = score_scene(scene, recipe, &user, &mut stages)?;
+    if options.only != Only::Merge {
+        let fewest = target.unwrap_or(scored.selection.counts.kept);
+        rank_in_rounds(scene, &mut scored, recipe, fewest, &mut stages)?;
+    }
     let sieved = sieve(scene, &scored, recipe, options.only, target, &mut stages)?;
     let chosen = match recipe.select.choose_by_views && options.only != Only::Merge {
         true => choose(scene, &scored, recipe, sieved, target, &mut stages)?,
         false => Chosen { sieved, left_out: Vec::new(), notes: Vec::new() },
     };
-    let sieved = chosen.sieved;
+    let mut sieved = chosen.sieved;
+    let refitted = refit(scene, &scored, recipe, &sieved, &mut stages)?;
+    sieved.recolor = refitted.recolor;
 
     let mut left_out = scored.left_out(scene);
     left_out.extend(stages_left_out(options, recipe));
@@ -107,9 +115,11 @@ pub fn compress_scene(
         left_out.push(LeftOut { what: "visible coverage", why });
     }
     left_out.extend(chosen.left_out);
+    left_out.extend(refitted.left_out);
     let mut notes = scene.notes.clone();
     notes.extend(selection_notes(&scored));
     notes.extend(chosen.notes);
+    notes.extend(refitted.note);
     let mut summary = Summary {
         tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
         input,

@@ -37,12 +37,14 @@ pub struct Sieved {
     pub proxies: Gaussians,
     /// What merging did; none where it was left out.
     pub summary: Option<MergeSummary>,
+    /// What is added to the base colours (`f_dc`), by place in the output; empty: nothing.
+    pub recolor: Vec<[f32; 3]>,
 }
 
 impl Sieved {
     /// The Gaussians `kept` (increasing) as they are.
     pub fn pruned(kept: Vec<u32>) -> Self {
-        Sieved { kept, clusters: Vec::new(), proxies: Gaussians::default(), summary: None }
+        Sieved { kept, clusters: Vec::new(), proxies: Gaussians::default(), summary: None, recolor: Vec::new() }
     }
 
     /// For every Gaussian of an input of `count` its place in the output, if it has one.
@@ -70,7 +72,7 @@ pub fn sieve(
     stages: &mut Stages,
 ) -> Result<Sieved> {
     let count = scene.input.source().info().count;
-    let ranking = &scored.selection.ranking;
+    let ranking = &scored.ranking;
     let all = ranking.order().len();
     let merges = only != Only::Prune && !recipe.merge.passes.is_empty();
     if let Some(target) = target {
@@ -230,7 +232,7 @@ impl<'a> Job<'a> {
             passes: merged.passes.clone(),
             deviation: None,
         };
-        Sieved { proxies: merged.states.pick(&grouped), kept, clusters, summary: Some(summary) }
+        Sieved { proxies: merged.states.pick(&grouped), kept, clusters, summary: Some(summary), recolor: Vec::new() }
     }
 }
 

@@ -10,8 +10,9 @@ use rayon::prelude::*;
 
 use super::compress::CompressOptions;
 use super::input::{Input, Scene};
-use super::merging::{Cluster, Sieved};
+use super::merging::Sieved;
 use super::proxies::{canonical_cloud, canonical_proxies};
+use super::result::{merged, result_frames};
 use super::scored::{Reference, Scored};
 use super::summary::{Stages, Summary};
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
@@ -194,7 +195,6 @@ impl Emission<'_> {
     /// Writes the result alone to `path`. Gives notes for the summary and, for a model, the furthest
     /// that a proxy strays from its members.
     fn write(&self, kind: OutputKind, path: &Path) -> Result<(Vec<String>, Option<f64>)> {
-        let Sieved { kept, clusters, .. } = self.sieved;
         if let Input::Model(model) = self.input {
             let found = canonical_proxies(model, self.reference, self.sieved, self.merge)?;
             let mut notes = found.notes;
@@ -221,11 +221,11 @@ impl Emission<'_> {
             }
             return Ok((notes, found.deviation));
         }
-        let members = clusters.iter().map(|cluster: &Cluster| (cluster.output, &cluster.members[..]));
-        let result = MergedSequence::new(self.input.source(), kept, members, self.merge);
         match self.input {
-            Input::Frames(frames) if kind != OutputKind::Gseq => self.write_like_frames(frames, &result, kind, path)?,
-            _ => write_sequence(&result, kind, path)?,
+            Input::Frames(frames) if kind != OutputKind::Gseq => {
+                self.write_like_frames(frames, &merged(self.input, self.sieved, self.merge), kind, path)?;
+            }
+            _ => write_sequence(&*result_frames(self.input, self.reference, self.merge, self.sieved)?, kind, path)?,
         }
         Ok((Vec::new(), None))
     }
@@ -260,7 +260,9 @@ impl Emission<'_> {
     }
 
     fn rows(&self) -> Vec<OutRow> {
-        let mut rows: Vec<OutRow> = self.sieved.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
+        let row = |&source: &u32| OutRow { source, proxy: None, recolor: [0.0; 3] };
+        let mut rows: Vec<OutRow> = self.sieved.kept.iter().map(row).collect();
+        rows.iter_mut().zip(&self.sieved.recolor).for_each(|(row, &recolor)| row.recolor = recolor);
         for (proxy, cluster) in self.sieved.clusters.iter().enumerate() {
             rows[cluster.output as usize].proxy = Some(proxy as u32);
         }

@@ -2,7 +2,7 @@
 
 use super::input::{Input, Scene};
 use crate::error::{Error, Result};
-use crate::model::{Columns, Gaussians, Rig, Split};
+use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
 use crate::pass::FrameSource;
 use crate::stream::gather;
 
@@ -103,6 +103,15 @@ pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
     // Fewer than there are frames: steps above 1 never take one twice.
     let kept: Vec<usize> = (0..count).map(|i| frames[(i as f64 * step).round_ties_even() as usize]).collect();
     pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
+}
+
+/// At most `count` (frame, camera) pairs, spread evenly over all of `schedule`; its cameras by index.
+pub fn spread(schedule: &Schedule, count: usize) -> Vec<(usize, u32)> {
+    let frames = schedule.frames.iter().enumerate();
+    let all: Vec<(usize, u32)> =
+        frames.flat_map(|(frame, views)| views.iter().map(move |&(_, camera)| (frame, camera))).collect();
+    let count = all.len().min(count);
+    (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect()
 }
 
 /// Hands every frame's state and its pictures to `visit`, in order, no more pictures at once than there

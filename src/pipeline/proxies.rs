@@ -9,7 +9,7 @@ use crate::ingest::ModelFolder;
 use crate::model::{Columns, Gaussians};
 use crate::pass::FrameSource;
 use crate::recipe::{Merge, Placement};
-use crate::stream::gather;
+use crate::stream::{gather, recolor};
 
 /// Frames at which proxies are compared with their members.
 const SAMPLED_FRAMES: usize = 16;
@@ -161,7 +161,7 @@ fn sampled(frames: usize) -> impl Iterator<Item = usize> {
     (0..count).map(move |k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) })
 }
 
-/// The whole canonical cloud of the result.
+/// The whole canonical cloud of the result, recoloured: the field's changes of colour add to the base.
 pub fn canonical_cloud(model: &ModelFolder, sieved: &Sieved, raw: &Gaussians) -> Gaussians {
     let mut cloud = model.canonical().pick(&sieved.kept);
     for (proxy, cluster) in sieved.clusters.iter().enumerate() {
@@ -171,6 +171,7 @@ pub fn canonical_cloud(model: &ModelFolder, sieved: &Sieved, raw: &Gaussians) ->
             }
         }
     }
+    recolor(&mut cloud, &sieved.recolor);
     cloud
 }
 

@@ -18,6 +18,10 @@ pub struct Scored {
     pub scores: Scores,
     /// Stages 1 and 2, with the user's overrides.
     pub selection: Selection,
+    /// The order in which Gaussians stay: the selection's, until there is a better one.
+    pub ranking: Ranking,
+    /// What that order goes by, for people.
+    pub ranked_by: &'static str,
     /// Ids that are to be kept as they are, unmerged; increasing.
     pub protected: Vec<u32>,
     /// Ids that are to be dropped; increasing.
@@ -104,8 +108,28 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
         let selection = select(&scores, &recipe.select, &overrides)?;
         let reference = Reference { frame: reference_frame, extent };
         let position_ulp = crate::stats::ulp(scanned.largest_coordinate);
-        Ok((Scored { rows, scores, selection, protected, dropped: drop, reference, position_ulp }, info.count))
+        let scored = Scored {
+            ranking: selection.ranking.clone(),
+            ranked_by: name(recipe.score.static_term),
+            rows,
+            scores,
+            selection,
+            protected,
+            dropped: drop,
+            reference,
+            position_ulp,
+        };
+        Ok((scored, info.count))
     })
+}
+
+/// A static term as people know it.
+pub fn name(term: StaticTerm) -> &'static str {
+    match term {
+        StaticTerm::Mean => "C",
+        StaticTerm::Peak => "W",
+        StaticTerm::Geometric => "sqrt(C*W)",
+    }
 }
 
 /// Whether C is visible contribution.

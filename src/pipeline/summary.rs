@@ -14,7 +14,7 @@ use crate::select::Counts;
 /// One stage of a run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Stage {
-    /// Its name: read, scan, visible, score, select, merge, choose, emit.
+    /// Its name: read, scan, visible, score, rounds, select, merge, choose, refit, emit.
     pub name: &'static str,
     /// Gaussians that entered it.
     pub gaussians_in: usize,

@@ -36,6 +36,8 @@ pub struct Recipe {
     pub select: Select,
     /// Stage 3.
     pub merge: Merge,
+    /// Colours of what is left.
+    pub refit: Refit,
 }
 
 /// Parameters of the pass over all frames.
@@ -138,6 +140,8 @@ pub struct Select {
     pub tau_static: f64,
     pub tau_dynamic: f64,
     pub low_priority: LowPriority,
+    pub round_fraction: f64,
+    pub contrast_floor: f64,
     pub choose_by_views: bool,
 }
 
@@ -168,6 +172,15 @@ pub struct Merge {
     pub opacity: ProxyOpacity,
     pub sh_high: ShHigh,
     pub passes: Vec<MergePass>,
+}
+
+/// Parameters of the colours of what is left.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Refit {
+    pub refit_pictures: u32,
+    pub refit_ridge: f64,
 }
 
 /// Thresholds of one merge pass.
@@ -302,6 +315,14 @@ impl Recipe {
             ("select.keep_fraction", self.select.keep_fraction, in_unit(self.select.keep_fraction), "0 to 1"),
             ("select.tau_static", self.select.tau_static, finite(self.select.tau_static), "finite, 0 or more"),
             ("select.tau_dynamic", self.select.tau_dynamic, nonnegative(self.select.tau_dynamic), "0 or more"),
+            (
+                "select.round_fraction",
+                self.select.round_fraction,
+                (0.1..=1.0).contains(&self.select.round_fraction),
+                "0.1 to 1",
+            ),
+            ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
+            ("refit.refit_ridge", self.refit.refit_ridge, finite(self.refit.refit_ridge), "finite, 0 or more"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
             ("merge.max_color_difference", max_color_difference, nonnegative(max_color_difference), "0 or more"),
             ("merge.motion_noise", motion_noise, finite(motion_noise), "finite, 0 or more"),

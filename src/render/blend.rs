@@ -81,8 +81,9 @@ pub(super) trait Ink {
     type Drop<V: Lanes>: Copy;
     /// The next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Drop<V>;
-    /// Its weights in one group of pixels.
-    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, weight: V) -> Self::Drop<V>;
+    /// Its weights in one group of pixels, and the transmittance left behind it, never 0; where the weight
+    /// is 0, that may be negative.
+    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, weight: V, left: V) -> Self::Drop<V>;
     /// The splat, `pair` of the tile, is done.
     fn end<V: Lanes>(&mut self, drop: Self::Drop<V>, pair: usize);
 }
@@ -99,7 +100,7 @@ impl Ink for Colour {
         [V::splat(splat.colour[0]), V::splat(splat.colour[1]), V::splat(splat.colour[2])]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, weight: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
         for (plane, colour) in self.planes.iter_mut().zip(colour) {
             V::load(&plane[group]).add(colour.mul(weight)).store(&mut plane[group]);
         }
@@ -130,19 +131,23 @@ impl Ink for Weights<'_> {
         [V::splat(0.0); 2]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, weight: V) -> [V; 2] {
+    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, weight: V, _: V) -> [V; 2] {
         [sum.add(weight), max.max(weight)]
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, [sum, max]: [V; 2], pair: usize) {
-        let (mut sums, mut maxima) = ([0.0; LANES], [0.0; LANES]);
-        sum.store(&mut sums);
+        let mut maxima = [0.0; LANES];
         max.store(&mut maxima);
-        self.pairs[pair] = Weight {
-            sum: ((sums[0] + sums[4]) + (sums[2] + sums[6])) + ((sums[1] + sums[5]) + (sums[3] + sums[7])),
-            max: maxima.into_iter().fold(0.0, f32::max),
-        };
+        self.pairs[pair] = Weight { sum: lane_sum(sum), max: maxima.into_iter().fold(0.0, f32::max) };
     }
+}
+
+/// Sum of all lanes, in a fixed order.
+#[inline(always)]
+pub(super) fn lane_sum<V: Lanes>(lanes: V) -> f32 {
+    let mut x = [0.0; LANES];
+    lanes.store(&mut x);
+    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 
 /// The instructions to blend with; all give the same bits.
@@ -240,7 +245,7 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
             if left.signs() == (1 << LANES) - 1 {
                 live &= !(1 << group);
             }
-            drop = ink.add::<V>(drop, group, weight);
+            drop = ink.add::<V>(drop, group, weight, left);
         }
         ink.end::<V>(drop, pair);
         if live == 0 {

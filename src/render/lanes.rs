@@ -25,6 +25,7 @@ pub(super) trait Lanes: Copy {
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
+    fn div(self, other: Self) -> Self;
     /// `other` where either is NaN.
     fn min(self, other: Self) -> Self;
     /// `other` where either is NaN.
@@ -97,6 +98,10 @@ impl Lanes for Portable {
     #[inline(always)]
     fn mul(self, other: Self) -> Self {
         self.zip(other, |a, b| a * b)
+    }
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.zip(other, |a, b| a / b)
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
@@ -179,6 +184,10 @@ mod avx2 {
         #[inline(always)]
         fn mul(self, other: Self) -> Self {
             Avx2(avx2!(_mm256_mul_ps(self.0, other.0)))
+        }
+        #[inline(always)]
+        fn div(self, other: Self) -> Self {
+            Avx2(avx2!(_mm256_div_ps(self.0, other.0)))
         }
         #[inline(always)]
         fn min(self, other: Self) -> Self {

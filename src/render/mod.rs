@@ -2,7 +2,8 @@
 //!
 //! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend`
 //! (pixels). Data in: [`Gaussians`] in stored encoding and a [`Camera`]. Data out: an [`Image`], or the
-//! [`Contribution`] of every Gaussian. Memory: 80 bytes per visible Gaussian and 4 (for contributions 12)
+//! [`Contribution`] or [`RemovalError`] of every Gaussian, or a [`Sight`], the picture as a linear map from
+//! colours. Memory: 80 bytes per visible Gaussian and 4 (for contributions 12)
 //! per pair of a Gaussian and a 16×16 tile it can change.
 //!
 //! Every convention is that of the original CUDA rasteriser (Kerbl et al., "3D Gaussian Splatting", 2023),
@@ -16,17 +17,22 @@ mod colour;
 mod contribution;
 mod lanes;
 mod project;
+mod removal;
+mod sight;
 
 use std::num::NonZeroU32;
 
 use rayon::prelude::*;
 
 pub use contribution::Contribution;
+pub use removal::RemovalError;
+pub use sight::{Pull, Sight};
 
 use crate::model::{Camera, Gaussians};
 use bin::Bins;
-use blend::{Blend, Colour, GROUPS, Lattice, Weight, Weights};
-use project::{BLOCK, Splats, View};
+use blend::{Blend, Colour, GROUPS, Lattice, Plane, Weight, Weights};
+use project::{BLOCK, Splat, Splats, View};
+use removal::Removal;
 
 /// Side of a tile in pixels; part of the result, for a Gaussian reaches whole tiles.
 const TILE: u32 = 16;
@@ -118,15 +124,14 @@ impl Renderer {
             for x in 0..across {
                 let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
                 let pairs = &self.bins.pairs()[self.bins.range(y * across + x..y * across + x + 1)];
-                let mut colour = Colour { planes: [[[0.0; 8]; GROUPS]; 3] };
-                let left = self.blend.tile(&self.splats.splats, pairs, &lattice, &mut colour);
+                let planes = paint(self.blend, &self.splats.splats, pairs, &lattice, background);
                 for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
                     let start = x * TILE as usize;
                     let pixels = row[start * 3..].chunks_exact_mut(3).take(TILE as usize);
                     for (u, pixel) in pixels.enumerate() {
                         let (group, lane) = (v + u / 8 * TILE as usize, u % 8);
                         for c in 0..3 {
-                            pixel[c] = colour.planes[c][group][lane] + left[group][lane].abs() * background[c];
+                            pixel[c] = planes[c][group][lane];
                         }
                     }
                 }
@@ -187,6 +192,39 @@ impl Renderer {
         }
     }
 
+    /// Adds what removing each Gaussian alone would change in `camera`'s picture to `errors`, on this thread.
+    ///
+    /// # Panics
+    /// If `errors` is not of as many Gaussians, or the columns of `gaussians` differ in length.
+    pub fn removal_error(
+        &mut self,
+        gaussians: &Gaussians,
+        camera: &Camera,
+        background: [f32; 3],
+        errors: &mut RemovalError,
+    ) {
+        assert_eq!(errors.len(), gaussians.len(), "errors of another model");
+        let view = View::new(camera);
+        self.prepare(gaussians, &view, true);
+        let splats = &self.splats.splats;
+        let mut sums = Vec::new();
+        for y in 0..view.tiles[1] {
+            for x in 0..view.tiles[0] {
+                let tile = (y * view.tiles[0] + x) as usize;
+                let pairs = &self.bins.pairs()[self.bins.range(tile..tile + 1)];
+                let lattice = Lattice::new([x, y], view.size, 1);
+                let rest = paint(self.blend, splats, pairs, &lattice, background);
+                sums.clear();
+                sums.resize(pairs.len(), 0.0);
+                let mut ink = Removal { rest, contrast_floor: errors.contrast_floor, pairs: &mut sums };
+                self.blend.tile(splats, pairs, &lattice, &mut ink);
+                for (&splat, &sum) in pairs.iter().zip(&sums) {
+                    errors.add(splats[splat as usize].id as usize, sum);
+                }
+            }
+        }
+    }
+
     /// Projects and bins.
     fn prepare(&mut self, gaussians: &Gaussians, view: &View, coloured: bool) {
         let count = gaussians.len();
@@ -212,6 +250,18 @@ impl Renderer {
         }
         self.bins.fill(&self.splats, view.tiles, self.parallel);
     }
+}
+
+/// The colours of one tile's sampled pixels.
+fn paint(blend: Blend, splats: &[Splat], pairs: &[u32], lattice: &Lattice, background: [f32; 3]) -> [Plane; 3] {
+    let mut colour = Colour { planes: [[[0.0; 8]; GROUPS]; 3] };
+    let left = blend.tile(splats, pairs, lattice, &mut colour);
+    for (plane, background) in colour.planes.iter_mut().zip(background) {
+        for (pixel, left) in plane.as_flattened_mut().iter_mut().zip(left.as_flattened()) {
+            *pixel += left.abs() * background;
+        }
+    }
+    colour.planes
 }
 
 #[cfg(test)]

@@ -14,6 +14,11 @@ pub struct Ranking {
 }
 
 impl Ranking {
+    /// Ids, each once, best first.
+    pub fn new(order: Vec<u32>) -> Self {
+        Ranking { order }
+    }
+
     /// The ids, best first.
     pub fn order(&self) -> &[u32] {
         &self.order

@@ -20,7 +20,8 @@ fn scores(parts: &[(f64, f64)]) -> Scores {
 }
 
 fn rule(low_priority: LowPriority, keep_fraction: f64, tau_static: f64, tau_dynamic: f64) -> Select {
-    Select { keep_fraction, tau_static, tau_dynamic, low_priority, choose_by_views: false }
+    let paper = Recipe::preset("paper").unwrap().select;
+    Select { keep_fraction, tau_static, tau_dynamic, low_priority, ..paper }
 }
 
 fn free(scores: &Scores, recipe: &Select) -> Selection {

@@ -1,57 +1,18 @@
 //! Visible contribution: what every Gaussian adds to the scored pictures, occlusion included.
 //!
 //! In: a source, its cameras frame by frame, which pictures to look at. Out: C `visible` and W (METHOD
-//! section 1). Frame-major, for occlusion needs all Gaussians of a frame at once: a frame is read once,
-//! by blocks on all threads, then its pictures run on all threads. Sums of integers and maxima: the same
-//! bits whatever the order, the threads and the batches.
+//! section 1). Sums of integers and maxima: the same bits whatever the order, the threads and the batches.
 
 use std::num::NonZeroU32;
-use std::sync::{Mutex, PoisonError};
 
-use rayon::prelude::*;
-
-use super::{BLOCK, Progress};
-use crate::error::{Error, Result};
-use crate::model::{Camera, Columns, Gaussians, Schedule};
-use crate::pass::{BlockReader, FrameSource, Ids};
-use crate::recipe;
+use super::look::{Sample, look};
+use crate::error::Result;
+use crate::model::Columns;
+use crate::pass::{FrameSource, Ids};
 use crate::render::{Contribution, Renderer};
 
 /// What contributions depend on: all but colour.
 const GEOMETRY: Columns = Columns::ALL.without(Columns::SH);
-
-/// Pictures of a batch for each thread: enough that the last ones to finish cost little.
-const PICTURES_PER_THREAD: usize = 4;
-
-/// Pictures to look at: frames in order, each with the cameras of its pictures, at least one.
-#[derive(Debug, Clone)]
-pub struct Sample<'a>(Vec<(usize, Vec<&'a Camera>)>);
-
-impl<'a> Sample<'a> {
-    /// What the strides of `scan` leave of `schedule`: of the frames that have pictures the first and
-    /// every `frame_stride`-th, of the pictures of each every `view_stride`-th, from one that moves on
-    /// from frame to frame, so that all views take their turns.
-    pub fn new(schedule: &'a Schedule, scan: &recipe::Scan) -> Self {
-        let view_stride = scan.view_stride.get() as usize;
-        let with_pictures = schedule.frames.iter().enumerate().filter(|(_, views)| !views.is_empty());
-        let sampled = with_pictures.step_by(scan.frame_stride.get() as usize).enumerate();
-        let taken = sampled.map(|(turn, (frame, views))| {
-            let views = views.iter().skip(turn % view_stride).step_by(view_stride);
-            (frame, views.map(|&(_, camera)| &schedule.cameras[camera as usize]).collect::<Vec<_>>())
-        });
-        Sample(taken.filter(|(_, cameras)| !cameras.is_empty()).collect())
-    }
-
-    /// Number of pictures.
-    pub fn pictures(&self) -> usize {
-        self.0.iter().map(|(_, cameras)| cameras.len()).sum()
-    }
-
-    /// Number of frames.
-    pub fn frames(&self) -> usize {
-        self.0.len()
-    }
-}
 
 /// What was seen of N Gaussians.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,93 +32,31 @@ pub struct Seen {
 /// with 4 × threads pictures between them); per thread 12 bytes of sums and a picture's buffers
 /// ([`crate::render`]). Nothing grows with frames or views.
 pub fn visible_contribution(source: &dyn FrameSource, sample: &Sample<'_>, pixel_stride: NonZeroU32) -> Result<Seen> {
-    let info = source.info();
+    let count = source.info().count;
     let pictures = sample.pictures();
-    let progress = Progress::new("visible", "pictures", pictures as u64);
-    let mut blocks: Vec<(Box<dyn BlockReader + '_>, Gaussians)> = (0..info.count.div_ceil(BLOCK))
-        .into_par_iter()
-        .map(|block| {
-            let range = block * BLOCK..info.count.min((block + 1) * BLOCK);
-            let state = Gaussians::zeros(range.len(), 0);
-            Ok((source.open(Ids::Range(range))?, state))
-        })
-        .collect::<Result<_>>()?;
-
-    // One per thread at most: a picture runs on the thread that took its worker.
-    let workers: Mutex<Vec<(Renderer, Contribution)>> = Mutex::default();
-    let mut states: Vec<Gaussians> = Vec::new();
-    for batch in batches(&sample.0, PICTURES_PER_THREAD * rayon::current_num_threads()) {
-        for (slot, &(frame, _)) in batch.iter().enumerate() {
-            let want = if slot < states.len() { info.varying & GEOMETRY } else { GEOMETRY };
-            if slot == states.len() {
-                states.push(Gaussians::zeros(info.count, 0));
-            }
-            read_frame(&mut blocks, frame, want, &mut states[slot])?;
-        }
-        let jobs: Vec<(&Gaussians, &Camera)> = batch
-            .iter()
-            .zip(&states)
-            .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
-            .collect();
-        jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
-            let free = workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
-            let mut worker = free.unwrap_or_else(|| (Renderer::new(), Contribution::new(info.count)));
-            worker.0.contribution(state, camera, pixel_stride, &mut worker.1);
-            workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
-            progress.advance(1);
-        });
-    }
-    let mut sum = Contribution::new(info.count);
-    for (_, of_thread) in workers.into_inner().unwrap_or_else(PoisonError::into_inner) {
-        sum.merge(&of_thread);
-    }
+    let seen = look(
+        source,
+        Ids::Range(0..count),
+        GEOMETRY,
+        sample,
+        "visible",
+        || (Renderer::new(), Contribution::new(count)),
+        |(renderer, seen), state, camera| renderer.contribution(state, camera, pixel_stride, seen),
+    )?;
+    let mut sum = Contribution::new(count);
+    seen.iter().for_each(|(_, of_thread)| sum.merge(of_thread));
     let per_pixel = f64::from(pixel_stride.get()).powi(2);
-    let coverage = (0..info.count).map(|i| sum.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+    let coverage = (0..count).map(|i| sum.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
     Ok(Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() })
-}
-
-/// Runs of frames with at least `pictures` pictures between them, the last one perhaps fewer.
-fn batches<T>(mut frames: &[(usize, Vec<T>)], pictures: usize) -> impl Iterator<Item = &[(usize, Vec<T>)]> {
-    std::iter::from_fn(move || {
-        let mut held = 0;
-        let enough = frames.iter().position(|(_, cameras)| {
-            held += cameras.len();
-            held >= pictures
-        });
-        let (batch, rest) = frames.split_at(enough.map_or(frames.len(), |last| last + 1));
-        frames = rest;
-        (!batch.is_empty()).then_some(batch)
-    })
-}
-
-/// Reads the columns `want` of all blocks at `frame` into `state`.
-fn read_frame(
-    blocks: &mut [(Box<dyn BlockReader + '_>, Gaussians)],
-    frame: usize,
-    want: Columns,
-    state: &mut Gaussians,
-) -> Result<()> {
-    if want.is_empty() {
-        return Ok(());
-    }
-    blocks.par_iter_mut().try_for_each(|(reader, block)| reader.read(frame, want, block))?;
-    for column in want.iter() {
-        let target = state.column_mut(column);
-        for c in 0..target.width() {
-            for (to, (_, block)) in target.plane_mut(c).chunks_mut(BLOCK).zip(&*blocks) {
-                to.copy_from_slice(block.column(column).plane(c));
-            }
-        }
-    }
-    Ok::<_, Error>(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::demo::Scene;
-    use crate::model::{Flags, Rig, Rows, SequenceInfo, Split};
-    use crate::recipe::Recipe;
+    use crate::model::{Camera, Flags, Gaussians, Rig, Rows, Schedule, SequenceInfo, Split};
+    use crate::pass::BlockReader;
+    use crate::recipe::{self, Recipe};
     use crate::select::{Overrides, select};
     use crate::{render, score};
 

@@ -28,7 +28,7 @@ impl Scratch {
 }
 
 fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutRow> {
-    ids.into_iter().map(|source| OutRow { source, proxy: None }).collect()
+    ids.into_iter().map(|source| OutRow { source, proxy: None, recolor: [0.0; 3] }).collect()
 }
 
 fn all(ply: &Ply) -> Gaussians {
@@ -121,9 +121,9 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
             let ply = scratch.open(&file(format, kind, &names, 6, "\n"));
             let proxies = proxies(2, 1);
             let rows = [
-                OutRow { source: 4, proxy: Some(1) },
-                OutRow { source: 2, proxy: None },
-                OutRow { source: 4, proxy: Some(0) },
+                OutRow { source: 4, proxy: Some(1), recolor: [0.0; 3] },
+                OutRow { source: 2, proxy: None, recolor: [0.0; 3] },
+                OutRow { source: 4, proxy: Some(0), recolor: [0.0; 3] },
             ];
             let written = scratch.write(&ply, &rows, &proxies);
             let folder = Scratch::new();
@@ -150,7 +150,7 @@ fn a_surfel_has_no_place_for_a_third_scale() {
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
     let ply = scratch.open(&file("binary_little_endian", "float", &names, 1, "\n"));
     let proxies = proxies(1, 1);
-    let written = scratch.write(&ply, &[OutRow { source: 0, proxy: Some(0) }], &proxies);
+    let written = scratch.write(&ply, &[OutRow { source: 0, proxy: Some(0), recolor: [0.0; 3] }], &proxies);
     let out = Scratch::new();
     let out = all(&out.open(&written));
     assert_eq!(out.log_scale.row::<2>(0), proxies.log_scale.row::<2>(0));
@@ -165,8 +165,10 @@ fn rows_and_proxies_that_do_not_exist_are_refused() {
         write_like(&ply, rows, proxies, &scratch.path("none.ply")).unwrap_err().to_string()
     };
     assert!(refusal(&kept([2]), &Gaussians::default()).contains("Gaussian 2 "));
-    assert!(refusal(&[OutRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
-    assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
+    assert!(refusal(&[OutRow { source: 0, proxy: Some(1), recolor: [0.0; 3] }], &proxies(1, 1)).contains("proxy 1 "));
+    assert!(
+        refusal(&[OutRow { source: 0, proxy: Some(0), recolor: [0.0; 3] }], &proxies(1, 3)).contains("48 SH planes")
+    );
     assert!(!scratch.path("none.ply").exists());
 }
 

@@ -230,7 +230,7 @@ fn vertex_rows(path: &Path, header: &Header, available: usize) -> Result<Range<u
 }
 
 /// Reads one property of the rows that start at `starts`.
-fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big_endian: bool, out: &mut [f32]) {
+pub(crate) fn read_plane(rows: &[u8], starts: &[usize], property: &Property, big_endian: bool, out: &mut [f32]) {
     let at = property.offset;
     match (property.scalar, big_endian) {
         (Scalar::F32, false) => fill(rows, starts, at, out, f32::from_le_bytes),

@@ -1,0 +1,194 @@
+//! A picture as a linear map: from changes of colour to changes of pixels, and back.
+//!
+//! With positions, shapes and opacities fixed, a pixel is Σ w·colour + what is left · background, where
+//! w = alpha · transmittance does not depend on colour. So a change δ of colours changes the picture by
+//! A·δ, and least squares over colours needs A·δ and Aᵀ·picture only, both of which the blend gives; A is
+//! never formed. Data in: one frame's Gaussians and a camera. Data out: sums per visible Gaussian.
+//! Memory: 72 bytes per visible Gaussian and 4 per (Gaussian, tile) pair, as long as the sight is kept.
+
+use super::bin::Bins;
+use super::blend::{Blend, GROUPS, Ink, Lattice, Plane, lane_sum};
+use super::lanes::{LANES, Lanes};
+use super::project::{Splat, Splats, View};
+use super::{Image, Renderer, TILE};
+use crate::model::{Camera, Gaussians};
+
+/// What one camera sees of Gaussians whose colours may change.
+///
+/// A channel that is cut off at 0 here, because its spherical harmonics go below, counts as one that no
+/// change moves: the map is that of small changes.
+#[derive(Debug)]
+pub struct Sight {
+    blend: Blend,
+    splats: Vec<Splat>,
+    bins: Bins,
+    size: [u32; 2],
+    tiles: [u32; 2],
+}
+
+/// Red, green and blue of every visible Gaussian of a [`Sight`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pull(Vec<[f64; 3]>);
+
+impl Sight {
+    /// What `camera` sees of `gaussians`.
+    ///
+    /// # Panics
+    /// If the columns of `gaussians` differ in length.
+    pub fn new(gaussians: &Gaussians, camera: &Camera) -> Self {
+        let view = View::new(camera);
+        let mut renderer = Renderer::new();
+        renderer.prepare(gaussians, &view, true);
+        let Renderer { blend, splats: Splats { splats, .. }, bins, .. } = renderer;
+        Sight { blend, splats, bins, size: view.size, tiles: view.tiles }
+    }
+
+    /// Aᵀ·`picture`: of every visible Gaussian Σ over pixels of w · pixel, per channel; f32 within a tile,
+    /// in a fixed order.
+    ///
+    /// # Panics
+    /// If `picture` has not the camera's size.
+    pub fn pull(&self, picture: &Image) -> Pull {
+        assert_eq!([picture.width, picture.height], self.size, "a picture of another size");
+        self.per_splat(|tile, lattice, pairs, sums| {
+            let planes = self.planes(picture, tile);
+            self.blend.tile(&self.splats, pairs, lattice, &mut Weighed { planes: &planes, pairs: sums });
+        })
+    }
+
+    /// AᵀA·`change`, with `change` `[N]` red, green and blue of every Gaussian, visible or not.
+    ///
+    /// # Panics
+    /// If `change` is shorter than the Gaussians that were seen.
+    pub fn pull_of_change(&self, change: &[[f32; 3]]) -> Pull {
+        self.per_splat(|_, lattice, pairs, sums| {
+            let mut made = Change { change, planes: [[[0.0; LANES]; GROUPS]; 3] };
+            self.blend.tile(&self.splats, pairs, lattice, &mut made);
+            self.blend.tile(&self.splats, pairs, lattice, &mut Weighed { planes: &made.planes, pairs: sums });
+        })
+    }
+
+    /// The diagonal of AᵀA: of every visible Gaussian Σ over pixels of w².
+    pub fn power(&self) -> Pull {
+        self.per_splat(|_, lattice, pairs, sums| {
+            self.blend.tile(&self.splats, pairs, lattice, &mut Power { pairs: sums });
+        })
+    }
+
+    /// Adds `pull`, which this sight made, to `[N]` totals.
+    ///
+    /// # Panics
+    /// If `total` is shorter than the Gaussians that were seen.
+    pub fn add(&self, pull: &Pull, total: &mut [[f64; 3]]) {
+        for (splat, pull) in self.splats.iter().zip(&pull.0) {
+            let total = &mut total[splat.id as usize];
+            (0..3).for_each(|c| total[c] += pull[c]);
+        }
+    }
+
+    /// Sums over tiles of what `of_tile` writes for every pair of a tile, zero for channels cut off at 0.
+    fn per_splat(&self, mut of_tile: impl FnMut([u32; 2], &Lattice, &[u32], &mut [[f32; 3]])) -> Pull {
+        let mut total = vec![[0.0; 3]; self.splats.len()];
+        let mut sums = Vec::new();
+        for y in 0..self.tiles[1] {
+            for x in 0..self.tiles[0] {
+                let tile = (y * self.tiles[0] + x) as usize;
+                let pairs = &self.bins.pairs()[self.bins.range(tile..tile + 1)];
+                sums.clear();
+                sums.resize(pairs.len(), [0.0; 3]);
+                of_tile([x, y], &Lattice::new([x, y], self.size, 1), pairs, &mut sums);
+                for (&splat, sum) in pairs.iter().zip(&sums) {
+                    let total = &mut total[splat as usize];
+                    (0..3).for_each(|c| total[c] += f64::from(sum[c]));
+                }
+            }
+        }
+        for (total, splat) in total.iter_mut().zip(&self.splats) {
+            (0..3).filter(|&c| splat.colour[c] == 0.0).for_each(|c| total[c] = 0.0);
+        }
+        Pull(total)
+    }
+
+    /// The pixels of one tile, 0 beyond the picture's edge.
+    fn planes(&self, picture: &Image, tile: [u32; 2]) -> [Plane; 3] {
+        let mut planes = [[[0.0; LANES]; GROUPS]; 3];
+        let [x0, y0] = tile.map(|t| t * TILE);
+        for v in 0..TILE.min(self.size[1] - y0) {
+            for u in 0..TILE.min(self.size[0] - x0) {
+                let pixel = ((y0 + v) as usize * self.size[0] as usize + (x0 + u) as usize) * 3;
+                let (group, lane) = (v as usize + u as usize / LANES * TILE as usize, u as usize % LANES);
+                for (c, plane) in planes.iter_mut().enumerate() {
+                    plane[group][lane] = picture.data[pixel + c];
+                }
+            }
+        }
+        planes
+    }
+}
+
+/// Paints changes of colour, without what is cut off at 0.
+struct Change<'a> {
+    change: &'a [[f32; 3]],
+    planes: [Plane; 3],
+}
+
+impl Ink for Change<'_> {
+    type Drop<V: Lanes> = [V; 3];
+    #[inline(always)]
+    fn begin<V: Lanes>(&self, splat: &Splat) -> [V; 3] {
+        let change = self.change[splat.id as usize];
+        std::array::from_fn(|c| V::splat(if splat.colour[c] > 0.0 { change[c] } else { 0.0 }))
+    }
+    #[inline(always)]
+    fn add<V: Lanes>(&mut self, change: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
+        for (plane, change) in self.planes.iter_mut().zip(change) {
+            V::load(&plane[group]).add(change.mul(weight)).store(&mut plane[group]);
+        }
+        change
+    }
+    #[inline(always)]
+    fn end<V: Lanes>(&mut self, _: [V; 3], _: usize) {}
+}
+
+/// Sums pixels by weight.
+struct Weighed<'a> {
+    planes: &'a [Plane; 3],
+    pairs: &'a mut [[f32; 3]],
+}
+
+impl Ink for Weighed<'_> {
+    type Drop<V: Lanes> = [V; 3];
+    #[inline(always)]
+    fn begin<V: Lanes>(&self, _: &Splat) -> [V; 3] {
+        [V::splat(0.0); 3]
+    }
+    #[inline(always)]
+    fn add<V: Lanes>(&mut self, sums: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
+        std::array::from_fn(|c| sums[c].add(weight.mul(V::load(&self.planes[c][group]))))
+    }
+    #[inline(always)]
+    fn end<V: Lanes>(&mut self, sums: [V; 3], pair: usize) {
+        self.pairs[pair] = sums.map(lane_sum);
+    }
+}
+
+/// Sums squares of weights, the same for all channels.
+struct Power<'a> {
+    pairs: &'a mut [[f32; 3]],
+}
+
+impl Ink for Power<'_> {
+    type Drop<V: Lanes> = V;
+    #[inline(always)]
+    fn begin<V: Lanes>(&self, _: &Splat) -> V {
+        V::splat(0.0)
+    }
+    #[inline(always)]
+    fn add<V: Lanes>(&mut self, sum: V, _: usize, weight: V, _: V) -> V {
+        sum.add(weight.mul(weight))
+    }
+    #[inline(always)]
+    fn end<V: Lanes>(&mut self, sum: V, pair: usize) {
+        self.pairs[pair] = [lane_sum(sum); 3];
+    }
+}

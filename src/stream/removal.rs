@@ -1,0 +1,65 @@
+//! What the scored pictures would lose with each Gaussian of a part of the input.
+
+use super::look::{Sample, look};
+use crate::error::Result;
+use crate::model::Columns;
+use crate::pass::{FrameSource, Ids};
+use crate::render::{RemovalError, Renderer};
+
+/// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over the pictures of `sample`: the same
+/// bits whatever the threads.
+///
+/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for a block's state and for each frame of
+/// a batch (frames with 4 × threads pictures between them); per thread 8 bytes of sums and a picture's
+/// buffers. Nothing grows with frames or views.
+pub fn removal_error(
+    source: &dyn FrameSource,
+    ids: &[u32],
+    sample: &Sample<'_>,
+    background: [f32; 3],
+    contrast_floor: f32,
+) -> Result<RemovalError> {
+    let found = look(
+        source,
+        Ids::List(ids),
+        Columns::ALL,
+        sample,
+        "rounds",
+        || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
+        |(renderer, errors), state, camera| renderer.removal_error(state, camera, background, errors),
+    )?;
+    let mut sum = RemovalError::new(ids.len(), contrast_floor);
+    found.iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+    Ok(sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::demo::Scene;
+    use crate::model::Split;
+    use crate::stream::gather;
+
+    #[test]
+    fn errors_are_the_bits_of_a_plain_loop_over_pictures_of_those_ids_alone_whatever_the_threads() {
+        let scene = Scene::new(2500, 4);
+        let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
+        let ids: Vec<u32> = (0..2500).filter(|id| id % 3 != 1).collect();
+        let background = [0.1, 0.2, 0.3];
+        let mut plain = RemovalError::new(ids.len(), 0.1);
+        for (t, views) in schedule.frames.iter().enumerate() {
+            let state = gather(&scene, &ids, t, Columns::ALL).unwrap();
+            for &(_, camera) in views {
+                Renderer::new().removal_error(&state, &schedule.cameras[camera as usize], background, &mut plain);
+            }
+        }
+        assert!(plain.sum.iter().filter(|&&sum| sum > 0).count() > 1000);
+        let sample = Sample::at_most(&schedule, usize::MAX);
+        assert_eq!(sample.pictures(), schedule.pairs());
+        for threads in [1, 3] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let found = pool.install(|| removal_error(&scene, &ids, &sample, background, 0.1)).unwrap();
+            assert!(found == plain, "{threads} threads");
+        }
+    }
+}
