@@ -83,6 +83,7 @@ impl Method {
             // S = C without clipping, so that no two Gaussians tie that differ in C.
             recipe.score.w_dynamic = 0.0;
             recipe.score.clip_norm = false;
+            recipe.select.round_fraction = 1.0;
             recipe.select.choose_by_views = false;
             Ok::<_, Error>(Means::Recipe(Box::new(recipe), Only::Prune))
         };
