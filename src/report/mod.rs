@@ -145,7 +145,7 @@ fn read_sweep(path: &Path) -> Result<TradeOff> {
     let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
     serde_json::from_str(&text).map_err(|error| {
         Error::input(path, format!("line {}", error.line()), "what `splatsieve sweep` wrote", error.to_string())
-            .hint("splatsieve sweep ORIGINAL --cameras F -o FOLDER writes sweep.json")
+            .hint("splatsieve sweep ORIGINAL --cameras F writes a sweep.json")
     })
 }
 
