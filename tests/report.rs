@@ -8,15 +8,16 @@ use std::path::Path;
 use scene::{Workplace, files};
 use serde_json::{Value, json};
 
-/// A folder with the demo's scene, cameras, compressed container, with proxies in it, and what lies beside
-/// it in `d`.
+/// A folder with the demo's scene and cameras in `d`, and `small.gseq` with proxies in it and all that lies
+/// beside it.
 fn compressed() -> Workplace {
     let at = Workplace::new();
-    at.done("demo -o d --gaussians 1200 --frames 5 --choose-by-views=false");
+    at.done("demo -o d --gaussians 1200 --frames 5");
+    at.done("compress d/scene.gseq --cameras d/cameras.json --choose-by-views=false -o small.gseq");
     at
 }
 
-const MODELS: &str = "d/scene.gseq d/compressed.gseq --cameras d/cameras.json";
+const MODELS: &str = "d/scene.gseq small.gseq --cameras d/cameras.json";
 
 fn read(path: &Path) -> String {
     fs::read_to_string(path).unwrap()
@@ -55,16 +56,23 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
     assert!(read(&at.path("r/pictures.csv")) == read(&at.path("all.csv")), "pictures.csv is not that of evaluate");
     let verdict = found["verdict"].as_str().unwrap();
     assert!(said.starts_with(verdict) && said.trim_end().ends_with("report.html"), "{said}");
-    let run: Value = serde_json::from_str(&read(&at.path("d/compressed.gseq.summary.json"))).unwrap();
+    let run: Value = serde_json::from_str(&read(&at.path("small.gseq.summary.json"))).unwrap();
     assert_eq!(found["run"], run);
     assert_eq!(read(&at.path("r/stages.csv")).lines().count(), 1 + run["stages"].as_array().unwrap().len());
     assert_eq!(found["trade_off"], sweep());
     assert_eq!(read(&at.path("r/trade_off.csv")).lines().count(), 4);
     assert_eq!(found["missing"], json!([]));
+    // Scores computed anew are those that decided, and where they are not, that is said.
+    assert_eq!(found["notes"], json!([]));
+    let recipe = at.path("small.gseq.recipe.toml");
+    fs::write(&recipe, read(&recipe).replace("view_stride = 1", "view_stride = 2")).unwrap();
+    at.done(&format!("report {rest} -o other"));
+    let note = data(&at, "other")["notes"][0].as_str().unwrap().to_owned();
+    assert!(note.contains("differ from those of the run"), "{note}");
     assert_eq!(read(&at.path("r/failure_modes.csv")).lines().count(), 4);
 
     // Every histogram counts every Gaussian once, by what the index map says of it.
-    let map = scene::index_map(&at.path("d/compressed.gseq.index_map.npy"));
+    let map = scene::index_map(&at.path("small.gseq.index_map.npy"));
     let dropped = map.iter().filter(|&&place| place == -1).count() as u64;
     for histogram in found["histograms"].as_array().unwrap() {
         let sum = |fate: &str| {
@@ -119,7 +127,7 @@ fn any_number_of_threads_gives_the_same_bytes() {
 #[test]
 fn what_is_not_beside_the_result_is_said_and_any_two_models_can_be_compared() {
     let at = compressed();
-    fs::copy(at.path("d/compressed.gseq"), at.path("alone.gseq")).unwrap();
+    fs::copy(at.path("small.gseq"), at.path("alone.gseq")).unwrap();
     at.done("report d/scene.gseq alone.gseq --cameras d/cameras.json -o r");
     let (page, found) = (read(&at.path("r/report.html")), data(&at, "r"));
     balanced(&page);

@@ -15,7 +15,7 @@ pub const STYLE: &str = include_str!("chart.css");
 /// Size of a chart in its own units, which are about a pixel.
 const WIDTH: f64 = 480.0;
 const HEIGHT: f64 = 270.0;
-const LEFT: f64 = 62.0;
+const LEFT: f64 = 70.0;
 const RIGHT: f64 = 14.0;
 const BOTTOM: f64 = 44.0;
 /// Height of a line of the legend, and about how wide one of its letters is.
@@ -322,7 +322,7 @@ impl Drawing {
         let middle = 0.5 * (bottom + self.top);
         let _ = write!(
             self.text,
-            "<text class=\"middle\" transform=\"translate(14 {middle:.1}) rotate(-90)\">{}</text>",
+            "<text class=\"middle\" transform=\"translate(13 {middle:.1}) rotate(-90)\">{}</text>",
             escape(y_label)
         );
         self.x_axis(x, x_label, [self.top, bottom]);

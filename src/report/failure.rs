@@ -1,6 +1,6 @@
 //! Looking for the failure modes that the paper names, in the pictures.
 //!
-//! In: what kinds of Gaussian there are ([`super::traits`]), and both models' pictures. Out: per kind
+//! In: what kinds of Gaussian there are ([`mod@super::traits`]), and both models' pictures. Out: per kind
 //! how much larger the error is where it is seen, where that is worst, and a verdict. Where a kind is
 //! seen is known exactly: the original is rendered once more with colours that say the kind, which gives
 //! for every pixel the share w of it that such Gaussians have.

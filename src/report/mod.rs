@@ -114,6 +114,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let recipe = recipe_to_look_with(&run)?;
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     let scored = score_scene(&side.scene, &recipe, &UserOverrides::default(), &mut Stages::default())?;
+    notes.extend(differing_terms(&run, &scored));
     let traits = traits(side.scene.input.source(), &scored, recipe.scan.alpha_min)?;
     let members = members(&scored, &traits, run.fates.as_deref());
     let (evaluation, seen) = side.evaluate(|state, camera, taken| observe(state, &traits, camera, taken))?;
@@ -145,7 +146,7 @@ fn read_sweep(path: &Path) -> Result<TradeOff> {
     let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
     serde_json::from_str(&text).map_err(|error| {
         Error::input(path, format!("line {}", error.line()), "what `splatsieve sweep` wrote", error.to_string())
-            .hint("splatsieve sweep ORIGINAL --cameras F -o FOLDER writes sweep.json")
+            .hint("splatsieve sweep ORIGINAL --cameras F writes a sweep.json")
     })
 }
 
@@ -190,6 +191,23 @@ fn scored_pictures(scene: &Scene, run: &Run) -> Result<Schedule> {
         first.get_or_insert(schedule);
     }
     first.map_or_else(|| scene.rig.schedule(times, None), Ok)
+}
+
+/// A term whose percentiles are not those of the run: the scores shown are then not those that decided.
+fn differing_terms(run: &Run, scored: &Scored) -> Option<String> {
+    // Numbers lose their last bit on the way through JSON.
+    let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
+    let (summary, _) = run.summary.as_ref()?;
+    let found = scored.terms();
+    let differs = |then: &&run::Term| {
+        !found.iter().any(|now| now.name == then.name && same(now.p1, then.p1) && same(now.p99, then.p99))
+    };
+    let then = summary.terms.iter().find(differs)?;
+    Some(format!(
+        "the scores shown are computed anew and differ from those of the run: its 99th percentile of {} was {}; other \
+         cameras, another split or other frames",
+        then.name, then.p99
+    ))
 }
 
 /// How many Gaussians of each kind there are, and what became of them.

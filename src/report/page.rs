@@ -382,8 +382,8 @@ fn sweep(report: &Report) -> String {
     let Some(found) = &report.trade_off else {
         return absent(&format!(
             "Curves of quality against size, time and memory come from a sweep: \
-             <code>splatsieve sweep {} --cameras F -o sweep</code>, then this report with \
-             <code>--sweep sweep/sweep.json</code>.",
+             <code>splatsieve sweep {} --cameras F</code> writes <code>sweep.json</code>, which <code>report</code> \
+             takes as <code>--sweep FILE</code>.",
             escape(&report.evaluation.path.original)
         ));
     };

@@ -1,7 +1,7 @@
 //! Pictures in the page: which ones, what of them, and as what.
 //!
 //! In: the scores of all pictures, then the chosen ones again. Out: PNG files as data URIs. A page holds
-//! at most [`CHOSEN`] pictures of at most [`MAX_PIXELS`] pixels, so that it stays at a few megabytes.
+//! at most [`CHOSEN`] of at most [`MAX_PIXELS`] pixels, three or four images of each: 5 MB at the most.
 
 use std::io;
 
@@ -17,8 +17,8 @@ use crate::render::Image;
 
 /// Pictures to look at: the worst, that of the worst view, of the worst frame, and the median.
 pub const CHOSEN: usize = 4;
-/// A picture of more pixels is shown smaller; three or four of each are 1.5 bytes a pixel in base64.
-const MAX_PIXELS: u64 = 160_000;
+/// A picture of more pixels is shown smaller. Trained scenes take about 2 bytes a pixel in base64.
+pub const MAX_PIXELS: u64 = 160_000;
 /// Differences are made brighter until this part of their values is still not clipped.
 const UNCLIPPED: f64 = 0.999;
 /// The most that differences are made brighter: one step of 255 is then a quarter of the range.

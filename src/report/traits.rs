@@ -3,7 +3,7 @@
 //! In: the original's frames and its rows of statistics. Out: for every Gaussian a [`Traits`] set.
 //! The kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
 //! Models", section 4.5; the paper gives no measures for them, those here are this project's.
-//! Memory: 24 bytes per Gaussian where colours vary, 130 per fast one.
+//! Memory: where colours vary one frame of them and 88 bytes per Gaussian; per fast one at most 190.
 
 use rayon::prelude::*;
 
@@ -191,4 +191,91 @@ fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_
         ((0..3).map(variance).sum::<f64>() / 3.0).sqrt()
     };
     Ok(sums.iter().map(deviation).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::SequenceInfo;
+    use crate::pass::{BlockReader, Ids};
+
+    /// Gaussians that a function of (Gaussian, frame) sets.
+    struct Made<F>(SequenceInfo, F);
+
+    impl<F: Fn(usize, usize, &mut Gaussians, usize) + Sync + Send> FrameSource for Made<F> {
+        fn info(&self) -> &SequenceInfo {
+            &self.0
+        }
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(Reader(ids.iter().collect(), &self.1)))
+        }
+    }
+
+    struct Reader<'a, F>(Vec<usize>, &'a F);
+
+    impl<F: Fn(usize, usize, &mut Gaussians, usize) + Sync> BlockReader for Reader<'_, F> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            let mut all = Gaussians::zeros(self.0.len(), 0);
+            for (row, &id) in self.0.iter().enumerate() {
+                (self.1)(id, frame, &mut all, row);
+            }
+            want.iter().for_each(|column| *out.column_mut(column) = all.column(column).clone());
+            Ok(())
+        }
+    }
+
+    fn info(count: usize, frames: usize) -> SequenceInfo {
+        SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Columns::ALL }
+    }
+
+    /// Bending of a 5 × 5 × 5 lattice that `place` moves.
+    fn bent(place: impl Fn([f64; 3], f64) -> [f64; 3] + Sync + Send) -> Vec<f64> {
+        let source = Made(info(125, 10), |id, frame, out: &mut Gaussians, row| {
+            let at = [id % 5, id / 5 % 5, id / 25].map(|k| k as f64);
+            out.position.set_row(row, place(at, frame as f64 / 9.0).map(|x| x as f32));
+        });
+        let all: Vec<u32> = (0..125).collect();
+        let reference = gather(&source, &all, 0, Columns::POSITION).unwrap();
+        bending(&source, &reference, &all, |_| true, &samples(10), 1e-3).unwrap()
+    }
+
+    #[test]
+    fn rigid_motion_bends_nothing_and_stretching_bends_by_its_part() {
+        let turned = bent(|[x, y, z], t| {
+            let (sin, cos) = (3.0 * t).sin_cos();
+            [x * cos - y * sin + 40.0 * t, x * sin + y * cos, z - 7.0 * t]
+        });
+        assert!(turned.iter().all(|&bent| bent < 1e-5), "got {turned:?}");
+        // Every distance grows by 40% towards the end, evenly.
+        let grown = bent(|at, t| at.map(|x| x * (1.0 + 0.4 * t)));
+        let expected = 0.4 * ((0..10).map(|k| f64::from(k * k) / 81.0).sum::<f64>() / 10.0).sqrt();
+        assert!(grown.iter().all(|&bent| (bent - expected).abs() < 1e-5), "got {grown:?}, expected {expected}");
+    }
+
+    #[test]
+    fn colours_count_while_a_gaussian_lives() {
+        // 0 flashes, 1 is constant, 2 flashes only while dead.
+        let source = Made(info(3, 8), |id, frame, out: &mut Gaussians, row| {
+            let flash = frame % 2 == 1;
+            let dead = id == 2 && flash;
+            out.opacity_logit.set_row(row, [if dead { -9.0 } else { 2.0 }]);
+            let away = if flash && id != 1 { 0.1 } else { 0.0 };
+            out.sh.set_row(row, [((0.2 + away) / SH_C0) as f32; 3]);
+        });
+        let found = colour_change(&source, &[0, 1, 2], &samples(8), 0.01).unwrap();
+        assert!((found[0] - 0.05).abs() < 1e-6, "half of the time 0.1 away: got {}", found[0]);
+        assert_eq!(found[1..], [0.0, 0.0]);
+        let still = Made(SequenceInfo { varying: Columns::POSITION, ..info(3, 8) }, source.1);
+        assert!(colour_change(&still, &[0, 1, 2], &samples(8), 0.01).unwrap().is_empty(), "nothing is read");
+    }
+
+    #[test]
+    fn samples_reach_from_the_first_frame_to_the_last() {
+        assert_eq!(samples(0), [0usize; 0]);
+        assert_eq!(samples(1), [0]);
+        assert_eq!(samples(3), [0, 1, 2]);
+        let many = samples(1000);
+        assert_eq!((many.len(), many[0], many[SAMPLES - 1]), (SAMPLES, 0, 999));
+        assert!(many.windows(2).all(|pair| pair[0] < pair[1]));
+    }
 }

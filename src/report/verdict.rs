@@ -2,11 +2,13 @@
 
 use super::failure::{FailureMode, Verdict};
 use super::html::percent;
+use crate::metrics::PSNR_CAP_DB;
 use crate::pipeline::evaluation::Evaluation;
 
 /// Mean PSNR, dB, from which a loss is called by the words beside it. From 50 dB on, the root mean square
 /// error is less than one step of 255; at 40 dB under three, at 30 eight, at 24 sixteen.
-const WORDS: [(f64, &str); 5] = [
+const WORDS: [(f64, &str); 6] = [
+    (PSNR_CAP_DB, "gives the same pictures as the original"),
     (50.0, "differs from the original by less than a screen can show"),
     (40.0, "looks like the original"),
     (30.0, "differs from the original visibly, side by side"),

@@ -51,7 +51,13 @@ impl Browser {
         let mut shell = Command::new("sh");
         // The browser expects its pipe as descriptors 3 and 4.
         shell.arg("-c").arg("exec \"$@\" 3<\"$TO\" 4>\"$FROM\"").arg("sh").arg(program);
-        shell.args(["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe", "--no-first-run"]);
+        shell.args([
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--remote-debugging-pipe",
+            "--disable-dev-shm-usage",
+        ]);
         shell.arg("--window-size=1100,900").arg(format!("--user-data-dir={}", home.path().display()));
         shell.env("TO", &pipes[0]).env("FROM", &pipes[1]).env("HOME", home.path());
         let process = shell.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
