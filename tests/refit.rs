@@ -88,6 +88,23 @@ fn every_kind_of_output_holds_the_same_colours() {
 }
 
 #[test]
+fn a_result_that_lacks_nothing_is_left_alone_and_says_so() {
+    let workplace = Workplace::new();
+    request(&workplace);
+    let request = "demo/scene.gseq --cameras demo/cameras.json --prune-only --target-ratio 1";
+    workplace.done(&format!("compress {request} -o plain"));
+    let summary = workplace.summary(&format!("{request} --refit-pictures 12 -o fitted"));
+    let left_out = summary["left_out"].to_string();
+    assert!(left_out.contains("refitting colours"), "{left_out}");
+    let points = |name: &str| {
+        let mut files = lasting_files(&workplace.path(name));
+        files.retain(|name, _| name.extension().is_some_and(|extension| extension == "ply"));
+        files
+    };
+    assert!(!points("plain").is_empty() && points("plain") == points("fitted"));
+}
+
+#[test]
 fn threads_change_no_byte() {
     let workplace = Workplace::new();
     let request = request(&workplace);

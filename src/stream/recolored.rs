@@ -53,3 +53,39 @@ pub fn recolor(state: &mut Gaussians, change: &[[f32; 3]]) {
         state.sh.plane_mut(c).iter_mut().zip(change).for_each(|(value, change)| *value += change[c]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::demo::Scene;
+
+    #[test]
+    fn any_block_of_ids_gets_the_changes_of_its_own_gaussians_and_of_nothing_but_base_colours() {
+        let plain = Scene::new(40, 3);
+        let change: Vec<[f32; 3]> = (0..40).map(|i| [0.5, -0.25, 1.0].map(|x| x * i as f32)).collect();
+        let recolored = Recolored::new(Box::new(Scene::new(40, 3)), &change);
+        for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
+            let read = |source: &dyn FrameSource| {
+                let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
+                source.open(ids.clone()).unwrap().read(2, Columns::ALL, &mut state).unwrap();
+                state
+            };
+            let (mut expected, got) = (read(&plain), read(&recolored));
+            for (row, id) in ids.iter().enumerate() {
+                for (c, by) in change[id].iter().enumerate() {
+                    expected.sh.plane_mut(c)[row] += by;
+                }
+            }
+            assert!(got == expected, "{ids:?}");
+        }
+        let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
+        Recolored::new(Box::new(Scene::new(40, 3)), &[])
+            .open(Ids::Range(0..40))
+            .unwrap()
+            .read(1, Columns::ALL, &mut untouched)
+            .unwrap();
+        let mut expected = untouched.clone();
+        plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::ALL, &mut expected).unwrap();
+        assert!(untouched == expected);
+    }
+}
