@@ -22,7 +22,7 @@ const BOTTOM: f64 = 44.0;
 const LINE: f64 = 18.0;
 const LETTER: f64 = 6.6;
 /// Colours, shapes and dashes that [`STYLE`] and this file know.
-const LOOKS: usize = 8;
+const LOOKS: usize = 9;
 
 /// A direction of a plot.
 #[derive(Debug, Clone, Default)]
@@ -135,7 +135,7 @@ impl Scale {
             let decades = (self.low.floor() as i32)..=(self.high.ceil() as i32);
             let few = self.high - self.low < 2.0;
             let step = ((self.high - self.low) / 6.0).ceil().max(1.0) as i32;
-            return decades
+            let ticks: Vec<f64> = decades
                 .filter(|power| few || power.rem_euclid(step) == 0)
                 .flat_map(|power| {
                     let factors: &[f64] = if few { &[1.0, 2.0, 5.0] } else { &[1.0] };
@@ -143,15 +143,25 @@ impl Scale {
                 })
                 .filter(|tick| (self.low..=self.high).contains(&tick.log10()))
                 .collect();
+            // Within a small part of a decade a logarithm is as good as straight.
+            if ticks.len() >= 2 {
+                return ticks;
+            }
+            return even_ticks(10f64.powf(self.low), 10f64.powf(self.high));
         }
-        let rough = (self.high - self.low) / 5.0;
-        let power = 10f64.powf(rough.log10().floor());
-        let step = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|&s| s >= rough);
-        let step = step.unwrap_or(10.0 * power);
-        let first = (self.low / step).ceil() as i64;
-        let last = (self.high / step).floor() as i64;
-        (first..=last).map(|k| k as f64 * step).collect()
+        even_ticks(self.low, self.high)
     }
+}
+
+/// Round values from `low` to `high`, evenly apart.
+fn even_ticks(low: f64, high: f64) -> Vec<f64> {
+    let rough = (high - low) / 5.0;
+    let power = 10f64.powf(rough.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|&s| s >= rough);
+    let step = step.unwrap_or(10.0 * power);
+    let first = (low / step).ceil() as i64;
+    let last = (high / step).floor() as i64;
+    (first..=last).map(|k| k as f64 * step).collect()
 }
 
 impl Plot {
@@ -395,6 +405,8 @@ mod tests {
             assert!((2..=12).contains(&ticks.len()), "{low} to {high}: {ticks:?}");
             assert!(ticks.iter().all(|&tick| tick >= low - 1e-9 * high && tick <= high * (1.0 + 1e-9)));
         }
+        let narrow = Scale { log: true, low: 62f64.log10(), high: 80f64.log10(), from: 0.0, to: 100.0 };
+        assert_eq!(narrow.ticks(), [65.0, 70.0, 75.0, 80.0]);
         let log = Scale { log: true, low: -7.0, high: 2.0, from: 0.0, to: 100.0 };
         assert!((3..=8).contains(&log.ticks().len()), "{:?}", log.ticks());
     }
