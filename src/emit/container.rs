@@ -11,7 +11,7 @@ use gseq::{ColumnSpec, Compression, EncodedTile, Layout, TileId, Writer, encode_
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, sh_coefficients};
+use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
 
 /// Gaussians per tile: what one task of a scan reads. Fixed, so that the bytes depend on nothing but
@@ -37,7 +37,7 @@ pub fn write_container(
         frame_block: FRAME_BLOCK as u32,
         columns: columns
             .iter()
-            .map(|&column| ColumnSpec { name: column.name().to_owned(), width: width(column, info.sh_degree) as u32 })
+            .map(|&column| ColumnSpec { name: column.name().to_owned(), width: column.width(info.sh_degree) as u32 })
             .collect(),
         attributes,
     };
@@ -69,15 +69,6 @@ pub fn write_container(
     Ok(())
 }
 
-fn width(column: Columns, sh_degree: usize) -> usize {
-    match column {
-        Columns::OPACITY => 1,
-        Columns::ROTATION => 4,
-        Columns::SH => 3 * sh_coefficients(sh_degree),
-        _ => 3,
-    }
-}
-
 /// The tiles of every column of one block of Gaussians over `frames`.
 fn encode_block(
     source: &dyn FrameSource,
@@ -103,7 +94,7 @@ fn encode_block(
         .iter()
         .zip(columns)
         .map(|(values, &column)| {
-            let width = width(column, info.sh_degree) as u32;
+            let width = column.width(info.sh_degree) as u32;
             let stored = if info.varying.contains(column) { frames.len() } else { 1 };
             Ok(encode_tile(values, stored as u32, width, len as u32, compression)?)
         })
