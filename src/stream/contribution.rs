@@ -10,10 +10,10 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::{BLOCK, Progress};
-use crate::error::{Error, Result};
+use super::{Frames, Progress};
+use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Schedule};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::FrameSource;
 use crate::recipe;
 use crate::render::{Contribution, Renderer};
 
@@ -27,18 +27,46 @@ const PICTURES_PER_THREAD: usize = 4;
 #[derive(Debug, Clone)]
 pub struct Sample<'a>(Vec<(usize, Vec<&'a Camera>)>);
 
+/// Decides frame by frame which pictures are looked at.
+#[derive(Debug, Clone)]
+pub struct Sampler {
+    frame_stride: usize,
+    view_stride: usize,
+    /// Frames so far that have pictures.
+    with_pictures: usize,
+}
+
+impl Sampler {
+    /// The strides of `scan`: of the frames that have pictures the first and every `frame_stride`-th, of the
+    /// pictures of each every `view_stride`-th, from one that moves on from frame to frame, so that all views
+    /// take their turns.
+    pub fn new(scan: &recipe::Scan) -> Self {
+        let (frame_stride, view_stride) = (scan.frame_stride.get() as usize, scan.view_stride.get() as usize);
+        Sampler { frame_stride, view_stride, with_pictures: 0 }
+    }
+
+    /// Cameras of the pictures of the next frame to look at, of those at `views` (view number, place in
+    /// `cameras`).
+    pub fn next<'a>(&mut self, views: &[(u32, u32)], cameras: &'a [Camera]) -> Vec<&'a Camera> {
+        if views.is_empty() {
+            return Vec::new();
+        }
+        let frame = self.with_pictures;
+        self.with_pictures += 1;
+        if !frame.is_multiple_of(self.frame_stride) {
+            return Vec::new();
+        }
+        let turn = frame / self.frame_stride;
+        let views = views.iter().skip(turn % self.view_stride).step_by(self.view_stride);
+        views.map(|&(_, camera)| &cameras[camera as usize]).collect()
+    }
+}
+
 impl<'a> Sample<'a> {
-    /// What the strides of `scan` leave of `schedule`: of the frames that have pictures the first and
-    /// every `frame_stride`-th, of the pictures of each every `view_stride`-th, from one that moves on
-    /// from frame to frame, so that all views take their turns.
+    /// What the strides of `scan` leave of `schedule`, see [`Sampler`].
     pub fn new(schedule: &'a Schedule, scan: &recipe::Scan) -> Self {
-        let view_stride = scan.view_stride.get() as usize;
-        let with_pictures = schedule.frames.iter().enumerate().filter(|(_, views)| !views.is_empty());
-        let sampled = with_pictures.step_by(scan.frame_stride.get() as usize).enumerate();
-        let taken = sampled.map(|(turn, (frame, views))| {
-            let views = views.iter().skip(turn % view_stride).step_by(view_stride);
-            (frame, views.map(|&(_, camera)| &schedule.cameras[camera as usize]).collect::<Vec<_>>())
-        });
+        let mut sampler = Sampler::new(scan);
+        let taken = schedule.frames.iter().map(|views| sampler.next(views, &schedule.cameras)).enumerate();
         Sample(taken.filter(|(_, cameras)| !cameras.is_empty()).collect())
     }
 
@@ -67,53 +95,80 @@ pub struct Seen {
 /// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
 /// pictures at all give zeros.
 ///
-/// Memory per Gaussian: its reader; 44 bytes for a block's state and for each frame of a batch (frames
-/// with 4 × threads pictures between them); per thread 12 bytes of sums and a picture's buffers
-/// ([`crate::render`]). Nothing grows with frames or views.
+/// Memory per Gaussian: its reader, and that of [`Looking`]. Nothing grows with frames or views.
 pub fn visible_contribution(source: &dyn FrameSource, sample: &Sample<'_>, pixel_stride: NonZeroU32) -> Result<Seen> {
-    let info = source.info();
-    let pictures = sample.pictures();
-    let progress = Progress::new("visible", "pictures", pictures as u64);
-    let mut blocks: Vec<(Box<dyn BlockReader + '_>, Gaussians)> = (0..info.count.div_ceil(BLOCK))
-        .into_par_iter()
-        .map(|block| {
-            let range = block * BLOCK..info.count.min((block + 1) * BLOCK);
-            let state = Gaussians::zeros(range.len(), 0);
-            Ok((source.open(Ids::Range(range))?, state))
-        })
-        .collect::<Result<_>>()?;
+    let progress = Progress::new("visible", "pictures", sample.pictures() as u64);
+    let mut looking = Looking::new(source.info().count, pixel_stride);
+    looking.add(source, &sample.0, |pictures| progress.advance(pictures))?;
+    Ok(looking.finish())
+}
 
-    // One per thread at most: a picture runs on the thread that took its worker.
-    let workers: Mutex<Vec<(Renderer, Contribution)>> = Mutex::default();
-    let mut states: Vec<Gaussians> = Vec::new();
-    for batch in batches(&sample.0, PICTURES_PER_THREAD * rayon::current_num_threads()) {
-        for (slot, &(frame, _)) in batch.iter().enumerate() {
-            let want = if slot < states.len() { info.varying & GEOMETRY } else { GEOMETRY };
-            if slot == states.len() {
-                states.push(Gaussians::zeros(info.count, 0));
-            }
-            read_frame(&mut blocks, frame, want, &mut states[slot])?;
+/// Contributions to the pictures so far.
+///
+/// Memory per Gaussian: 44 bytes for a block's state and for each frame of a batch (frames with 4 × threads
+/// pictures between them); per thread 12 bytes of sums and a picture's buffers ([`crate::render`]).
+pub struct Looking {
+    count: usize,
+    pixel_stride: NonZeroU32,
+    pictures: usize,
+    /// One per thread at most: a picture runs on the thread that took its worker.
+    workers: Mutex<Vec<(Renderer, Contribution)>>,
+    states: Vec<Gaussians>,
+}
+
+impl Looking {
+    /// No pictures yet of `count` Gaussians.
+    pub fn new(count: usize, pixel_stride: NonZeroU32) -> Self {
+        Looking { count, pixel_stride, pictures: 0, workers: Mutex::default(), states: Vec::new() }
+    }
+
+    /// Looks at pictures of `source`: frames, each with the cameras of its pictures. Every source that is
+    /// added must have the same Gaussians, and the same values in columns that do not vary.
+    pub fn add(
+        &mut self,
+        source: &dyn FrameSource,
+        frames: &[(usize, Vec<&Camera>)],
+        advance: impl Fn(u64) + Sync,
+    ) -> Result<()> {
+        if frames.is_empty() {
+            return Ok(());
         }
-        let jobs: Vec<(&Gaussians, &Camera)> = batch
-            .iter()
-            .zip(&states)
-            .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
-            .collect();
-        jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
-            let free = workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
-            let mut worker = free.unwrap_or_else(|| (Renderer::new(), Contribution::new(info.count)));
-            worker.0.contribution(state, camera, pixel_stride, &mut worker.1);
-            workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
-            progress.advance(1);
-        });
+        let mut reader = Frames::open(source, GEOMETRY)?;
+        for batch in batches(frames, PICTURES_PER_THREAD * rayon::current_num_threads()) {
+            for (slot, &(frame, _)) in batch.iter().enumerate() {
+                let want = if slot < self.states.len() { source.info().varying } else { GEOMETRY };
+                if slot == self.states.len() {
+                    self.states.push(reader.state());
+                }
+                reader.read(frame, want, &mut self.states[slot])?;
+            }
+            let jobs: Vec<(&Gaussians, &Camera)> = batch
+                .iter()
+                .zip(&self.states)
+                .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
+                .collect();
+            self.pictures += jobs.len();
+            jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
+                let free = self.workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+                let mut worker = free.unwrap_or_else(|| (Renderer::new(), Contribution::new(self.count)));
+                worker.0.contribution(state, camera, self.pixel_stride, &mut worker.1);
+                self.workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
+                advance(1);
+            });
+        }
+        Ok(())
     }
-    let mut sum = Contribution::new(info.count);
-    for (_, of_thread) in workers.into_inner().unwrap_or_else(PoisonError::into_inner) {
-        sum.merge(&of_thread);
+
+    /// What was seen in all pictures.
+    pub fn finish(self) -> Seen {
+        let mut sum = Contribution::new(self.count);
+        for (_, of_thread) in self.workers.into_inner().unwrap_or_else(PoisonError::into_inner) {
+            sum.merge(&of_thread);
+        }
+        let per_pixel = f64::from(self.pixel_stride.get()).powi(2);
+        let coverage = (0..self.count).map(|i| sum.pixels(i) * per_pixel / self.pictures.max(1) as f64).collect();
+        Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() }
     }
-    let per_pixel = f64::from(pixel_stride.get()).powi(2);
-    let coverage = (0..info.count).map(|i| sum.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
-    Ok(Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() })
 }
 
 /// Runs of frames with at least `pictures` pictures between them, the last one perhaps fewer.
@@ -130,33 +185,12 @@ fn batches<T>(mut frames: &[(usize, Vec<T>)], pictures: usize) -> impl Iterator<
     })
 }
 
-/// Reads the columns `want` of all blocks at `frame` into `state`.
-fn read_frame(
-    blocks: &mut [(Box<dyn BlockReader + '_>, Gaussians)],
-    frame: usize,
-    want: Columns,
-    state: &mut Gaussians,
-) -> Result<()> {
-    if want.is_empty() {
-        return Ok(());
-    }
-    blocks.par_iter_mut().try_for_each(|(reader, block)| reader.read(frame, want, block))?;
-    for column in want.iter() {
-        let target = state.column_mut(column);
-        for c in 0..target.width() {
-            for (to, (_, block)) in target.plane_mut(c).chunks_mut(BLOCK).zip(&*blocks) {
-                to.copy_from_slice(block.column(column).plane(c));
-            }
-        }
-    }
-    Ok::<_, Error>(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::demo::Scene;
     use crate::model::{Flags, Rig, Rows, SequenceInfo, Split};
+    use crate::pass::{BlockReader, Ids};
     use crate::recipe::Recipe;
     use crate::select::{Overrides, select};
     use crate::{render, score};
