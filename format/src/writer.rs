@@ -113,16 +113,7 @@ impl Writer {
     /// Writes one tile. Errors: there is no such tile, its time stamps have not been appended, it was written
     /// already, or `tile` has another shape.
     pub fn write_tile(&mut self, at: TileId, tile: &EncodedTile) -> Result<()> {
-        let frames = self.layout.frame_range(at.frame_block, self.times.len() as u64);
-        let Some(index) =
-            self.layout.index_of(at).map(|index| index as usize).filter(|&index| index < self.tiles.len())
-        else {
-            return Err(Error::usage(format!("there is no {at:?} after {} frames", self.times.len())));
-        };
-        if self.tiles[index].is_some() {
-            return Err(Error::usage(format!("{at:?} was written already")));
-        }
-        let frames = (frames.end - frames.start) as u32;
+        let (index, frames) = self.free_slot(at)?;
         let width = self.layout.columns[at.column as usize].width;
         let len = self.layout.block_len(at.gaussian_block);
         let shape = |frames, width, len| format!("{frames} frames × {width} components × {len} Gaussians");
@@ -157,6 +148,37 @@ impl Writer {
         self.tiles[index] = Some(record);
         self.written += 1;
         Ok(())
+    }
+
+    /// Writes a tile once more as the last constant tile of its column and Gaussian block: the same file as if
+    /// [`Writer::write_tile`] were given that tile again, without encoding it again. Errors: there is no such tile,
+    /// its time stamps have not been appended, it was written already, or no constant tile came before it.
+    pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
+        let (index, frames) = self.free_slot(at)?;
+        let slot = index % self.constants.len();
+        let Some(earlier) = self.constants[slot] else {
+            return Err(Error::usage(format!("{at:?} has no constant tile before it to repeat")));
+        };
+        let record = TileRecord { id: at, frames, ..earlier };
+        self.put(&[&Record::Tile(record).to_bytes()])?;
+        self.constants[slot] = Some(record);
+        self.tiles[index] = Some(record);
+        self.written += 1;
+        Ok(())
+    }
+
+    /// Place in the index of a tile that is still to be written, and the frames it covers.
+    fn free_slot(&self, at: TileId) -> Result<(usize, u32)> {
+        let Some(index) =
+            self.layout.index_of(at).map(|index| index as usize).filter(|&index| index < self.tiles.len())
+        else {
+            return Err(Error::usage(format!("there is no {at:?} after {} frames", self.times.len())));
+        };
+        if self.tiles[index].is_some() {
+            return Err(Error::usage(format!("{at:?} was written already")));
+        }
+        let frames = self.layout.frame_range(at.frame_block, self.times.len() as u64);
+        Ok((index, (frames.end - frames.start) as u32))
     }
 
     /// Writes the footer, syncs, renames the file to its final name (replacing what was there) and syncs the

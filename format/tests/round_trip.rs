@@ -72,6 +72,28 @@ fn a_column_that_never_changes_is_stored_once() {
 }
 
 #[test]
+fn a_repeated_tile_is_the_tile_written_again() {
+    let folder = scene::folder();
+    let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
+    let tile = encode_tile(&[1.0, 2.0, 3.0], 1, 3, 1, Compression::Zstd(1)).unwrap();
+    for (path, repeat) in [(&a, false), (&b, true)] {
+        let mut writer = Writer::create(path, layout(1, 1, 2, &[3])).unwrap();
+        for times in [&[0.0, 1.0][..], &[2.0, 3.0], &[4.0]] {
+            let at = TileId { frame_block: writer.append_times(times).unwrap(), ..AT };
+            if at.frame_block > 0 && repeat {
+                writer.repeat_tile(at).unwrap();
+                assert!(writer.repeat_tile(at).is_err(), "a tile is written once");
+            } else {
+                assert!(at.frame_block > 0 || writer.repeat_tile(at).is_err(), "there is nothing to repeat yet");
+                writer.write_tile(at, &tile).unwrap();
+            }
+        }
+        writer.finish().unwrap();
+    }
+    assert_eq!(fs::read(a).unwrap(), fs::read(b).unwrap());
+}
+
+#[test]
 fn one_encoded_frame_serves_frame_blocks_of_any_length() {
     let folder = scene::folder();
     let path = folder.path().join("a");

@@ -18,6 +18,8 @@ Examples:
   splatsieve sweep model --cameras data -o curves        every method at every size
   splatsieve report model small --cameras data -o report  the same as a page to look at
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
+  exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
+  splatsieve unpack a.gseq --stream | splatsieve compress - -o b.gseq
   splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq";
 
 /// Shrinks trained dynamic Gaussian-splatting models, without retraining.
@@ -53,7 +55,7 @@ pub(super) enum Verb {
     Info(Info),
     /// Check every byte of a .gseq container
     Verify(Verify),
-    /// Write a .gseq container's frames as a folder of PLY files
+    /// Write an input's frames as a folder of PLY files, or as a frame stream
     Unpack(Unpack),
     /// Save the complete frames of a .gseq container that was cut short
     Recover(Recover),
@@ -68,11 +70,16 @@ pub(super) enum Verb {
 /// What to read.
 #[derive(Debug, Args)]
 pub(super) struct Input {
-    /// 4DGaussians model folder, folder of PLY frames, one .ply, or .gseq
+    /// 4DGaussians model folder, folder of PLY frames, one .ply, .gseq, or - for a frame stream on standard
+    /// input
     pub(super) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
+    /// Folder for the packed frames of a stream while the run lasts [default: that of the output, else the
+    /// system's]
+    #[arg(long, value_name = "FOLDER")]
+    pub(super) scratch_dir: Option<PathBuf>,
 }
 
 /// The file of the cameras.
@@ -386,8 +393,11 @@ pub(super) struct Unpack {
     #[command(flatten)]
     pub(super) cameras: Cameras,
     /// Folder to write frame_NNNNN.ply into
-    #[arg(short, long, value_name = "FOLDER")]
-    pub(super) output: PathBuf,
+    #[arg(short, long, value_name = "FOLDER", required_unless_present = "stream", conflicts_with = "stream")]
+    pub(super) output: Option<PathBuf>,
+    /// Write a frame stream to standard output instead, for another program to read (format/STREAM.md)
+    #[arg(long)]
+    pub(super) stream: bool,
     /// Replace an earlier output
     #[arg(long)]
     pub(super) overwrite: bool,

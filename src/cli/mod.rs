@@ -3,7 +3,8 @@
 mod args;
 mod recipe_flags;
 
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
@@ -12,6 +13,7 @@ use gseq::Compression;
 use crate::emit::image::ImageFormat;
 use crate::error::{Error, Result};
 use crate::model::Split;
+use crate::pipeline::arrival::scratch_beside;
 use crate::pipeline::compress::{CompressOptions, Only, Target, compress};
 use crate::pipeline::evaluate::EvaluateOptions;
 use crate::pipeline::input::InputOptions;
@@ -60,7 +62,7 @@ fn run(cli: Cli) -> Result<()> {
             print(&if json { summary.json() } else { summary.text() })
         }
         Verb::Score(args) => {
-            let input = input_options(args.input, Some(args.cameras));
+            let input = input_options(args.input, Some(args.cameras), Some(&args.output));
             let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.overwrite)?;
             notes(&report.notes);
             print(&format!(
@@ -101,19 +103,19 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
-            let input = input_options(args.input, Some(args.cameras));
-            let (opened, bytes) = container::pack(&input, &args.output, compression, args.overwrite)?;
-            notes(&opened.notes);
-            let info = opened.input.source().info();
+            let input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            let packed = container::pack(&input, &args.output, compression, args.overwrite)?;
+            notes(&packed.notes);
             print(&format!(
-                "{}: {} Gaussians x {} frames in {bytes} bytes\n",
+                "{}: {} Gaussians x {} frames in {} bytes\n",
                 args.output.display(),
-                info.count,
-                info.times.len()
+                packed.gaussians,
+                packed.frames,
+                packed.bytes
             ))
         }
         Verb::Info(args) => {
-            let info = container::info(&input_options(args.input, None))?;
+            let info = container::info(&input_options(args.input, None, None))?;
             print(&if args.json { json(&info) } else { info.text() })
         }
         Verb::Verify(args) => {
@@ -130,11 +132,19 @@ fn run(cli: Cli) -> Result<()> {
             })
         }
         Verb::Unpack(args) => {
-            let input = input_options(args.input, Some(args.cameras));
-            let opened = container::unpack(&input, &args.output, args.overwrite)?;
+            let input = input_options(args.input, Some(args.cameras), args.output.as_deref());
+            let Some(output) = args.output else {
+                let stdout = io::stdout().lock();
+                if stdout.is_terminal() {
+                    return Err(Error::usage("a frame stream is not for a terminal; pipe it into a program or a file"));
+                }
+                notes(&container::unpack_stream(&input, stdout)?.notes);
+                return Ok(());
+            };
+            let opened = container::unpack(&input, &output, args.overwrite)?;
             notes(&opened.notes);
             let frames = opened.input.source().info().times.len();
-            print(&format!("{}: {frames} PLY files\n", args.output.display()))
+            print(&format!("{}: {frames} PLY files\n", output.display()))
         }
         Verb::Recover(args) => {
             let report = container::recover(&args.input, &args.output, args.overwrite)?;
@@ -174,7 +184,7 @@ fn compress_options(args: Compress) -> Result<CompressOptions> {
         args::OutputKind::Ply => OutputKind::Ply,
     });
     Ok(CompressOptions {
-        input: input_options(args.input, Some(args.cameras)),
+        input: input_options(args.input, Some(args.cameras), Some(&args.output)),
         output: args.output,
         kind,
         recipe,
@@ -201,7 +211,7 @@ fn render_options(args: Render) -> RenderOptions {
         Some((frame, view)) => (Wanted::One { frame: frame as usize, view }, Part::All),
         None => (Wanted::All(format), Part::HeldOut),
     };
-    let mut input = input_options(args.input, None);
+    let mut input = input_options(args.input, None, Some(&args.output));
     input.look_from(args.cameras);
     RenderOptions {
         input,
@@ -230,7 +240,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
 }
 
 fn sweep_options(args: Sweep) -> SweepOptions {
-    let mut input = input_options(args.input, None);
+    let mut input = input_options(args.input, None, Some(&args.output));
     input.look_from(args.cameras);
     let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
     SweepOptions {
@@ -252,8 +262,9 @@ fn part_of(split: SplitArg) -> Part {
     }
 }
 
-fn input_options(input: Input, cameras: Option<Cameras>) -> InputOptions {
+fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {
     let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
+    options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         options.look_from(cameras.file);
         options.split = match cameras.split {

@@ -21,6 +21,9 @@ const WRITING: &str = "splatsieve-tmp";
 /// Ends the name of an earlier output about to be deleted.
 const REPLACED: &str = "splatsieve-old";
 
+/// What the names of scratch files are made of, in whatever folder.
+const SCRATCH: &str = "splatsieve-scratch";
+
 /// What an output is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
@@ -171,6 +174,33 @@ impl StagedFolder {
     }
 }
 
+/// A file for as long as a run lasts: removed when this is dropped.
+#[derive(Debug)]
+pub struct ScratchFile(PathBuf);
+
+impl ScratchFile {
+    /// A name in `folder` that no other file has. Nothing is created yet; what killed runs left there is removed.
+    ///
+    /// # Errors
+    /// A folder that does not exist; the system refuses.
+    pub fn new(folder: &Path) -> Result<ScratchFile> {
+        let target = folder.join(SCRATCH);
+        tidy(&target)?;
+        sibling(&target, WRITING).map(ScratchFile)
+    }
+
+    /// Where to write it.
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for ScratchFile {
+    fn drop(&mut self) {
+        remove(&self.0);
+    }
+}
+
 /// A target and the temporary name its content has meanwhile.
 #[derive(Debug)]
 struct Staged {
@@ -182,6 +212,7 @@ struct Staged {
 impl Staged {
     fn new(target: &Path, overwrite: bool) -> Result<Staged> {
         tidy(target)?;
+        tidy(&target.with_file_name(SCRATCH))?;
         let staged = Staged { target: target.to_owned(), temporary: sibling(target, WRITING)?, overwrite };
         staged.refuse_newcomer()?;
         Ok(staged)

@@ -1,23 +1,24 @@
-//! Any sequence into a container, tile by tile.
+//! Any sequence into a container, frame block by frame block, tile by tile.
 //!
-//! Memory: for every thread one tile of every column, [`GAUSSIAN_BLOCK`] × [`FRAME_BLOCK`] values of
+//! Memory: for every thread one tile of every column, [`GAUSSIAN_BLOCK`] × frames of a block values of
 //! each of its components, and as much again while it is encoded; nothing grows with N or T but the
 //! index, 64 bytes per tile.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::Path;
 
 use gseq::{ColumnSpec, Compression, EncodedTile, Layout, TileId, Writer, encode_tile};
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, sh_coefficients};
+use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
 
 /// Gaussians per tile: what one task of a scan reads. Fixed, so that the bytes depend on nothing but
 /// the content.
 pub const GAUSSIAN_BLOCK: usize = 1024;
-/// Frames per tile.
+/// Frames per tile, but for streams whose frames are large.
 pub const FRAME_BLOCK: usize = 32;
 
 /// Writes `source` to the container `path`, which appears complete or not at all. `advance` is told
@@ -30,82 +31,118 @@ pub fn write_container(
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     let info = source.info();
-    let columns: Vec<Columns> = Columns::ALL.iter().collect();
-    let layout = Layout {
-        gaussians: info.count as u64,
-        gaussian_block: GAUSSIAN_BLOCK as u32,
-        frame_block: FRAME_BLOCK as u32,
-        columns: columns
-            .iter()
-            .map(|&column| ColumnSpec { name: column.name().to_owned(), width: width(column, info.sh_degree) as u32 })
-            .collect(),
-        attributes,
-    };
-    let blocks: Vec<u32> = (0..layout.gaussian_blocks()).collect();
-    let mut writer = Writer::create(path, layout)?;
-    for (index, times) in info.times.chunks(FRAME_BLOCK).enumerate() {
-        let frame_block = writer.append_times(times)?;
-        let frames = index * FRAME_BLOCK..index * FRAME_BLOCK + times.len();
+    let mut writer = ContainerWriter::create(path, info.count, info.sh_degree, FRAME_BLOCK, compression, attributes)?;
+    for start in (0..info.times.len()).step_by(FRAME_BLOCK) {
+        let end = info.times.len().min(start + FRAME_BLOCK);
+        writer.append(source, start..end, &advance)?;
+    }
+    writer.finish()
+}
+
+/// A container that grows by one frame block at a time. Dropped unfinished, it leaves nothing.
+pub struct ContainerWriter {
+    writer: Writer,
+    compression: Compression,
+    frame_blocks: usize,
+}
+
+impl ContainerWriter {
+    /// Starts the container `path` of `count` Gaussians in blocks of `frame_block` frames.
+    pub fn create(
+        path: &Path,
+        count: usize,
+        sh_degree: usize,
+        frame_block: usize,
+        compression: Compression,
+        attributes: BTreeMap<String, String>,
+    ) -> Result<ContainerWriter> {
+        let column =
+            |column: Columns| ColumnSpec { name: column.name().to_owned(), width: column.width(sh_degree) as u32 };
+        let layout = Layout {
+            gaussians: count as u64,
+            gaussian_block: GAUSSIAN_BLOCK as u32,
+            frame_block: frame_block as u32,
+            columns: Columns::ALL.iter().map(column).collect(),
+            attributes,
+        };
+        Ok(ContainerWriter { writer: Writer::create(path, layout)?, compression, frame_blocks: 0 })
+    }
+
+    /// Adds the next frame block: `frames` of `source`, as many as a block has; fewer end the sequence.
+    /// Columns that do not vary must hold what they held in the blocks before.
+    pub fn append(
+        &mut self,
+        source: &dyn FrameSource,
+        frames: Range<usize>,
+        advance: impl Fn(u64) + Sync,
+    ) -> Result<()> {
+        let info = source.info();
+        let frame_block = self.writer.append_times(&info.times[frames.clone()])?;
+        // A column that never varies is encoded for the first block alone.
+        let columns = if self.frame_blocks == 0 { Columns::ALL } else { info.varying };
+        self.frame_blocks += 1;
+        let blocks: Vec<u32> = (0..self.writer.layout().gaussian_blocks()).collect();
         // One batch of blocks at a time bounds the tiles that wait for the writer.
         for batch in blocks.chunks(2 * rayon::current_num_threads()) {
-            let tiles: Vec<Vec<EncodedTile>> = batch
+            let tiles: Vec<Vec<Option<EncodedTile>>> = batch
                 .par_iter()
                 .map(|&block| {
                     let start = block as usize * GAUSSIAN_BLOCK;
                     let end = (start + GAUSSIAN_BLOCK).min(info.count);
-                    let tiles = encode_block(source, start..end, frames.clone(), &columns, compression);
-                    advance(((end - start) * times.len()) as u64);
+                    let tiles = encode_block(source, start..end, frames.clone(), columns, self.compression);
+                    advance(((end - start) * frames.len()) as u64);
                     tiles
                 })
                 .collect::<Result<_>>()?;
             for (&gaussian_block, tiles) in batch.iter().zip(&tiles) {
                 for (column, tile) in tiles.iter().enumerate() {
-                    writer.write_tile(TileId { column: column as u32, gaussian_block, frame_block }, tile)?;
+                    let at = TileId { column: column as u32, gaussian_block, frame_block };
+                    match tile {
+                        Some(tile) => self.writer.write_tile(at, tile)?,
+                        None => self.writer.repeat_tile(at)?,
+                    }
                 }
             }
         }
+        Ok(())
     }
-    writer.finish()?;
-    Ok(())
-}
 
-fn width(column: Columns, sh_degree: usize) -> usize {
-    match column {
-        Columns::OPACITY => 1,
-        Columns::ROTATION => 4,
-        Columns::SH => 3 * sh_coefficients(sh_degree),
-        _ => 3,
+    /// Completes the container and gives it its name.
+    pub fn finish(self) -> Result<()> {
+        self.writer.finish()?;
+        Ok(())
     }
 }
 
-/// The tiles of every column of one block of Gaussians over `frames`.
+/// The tiles of one block of Gaussians over `frames`, one entry per column; none for those not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,
-    gaussians: std::ops::Range<usize>,
-    frames: std::ops::Range<usize>,
-    columns: &[Columns],
+    gaussians: Range<usize>,
+    frames: Range<usize>,
+    columns: Columns,
     compression: Compression,
-) -> Result<Vec<EncodedTile>> {
+) -> Result<Vec<Option<EncodedTile>>> {
     let info = source.info();
     let len = gaussians.len();
     let mut reader = source.open(Ids::Range(gaussians))?;
     let mut state = Gaussians::zeros(len, info.sh_degree);
-    let mut values: Vec<Vec<f32>> = vec![Vec::new(); columns.len()];
+    let mut values: Vec<Vec<f32>> = Columns::ALL.iter().map(|_| Vec::new()).collect();
     for frame in frames.clone() {
         // A column that never varies is one frame for all; the container stores it once.
-        let want = if frame == frames.start { Columns::ALL } else { info.varying };
+        let want = if frame == frames.start { columns } else { info.varying };
         reader.read(frame, want, &mut state)?;
-        for (values, &column) in values.iter_mut().zip(columns).filter(|(_, column)| want.contains(**column)) {
+        for (values, column) in values.iter_mut().zip(Columns::ALL.iter()).filter(|(_, column)| want.contains(*column))
+        {
             values.extend_from_slice(state.column(column).planes());
         }
     }
-    values
-        .iter()
-        .zip(columns)
-        .map(|(values, &column)| {
-            let width = width(column, info.sh_degree) as u32;
-            let stored = if info.varying.contains(column) { frames.len() } else { 1 };
-            Ok(encode_tile(values, stored as u32, width, len as u32, compression)?)
-        })
-        .collect()
+    let encode = |(values, column): (&Vec<f32>, Columns)| {
+        if !columns.contains(column) {
+            return Ok(None);
+        }
+        let width = column.width(info.sh_degree) as u32;
+        let stored = if info.varying.contains(column) { frames.len() } else { 1 };
+        Ok(Some(encode_tile(values, stored as u32, width, len as u32, compression)?))
+    };
+    values.iter().zip(Columns::ALL.iter()).map(encode).collect()
 }

@@ -1,10 +1,11 @@
-//! Sinks: model folders, PLY files, containers, rows, pictures.
+//! Sinks: model folders, PLY files, containers, streams, rows, pictures.
 //!
 //! Writers create the file they are given; [`atomic`] hands out the temporary names to give them and
 //! moves what was written to where the user asked for it.
 
 pub mod atomic;
 pub mod container;
+pub mod frame_stream;
 pub mod image;
 pub mod index_map;
 pub mod ply;

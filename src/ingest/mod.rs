@@ -1,8 +1,9 @@
-//! Sources: model folders, PLY files and sequences, containers, cameras, pictures.
+//! Sources: model folders, PLY files and sequences, containers, streams, cameras, pictures.
 
 pub mod cameras;
 mod cfg_args;
 pub mod container;
+pub mod frame_stream;
 pub mod image;
 mod map;
 mod model_folder;

@@ -110,6 +110,12 @@ impl Rig {
         times
     }
 
+    /// How far from a frame's time a picture of it may be taken, if the frames span the pictures' times.
+    pub fn time_tolerance(&self) -> f64 {
+        let times = self.times();
+        TIME_TOLERANCE * if times.len() > 1 { span(&times) } else { 1.0 }
+    }
+
     /// Which cameras see which frame, for the pictures of one split (`None`: all of them).
     ///
     /// `frame_times` must increase. A picture belongs to the nearest frame, which must lie within

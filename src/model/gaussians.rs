@@ -19,6 +19,15 @@ impl Column {
         Column { width, len, data: vec![0.0; width * len] }
     }
 
+    /// Planes of equal length, one after the other: `[width, len]`.
+    ///
+    /// # Panics
+    /// If `width` planes of equal length do not make up `data`.
+    pub fn from_planes(width: usize, data: Vec<f32>) -> Self {
+        assert!(data.len().is_multiple_of(width), "{} values are not {width} planes", data.len());
+        Column { width, len: data.len() / width, data }
+    }
+
     /// Components per Gaussian.
     pub fn width(&self) -> usize {
         self.width
@@ -211,6 +220,27 @@ impl Columns {
     /// The columns of the set, one at a time, in storage order.
     pub fn iter(self) -> impl Iterator<Item = Columns> {
         (0..5).map(|bit| Columns(1 << bit)).filter(move |&one| self.contains(one))
+    }
+
+    /// The set as bits, in storage order from bit 0: position, rotation, log_scale, opacity_logit, sh.
+    pub const fn bits(self) -> u8 {
+        self.0
+    }
+
+    /// The inverse of [`Columns::bits`]; none for bits that stand for no column.
+    pub fn from_bits(bits: u32) -> Option<Columns> {
+        u8::try_from(bits).ok().filter(|&bits| bits <= Columns::ALL.0).map(Columns)
+    }
+
+    /// Components per Gaussian of all columns of the set together, for harmonics of degree `sh_degree`.
+    pub fn width(self, sh_degree: usize) -> usize {
+        let of = |column: Columns| match column {
+            Columns::OPACITY => 1,
+            Columns::ROTATION => 4,
+            Columns::SH => 3 * sh_coefficients(sh_degree),
+            _ => 3,
+        };
+        self.iter().map(of).sum()
     }
 
     /// Name of a single column as the container and messages spell it.

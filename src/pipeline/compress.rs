@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::arrival::open_measured;
 use super::choose::{Chosen, choose};
 use super::input::{InputOptions, Scene, open_scene};
 use super::merging::sieve;
@@ -9,7 +10,7 @@ use super::output::{OutputKind, check_output, write_result};
 use super::overrides::parse_ids;
 use super::refit::refit;
 use super::rounds::rank_in_rounds;
-use super::scored::{Scored, UserOverrides, score_scene};
+use super::scored::{Measured, Scored, UserOverrides, measure, score_measured};
 use super::summary::{CameraSummary, LeftOut, Stages, Summary};
 use crate::error::{Error, Result};
 use crate::recipe::{Coverage, Recipe};
@@ -69,32 +70,40 @@ pub struct CompressOptions {
 pub fn compress(options: &CompressOptions) -> Result<Summary> {
     options.recipe.validate().map_err(Error::usage)?;
     let mut stages = Stages::default();
-    let scene = stages.run("read", 0, 0.0, || {
-        let scene = open_scene(&options.input)?;
+    let is_stream = options.input.is_stream();
+    let name = if is_stream { "receive" } else { "read" };
+    let (scene, measured) = stages.run(name, 0, f64::from(u8::from(is_stream)), || {
+        let (scene, measured) = match is_stream {
+            true => open_measured(&options.input, &options.recipe, |count| options.check_stream(count))?,
+            false => (open_scene(&options.input)?, None),
+        };
         let count = scene.input.source().info().count;
-        Ok::<_, Error>((scene, count))
+        Ok::<_, Error>(((scene, measured), count))
     })?;
-    Ok(compress_scene(&scene, options, stages)?.0)
+    Ok(compress_measured(&scene, measured, options, stages)?.0)
 }
 
 /// [`compress`] of a scene that is open already; also gives every Gaussian's place in the output.
-pub fn compress_scene(
+pub fn compress_scene(scene: &Scene, options: &CompressOptions, stages: Stages) -> Result<(Summary, Vec<Option<u32>>)> {
+    compress_measured(scene, None, options, stages)
+}
+
+/// [`compress_scene`] of a scene that may have been measured as it arrived.
+fn compress_measured(
     scene: &Scene,
+    measured: Option<Measured>,
     options: &CompressOptions,
     mut stages: Stages,
 ) -> Result<(Summary, Vec<Option<u32>>)> {
     let recipe = &options.recipe;
     let info = scene.input.source().info();
     let kind = OutputKind::of(&options.output, options.kind, &scene.input)?;
-    check_output(&options.output, kind, scene, options.overwrite)?;
+    check_output(&options.output, kind, &[&scene.path], options.overwrite)?;
     let target = options.target.map(|target| target.count(info.count)).transpose()?;
-    let user = UserOverrides {
-        keep: options.keep_ids.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, info.count))?,
-        drop: options.drop_ids.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, info.count))?,
-        keep_box: options.keep_box,
-    };
+    let user = options.overrides(info.count)?;
     let input = scene.input.summary(&scene.path)?;
-    let mut scored = score_scene(scene, recipe, &user, &mut stages)?;
+    let measured = measured.map_or_else(|| measure(scene, recipe, &mut stages), Ok)?;
+    let mut scored = score_measured(scene, measured, recipe, &user, &mut stages)?;
     if options.only != Only::Merge {
         let fewest = target.unwrap_or(scored.selection.counts.kept);
         rank_in_rounds(scene, &mut scored, recipe, fewest, &mut stages)?;
@@ -145,6 +154,24 @@ pub fn compress_scene(
     }
     let summary = write_result(scene, &scored, &sieved, options, kind, summary, stages)?;
     Ok((summary, sieved.index_map(info.count)))
+}
+
+impl CompressOptions {
+    /// The user's overrides for an input of `count` Gaussians.
+    fn overrides(&self, count: usize) -> Result<UserOverrides> {
+        Ok(UserOverrides {
+            keep: self.keep_ids.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, count))?,
+            drop: self.drop_ids.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, count))?,
+            keep_box: self.keep_box,
+        })
+    }
+
+    /// What can be refused of a stream of `count` Gaussians before its frames, which may take hours, arrive.
+    fn check_stream(&self, count: usize) -> Result<()> {
+        check_output(&self.output, OutputKind::of_sequence(&self.output, self.kind)?, &[], self.overwrite)?;
+        self.target.map(|target| target.count(count)).transpose()?;
+        self.overrides(count).map(|_| ())
+    }
 }
 
 impl Target {

@@ -2,22 +2,52 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Write;
 use std::path::Path;
 
 use gseq::{Compression, Encoding, Reader, RecoverReport, TileId, VerifyReport};
 use serde::Serialize;
 
+use super::arrival::{open_stream, pack_stream};
 use super::input::{Input, InputOptions, Opened, open_input};
 use super::output::{OutputKind, write_sequence};
 use super::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
 use crate::emit::container::write_container;
+use crate::emit::frame_stream::StreamWriter;
 use crate::error::{Error, Result};
-use crate::stream::Progress;
+use crate::ingest::container::Container;
+use crate::ingest::frame_stream::StreamHeader;
+use crate::model::Columns;
+use crate::pass::{FrameSource, Ids};
+use crate::stream::{Frames, Progress};
 
-/// Packs any input into a container; gives the input and the bytes written.
-pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: bool) -> Result<(Opened, u64)> {
+/// What `pack` wrote.
+#[derive(Debug)]
+pub struct Packed {
+    /// N.
+    pub gaussians: usize,
+    /// T.
+    pub frames: usize,
+    /// Size of the container.
+    pub bytes: u64,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Packs any input into a container. That of a stream names no digest of its source, which is known only
+/// when the container's header has long been written.
+pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: bool) -> Result<Packed> {
     check_target(output, Kind::File, &[&input.path], overwrite)?;
+    if input.is_stream() {
+        let staged = StagedFile::new(output, overwrite)?;
+        pack_stream(open_stream(input)?, staged.path(), compression, |_| Ok(()))?;
+        let container = Container::open(staged.path())?;
+        let (gaussians, frames) = (container.info().count, container.info().times.len());
+        let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+        staged.commit()?;
+        return Ok(Packed { gaussians, frames, bytes, notes: Vec::new() });
+    }
     let opened = open_input(input)?;
     let source = opened.input.source();
     let staged = StagedFile::new(output, overwrite)?;
@@ -28,7 +58,33 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
     drop(progress);
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
-    Ok((opened, bytes))
+    let info = opened.input.source().info();
+    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, notes: opened.notes })
+}
+
+/// Writes any input as a frame stream; gives the input.
+///
+/// Memory per Gaussian: its reader, and twice its state at one frame.
+pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
+    let opened = open_input(input)?;
+    let source = opened.input.source();
+    let info = source.info();
+    let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL)?;
+    let mut state = frames.state();
+    if !info.times.is_empty() {
+        frames.read(0, Columns::ALL, &mut state)?;
+    }
+    let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+    let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
+    for (frame, &time) in info.times.iter().enumerate() {
+        frames.read(frame, info.varying, &mut state)?;
+        stream.frame(time, &state)?;
+        progress.advance(1);
+    }
+    stream.finish()?;
+    drop((progress, frames));
+    Ok(opened)
 }
 
 /// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
@@ -100,7 +156,10 @@ pub struct ColumnInfo {
 
 /// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
 pub fn info(options: &InputOptions) -> Result<Info> {
-    let input = Input::open(&options.path, options.iteration)?;
+    let input = match options.is_stream() {
+        true => open_input(options)?.input,
+        false => Input::open(&options.path, options.iteration)?,
+    };
     let columns = match &input {
         Input::Container(container) => columns(container.reader())?,
         _ => Vec::new(),

@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 
+use super::arrival::open_arriving;
+use crate::emit::atomic::ScratchFile;
 use crate::error::{Error, Result};
 use crate::ingest::ModelFolder;
 use crate::ingest::cameras::{self, CameraOptions};
@@ -18,7 +20,7 @@ use crate::stream::gather;
 /// What to read and from where to look.
 #[derive(Debug, Clone, Default)]
 pub struct InputOptions {
-    /// Model folder, folder of PLY files, .ply or .gseq.
+    /// Model folder, folder of PLY files, .ply or .gseq; `-`: a frame stream on standard input.
     pub path: PathBuf,
     /// Training iteration of a model folder; none: the largest.
     pub iteration: Option<u32>,
@@ -30,6 +32,15 @@ pub struct InputOptions {
     pub size: Option<(u32, u32)>,
     /// Which pictures to score with; none: all.
     pub split: Option<Split>,
+    /// Folder for the packed frames of a stream while the run lasts; none: the system's for such files.
+    pub scratch: Option<PathBuf>,
+}
+
+impl InputOptions {
+    /// Whether the input is the stream on standard input.
+    pub fn is_stream(&self) -> bool {
+        self.path == Path::new("-")
+    }
 }
 
 /// An open input.
@@ -40,6 +51,18 @@ pub enum Input {
     Frames(PlySequence),
     /// A container.
     Container(Container),
+    /// A stream that was packed as it arrived.
+    Stream(Streamed),
+}
+
+/// What a stream has become.
+pub struct Streamed {
+    /// Its frames.
+    pub container: Container,
+    /// Bytes that arrived.
+    pub received: u64,
+    /// Keeps the container's file until nobody reads it any more.
+    pub(super) _scratch: ScratchFile,
 }
 
 /// An input with the cameras that look at it.
@@ -70,14 +93,13 @@ pub struct Opened {
 
 /// Opens an input; cameras only say which frames it has.
 pub fn open_input(options: &InputOptions) -> Result<Opened> {
+    if options.is_stream() {
+        return check_frames(open_arriving(options)?, &options.path);
+    }
     let path = &options.path;
     let mut notes = Vec::new();
     let input = Input::open(path, options.iteration)?;
-    let camera_options = CameraOptions { size: options.size, frames: options.frames };
-    let rig = match camera_path(options, &input) {
-        Some(found) => Some(cameras::load(&found, &camera_options)?),
-        None => None,
-    };
+    let rig = load_cameras(options, camera_path(options, &input).as_deref())?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input {
         Input::Model(model) => {
@@ -116,18 +138,32 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
         }
         input => input,
     };
-    let info = input.source().info();
+    check_frames(Opened { input, rig, notes }, path)
+}
+
+fn check_frames(opened: Opened, path: &Path) -> Result<Opened> {
+    let info = opened.input.source().info();
     if info.times.is_empty() && info.count > 0 {
         let found = format!("none of {} Gaussians", info.count);
         return Err(Error::input(path, "", "at least one frame", found));
     }
-    Ok(Opened { input, rig, notes })
+    Ok(opened)
+}
+
+/// The cameras of a file, if there is one.
+pub(super) fn load_cameras(options: &InputOptions, path: Option<&Path>) -> Result<Option<Rig>> {
+    let camera_options = CameraOptions { size: options.size, frames: options.frames };
+    path.map(|path| cameras::load(path, &camera_options)).transpose()
 }
 
 /// Opens an input and the cameras that look at it.
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
-    let Opened { input, rig, mut notes } = open_input(options)?;
-    let path = &options.path;
+    scene_of(open_input(options)?, &options.path, options.split)
+}
+
+/// An open input as the cameras of `split` see it.
+pub(super) fn scene_of(opened: Opened, path: &Path, split: Option<Split>) -> Result<Scene> {
+    let Opened { input, rig, mut notes } = check_frames(opened, path)?;
     let has_cameras = rig.is_some();
     let rig = match rig {
         Some(rig) => rig,
@@ -137,11 +173,11 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
             rig
         }
     };
-    let schedule = rig.schedule(&input.source().info().times, options.split)?;
+    let schedule = rig.schedule(&input.source().info().times, split)?;
     if schedule.pairs() == 0 && !input.source().info().times.is_empty() {
         return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
     }
-    Ok(Scene { path: path.clone(), input, rig, schedule, has_cameras, notes })
+    Ok(Scene { path: path.to_owned(), input, rig, schedule, has_cameras, notes })
 }
 
 /// Frames of a model for which neither cameras nor the user name any.
@@ -201,6 +237,7 @@ impl Input {
             Input::Model(model) => model,
             Input::Frames(frames) => frames,
             Input::Container(container) => container,
+            Input::Stream(streamed) => &streamed.container,
         }
     }
 
@@ -218,6 +255,7 @@ impl Input {
             Input::Model(_) => "4DGaussians model",
             Input::Frames(_) => "PLY frames",
             Input::Container(_) => "gseq container",
+            Input::Stream(_) => "frame stream",
         }
     }
 
@@ -227,6 +265,7 @@ impl Input {
             Input::Model(model) => model.paths().digest(),
             Input::Frames(frames) => frames.digest(),
             Input::Container(container) => Ok(container.digest()),
+            Input::Stream(streamed) => Ok(streamed.container.digest()),
         }
     }
 
@@ -245,12 +284,13 @@ impl Input {
         })
     }
 
-    /// Bytes of the files that grow with the Gaussians.
+    /// Bytes of the files that grow with the Gaussians; of a stream, those that arrived.
     pub fn bytes(&self) -> Result<u64> {
         let paths: Vec<&Path> = match self {
             Input::Model(model) => vec![&model.paths().point_cloud],
             Input::Frames(frames) => frames.paths().iter().map(PathBuf::as_path).collect(),
             Input::Container(container) => vec![container.path()],
+            Input::Stream(streamed) => return Ok(streamed.received),
         };
         paths.iter().map(|path| Ok(std::fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
     }

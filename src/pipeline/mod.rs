@@ -1,5 +1,6 @@
 //! The order of the passes: what each verb does from input to output.
 
+pub mod arrival;
 pub mod baseline;
 pub mod choose;
 pub mod compress;

@@ -47,28 +47,36 @@ impl OutputKind {
     /// The kind a path asks for by its name, or the one asked for outright, checked against what the
     /// input can give. A folder is of the input's own kind.
     pub fn of(path: &Path, asked: Option<OutputKind>, input: &Input) -> Result<OutputKind> {
-        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
-        let is_model = matches!(input, Input::Model(_));
-        let by_name = match extension.as_str() {
-            "gseq" => OutputKind::Gseq,
-            "ply" => OutputKind::Ply,
-            _ if is_model => OutputKind::Model,
-            _ => OutputKind::PlySequence,
-        };
-        let kind = asked.unwrap_or(by_name);
-        if kind == OutputKind::Model && !is_model {
-            return Err(Error::usage(
-                "only a 4DGaussians model can be written as a model folder\n  write a .gseq or --as ply-sequence",
-            ));
+        if matches!(input, Input::Model(_)) {
+            return Ok(asked.or(Self::by_name(path)).unwrap_or(OutputKind::Model));
         }
+        let kind = Self::of_sequence(path, asked)?;
         let frames = input.source().info().times.len();
-        if kind == OutputKind::Ply && !is_model && frames != 1 {
+        if kind == OutputKind::Ply && frames != 1 {
             return Err(Error::usage(format!(
                 "{}: {frames} frames do not fit one .ply\n  write a .gseq or --as ply-sequence",
                 path.display()
             )));
         }
         Ok(kind)
+    }
+
+    /// [`OutputKind::of`] an input that is no model and whose frames nobody has counted yet.
+    pub fn of_sequence(path: &Path, asked: Option<OutputKind>) -> Result<OutputKind> {
+        match asked.or(Self::by_name(path)) {
+            Some(OutputKind::Model) => Err(Error::usage(
+                "only a 4DGaussians model can be written as a model folder\n  write a .gseq or --as ply-sequence",
+            )),
+            kind => Ok(kind.unwrap_or(OutputKind::PlySequence)),
+        }
+    }
+
+    fn by_name(path: &Path) -> Option<OutputKind> {
+        match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
+            "gseq" => Some(OutputKind::Gseq),
+            "ply" => Some(OutputKind::Ply),
+            _ => None,
+        }
     }
 
     /// Whether the result is a folder.
@@ -94,14 +102,13 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
 }
 
 /// Confirms, before any work, that the result and what goes beside it can be written.
-pub fn check_output(path: &Path, kind: OutputKind, scene: &Scene, overwrite: bool) -> Result<()> {
-    let inputs = [scene.path.as_path()];
+pub fn check_output(path: &Path, kind: OutputKind, inputs: &[&Path], overwrite: bool) -> Result<()> {
     if kind.is_folder() {
-        return check_target(path, Kind::Folder, &inputs, overwrite);
+        return check_target(path, Kind::Folder, inputs, overwrite);
     }
-    check_target(path, Kind::File, &inputs, overwrite)?;
+    check_target(path, Kind::File, inputs, overwrite)?;
     for name in [RECIPE, INDEX_MAP, MARKER] {
-        check_target(&beside(path, false, name), Kind::File, &inputs, overwrite)?;
+        check_target(&beside(path, false, name), Kind::File, inputs, overwrite)?;
     }
     Ok(())
 }

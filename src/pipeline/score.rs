@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
+use super::arrival::open_measured;
 use super::input::{InputOptions, open_scene};
-use super::scored::{UserOverrides, score_scene};
+use super::scored::{UserOverrides, measure, score_measured};
 use super::summary::Stages;
 use crate::emit::atomic::{Kind, StagedFile, check_target};
 use crate::emit::rows::RowTable;
@@ -18,8 +19,13 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bo
         return Err(Error::usage(format!("{}: expected a name that ends in .npz or .csv", output.display())));
     }
     check_target(output, Kind::File, &[&input.path], overwrite)?;
-    let scene = open_scene(input)?;
-    let scored = score_scene(&scene, recipe, &UserOverrides::default(), &mut Stages::default())?;
+    let stages = &mut Stages::default();
+    let (scene, measured) = match input.is_stream() {
+        true => open_measured(input, recipe, |_| Ok(()))?,
+        false => (open_scene(input)?, None),
+    };
+    let measured = measured.map_or_else(|| measure(&scene, recipe, stages), Ok)?;
+    let scored = score_measured(&scene, measured, recipe, &UserOverrides::default(), stages)?;
     let table = RowTable {
         rows: &scored.rows,
         static_score: &scored.scores.static_score,

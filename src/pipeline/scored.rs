@@ -8,7 +8,7 @@ use crate::recipe::{self, Coverage, NonFinite, Recipe, StaticTerm};
 use crate::score::{Scores, score};
 use crate::select::{Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, ScanPlan, fill_anisotropy, snap};
-use crate::stream::{Sample, gather, scan, visible_contribution};
+use crate::stream::{Sample, Scanned, Seen, gather, scan, visible_contribution};
 
 /// A scene with statistics, scores and a selection for every Gaussian.
 pub struct Scored {
@@ -41,6 +41,14 @@ pub struct Reference {
     pub extent: f64,
 }
 
+/// What the frames say before anything is scored.
+pub struct Measured {
+    /// Statistics of every Gaussian.
+    pub scanned: Scanned,
+    /// What the pictures show of each, where that is asked for.
+    pub seen: Option<Seen>,
+}
+
 /// What the user knows better, before ids are resolved.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct UserOverrides {
@@ -54,6 +62,12 @@ pub struct UserOverrides {
 
 /// Scans, scores and selects.
 pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages: &mut Stages) -> Result<Scored> {
+    let measured = measure(scene, recipe, stages)?;
+    score_measured(scene, measured, recipe, user, stages)
+}
+
+/// Scans the frames and looks at the pictures, one stage each.
+pub fn measure(scene: &Scene, recipe: &Recipe, stages: &mut Stages) -> Result<Measured> {
     let source = scene.input.source();
     let info = source.info();
     let plan = ScanPlan::new(&recipe.scan, &info.times, &scene.schedule)?;
@@ -61,19 +75,35 @@ pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides, stages:
         let scanned = scan(source, &scene.schedule, &plan)?;
         Ok::<_, Error>((scanned, info.count))
     })?;
-    let mut rows = scanned.rows;
-    if looks(scene, recipe.scan.coverage) {
+    let mut seen = None;
+    if looks(scene.has_cameras, recipe.scan.coverage) {
         let sample = Sample::new(&scene.schedule, &recipe.scan);
         let reads = sample.frames() as f64 / info.times.len().max(1) as f64;
-        stages.run("visible", info.count, reads, || {
-            let seen = visible_contribution(source, &sample, recipe.scan.pixel_stride)?;
-            (rows.c, rows.w) = (seen.coverage, seen.peak);
-            let odd: Vec<u32> = non_finite(&rows).collect();
-            for id in odd {
-                (rows.c[id as usize], rows.w[id as usize]) = (0.0, 0.0);
-            }
-            Ok::<_, Error>(((), info.count))
-        })?;
+        seen = Some(stages.run("visible", info.count, reads, || {
+            Ok::<_, Error>((visible_contribution(source, &sample, recipe.scan.pixel_stride)?, info.count))
+        })?);
+    }
+    Ok(Measured { scanned, seen })
+}
+
+/// Scores and selects by what was measured.
+pub fn score_measured(
+    scene: &Scene,
+    measured: Measured,
+    recipe: &Recipe,
+    user: &UserOverrides,
+    stages: &mut Stages,
+) -> Result<Scored> {
+    let source = scene.input.source();
+    let info = source.info();
+    let Measured { scanned, seen } = measured;
+    let mut rows = scanned.rows;
+    if let Some(seen) = seen {
+        (rows.c, rows.w) = (seen.coverage, seen.peak);
+        let odd: Vec<u32> = non_finite(&rows).collect();
+        for id in odd {
+            (rows.c[id as usize], rows.w[id as usize]) = (0.0, 0.0);
+        }
     }
     let reference_frame = first_of_largest(&scanned.alive_per_frame);
     stages.run("score", info.count, 0.0, || {
@@ -133,9 +163,9 @@ pub fn name(term: StaticTerm) -> &'static str {
 }
 
 /// Whether C is visible contribution.
-fn looks(scene: &Scene, coverage: Coverage) -> bool {
+pub(super) fn looks(has_cameras: bool, coverage: Coverage) -> bool {
     match coverage {
-        Coverage::Auto => scene.has_cameras,
+        Coverage::Auto => has_cameras,
         Coverage::Visible => true,
         Coverage::Projected => false,
     }

@@ -145,6 +145,9 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     if let Some(&odd) = options.fractions.iter().find(|&&fraction| !(fraction > 0.0 && fraction <= 1.0)) {
         return Err(Error::usage(format!("--fractions: expected numbers above 0 and at most 1, found {odd}")));
     }
+    if options.input.is_stream() {
+        return Err(Error::usage("sweep reads its input many times: pack the stream first, then sweep the .gseq"));
+    }
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;

@@ -26,4 +26,4 @@ pub use anisotropy::fill_anisotropy;
 pub use bounds::RobustBox;
 pub use noise::{Snapped, snap, ulp};
 pub use plan::ScanPlan;
-pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics};
+pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, NEEDED};

@@ -1,7 +1,7 @@
 //! What a scan must know before its first frame.
 
 use crate::error::{Error, Result};
-use crate::model::Schedule;
+use crate::model::{Camera, Schedule};
 use crate::recipe::{Motion, Scan};
 
 /// Deviation of a time step from the mean step, as a fraction of it, up to which frames count as
@@ -12,8 +12,8 @@ const EVEN_TOLERANCE: f64 = 1e-2;
 /// adding 2⁵², so a contribution must stay below it; one bit is kept in reserve.
 const CONTRIBUTION_BITS: i32 = 51;
 
-/// Bits of the sum over all pairs; one bit of the u64 is kept in reserve.
-const SUM_BITS: i32 = 63;
+/// Contributions that fit a u64 sum before it must be carried: 2¹² of 2⁵¹, with one bit in reserve.
+pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 
 /// Everything the scan of any block needs: one plan serves all blocks of a sequence.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,15 +57,31 @@ impl ScanPlan {
         }
         let pairs = u32::try_from(schedule.pairs())
             .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pairs())))?;
-        let image_px = schedule.cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         Ok(ScanPlan {
-            alpha_min: scan.alpha_min,
-            motion: scan.motion,
             steps: if scan.motion == Motion::Runs { uneven_steps(times) } else { Vec::new() },
             frames: times.len(),
             pairs,
-            coverage_exponent: coverage_exponent(image_px, pairs),
+            ..ScanPlan::arriving(scan, &schedule.cameras)
         })
+    }
+
+    /// The scan of frames that are still to come, as it is if they prove to be even: then the plan that knows
+    /// them all can finish what this one began.
+    pub fn arriving(scan: &Scan, cameras: &[Camera]) -> Self {
+        let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
+        ScanPlan {
+            alpha_min: scan.alpha_min,
+            motion: scan.motion,
+            steps: Vec::new(),
+            frames: 0,
+            pairs: 0,
+            coverage_exponent: coverage_exponent(image_px),
+        }
+    }
+
+    /// Whether this plan, which knows all frames, can finish a scan begun with `arriving`.
+    pub fn finishes(&self, arriving: &ScanPlan) -> bool {
+        *arriving == ScanPlan { frames: arriving.frames, pairs: arriving.pairs, ..self.clone() }
     }
 
     /// T, the number of frames.
@@ -98,11 +114,10 @@ fn uneven_steps(times: &[f64]) -> Vec<f64> {
     if steps.iter().all(|step| (step - 1.0).abs() <= EVEN_TOLERANCE) { Vec::new() } else { steps }
 }
 
-/// Largest e for which one contribution of `image_px` and a sum of `pairs` of them, times 2ᵉ, fit.
-fn coverage_exponent(image_px: f64, pairs: u32) -> i32 {
-    let image_bits = image_px.log2().ceil() as i32;
-    let pair_bits = f64::from(pairs.max(1)).log2().ceil() as i32;
-    (CONTRIBUTION_BITS - image_bits).min(SUM_BITS - image_bits - pair_bits)
+/// Largest e for which one contribution of `image_px`, times 2ᵉ, fits. It must not depend on the number of
+/// pairs, which a stream does not know ahead: sums are carried instead.
+fn coverage_exponent(image_px: f64) -> i32 {
+    CONTRIBUTION_BITS - image_px.log2().ceil() as i32
 }
 
 #[cfg(test)]
@@ -131,11 +146,21 @@ mod tests {
     }
 
     #[test]
-    fn coverage_cannot_wrap_whatever_the_pictures_and_their_number() {
-        for (image_px, pairs) in [(1.0, 0), (82_944.0, 780), (8192.0 * 8192.0, u32::MAX), (1.8e19, 3)] {
-            let unit = 2f64.powi(coverage_exponent(image_px, pairs));
-            assert!(image_px * unit <= 2f64.powi(CONTRIBUTION_BITS));
-            assert!(image_px * unit * f64::from(pairs) <= 2f64.powi(SUM_BITS));
+    fn coverage_cannot_wrap_between_carries_whatever_the_pictures() {
+        for image_px in [1.0, 82_944.0, 8192.0 * 8192.0, 1.8e19] {
+            let contribution = image_px * 2f64.powi(coverage_exponent(image_px));
+            assert!(contribution <= 2f64.powi(CONTRIBUTION_BITS));
+            assert!(contribution * PAIRS_PER_CARRY as f64 <= 2f64.powi(63));
         }
+    }
+
+    #[test]
+    fn only_even_frames_finish_what_began_before_they_were_known() {
+        let scan = Recipe::preset("default").unwrap().scan;
+        let arriving = ScanPlan::arriving(&scan, &[]);
+        assert!(plan(&[0.0, 1.0, 2.0]).unwrap().finishes(&arriving));
+        assert!(plan(&[]).unwrap().finishes(&arriving));
+        assert!(!plan(&[0.0, 1.0, 3.0]).unwrap().finishes(&arriving));
+        assert!(!plan(&[0.0]).unwrap().finishes(&ScanPlan::arriving(&Scan { alpha_min: 0.5, ..scan }, &[])));
     }
 }

@@ -4,7 +4,7 @@ use std::mem::size_of;
 
 use super::life::Life;
 use super::motion::Motion;
-use super::plan::ScanPlan;
+use super::plan::{PAIRS_PER_CARRY, ScanPlan};
 use super::projection::{Footprints, Scale, Sums, project};
 use super::state::State;
 use crate::model::{Camera, Columns, Flags, Gaussians, Rows};
@@ -14,14 +14,17 @@ pub const BYTES_PER_GAUSSIAN: usize = State::BYTES_PER_GAUSSIAN
     + Life::BYTES_PER_GAUSSIAN
     + Motion::BYTES_PER_GAUSSIAN
     + size_of::<u64>()
-    + size_of::<u32>();
+    + 2 * size_of::<u32>();
 
 /// Gaussians projected at a time: about 108 bytes each, so that every view of a frame but the first
 /// finds them in the first-level cache.
 const CHUNK: usize = 256;
 
+/// Bits of a coverage sum that stay when it is carried: 2³² pairs of at most 2⁵¹ leave 2³¹ above them.
+const CARRY_BITS: u32 = 52;
+
 /// Columns a scan needs whatever the model; SH may be left out.
-const NEEDED: Columns = Columns::ALL.without(Columns::SH);
+pub const NEEDED: Columns = Columns::ALL.without(Columns::SH);
 
 /// The running statistics of consecutive Gaussians.
 pub struct BlockScan<'a> {
@@ -31,7 +34,11 @@ pub struct BlockScan<'a> {
     state: State,
     life: Life,
     motion: Motion,
+    /// Σ A·opacity in fixed point is `carried · 2^CARRY_BITS + coverage`.
     coverage: Vec<u64>,
+    carried: Vec<u32>,
+    /// Pairs added to `coverage` since it was last carried.
+    uncarried: usize,
     touched: Vec<u32>,
     alive_per_frame: Vec<u32>,
 }
@@ -44,7 +51,8 @@ pub struct BlockStatistics {
     /// One row per Gaussian. `e` is 0 until [`super::fill_anisotropy`]; D and κ include rounding noise until
     /// [`super::snap`]. A Gaussian with [`Flags::NON_FINITE`] has zeros throughout.
     pub rows: Rows,
-    /// Living Gaussians of the block in each of the T frames; those with NaN somewhere included.
+    /// Living Gaussians of the block in each of the T frames that [`BlockScan::take_alive`] has not given; those
+    /// with NaN somewhere included.
     pub alive_per_frame: Vec<u32>,
     /// Largest finite |coordinate| of a position in the block, scene units.
     pub largest_coordinate: f32,
@@ -61,6 +69,8 @@ impl<'a> BlockScan<'a> {
             life: Life::new(len),
             motion: Motion::new(len, plan.motion),
             coverage: vec![0; len],
+            carried: vec![0; len],
+            uncarried: 0,
             touched: vec![0; len],
             alive_per_frame: Vec::with_capacity(plan.frames),
         }
@@ -82,7 +92,27 @@ impl<'a> BlockScan<'a> {
         self.alive_per_frame.push(self.life.frame(&self.state.opacity, alpha_min));
         let (step, step_before) = (self.plan.step(t), self.plan.step(t.saturating_sub(1)));
         self.motion.frame(&gaussians.position, &self.state.opacity, alpha_min, step, step_before);
-        self.project(gaussians, cameras);
+        for cameras in cameras.chunks(PAIRS_PER_CARRY) {
+            if self.uncarried + cameras.len() > PAIRS_PER_CARRY {
+                self.carry();
+            }
+            self.uncarried += cameras.len();
+            self.project(gaussians, cameras);
+        }
+    }
+
+    /// Makes room in `coverage` for as many pairs again.
+    fn carry(&mut self) {
+        for (coverage, carried) in self.coverage.iter_mut().zip(&mut self.carried) {
+            *carried += (*coverage >> CARRY_BITS) as u32;
+            *coverage &= (1 << CARRY_BITS) - 1;
+        }
+        self.uncarried = 0;
+    }
+
+    /// Living Gaussians of the block in each frame since this was last asked.
+    pub fn take_alive(&mut self) -> Vec<u32> {
+        std::mem::take(&mut self.alive_per_frame)
     }
 
     fn project(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
@@ -104,7 +134,7 @@ impl<'a> BlockScan<'a> {
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let sums = size_of_val(&self.coverage[..]) + size_of_val(&self.touched[..]);
+        let sums = size_of_val(&self.coverage[..]) + size_of_val(&self.carried[..]) + size_of_val(&self.touched[..]);
         self.state.resident_bytes() + self.life.resident_bytes() + self.motion.resident_bytes() + sums
     }
 
@@ -113,16 +143,27 @@ impl<'a> BlockScan<'a> {
     /// # Panics
     /// If frames are missing.
     pub fn finish(self) -> BlockStatistics {
-        assert_eq!(self.next_frame, self.plan.frames, "every frame is scanned");
-        let pairs = f64::from(self.plan.pairs.max(1));
-        let resolution = self.plan.coverage_resolution_px();
+        let plan = self.plan;
+        self.finish_by(plan)
+    }
+
+    /// The statistics of a scan begun before all frames were known, by the plan that knows them.
+    ///
+    /// # Panics
+    /// If frames are missing, or `plan` does not finish the one this scan began with.
+    pub fn finish_by(self, plan: &ScanPlan) -> BlockStatistics {
+        assert_eq!(self.next_frame, plan.frames, "every frame is scanned");
+        assert!(std::ptr::eq(plan, self.plan) || plan.finishes(self.plan), "the plan is that of another scan");
+        let pairs = f64::from(plan.pairs.max(1));
+        let resolution = plan.coverage_resolution_px();
+        let sum = |(&coverage, &carried): (&u64, &u32)| (u128::from(carried) << CARRY_BITS) + u128::from(coverage);
         let life = self.life.frames();
         let mut rows = Rows {
             d: self.motion.magnitude(life),
             kappa: self.motion.curvature(life),
             v: self.life.variance(),
             life: life.to_vec(),
-            c: self.coverage.iter().map(|&sum| sum as f64 * resolution / pairs).collect(),
+            c: self.coverage.iter().zip(&self.carried).map(sum).map(|sum| sum as f64 * resolution / pairs).collect(),
             w: Vec::new(),
             e: vec![0.0; life.len()],
             vis: self.touched.iter().map(|&count| f64::from(count) / pairs).collect(),

@@ -352,6 +352,20 @@ fn uneven_frames_are_measured_in_real_time() {
 }
 
 #[test]
+fn coverage_of_very_many_pictures_is_that_of_one() {
+    // Far more contributions than a 64-bit sum in fixed point holds; the mean of equal ones is any of them.
+    let (mut frames, one) = (wanderers(40, 1, 3), schedule(1, 1));
+    frames[0].log_scale.planes_mut().fill(2.0);
+    let many = Schedule { frames: vec![vec![(0, 0); 300_000]], ..one.clone() };
+    let [one, many] = [one, many].map(|schedule| scan(&frames, &schedule, &recipe(Motion::Runs)).rows);
+    assert!(one.c.iter().filter(|&&c| c * 300_000.0 > 2f64.powi(64 - 34)).count() > 10, "the case must overflow");
+    for i in 0..40 {
+        close("C", many.c[i], one.c[i], 1e-15, 0.0);
+    }
+    assert_eq!(many.vis, one.vis);
+}
+
+#[test]
 fn unchanged_columns_need_not_be_announced() {
     let (mut frames, schedule) = (wanderers(300, 5, 8), schedule(5, 2));
     let first = frames[0].clone();

@@ -5,9 +5,10 @@
 
 use std::num::NonZeroU32;
 
-use super::look::{Sample, look};
+use super::Progress;
+use super::look::{Looks, Sample};
 use crate::error::Result;
-use crate::model::Columns;
+use crate::model::{Camera, Columns};
 use crate::pass::{FrameSource, Ids};
 use crate::render::{Contribution, Renderer};
 
@@ -28,33 +29,68 @@ pub struct Seen {
 /// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
 /// pictures at all give zeros.
 ///
-/// Memory per Gaussian: its reader; 44 bytes for a block's state and for each frame of a batch (frames
-/// with 4 × threads pictures between them); per thread 12 bytes of sums and a picture's buffers
-/// ([`crate::render`]). Nothing grows with frames or views.
+/// Memory per Gaussian: its reader, and that of [`Looking`]. Nothing grows with frames or views.
 pub fn visible_contribution(source: &dyn FrameSource, sample: &Sample<'_>, pixel_stride: NonZeroU32) -> Result<Seen> {
-    let count = source.info().count;
-    let pictures = sample.pictures();
-    let seen = look(
-        source,
-        Ids::Range(0..count),
-        GEOMETRY,
-        sample,
-        "visible",
-        || (Renderer::new(), Contribution::new(count)),
-        |(renderer, seen), state, camera| renderer.contribution(state, camera, pixel_stride, seen),
-    )?;
-    let mut sum = Contribution::new(count);
-    seen.iter().for_each(|(_, of_thread)| sum.merge(of_thread));
-    let per_pixel = f64::from(pixel_stride.get()).powi(2);
-    let coverage = (0..count).map(|i| sum.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
-    Ok(Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() })
+    let progress = Progress::new("visible", "pictures", sample.pictures() as u64);
+    let mut looking = Looking::new(source.info().count, pixel_stride);
+    looking.add(source, &sample.0, |pictures| progress.advance(pictures))?;
+    Ok(looking.finish())
+}
+
+/// Contributions to the pictures so far.
+///
+/// Memory per Gaussian: 44 bytes for a block's state and for each frame of a batch (frames with 4 × threads
+/// pictures between them); per thread 12 bytes of sums and a picture's buffers ([`crate::render`]).
+pub struct Looking {
+    count: usize,
+    pixel_stride: NonZeroU32,
+    pictures: usize,
+    looks: Looks<(Renderer, Contribution)>,
+}
+
+impl Looking {
+    /// No pictures yet of `count` Gaussians.
+    pub fn new(count: usize, pixel_stride: NonZeroU32) -> Self {
+        Looking { count, pixel_stride, pictures: 0, looks: Looks::new(GEOMETRY) }
+    }
+
+    /// Looks at pictures of `source`: frames, each with the cameras of its pictures. Every source that is
+    /// added must have the same Gaussians, and the same values in columns that do not vary.
+    pub fn add(
+        &mut self,
+        source: &dyn FrameSource,
+        frames: &[(usize, Vec<&Camera>)],
+        advance: impl Fn(u64) + Sync,
+    ) -> Result<()> {
+        let (count, pixel_stride) = (self.count, self.pixel_stride);
+        self.pictures += frames.iter().map(|(_, cameras)| cameras.len()).sum::<usize>();
+        self.looks.add(
+            source,
+            Ids::Range(0..count),
+            frames,
+            || (Renderer::new(), Contribution::new(count)),
+            |(renderer, seen), state, camera| {
+                renderer.contribution(state, camera, pixel_stride, seen);
+                advance(1);
+            },
+        )
+    }
+
+    /// What was seen in all pictures.
+    pub fn finish(self) -> Seen {
+        let mut sum = Contribution::new(self.count);
+        self.looks.into_workers().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+        let per_pixel = f64::from(self.pixel_stride.get()).powi(2);
+        let coverage = (0..self.count).map(|i| sum.pixels(i) * per_pixel / self.pictures.max(1) as f64).collect();
+        Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::demo::Scene;
-    use crate::model::{Camera, Flags, Gaussians, Rig, Rows, Schedule, SequenceInfo, Split};
+    use crate::model::{Flags, Gaussians, Rig, Rows, Schedule, SequenceInfo, Split};
     use crate::pass::BlockReader;
     use crate::recipe::{self, Recipe};
     use crate::select::{Overrides, select};

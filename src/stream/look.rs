@@ -7,10 +7,10 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::{BLOCK, Progress};
-use crate::error::{Error, Result};
+use super::{Frames, Progress};
+use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Schedule};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{FrameSource, Ids};
 use crate::recipe;
 
 /// Pictures of a batch for each thread: enough that the last ones to finish cost little.
@@ -23,12 +23,48 @@ const VIEWS_AT_ONCE: usize = 3;
 #[derive(Debug, Clone)]
 pub struct Sample<'a>(pub(super) Vec<(usize, Vec<&'a Camera>)>);
 
+/// Decides frame by frame which pictures are looked at.
+#[derive(Debug, Clone)]
+pub struct Sampler {
+    frame_stride: usize,
+    view_stride: usize,
+    /// Frames so far that have pictures.
+    with_pictures: usize,
+}
+
+impl Sampler {
+    /// The strides of `scan`: of the frames that have pictures the first and every `frame_stride`-th, of the
+    /// pictures of each every `view_stride`-th, from one that moves on from frame to frame, so that all views
+    /// take their turns.
+    pub fn new(scan: &recipe::Scan) -> Self {
+        Self::with_strides(scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
+    }
+
+    fn with_strides(frame_stride: usize, view_stride: usize) -> Self {
+        Sampler { frame_stride, view_stride, with_pictures: 0 }
+    }
+
+    /// Cameras of the pictures of the next frame to look at, of those at `views` (view number, place in
+    /// `cameras`).
+    pub fn next<'a>(&mut self, views: &[(u32, u32)], cameras: &'a [Camera]) -> Vec<&'a Camera> {
+        if views.is_empty() {
+            return Vec::new();
+        }
+        let frame = self.with_pictures;
+        self.with_pictures += 1;
+        if !frame.is_multiple_of(self.frame_stride) {
+            return Vec::new();
+        }
+        let turn = frame / self.frame_stride;
+        let views = views.iter().skip(turn % self.view_stride).step_by(self.view_stride);
+        views.map(|&(_, camera)| &cameras[camera as usize]).collect()
+    }
+}
+
 impl<'a> Sample<'a> {
-    /// What the strides of `scan` leave of `schedule`: of the frames that have pictures the first and
-    /// every `frame_stride`-th, of the pictures of each every `view_stride`-th, from one that moves on
-    /// from frame to frame, so that all views take their turns.
+    /// What the strides of `scan` leave of `schedule`, see [`Sampler`].
     pub fn new(schedule: &'a Schedule, scan: &recipe::Scan) -> Self {
-        Self::with_strides(schedule, scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
+        Self::of(schedule, Sampler::new(scan))
     }
 
     /// About `pictures` pictures at most, spread over all frames and views, of no more frames than it takes
@@ -39,16 +75,11 @@ impl<'a> Sample<'a> {
         let views = schedule.pairs().div_ceil(frames).clamp(1, VIEWS_AT_ONCE);
         let frame_stride = frames.div_ceil(pictures.div_ceil(views).max(1));
         let left = schedule.pairs().div_ceil(frame_stride);
-        Self::with_strides(schedule, frame_stride, left.div_ceil(pictures.max(1)).max(1))
+        Self::of(schedule, Sampler::with_strides(frame_stride, left.div_ceil(pictures.max(1)).max(1)))
     }
 
-    fn with_strides(schedule: &'a Schedule, frame_stride: usize, view_stride: usize) -> Self {
-        let with_pictures = schedule.frames.iter().enumerate().filter(|(_, views)| !views.is_empty());
-        let sampled = with_pictures.step_by(frame_stride).enumerate();
-        let taken = sampled.map(|(turn, (frame, views))| {
-            let views = views.iter().skip(turn % view_stride).step_by(view_stride);
-            (frame, views.map(|&(_, camera)| &schedule.cameras[camera as usize]).collect::<Vec<_>>())
-        });
+    fn of(schedule: &'a Schedule, mut sampler: Sampler) -> Self {
+        let taken = schedule.frames.iter().map(|views| sampler.next(views, &schedule.cameras)).enumerate();
         Sample(taken.filter(|(_, cameras)| !cameras.is_empty()).collect())
     }
 
@@ -64,10 +95,7 @@ impl<'a> Sample<'a> {
 }
 
 /// Shows the Gaussians `ids` to every camera of `sample` and gives what the workers gathered, at most one per
-/// thread, in no order: fold them by what does not depend on it.
-///
-/// Memory per Gaussian: its reader; the columns `want` for a block and for each frame of a batch (frames
-/// with 4 × threads pictures between them); what a worker holds.
+/// thread, in no order: fold them by what does not depend on it. Memory: see [`Looks`].
 pub(super) fn look<W: Send>(
     source: &dyn FrameSource,
     ids: Ids<'_>,
@@ -77,48 +105,73 @@ pub(super) fn look<W: Send>(
     new_worker: impl Fn() -> W + Sync,
     picture: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
 ) -> Result<Vec<W>> {
-    let info = source.info();
-    let count = ids.len();
-    let degree = if want.contains(Columns::SH) { info.sh_degree } else { 0 };
     let progress = Progress::new(stage, "pictures", sample.pictures() as u64);
-    let mut blocks: Vec<(Box<dyn BlockReader + '_>, Gaussians)> = (0..count.div_ceil(BLOCK))
-        .into_par_iter()
-        .map(|block| {
-            let rows = block * BLOCK..count.min((block + 1) * BLOCK);
-            let state = Gaussians::zeros(rows.len(), degree);
-            let ids = match &ids {
-                Ids::Range(range) => Ids::Range(range.start + rows.start..range.start + rows.end),
-                Ids::List(list) => Ids::List(&list[rows]),
-            };
-            Ok((source.open(ids)?, state))
-        })
-        .collect::<Result<_>>()?;
+    let mut looks = Looks::new(want);
+    looks.add(source, ids, &sample.0, new_worker, |worker, state, camera| {
+        picture(worker, state, camera);
+        progress.advance(1);
+    })?;
+    Ok(looks.into_workers())
+}
 
-    // One per thread at most: a picture runs on the thread that took its worker.
-    let workers: Mutex<Vec<W>> = Mutex::default();
-    let mut states: Vec<Gaussians> = Vec::new();
-    for batch in batches(&sample.0, PICTURES_PER_THREAD * rayon::current_num_threads()) {
-        for (slot, &(frame, _)) in batch.iter().enumerate() {
-            let want = if slot < states.len() { info.varying & want } else { want };
-            if slot == states.len() {
-                states.push(Gaussians::zeros(count, degree));
-            }
-            read_frame(&mut blocks, frame, want, &mut states[slot])?;
-        }
-        let jobs: Vec<(&Gaussians, &Camera)> = batch
-            .iter()
-            .zip(&states)
-            .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
-            .collect();
-        jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
-            let free = workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
-            let mut worker = free.unwrap_or_else(&new_worker);
-            picture(&mut worker, state, camera);
-            workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
-            progress.advance(1);
-        });
+/// Workers that have seen some pictures and may see more.
+///
+/// Memory per Gaussian: its reader; the columns looked at for a block and for each frame of a batch (frames
+/// with 4 × threads pictures between them); what a worker holds.
+pub(super) struct Looks<W> {
+    want: Columns,
+    /// One per thread at most: a picture runs on the thread that took its worker.
+    workers: Mutex<Vec<W>>,
+    states: Vec<Gaussians>,
+}
+
+impl<W: Send> Looks<W> {
+    /// Nothing seen yet, of the columns `want`.
+    pub(super) fn new(want: Columns) -> Self {
+        Looks { want, workers: Mutex::default(), states: Vec::new() }
     }
-    Ok(workers.into_inner().unwrap_or_else(PoisonError::into_inner))
+
+    /// Shows the Gaussians `ids` of `source` at `frames`, each to the cameras of its pictures. Every source that
+    /// is added must have the same Gaussians, and the same values in columns that do not vary.
+    pub(super) fn add(
+        &mut self,
+        source: &dyn FrameSource,
+        ids: Ids<'_>,
+        frames: &[(usize, Vec<&Camera>)],
+        new_worker: impl Fn() -> W + Sync,
+        picture: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
+    ) -> Result<()> {
+        if frames.is_empty() {
+            return Ok(());
+        }
+        let mut reader = Frames::open(source, ids, self.want)?;
+        for batch in batches(frames, PICTURES_PER_THREAD * rayon::current_num_threads()) {
+            for (slot, &(frame, _)) in batch.iter().enumerate() {
+                let want = if slot < self.states.len() { source.info().varying } else { self.want };
+                if slot == self.states.len() {
+                    self.states.push(reader.state());
+                }
+                reader.read(frame, want, &mut self.states[slot])?;
+            }
+            let jobs: Vec<(&Gaussians, &Camera)> = batch
+                .iter()
+                .zip(&self.states)
+                .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
+                .collect();
+            jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
+                let free = self.workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+                let mut worker = free.unwrap_or_else(&new_worker);
+                picture(&mut worker, state, camera);
+                self.workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
+            });
+        }
+        Ok(())
+    }
+
+    /// The workers, in no order.
+    pub(super) fn into_workers(self) -> Vec<W> {
+        self.workers.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 /// Runs of frames with at least `pictures` pictures between them, the last one perhaps fewer.
@@ -133,28 +186,6 @@ fn batches<T>(mut frames: &[(usize, Vec<T>)], pictures: usize) -> impl Iterator<
         frames = rest;
         (!batch.is_empty()).then_some(batch)
     })
-}
-
-/// Reads the columns `want` of all blocks at `frame` into `state`.
-fn read_frame(
-    blocks: &mut [(Box<dyn BlockReader + '_>, Gaussians)],
-    frame: usize,
-    want: Columns,
-    state: &mut Gaussians,
-) -> Result<()> {
-    if want.is_empty() {
-        return Ok(());
-    }
-    blocks.par_iter_mut().try_for_each(|(reader, block)| reader.read(frame, want, block))?;
-    for column in want.iter() {
-        let target = state.column_mut(column);
-        for c in 0..target.width() {
-            for (to, (_, block)) in target.plane_mut(c).chunks_mut(BLOCK).zip(&*blocks) {
-                to.copy_from_slice(block.column(column).plane(c));
-            }
-        }
-    }
-    Ok::<_, Error>(())
 }
 
 #[cfg(test)]

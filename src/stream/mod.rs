@@ -1,7 +1,9 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
 mod contribution;
+mod frames;
 mod gather;
+mod held;
 mod look;
 mod merged;
 mod motion;
@@ -10,15 +12,17 @@ mod recolored;
 mod removal;
 mod scan;
 
-pub use contribution::{Seen, visible_contribution};
+pub use contribution::{Looking, Seen, visible_contribution};
+pub use frames::Frames;
 pub use gather::gather;
-pub use look::Sample;
+pub use held::HeldFrames;
+pub use look::{Sample, Sampler};
 pub use merged::MergedSequence;
 pub use motion::measure_motion;
 pub use progress::Progress;
 pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;
-pub use scan::{Scanned, scan};
+pub use scan::{RunningScan, Scanned, scan};
 
 /// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.
 /// Results do not depend on it.

@@ -27,6 +27,21 @@ impl Progress {
         Progress(bar)
     }
 
+    /// A counter of work whose amount nobody knows ahead.
+    pub fn counting(what: &'static str, unit: &str) -> Self {
+        if !std::io::stderr().is_terminal() {
+            return Progress(ProgressBar::hidden());
+        }
+        let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr_with_hz(10));
+        let template = format!("{{prefix:>10}} {{spinner}} {{human_pos}} {unit}, {{per_sec}}");
+        if let Ok(style) = ProgressStyle::with_template(&template) {
+            bar.set_style(style);
+        }
+        bar.set_prefix(what);
+        bar.enable_steady_tick(Duration::from_millis(200));
+        Progress(bar)
+    }
+
     /// Marks `units` as done.
     pub fn advance(&self, units: u64) {
         self.0.inc(units);

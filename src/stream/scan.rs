@@ -8,7 +8,7 @@ use super::{BLOCK, Progress};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
 use crate::pass::{FrameSource, Ids};
-use crate::stats::{BlockScan, ScanPlan};
+use crate::stats::{BlockScan, NEEDED, ScanPlan};
 
 /// What a scan gives.
 #[derive(Debug)]
@@ -58,12 +58,76 @@ pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> R
             Ok((found.rows, found.largest_coordinate))
         })
         .collect::<Result<_>>()?;
+    Ok(joined(blocks, alive.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner())))
+}
+
+/// The blocks of a sequence, in order, as one.
+fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> Scanned {
     let mut rows = Rows::default();
     let mut largest_coordinate = 0.0f32;
     for (mut block, largest) in blocks {
         rows.append(&mut block);
         largest_coordinate = largest_coordinate.max(largest);
     }
-    let alive_per_frame = alive.into_inner().unwrap_or_else(|poisoned| poisoned.into_inner());
-    Ok(Scanned { rows, alive_per_frame, largest_coordinate })
+    Scanned { rows, alive_per_frame, largest_coordinate }
+}
+
+/// A scan of frames as they arrive: [`scan`] with the frames cut into parts that are seen once each.
+///
+/// Memory: the accumulators of all Gaussians ([`crate::stats::BYTES_PER_GAUSSIAN`] each), 4 bytes per frame, and
+/// per thread one block's state at one frame.
+pub struct RunningScan<'a> {
+    blocks: Vec<BlockScan<'a>>,
+    alive_per_frame: Vec<u32>,
+}
+
+impl<'a> RunningScan<'a> {
+    /// No frames yet of `count` Gaussians.
+    pub fn new(count: usize, plan: &'a ScanPlan) -> Self {
+        let block = |start: usize| BlockScan::new(BLOCK.min(count - start), start, plan);
+        RunningScan { blocks: (0..count).step_by(BLOCK).map(block).collect(), alive_per_frame: Vec::new() }
+    }
+
+    /// Adds the next frames: all those of `source`, each with the cameras that see it.
+    pub fn add(&mut self, source: &dyn FrameSource, cameras: &[Vec<&Camera>]) -> Result<()> {
+        let info = source.info();
+        let first = self.alive_per_frame.len();
+        let alive: Vec<Vec<u32>> = self
+            .blocks
+            .par_iter_mut()
+            .enumerate()
+            .map(|(block, scan)| {
+                let range = block * BLOCK..info.count.min((block + 1) * BLOCK);
+                let mut state = Gaussians::zeros(range.len(), info.sh_degree);
+                let mut reader = source.open(Ids::Range(range))?;
+                for (t, cameras) in cameras.iter().enumerate() {
+                    let changed = if first + t == 0 { Columns::ALL } else { info.varying };
+                    // The state is new, though the accumulators know what does not vary.
+                    let want = if t == 0 { changed | NEEDED } else { changed };
+                    reader.read(t, want, &mut state)?;
+                    scan.frame(first + t, &state, cameras, changed);
+                }
+                Ok(scan.take_alive())
+            })
+            .collect::<Result<_>>()?;
+        self.alive_per_frame.resize(first + cameras.len(), 0);
+        for alive in alive {
+            for (sum, count) in self.alive_per_frame[first..].iter_mut().zip(alive) {
+                *sum += count;
+            }
+        }
+        Ok(())
+    }
+
+    /// The rows, by the plan that knows all frames.
+    ///
+    /// # Panics
+    /// If `plan` is not of the frames that were added ([`ScanPlan::finishes`]).
+    pub fn finish(self, plan: &ScanPlan) -> Scanned {
+        let blocks = self.blocks.into_iter().map(|block| {
+            let found = block.finish_by(plan);
+            (found.rows, found.largest_coordinate)
+        });
+        joined(blocks, self.alive_per_frame)
+    }
 }

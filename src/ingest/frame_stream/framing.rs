@@ -1,0 +1,185 @@
+//! The fixed parts of a frame stream, bytes in, values out (format/STREAM.md).
+
+use crate::model::{Columns, sh_coefficients};
+
+const VERSION: u32 = 1;
+const FRAME: [u8; 4] = *b"FRAM";
+const END: [u8; 4] = *b"DONE";
+
+/// What a stream says of itself before its first frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StreamHeader {
+    /// N, Gaussians in every frame; below 2³².
+    pub count: usize,
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub sh_degree: usize,
+    /// Columns that come with every frame; the others come once.
+    pub varying: Columns,
+}
+
+/// What stands before the columns of a frame, or ends the stream.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Mark {
+    /// A frame's number, time stamp and bytes.
+    Frame { index: u32, time: f64, bytes: u64 },
+    /// Number of frames.
+    End(u32),
+}
+
+/// What is wrong with a field: its offset within its part, what it must be, what it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Illegal {
+    pub(crate) offset: u64,
+    pub(crate) expected: String,
+    pub(crate) found: String,
+    pub(crate) hint: &'static str,
+}
+
+/// Something else has written into the stream, or frames have another length than they say.
+const FOREIGN: &str = "whatever the exporter prints must go to standard error, never into the stream";
+
+impl StreamHeader {
+    pub(crate) const BYTES: usize = 32;
+    /// First bytes of every stream, chosen like the container's.
+    pub(crate) const MAGIC: [u8; 8] = *b"\x89GSTR\r\n\x1a";
+
+    /// Bytes of the columns of one frame.
+    pub fn frame_bytes(&self) -> u64 {
+        4 * self.varying.width(self.sh_degree) as u64 * self.count as u64
+    }
+
+    pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
+        let mut bytes = [0; Self::BYTES];
+        bytes[..8].copy_from_slice(&Self::MAGIC);
+        bytes[8..12].copy_from_slice(&VERSION.to_le_bytes());
+        bytes[12..16].copy_from_slice(&(self.sh_degree as u32).to_le_bytes());
+        bytes[16..24].copy_from_slice(&(self.count as u64).to_le_bytes());
+        bytes[24..28].copy_from_slice(&u32::from(self.varying.bits()).to_le_bytes());
+        bytes
+    }
+
+    pub(crate) fn from_bytes(bytes: &[u8; Self::BYTES]) -> Result<Self, Illegal> {
+        let illegal = |offset, expected: &str, found: String, hint| {
+            Err(Illegal { offset, expected: expected.to_owned(), found, hint })
+        };
+        if bytes[..8] != Self::MAGIC {
+            return illegal(0, "a frame stream (format/STREAM.md)", format!("{:?}", shown(&bytes[..8])), FOREIGN);
+        }
+        let version = u32_at(bytes, 8);
+        if version != VERSION {
+            return illegal(8, "version 1", format!("version {version}"), "a newer splatsieve may read it");
+        }
+        let degree = u32_at(bytes, 12);
+        if degree > 3 {
+            return illegal(12, "a degree of spherical harmonics from 0 to 3", degree.to_string(), "");
+        }
+        let count = u64_at(bytes, 16);
+        let Some(count) = usize::try_from(count).ok().filter(|&count| count <= u32::MAX as usize) else {
+            return illegal(16, "fewer than 2^32 Gaussians", count.to_string(), "");
+        };
+        let Some(varying) = Columns::from_bits(u32_at(bytes, 24)) else {
+            return illegal(24, "a set of the five columns", format!("bits {:#x}", u32_at(bytes, 24)), "");
+        };
+        if u32_at(bytes, 28) != 0 {
+            return illegal(28, "a reserved field of 0", u32_at(bytes, 28).to_string(), "");
+        }
+        Ok(StreamHeader { count, sh_degree: degree as usize, varying })
+    }
+}
+
+impl Mark {
+    pub(crate) const BYTES: usize = 24;
+
+    pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
+        let (mark, index, time, length) = match self {
+            Mark::Frame { index, time, bytes } => (FRAME, index, time, bytes),
+            Mark::End(frames) => (END, frames, 0.0, 0),
+        };
+        let mut bytes = [0; Self::BYTES];
+        bytes[..4].copy_from_slice(&mark);
+        bytes[4..8].copy_from_slice(&index.to_le_bytes());
+        bytes[8..16].copy_from_slice(&time.to_le_bytes());
+        bytes[16..].copy_from_slice(&length.to_le_bytes());
+        bytes
+    }
+
+    /// The mark that follows `frames` complete frames, the last of them at time `before`, in a stream of `header`.
+    pub(crate) fn from_bytes(
+        bytes: &[u8; Self::BYTES],
+        header: &StreamHeader,
+        frames: u32,
+        before: Option<f64>,
+    ) -> Result<Self, Illegal> {
+        let illegal = |offset, expected: String, found: String, hint| Err(Illegal { offset, expected, found, hint });
+        let index = u32_at(bytes, 4);
+        match [bytes[0], bytes[1], bytes[2], bytes[3]] {
+            END => {
+                if index != frames {
+                    let found = format!("an end mark after {index}");
+                    return illegal(
+                        4,
+                        format!("{frames} frames, which arrived"),
+                        found,
+                        "frames were lost or repeated",
+                    );
+                }
+                if bytes[8..].iter().any(|&byte| byte != 0) {
+                    return illegal(8, "a reserved field of 0".into(), "another value".into(), "");
+                }
+                Ok(Mark::End(frames))
+            }
+            FRAME => {
+                let time = f64::from_bits(u64_at(bytes, 8));
+                let length = u64_at(bytes, 16);
+                if index != frames {
+                    let found = format!("frame {index}");
+                    return illegal(4, format!("frame {frames}"), found, "frames come once each, in order");
+                }
+                if !time.is_finite() {
+                    return illegal(8, "a time stamp".into(), time.to_string(), "");
+                }
+                if let Some(before) = before.filter(|&before| before >= time) {
+                    let expected = format!("a time stamp above {before}, that of frame {}", frames - 1);
+                    return illegal(8, expected, time.to_string(), "frames come in the order of their times");
+                }
+                if length != header.frame_bytes() {
+                    return illegal(16, expected_length(header), found_length(header, length), SAME_IN_EVERY_FRAME);
+                }
+                Ok(Mark::Frame { index, time, bytes: length })
+            }
+            _ => illegal(0, format!("frame {frames} or the end mark"), format!("{:?}", shown(&bytes[..4])), FOREIGN),
+        }
+    }
+}
+
+const SAME_IN_EVERY_FRAME: &str = "every frame must hold the same Gaussians in the same columns";
+
+fn expected_length(header: &StreamHeader) -> String {
+    let names: Vec<&str> = header.varying.iter().map(Columns::name).collect();
+    format!("{} bytes: {} Gaussians of {}", header.frame_bytes(), header.count, names.join(", "))
+}
+
+/// A length that is not the header's, read as what it would be: other Gaussians, or other columns.
+fn found_length(header: &StreamHeader, length: u64) -> String {
+    let per_gaussian = 4 * header.varying.width(header.sh_degree) as u64;
+    if length.checked_rem(per_gaussian) == Some(0) {
+        return format!("{length} bytes, as {} Gaussians have", length / per_gaussian);
+    }
+    format!("{length} bytes, which no number of Gaussians of these columns has")
+}
+
+/// Bytes for people: text as it is, anything else escaped.
+fn shown(bytes: &[u8]) -> String {
+    bytes.escape_ascii().to_string()
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
+}
+
+fn u64_at(bytes: &[u8], at: usize) -> u64 {
+    u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]))
+}
+
+/// Values of the column set for one Gaussian cannot overflow a u64 with any legal header.
+const _: () = assert!((u32::MAX as u64).checked_mul(4 * (11 + 3 * sh_coefficients(3)) as u64).is_some());

@@ -1,0 +1,95 @@
+//! Consecutive frames of a sequence that are in memory together: how what arrives frame by frame meets
+//! passes that go Gaussian by Gaussian.
+
+use std::ops::Range;
+
+use crate::error::Result;
+use crate::model::{Column, Columns, Gaussians, SequenceInfo};
+use crate::pass::{BlockReader, FrameSource, Ids};
+
+/// Frames with all columns, as a source; its frame 0 is the first that is held.
+pub struct HeldFrames {
+    info: SequenceInfo,
+    constant: Gaussians,
+    frames: Vec<Gaussians>,
+}
+
+impl HeldFrames {
+    /// No frames yet of `count` Gaussians. `constant` holds the columns outside `varying`.
+    pub fn new(count: usize, sh_degree: usize, varying: Columns, constant: Gaussians) -> Self {
+        let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
+        HeldFrames { info, constant, frames: Vec::new() }
+    }
+
+    /// Adds a frame: of `state` the varying columns, for all Gaussians.
+    pub fn push(&mut self, time: f64, state: Gaussians) {
+        self.info.times.push(time);
+        self.frames.push(state);
+    }
+
+    /// Takes all frames out.
+    pub fn drain(&mut self) -> impl Iterator<Item = Gaussians> {
+        self.info.times.clear();
+        self.frames.drain(..)
+    }
+
+    /// Positions of all Gaussians at a frame that is held.
+    pub fn position(&self, frame: usize) -> &Column {
+        let varies = self.info.varying.contains(Columns::POSITION);
+        if varies { &self.frames[frame].position } else { &self.constant.position }
+    }
+
+    /// Number of frames held.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Whether no frame is held.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+}
+
+impl FrameSource for HeldFrames {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let mut runs: Vec<Range<usize>> = Vec::new();
+        for id in ids.iter() {
+            match runs.last_mut() {
+                Some(run) if run.end == id => run.end += 1,
+                _ => runs.push(id..id + 1),
+            }
+        }
+        Ok(Box::new(HeldReader { held: self, len: ids.len(), runs }))
+    }
+}
+
+struct HeldReader<'a> {
+    held: &'a HeldFrames,
+    len: usize,
+    /// Consecutive ids, in the order asked for.
+    runs: Vec<Range<usize>>,
+}
+
+impl BlockReader for HeldReader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        for column in want.iter() {
+            let varies = self.held.info.varying.contains(column);
+            let from = if varies { &self.held.frames[frame] } else { &self.held.constant }.column(column);
+            let to = out.column_mut(column);
+            to.resize(self.len);
+            for c in 0..to.width() {
+                let (plane, mut rest) = (from.plane(c), to.plane_mut(c));
+                for run in &self.runs {
+                    let (part, after) = rest.split_at_mut(run.len());
+                    part.copy_from_slice(&plane[run.clone()]);
+                    rest = after;
+                }
+            }
+        }
+        Ok(())
+    }
+}
