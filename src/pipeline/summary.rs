@@ -14,7 +14,7 @@ use crate::select::Counts;
 /// One stage of a run.
 #[derive(Debug, Clone, Serialize)]
 pub struct Stage {
-    /// Its name: read, scan, visible, score, rounds, select, merge, choose, refit, emit.
+    /// Its name: read (of a stream: receive), scan, visible, score, rounds, select, merge, choose, refit, emit.
     pub name: &'static str,
     /// Gaussians that entered it.
     pub gaussians_in: usize,
@@ -54,7 +54,7 @@ pub struct InputSummary {
     pub sh_degree: usize,
     /// Columns that differ between frames.
     pub varying: Vec<&'static str>,
-    /// Bytes of the input file or, for a model, of its point cloud.
+    /// Bytes of the input file, that arrived of a stream, or of the point cloud of a model.
     pub bytes: u64,
 }
 
