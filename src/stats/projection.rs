@@ -175,6 +175,7 @@ impl<const N: usize> Stage<N> {
 
     /// The 2-D covariance.
     #[inline(always)]
+    #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
     fn spread(&mut self, view: &View, axes: [&[f64; N]; 9]) {
         let View { rotation: [w0, w1, w2], focal, slope_limit, .. } = view;
         for i in 0..N {
