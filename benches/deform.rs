@@ -12,7 +12,7 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Deltas, Field, FieldConfig, Scratch, Tensor, Tensors};
 use splatsieve::model::{Column, Columns};
 
-const BLOCK: usize = 4096;
+const BLOCK: usize = 1024;
 
 /// Values in [−1, 1), the same on every run.
 fn noise(seed: &mut u64) -> f32 {

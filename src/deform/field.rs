@@ -12,13 +12,13 @@ use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians};
 
 use super::deltas::Deltas;
-use super::linear::{Linear, Stride, add_bias, multiply};
-use super::planes::{Planes, PreparedPlanes};
+use super::linear::{Hidden, Output, Rows};
+use super::planes::{Lines, Planes, PreparedPlanes};
 use super::tensors::{Lookup, Tensors};
 use super::voxel::VoxelMask;
 
-/// Rows evaluated at a time: the activations of a block stay in the second-level cache.
-const ROWS: usize = 256;
+/// Rows evaluated at a time: whole tiles of both kinds of layer, their activations in the first-level cache.
+const ROWS: usize = 96;
 
 /// What of a model's hyper-parameters decides the evaluation and cannot be told from tensor shapes.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,12 +46,13 @@ enum Mask {
     Voxel(VoxelMask),
 }
 
-/// One head: ReLU, then a slice of the fused hidden layer, ReLU, output layer.
+/// One head: hidden layer, ReLU, output layer, on top of the trunk's ReLU.
 #[derive(Debug, Clone)]
 struct Head {
     /// The column it deforms; none for the mask of `static_mlp`.
     column: Option<Columns>,
-    output: Linear,
+    hidden: Hidden,
+    output: Output,
 }
 
 /// A 4DGaussians deformation field. Evaluates any block of Gaussians at any time; the result of a
@@ -61,9 +62,7 @@ pub struct Field {
     config: FieldConfig,
     /// None when the trunk reads positions.
     planes: Option<Planes>,
-    trunk: Vec<Linear>,
-    /// First layers of all heads side by side: `[width, width·heads]`.
-    hidden: Option<Linear>,
+    trunk: Vec<Hidden>,
     heads: Vec<Head>,
     mask: Mask,
 }
@@ -119,10 +118,10 @@ impl Field {
             Some(planes) => planes.width(),
         };
         let layer = |i: usize| format!("deformation_net.feature_out.{}", 2 * i);
-        let mut trunk = vec![Linear::load(lookup, &layer(0), inputs, None, "the features it reads")?];
+        let mut trunk = vec![Hidden::load(lookup, &layer(0), inputs, None, "the features it reads")?];
         let width = trunk[0].outputs;
         while lookup.has(&format!("{}.weight", layer(trunk.len()))) {
-            trunk.push(Linear::load(lookup, &layer(trunk.len()), width, Some(width), "the width of the network")?);
+            trunk.push(Hidden::load(lookup, &layer(trunk.len()), width, Some(width), "the width of the network")?);
         }
 
         let shape = Gaussians::zeros(0, sh_degree);
@@ -139,15 +138,14 @@ impl Field {
         } else {
             Mask::None
         };
-        let mut first = Vec::new();
         let mut heads = Vec::new();
         for (column, (name, why), outputs) in wanted {
             let name = format!("deformation_net.{name}");
-            first.push(Linear::load(lookup, &format!("{name}.1"), width, Some(width), why)?);
-            let output = Linear::load(lookup, &format!("{name}.3"), width, Some(outputs), why)?;
-            heads.push(Head { column, output });
+            let hidden = Hidden::load(lookup, &format!("{name}.1"), width, Some(width), why)?;
+            let output = Output::load(lookup, &format!("{name}.3"), width, Some(outputs), why)?;
+            heads.push(Head { column, hidden, output });
         }
-        Ok(Field { config, planes, trunk, hidden: Linear::fuse(&first), heads, mask })
+        Ok(Field { config, planes, trunk, heads, mask })
     }
 
     /// Columns that change with time.
@@ -214,114 +212,92 @@ impl Field {
         if want.is_empty() {
             return Ok(());
         }
+        if let (None, PreparedInput::Planes(_)) | (Some(_), PreparedInput::Position(_)) =
+            (&self.planes, &prepared.input)
+        {
+            return Err(Error::usage("a block prepared by another field was given"));
+        }
         let time = time as f32;
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
-        for start in (0..prepared.rows).step_by(ROWS) {
-            let rows = ROWS.min(prepared.rows - start);
-            let input = match (&self.planes, &prepared.input) {
-                (Some(planes), PreparedInput::Planes(block)) => {
-                    scratch.features.resize(rows * planes.width(), 0.0);
-                    planes.features(block, &lines, start, &mut scratch.features);
-                    if self.config.grid_pe > 1 {
-                        scratch.features =
-                            with_frequencies(&scratch.features, planes.width(), self.config.grid_pe as f32);
-                    }
-                    &scratch.features
-                }
-                (_, PreparedInput::Position(position)) => {
-                    scratch.features.clear();
-                    for i in start..start + rows {
-                        let [x, y, z] = position.row(i);
-                        scratch.features.extend([x, y, z, time]);
-                    }
-                    &scratch.features
-                }
-                (None, PreparedInput::Planes(_)) => {
-                    return Err(Error::usage("a block prepared by another field was given"));
-                }
-            };
-            run_trunk(&self.trunk, input, rows, &mut scratch.trunk);
-            self.run_heads(&scratch.trunk[0], rows, start, want, masked, &mut scratch.hidden, out);
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
+            // SAFETY: the line above saw that this processor has AVX2 and FMA.
+            unsafe { self.evaluate_fma(prepared, time, &lines, scratch, out) };
+            return Ok(());
         }
+        self.evaluate::<false>(prepared, time, &lines, scratch, out);
         Ok(())
     }
 
-    /// Both layers of the wanted heads for one sub-block; `width` activations per row in `trunk`.
-    #[expect(clippy::too_many_arguments, reason = "one call site; the arguments are the sub-block")]
-    fn run_heads(
+    /// [`Field::evaluate`] compiled for AVX2 and FMA.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,fma")]
+    fn evaluate_fma(&self, prepared: &Prepared, time: f32, lines: &[Lines], scratch: &mut Scratch, out: &mut Deltas) {
+        self.evaluate::<true>(prepared, time, lines, scratch, out);
+    }
+
+    /// Fills what `out` has begun; inlined, with all it calls, into each instruction set's copy.
+    #[inline(always)]
+    fn evaluate<const FMA: bool>(
         &self,
-        trunk: &[f32],
-        rows: usize,
-        start: usize,
-        want: Columns,
-        masked: bool,
-        hidden: &mut Vec<f32>,
+        prepared: &Prepared,
+        time: f32,
+        lines: &[Lines],
+        scratch: &mut Scratch,
         out: &mut Deltas,
     ) {
-        let Some(layer) = &self.hidden else { return };
-        let width = layer.inputs;
-        let all = layer.outputs;
-        let wanted = |head: &Head| head.column.map_or(masked, |column| want.contains(column));
-        hidden.resize(rows * all, 0.0);
-        // Wanted heads that lie side by side share one multiplication.
-        let mut first = 0;
-        for run in self.heads.chunk_by(|a, b| wanted(a) == wanted(b)) {
-            let (from, to) = (first * width, (first + run.len()) * width);
-            first += run.len();
-            if wanted(&run[0]) {
-                multiply(
-                    [rows, width, to - from],
-                    (trunk, Stride { row: width, col: 1 }),
-                    (&layer.weight[from..], Stride { row: all, col: 1 }),
-                    (&mut hidden[from..], Stride { row: all, col: 1 }),
-                );
-                for row in hidden.chunks_exact_mut(all) {
-                    add_bias(&mut row[from..to], &layer.bias[from..to], true);
+        let Scratch { features, trunk, hidden } = scratch;
+        for start in (0..prepared.rows).step_by(ROWS) {
+            let rows = ROWS.min(prepared.rows - start);
+            let mut width = 4;
+            match (&self.planes, &prepared.input) {
+                (Some(planes), PreparedInput::Planes(block)) => {
+                    width = planes.width();
+                    features.resize(rows * width, 0.0);
+                    planes.features(block, lines, start, features);
+                    if self.config.grid_pe > 1 {
+                        *features = with_frequencies(features, width, self.config.grid_pe as f32);
+                        width *= 3;
+                    }
                 }
+                (_, PreparedInput::Position(position)) => {
+                    features.clear();
+                    for i in start..start + rows {
+                        let [x, y, z] = position.row(i);
+                        features.extend([x, y, z, time]);
+                    }
+                }
+                (None, PreparedInput::Planes(_)) => {}
             }
-        }
-        for (h, head) in self.heads.iter().enumerate().filter(|(_, head)| wanted(head)) {
-            let (planes, len) = match (head.column, &mut out.mask) {
-                (Some(column), _) => {
-                    let column = out.delta.column_mut(column);
-                    let len = column.len();
-                    (column.planes_mut(), len)
-                }
-                (None, Some(mask)) => {
-                    let len = mask.len();
-                    (mask.as_mut_slice(), len)
-                }
-                (None, None) => continue,
-            };
-            let outputs = head.output.outputs;
-            multiply(
-                [rows, width, outputs],
-                (&hidden[h * width..], Stride { row: all, col: 1 }),
-                (&head.output.weight, Stride { row: outputs, col: 1 }),
-                (&mut planes[start..], Stride { row: 1, col: len }),
-            );
-            for (plane, bias) in planes.chunks_exact_mut(len).zip(&head.output.bias) {
-                plane[start..start + rows].iter_mut().for_each(|x| *x += bias);
+            let trunk = run_trunk::<FMA>(&self.trunk, Rows { values: features, stride: width }, trunk);
+            for head in &self.heads {
+                let (planes, len) = match (head.column, &mut out.mask) {
+                    (Some(column), _) if out.active.contains(column) => {
+                        let column = out.delta.column_mut(column);
+                        let len = column.len();
+                        (column.planes_mut(), len)
+                    }
+                    (None, Some(mask)) => (mask.as_mut_slice(), prepared.rows),
+                    _ => continue,
+                };
+                let hidden = head.hidden.activate::<FMA>(trunk, hidden);
+                head.output.write::<FMA>(hidden, planes, len, start);
             }
         }
     }
 }
 
-/// Runs the trunk on `rows` rows of `input`; leaves its ReLU-ed output, as every head wants it, in
-/// `buffers[0]`.
-fn run_trunk(layers: &[Linear], input: &[f32], rows: usize, buffers: &mut [Vec<f32>; 2]) {
+/// Runs the trunk on the rows of `input`; gives its ReLU-ed output, as every head wants it.
+#[inline(always)]
+fn run_trunk<'a, const FMA: bool>(layers: &[Hidden], input: Rows<'_>, buffers: &'a mut [Vec<f32>; 2]) -> Rows<'a> {
+    let [even, odd] = buffers;
+    let mut stride = input.stride;
     for (i, layer) in layers.iter().enumerate() {
-        buffers.swap(0, 1);
-        let [out, previous] = buffers;
-        out.resize(rows * layer.outputs, 0.0);
-        multiply(
-            [rows, layer.inputs, layer.outputs],
-            (if i == 0 { input } else { previous }, Stride { row: layer.inputs, col: 1 }),
-            (&layer.weight, Stride { row: layer.outputs, col: 1 }),
-            (out, Stride { row: layer.outputs, col: 1 }),
-        );
-        add_bias(out, &layer.bias, true);
+        let (from, to) = if i % 2 == 0 { (&*odd, &mut *even) } else { (&*even, &mut *odd) };
+        let from = if i == 0 { input } else { Rows { values: from, stride } };
+        stride = layer.activate::<FMA>(from, to).stride;
     }
+    Rows { values: if layers.len() % 2 == 1 { even } else { odd }, stride }
 }
 
 /// `[f, sin(p·f), cos(p·f)]` for every row of `width` features.

@@ -36,6 +36,9 @@ struct Level {
     temporal: [Plane; 3],
 }
 
+/// The time planes of a level at one time, by axis: `[size_a, channels]` each.
+pub(super) type Lines = [Vec<f32>; 3];
+
 /// The planes of all levels and the box they cover.
 #[derive(Debug, Clone)]
 pub(super) struct Planes {
@@ -109,12 +112,11 @@ fn tap(u: f32, size: usize) -> Tap {
     Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
-/// Interpolates `a` to `b` by `fraction` and multiplies `out` by it.
-fn multiply_mix(out: &mut [f32], a: &[f32], b: &[f32], fraction: f32) {
-    let rest = 1.0 - fraction;
-    for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
-        *out *= a * rest + b * fraction;
-    }
+/// The two texels of a line that a tap lies between, and its fraction.
+#[inline(always)]
+fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
+    let texel = |at: u32| &line[at as usize * channels..][..channels];
+    ([texel(tap.low), texel(tap.high)], tap.fraction)
 }
 
 impl Planes {
@@ -181,8 +183,8 @@ impl Planes {
         prepared
     }
 
-    /// The time planes of every level interpolated at `time`: for each level and axis `[size_a, channels]`.
-    pub(super) fn lines(&self, time: f32) -> Vec<[Vec<f32>; 3]> {
+    /// The time planes of every level interpolated at `time`.
+    pub(super) fn lines(&self, time: f32) -> Vec<Lines> {
         let line = |level: &Level, plane: &Plane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);
             let row =
@@ -193,20 +195,28 @@ impl Planes {
     }
 
     /// Writes the features of rows `start..` of the prepared block into `out` `[rows, width]`.
-    pub(super) fn features(&self, prepared: &PreparedPlanes, lines: &[[Vec<f32>; 3]], start: usize, out: &mut [f32]) {
+    #[inline(always)]
+    pub(super) fn features(&self, prepared: &PreparedPlanes, lines: &[Lines], start: usize, out: &mut [f32]) {
         let width = self.width();
-        out.copy_from_slice(&prepared.product[start * width..][..out.len()]);
+        let product = &prepared.product[start * width..][..out.len()];
         let taps = &prepared.taps[start * 3 * self.levels.len()..];
-        for (row, taps) in out.chunks_exact_mut(width).zip(taps.chunks_exact(3 * self.levels.len())) {
-            let mut rest = row;
-            for ((level, lines), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
+        let rows = out.chunks_exact_mut(width).zip(product.chunks_exact(width));
+        for ((out, product), taps) in rows.zip(taps.chunks_exact(3 * self.levels.len())) {
+            let mut first = 0;
+            for ((level, [x, y, z]), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
                 let n = level.channels;
-                let out;
-                (out, rest) = rest.split_at_mut(n);
-                for (line, tap) in lines.iter().zip(taps) {
-                    let (a, b) = (tap.low as usize * n, tap.high as usize * n);
-                    multiply_mix(out, &line[a..a + n], &line[b..b + n], tap.fraction);
+                let (out, product) = (&mut out[first..][..n], &product[first..][..n]);
+                let ([x0, x1], x) = texels(x, taps[0], n);
+                let ([y0, y1], y) = texels(y, taps[1], n);
+                let ([z0, z1], z) = texels(z, taps[2], n);
+                // All three in one pass: each on its own would read and write the row again.
+                for c in 0..n {
+                    let along_x = x0[c] * (1.0 - x) + x1[c] * x;
+                    let along_y = y0[c] * (1.0 - y) + y1[c] * y;
+                    let along_z = z0[c] * (1.0 - z) + z1[c] * z;
+                    out[c] = product[c] * along_x * along_y * along_z;
                 }
+                first += n;
             }
         }
     }

@@ -22,21 +22,22 @@ impl Life {
     }
 
     /// Adds a frame of opacities in [0, 1]; says how many Gaussians are alive in it.
+    #[inline(always)]
     pub(super) fn frame(&mut self, opacity: &[f64], alpha_min: f64) -> u32 {
-        let mut alive = 0;
-        for (i, &alpha) in opacity.iter().enumerate() {
-            if alpha >= alpha_min {
-                if self.frames[i] == 0 {
-                    self.first[i] = alpha;
-                }
-                let shifted = alpha - self.first[i];
-                self.sum[i] += shifted;
-                self.sum_of_squares[i] += shifted * shifted;
-                self.frames[i] += 1;
-                alive += 1;
-            }
+        let n = opacity.len();
+        let (first, sum, sum_of_squares) = (&mut self.first[..n], &mut self.sum[..n], &mut self.sum_of_squares[..n]);
+        let frames = &mut self.frames[..n];
+        let mut all = 0;
+        for i in 0..n {
+            let alive = opacity[i] >= alpha_min;
+            first[i] = if alive & (frames[i] == 0) { opacity[i] } else { first[i] };
+            let shifted = if alive { opacity[i] - first[i] } else { 0.0 };
+            sum[i] += shifted;
+            sum_of_squares[i] += shifted * shifted;
+            frames[i] += u32::from(alive);
+            all += u32::from(alive);
         }
-        alive
+        all
     }
 
     /// Life frames of every Gaussian so far.

@@ -60,9 +60,13 @@ impl Motion {
 
     /// Adds a frame: positions `[3, len]`, opacities, and the durations, in mean steps, of the last
     /// step and of the one before it.
+    #[inline(always)]
     pub(super) fn frame(&mut self, position: &Column, opacity: &[f64], alpha_min: f64, step: f64, step_before: f64) {
         match self.kind {
-            recipe::Motion::Runs => self.frame_of_runs(position, opacity, alpha_min, step, step_before),
+            recipe::Motion::Runs if step == 1.0 && step_before == 1.0 => {
+                self.frame_of_runs::<true>(position, opacity, alpha_min, [1.0; 2]);
+            }
+            recipe::Motion::Runs => self.frame_of_runs::<false>(position, opacity, alpha_min, [step, step_before]),
             recipe::Motion::Literal => self.frame_of_literal(position, opacity, alpha_min),
         }
         std::mem::swap(&mut self.previous, &mut self.before);
@@ -70,59 +74,46 @@ impl Motion {
         self.frames += 1;
     }
 
-    fn frame_of_runs(&mut self, position: &Column, opacity: &[f64], alpha_min: f64, step: f64, step_before: f64) {
-        for (i, &alpha) in opacity.iter().enumerate() {
-            let history = self.history[i];
-            let alive = alpha >= alpha_min;
-            if alive && history & ALIVE != 0 {
-                let (last, turn) = self.differences(position, i, step, step_before);
-                self.sum_step2[i] += last;
-                self.steps[i] += 1;
-                if history & ALIVE_BEFORE != 0 {
-                    self.sum_turn[i] += turn;
-                    self.turns[i] += 1;
-                }
-            }
-            self.history[i] = next(history, alive);
+    /// `EVEN`: both steps last 1, and dividing by that would cost more than all the rest.
+    #[inline(always)]
+    fn frame_of_runs<const EVEN: bool>(&mut self, position: &Column, opacity: &[f64], alpha_min: f64, steps: [f64; 2]) {
+        let n = opacity.len();
+        let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
+        let (sum_step2, sum_turn) = (&mut self.sum_step2[..n], &mut self.sum_turn[..n]);
+        let (step_count, turn_count) = (&mut self.steps[..n], &mut self.turns[..n]);
+        let history = &mut self.history[..n];
+        for i in 0..n {
+            let alive = opacity[i] >= alpha_min;
+            let stepped = alive & (history[i] & ALIVE != 0);
+            let turned = stepped & (history[i] & ALIVE_BEFORE != 0);
+            let (step2, turn) = differences::<EVEN>([row(x, i), row(previous, i), row(before, i)], steps);
+            sum_step2[i] += if stepped { step2 } else { 0.0 };
+            sum_turn[i] += if turned { turn } else { 0.0 };
+            step_count[i] += u32::from(stepped);
+            turn_count[i] += u32::from(turned);
+            history[i] = next(history[i], alive);
         }
     }
 
+    #[inline(always)]
     fn frame_of_literal(&mut self, position: &Column, opacity: &[f64], alpha_min: f64) {
-        for (i, &alpha) in opacity.iter().enumerate() {
-            let history = self.history[i];
-            let alive = alpha >= alpha_min;
-            let (last, turn) = self.differences(position, i, 1.0, 1.0);
+        let n = opacity.len();
+        let [x, previous, before] = [position, &self.previous, &self.before].map(|column| planes(column, n));
+        let (sum_step2, sum_turn) = (&mut self.sum_step2[..n], &mut self.sum_turn[..n]);
+        let (pending, history) = (&mut self.pending[..n], &mut self.history[..n]);
+        let first = self.frames == 0;
+        for i in 0..n {
+            let alive = opacity[i] >= alpha_min;
+            let (step2, turn) = differences::<true>([row(x, i), row(previous, i), row(before, i)], [1.0; 2]);
             // The previous frame is a centre if it lives and is not the first that does.
-            if history & ALIVE != 0 && history & BORN_BEFORE != 0 {
-                self.pending[i] = turn;
-            }
-            if alive {
-                // Life goes on, so the centre in waiting was not its last frame.
-                self.sum_turn[i] += std::mem::take(&mut self.pending[i]);
-                if self.frames > 0 {
-                    self.sum_step2[i] += last;
-                }
-            }
-            self.history[i] = next(history, alive);
+            let centre = (history[i] & ALIVE != 0) & (history[i] & BORN_BEFORE != 0);
+            let waiting = if centre { turn } else { pending[i] };
+            // Once life goes on, the centre in waiting was not its last frame.
+            sum_turn[i] += if alive { waiting } else { 0.0 };
+            pending[i] = if alive { 0.0 } else { waiting };
+            sum_step2[i] += if alive & !first { step2 } else { 0.0 };
+            history[i] = next(history[i], alive);
         }
-    }
-
-    /// ‖last step‖² and ‖turn about the previous frame‖, per mean step; meaningless where the
-    /// history is shorter.
-    fn differences(&self, position: &Column, i: usize, step: f64, step_before: f64) -> (f64, f64) {
-        let (mut step2, mut turn2) = (0.0, 0.0);
-        for axis in 0..3 {
-            let x = f64::from(position.plane(axis)[i]);
-            let previous = f64::from(self.previous.plane(axis)[i]);
-            let before = f64::from(self.before.plane(axis)[i]);
-            let velocity = (x - previous) / step;
-            let velocity_before = (previous - before) / step_before;
-            // Both are 1 for even frames, which leaves x − 2·previous + before.
-            let turn = (velocity - velocity_before) / (0.5 * (step + step_before));
-            step2 += velocity * velocity;
-            turn2 += turn * turn;
-        }
-        (step2, turn2.sqrt())
     }
 
     /// D of every Gaussian, given its life frames; 0 where no step counts.
@@ -151,7 +142,43 @@ impl Motion {
     }
 }
 
+/// Planes x, y, z of a column of `n` Gaussians; equal lengths known to the compiler spare the bounds checks.
+#[inline(always)]
+fn planes(column: &Column, n: usize) -> [&[f32]; 3] {
+    std::array::from_fn(|axis| &column.plane(axis)[..n])
+}
+
+/// Spelled out, as `map` over an array stays a call in a function with other target features.
+#[inline(always)]
+fn row([x, y, z]: [&[f32]; 3], i: usize) -> [f32; 3] {
+    [x[i], y[i], z[i]]
+}
+
+/// ‖last step‖² and ‖turn about the previous frame‖ per mean step, from the positions now, in the previous frame
+/// and in the one before it; meaningless where the history is shorter.
+#[inline(always)]
+fn differences<const EVEN: bool>([now, previous, before]: [[f32; 3]; 3], [step, step_before]: [f64; 2]) -> (f64, f64) {
+    let (mut step2, mut turn2) = (0.0, 0.0);
+    for axis in 0..3 {
+        let middle = f64::from(previous[axis]);
+        let mut velocity = f64::from(now[axis]) - middle;
+        let mut velocity_before = middle - f64::from(before[axis]);
+        if !EVEN {
+            velocity /= step;
+            velocity_before /= step_before;
+        }
+        let mut turn = velocity - velocity_before;
+        if !EVEN {
+            turn /= 0.5 * (step + step_before);
+        }
+        step2 += velocity * velocity;
+        turn2 += turn * turn;
+    }
+    (step2, turn2.sqrt())
+}
+
 /// History once the current frame has become the previous one.
+#[inline(always)]
 fn next(history: u8, alive: bool) -> u8 {
     let now = if alive { ALIVE } else { 0 };
     let before = if history & ALIVE != 0 { ALIVE_BEFORE | BORN_BEFORE } else { 0 };

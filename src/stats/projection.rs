@@ -25,6 +25,9 @@ const JACOBIAN_CLAMP: f64 = 1.3;
 const DILATION_PX2: f64 = 0.3;
 /// Footprints reach this many standard deviations.
 const REACH: f64 = 3.0;
+/// Gaussians taken through one stage of the projection before the next. A single loop over all stages is
+/// a chain of some 150 cycles per iteration, too long for a processor to work on two at a time.
+const LANES: usize = 32;
 /// 2⁵²: adding it to x in [0, 2⁵²) leaves x, rounded, in the low bits of the sum.
 const ROUNDER: f64 = 4_503_599_627_370_496.0;
 
@@ -107,48 +110,118 @@ impl View {
     }
 }
 
-/// The sequential definition; inlined into each instruction set's copy.
+/// The definition, in stages over [`LANES`] Gaussians; inlined into each instruction set's copy.
 #[inline(always)]
 fn project_planes(view: &View, from: &Footprints<'_>, scale: Scale, sums: &mut Sums<'_>) {
     let n = from.opacity.len();
-    // Equal lengths known to the compiler spare the bounds checks.
-    let [px, py, pz] = from.position.map(|plane| &plane[..n]);
-    let axes = from.axes.map(|plane| &plane[..n]);
-    let coverage = &mut sums.coverage[..n];
-    let touched = &mut sums.touched[..n];
-    let unit = 2f64.powi(scale.exponent);
-    let View { rotation: [w0, w1, w2], translation: t, focal, principal, size, slope_limit } = view;
-    for i in 0..n {
-        let world = [f64::from(px[i]), f64::from(py[i]), f64::from(pz[i])];
-        let z = dot(w2, world) + t[2];
-        let in_front = z > NEAR;
-        let inverse_depth = 1.0 / if in_front { z } else { 1.0 };
-        let slope_x = (dot(w0, world) + t[0]) * inverse_depth;
-        let slope_y = (dot(w1, world) + t[1]) * inverse_depth;
+    let blocks = n / LANES;
+    let mut stage = Stage::<LANES>::new();
+    for block in 0..blocks {
+        stage.project(view, from, scale, sums, block);
+    }
+    let mut stage = Stage::<1>::new();
+    for i in blocks * LANES..n {
+        stage.project(view, from, scale, sums, i);
+    }
+}
 
-        let jw_x = jacobian_row(focal[0] * inverse_depth, clamp(slope_x, slope_limit[0]), w0, w2);
-        let jw_y = jacobian_row(focal[1] * inverse_depth, clamp(slope_y, slope_limit[1]), w1, w2);
-        let column = |k: usize| [axes[k][i], axes[3 + k][i], axes[6 + k][i]];
-        let (a, b, c) = (column(0), column(1), column(2));
-        let m_x = [dot(&jw_x, a), dot(&jw_x, b), dot(&jw_x, c)];
-        let m_y = [dot(&jw_y, a), dot(&jw_y, b), dot(&jw_y, c)];
+/// What the stages hand on about `N` Gaussians.
+struct Stage<const N: usize> {
+    depth: [f64; N],
+    /// 1/depth; 1 for a culled Gaussian.
+    inverse_depth: [f64; N],
+    /// x/z and y/z.
+    slope: [[f64; N]; 2],
+    /// √Σ_xx and √Σ_yy, px.
+    sigma: [[f64; N]; 2],
+    /// √det Σ, px².
+    root_det: [f64; N],
+}
 
-        let (xx, yy) = (dot(&m_x, m_x), dot(&m_y, m_y));
-        let minors = cross(m_x, m_y);
-        let det = dot(&minors, minors) + DILATION_PX2 * (xx + yy) + DILATION_PX2 * DILATION_PX2;
-        let sigma_x = (xx + DILATION_PX2).sqrt();
-        let sigma_y = (yy + DILATION_PX2).sqrt();
+impl<const N: usize> Stage<N> {
+    fn new() -> Self {
+        let zeros = [0.0; N];
+        Stage { depth: zeros, inverse_depth: zeros, slope: [zeros; 2], sigma: [zeros; 2], root_det: zeros }
+    }
 
-        let inside_x = overlap(focal[0] * slope_x + principal[0], REACH * sigma_x, size[0]);
-        let inside_y = overlap(focal[1] * slope_y + principal[1], REACH * sigma_y, size[1]);
-        let touches = in_front & (inside_x > 0.0) & (inside_y > 0.0);
-        // 9π√det × inside_x·inside_y / (6σ_x · 6σ_y)
-        let area = FRAC_PI_4 * (det.sqrt() / (sigma_x * sigma_y)) * (inside_x * inside_y);
-        let contribution = if touches { area * from.opacity[i] } else { 0.0 };
-        let fixed = (contribution * unit + ROUNDER).to_bits().wrapping_sub(ROUNDER.to_bits());
-        coverage[i] = coverage[i].wrapping_add(fixed);
-        let seen = touches & (from.opacity[i] >= scale.alpha_min);
-        touched[i] = touched[i].wrapping_add(u32::from(seen));
+    /// Projects the `block`-th `N` Gaussians.
+    #[inline(always)]
+    fn project(&mut self, view: &View, from: &Footprints<'_>, scale: Scale, sums: &mut Sums<'_>, block: usize) {
+        self.place(view, from.position.map(|plane| &plane.as_chunks().0[block]));
+        self.spread(view, from.axes.map(|plane| &plane.as_chunks().0[block]));
+        self.accumulate(
+            view,
+            &from.opacity.as_chunks().0[block],
+            scale,
+            &mut sums.coverage.as_chunks_mut().0[block],
+            &mut sums.touched.as_chunks_mut().0[block],
+        );
+    }
+
+    /// Where the centers lie in the camera.
+    #[inline(always)]
+    fn place(&mut self, view: &View, [px, py, pz]: [&[f32; N]; 3]) {
+        let View { rotation: [w0, w1, w2], translation: t, .. } = view;
+        for i in 0..N {
+            let world = [f64::from(px[i]), f64::from(py[i]), f64::from(pz[i])];
+            let z = dot(w2, world) + t[2];
+            let inverse_depth = 1.0 / if z > NEAR { z } else { 1.0 };
+            self.depth[i] = z;
+            self.inverse_depth[i] = inverse_depth;
+            self.slope[0][i] = (dot(w0, world) + t[0]) * inverse_depth;
+            self.slope[1][i] = (dot(w1, world) + t[1]) * inverse_depth;
+        }
+    }
+
+    /// The 2-D covariance.
+    #[inline(always)]
+    #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
+    fn spread(&mut self, view: &View, axes: [&[f64; N]; 9]) {
+        let View { rotation: [w0, w1, w2], focal, slope_limit, .. } = view;
+        for i in 0..N {
+            let row = |k: usize, w: &[f64; 3]| {
+                let slope = clamp(self.slope[k][i], slope_limit[k]);
+                jacobian_row(focal[k] * self.inverse_depth[i], slope, w, w2)
+            };
+            let (jw_x, jw_y) = (row(0, w0), row(1, w1));
+            let column = |k: usize| [axes[k][i], axes[3 + k][i], axes[6 + k][i]];
+            let (a, b, c) = (column(0), column(1), column(2));
+            let m_x = [dot(&jw_x, a), dot(&jw_x, b), dot(&jw_x, c)];
+            let m_y = [dot(&jw_y, a), dot(&jw_y, b), dot(&jw_y, c)];
+            let (xx, yy) = (dot(&m_x, m_x), dot(&m_y, m_y));
+            let minors = cross(m_x, m_y);
+            let det = dot(&minors, minors) + DILATION_PX2 * (xx + yy) + DILATION_PX2 * DILATION_PX2;
+            self.sigma[0][i] = (xx + DILATION_PX2).sqrt();
+            self.sigma[1][i] = (yy + DILATION_PX2).sqrt();
+            self.root_det[i] = det.sqrt();
+        }
+    }
+
+    /// What the picture shows of them.
+    #[inline(always)]
+    fn accumulate(
+        &self,
+        view: &View,
+        opacity: &[f64; N],
+        scale: Scale,
+        coverage: &mut [u64; N],
+        touched: &mut [u32; N],
+    ) {
+        let View { focal, principal, size, .. } = view;
+        let unit = 2f64.powi(scale.exponent);
+        for i in 0..N {
+            let sigma = [self.sigma[0][i], self.sigma[1][i]];
+            let inside = |k: usize| overlap(focal[k] * self.slope[k][i] + principal[k], REACH * sigma[k], size[k]);
+            let (inside_x, inside_y) = (inside(0), inside(1));
+            let touches = (self.depth[i] > NEAR) & (inside_x > 0.0) & (inside_y > 0.0);
+            // 9π√det × inside_x·inside_y / (6σ_x · 6σ_y)
+            let area = FRAC_PI_4 * (self.root_det[i] / (sigma[0] * sigma[1])) * (inside_x * inside_y);
+            let contribution = if touches { area * opacity[i] } else { 0.0 };
+            let fixed = (contribution * unit + ROUNDER).to_bits().wrapping_sub(ROUNDER.to_bits());
+            coverage[i] = coverage[i].wrapping_add(fixed);
+            let seen = touches & (opacity[i] >= scale.alpha_min);
+            touched[i] = touched[i].wrapping_add(u32::from(seen));
+        }
     }
 }
 

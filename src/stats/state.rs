@@ -32,21 +32,30 @@ impl State {
         }
     }
 
-    /// Takes over the columns `changed`, and flags what is odd in them.
-    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns) {
+    /// Takes over the columns `changed`, and flags what is odd in them. The axes are for projections only: without
+    /// `projected` they are left alone.
+    #[inline(always)]
+    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns, projected: bool) {
         for column in changed.iter() {
-            self.flag_non_finite(gaussians.column(column));
-        }
-        if changed.contains(Columns::POSITION) {
-            let finite = gaussians.position.planes().iter().filter(|x| x.is_finite());
-            self.largest_coordinate = finite.fold(self.largest_coordinate, |largest, x| largest.max(x.abs()));
+            let values = gaussians.column(column);
+            let largest = largest_magnitude(values.planes());
+            if !largest.is_finite() {
+                self.flag_non_finite(values);
+            }
+            if column == Columns::POSITION {
+                let finite = if largest.is_finite() { largest } else { largest_finite(values.planes()) };
+                self.largest_coordinate = self.largest_coordinate.max(finite);
+            }
         }
         if changed.contains(Columns::OPACITY) {
             for (opacity, &logit) in self.opacity.iter_mut().zip(gaussians.opacity_logit.plane(0)) {
                 *opacity = model::opacity(logit);
             }
         }
-        if !(changed & (Columns::ROTATION | Columns::LOG_SCALE)).is_empty() {
+        if changed.contains(Columns::ROTATION) {
+            self.flag_zero_rotation(&gaussians.rotation);
+        }
+        if projected && !(changed & (Columns::ROTATION | Columns::LOG_SCALE)).is_empty() {
             self.update_axes(gaussians);
         }
     }
@@ -59,12 +68,21 @@ impl State {
         }
     }
 
+    #[inline(always)]
+    fn flag_zero_rotation(&mut self, rotation: &Column) {
+        let n = self.flags.len();
+        let [w, x, y, z]: [&[f32]; 4] = std::array::from_fn(|c| &rotation.plane(c)[..n]);
+        for (i, flags) in self.flags.iter_mut().enumerate() {
+            let zero = (w[i] == 0.0) & (x[i] == 0.0) & (y[i] == 0.0) & (z[i] == 0.0);
+            flags.0 |= u8::from(zero) * Flags::ZERO_ROTATION;
+        }
+    }
+
     fn update_axes(&mut self, gaussians: &Gaussians) {
         for i in 0..self.flags.len() {
             let mut quaternion = gaussians.rotation.row::<4>(i).map(f64::from);
             if quaternion == [0.0; 4] {
                 quaternion = [1.0, 0.0, 0.0, 0.0];
-                self.flags[i].0 |= Flags::ZERO_ROTATION;
             }
             let rotation = rotation_matrix(quaternion);
             let scale = gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).min(MAX_LOG_SCALE).exp());
@@ -81,6 +99,17 @@ impl State {
             + axes.iter().map(|plane| size_of_val(&plane[..])).sum::<usize>()
             + size_of_val(&flags[..])
     }
+}
+
+/// Largest |x|, or something that is not finite if any value is not. The bits of magnitudes sort like the magnitudes,
+/// those of NaN and infinity last, and integers are compared many at a time.
+#[inline(always)]
+fn largest_magnitude(values: &[f32]) -> f32 {
+    f32::from_bits(values.iter().fold(0, |largest, x| largest.max(x.abs().to_bits())))
+}
+
+fn largest_finite(values: &[f32]) -> f32 {
+    values.iter().filter(|x| x.is_finite()).fold(0.0, |largest, x| largest.max(x.abs()))
 }
 
 /// Rows of the rotation of a wxyz quaternion of any length but zero. Dividing the quadratic form by
