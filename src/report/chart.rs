@@ -405,7 +405,7 @@ mod tests {
             assert!((2..=12).contains(&ticks.len()), "{low} to {high}: {ticks:?}");
             assert!(ticks.iter().all(|&tick| tick >= low - 1e-9 * high && tick <= high * (1.0 + 1e-9)));
         }
-        let narrow = Scale { log: true, low: 62f64.log10(), high: 80f64.log10(), from: 0.0, to: 100.0 };
+        let narrow = Scale { log: true, low: 62f64.log10(), high: 82f64.log10(), from: 0.0, to: 100.0 };
         assert_eq!(narrow.ticks(), [65.0, 70.0, 75.0, 80.0]);
         let log = Scale { log: true, low: -7.0, high: 2.0, from: 0.0, to: 100.0 };
         assert!((3..=8).contains(&log.ticks().len()), "{:?}", log.ticks());

@@ -24,6 +24,8 @@ pub struct ScanPlan {
     pub(super) steps: Vec<f64>,
     pub(super) frames: usize,
     pub(super) pairs: u32,
+    /// Whether there is any camera to project to.
+    pub(super) projects: bool,
     pub(super) coverage_exponent: i32,
 }
 
@@ -75,6 +77,7 @@ impl ScanPlan {
             steps: Vec::new(),
             frames: 0,
             pairs: 0,
+            projects: !cameras.is_empty(),
             coverage_exponent: coverage_exponent(image_px),
         }
     }

@@ -130,7 +130,7 @@ impl<'a> BlockScan<'a> {
     /// State, life and motion; inlined, with the loops it calls, into each instruction set's copy.
     #[inline(always)]
     fn advance_plainly(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
-        self.state.update(gaussians, changed, self.plan.pairs > 0);
+        self.state.update(gaussians, changed, self.plan.projects);
         let alpha_min = self.plan.alpha_min;
         self.alive_per_frame.push(self.life.frame(&self.state.opacity, alpha_min));
         let (step, step_before) = (self.plan.step(t), self.plan.step(t.saturating_sub(1)));
