@@ -4,8 +4,9 @@
 //! `picture/*` renders and scores a view of each trained model, its state known (skipped where the models
 //! are absent); the bar is 25 ms for `room2_big`. `size/*` does the same for synthetic clouds in a 640×512
 //! picture. criterion's throughput is Gaussians per second, so for `score` its inverse is the cost of one
-//! (Gaussian, frame, view); before each group the pixels and blend events (pixels that a Gaussian changed)
-//! of the picture are printed, counted by the tests' oracle. The rival is the C++ AVX-512 port of the
+//! (Gaussian, frame, view); before each group the Gaussians, pixels and blend events (pixels that a Gaussian
+//! changed, counted by the tests' oracle) of the picture are printed, and how many of each a second at the
+//! median time of some renders. The rival is the C++ AVX-512 port of the
 //! original rasteriser, measured elsewhere: 26, 14 and 12 ms for `room2_big`, `room2_dynerf`, `deform2`.
 //!
 //! Times are wall-clock: on a busy machine they are several times the cost. Criterion arguments filter:
@@ -16,19 +17,39 @@ mod models;
 #[path = "../tests/oracle/mod.rs"]
 mod oracle;
 
+use std::hint::black_box;
 use std::num::NonZeroU32;
+use std::time::Instant;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3};
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Contribution, Renderer};
 
+/// Pictures whose median time gives the rates.
+const PICTURES: usize = 21;
+
 /// Renders and scores one view.
 fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians, camera: &Camera) {
     let events = oracle::picture(state, camera, [0.0; 3], 1).events;
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
-    eprintln!("{group} {name}: {count} Gaussians, {pixels} pixels, {events} blend events");
     let mut renderer = Renderer::new();
+    let mut seconds: Vec<f64> = (0..PICTURES)
+        .map(|_| {
+            let start = Instant::now();
+            black_box(renderer.render(state, camera, [0.0; 3]));
+            start.elapsed().as_secs_f64()
+        })
+        .collect();
+    seconds.sort_by(f64::total_cmp);
+    let rate = |amount: f64| amount / seconds[PICTURES / 2] / 1e6;
+    eprintln!(
+        "{group} {name}: {count} Gaussians, {pixels} pixels, {events} blend events in {:.1} ms: {:.1}, {:.1} and {:.0} million a second",
+        1e3 * seconds[PICTURES / 2],
+        rate(count as f64),
+        rate(pixels as f64),
+        rate(events as f64)
+    );
     let mut group = criterion.benchmark_group(group);
     group.sample_size(20).throughput(Throughput::Elements(count as u64));
     group.bench_function(BenchmarkId::new("render", name), |b| {

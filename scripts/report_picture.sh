@@ -1,8 +1,8 @@
 #!/bin/sh
-# Makes docs/report.png, the README's picture: the slider of a report on a strongly compressed model.
+# Makes scripts/report_picture.png, the README's picture: the slider of a report on a strongly compressed model.
 #
 #     cargo build --release
-#     scripts/report_picture.sh target/release/splatsieve DATA/room2_dynerf docs/report.png
+#     scripts/report_picture.sh target/release/splatsieve DATA/room2_dynerf scripts/report_picture.png
 #
 # DATA/<name> is a model folder with its cameras inside. Needs Chromium (apt-get install chromium-headless-shell),
 # or another one named in SPLATSIEVE_BROWSER.

@@ -4,13 +4,15 @@
     cargo build --release
     python3 scripts/sweep_table.py target/release/splatsieve DATA CURVES
 
-DATA/<name>/ is a model folder with its cameras inside, DATA/static/<name>.ply a model without cameras. Results go
-to CURVES/<name>/; a model whose CURVES/<name>/sweep.json is there already is not swept again. Below the
+DATA/<name>/ is a model folder with its cameras inside, DATA/static/<name>.ply a model without cameras, for which
+12 to score by and 4 to compare by are set around it, written to CURVES/<name>.json. Results go to CURVES/<name>/; a model whose CURVES/<name>/sweep.json is there already is not swept again. Below the
 tables stands where `default` is more than 0.05 dB below another method, and where `visible` is not above
 `projected`: it is expected to say "nowhere" twice. Standard library only.
 """
 
+import array
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -18,12 +20,44 @@ from pathlib import Path
 FRACTIONS = ["0.8", "0.6", "0.4", "0.2", "0.1"]
 
 
+def positions(ply):
+    """Columns x, y, z of a binary PLY whose properties are all float and begin with these."""
+    head, body = ply.read_bytes().split(b"end_header\n", 1)
+    width = head.count(b"property float")
+    values = array.array("f")
+    values.frombytes(body[: len(body) // 4 * 4])
+    return [sorted(values[axis::width]) for axis in range(3)]
+
+
+def cameras_around(ply, path, count=16, pixels=300, field_of_view=60):
+    """Cameras on a Fibonacci sphere of two extents around the robust middle, every fourth held out."""
+    ranges = [(axis[len(axis) // 100], axis[-1 - len(axis) // 100]) for axis in positions(ply)]
+    middle = [(low + high) / 2 for low, high in ranges]
+    radius = 2 * max(high - low for low, high in ranges)
+    focal = pixels / 2 / math.tan(math.radians(field_of_view / 2))
+    frames = []
+    for k in range(count):
+        z, turn = 1 - (2 * k + 1) / count, k * math.pi * (3 - math.sqrt(5))
+        out = [math.cos(turn) * math.sqrt(1 - z * z), math.sin(turn) * math.sqrt(1 - z * z), z]
+        right = [-math.sin(turn), math.cos(turn), 0]
+        down = [right[1] * out[2], -right[0] * out[2], right[0] * out[1] - right[1] * out[0]]
+        axes = [right, down, [-x for x in out]]
+        eye = [m + radius * x for m, x in zip(middle, out)]
+        rows = [[*axis, -sum(a * e for a, e in zip(axis, eye))] for axis in axes]
+        frames.append(
+            {"v": k, "split": "test" if k % 4 == 2 else "train", "width": pixels, "height": pixels, "fx": focal}
+            | {"fy": focal, "cx": pixels / 2, "cy": pixels / 2, "w2c": [*rows, [0, 0, 0, 1]]}
+        )
+    path.write_text(json.dumps({"background": [0, 0, 0], "frames": frames}, indent=1) + "\n")
+    return path
+
+
 def sweep(binary, source, output):
     found = output / "sweep.json"
     if not found.exists():
-        # A static model has no cameras: a virtual rig looks at it.
-        cameras = ["--cameras", str(source)] if source.is_dir() else []
-        command = [binary, "sweep", str(source), *cameras, "--fractions", ",".join(FRACTIONS), "-o", str(output)]
+        cameras = source if source.is_dir() else cameras_around(source, output.with_suffix(".json"))
+        command = [binary, "sweep", str(source), "--cameras", str(cameras), "--fractions", ",".join(FRACTIONS)]
+        command += ["-o", str(output)]
         result = subprocess.run(command, capture_output=True, text=True)
         if result.returncode != 0:
             sys.exit(f"{' '.join(command)}\n{result.stderr}")
