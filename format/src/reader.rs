@@ -260,12 +260,6 @@ impl Reader {
 }
 
 impl TileBuffer {
-    /// Exchanges the values of the tile that was read last for `other`, which is reused: to keep a tile without
-    /// copying it.
-    pub fn swap_values(&mut self, other: &mut Vec<f32>) {
-        std::mem::swap(&mut self.values, other);
-    }
-
     /// The values of the tile that was read last.
     pub(crate) fn values(&self) -> &[f32] {
         &self.values

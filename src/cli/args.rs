@@ -16,7 +16,7 @@ Examples:
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
   splatsieve sweep model --cameras data -o curves        every method at every size
-  splatsieve report model small --cameras data -o report  the same as a page to look at
+  splatsieve report model small --cameras data -o page   what it cost, as a page to look at
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
   splatsieve unpack a.gseq --stream | splatsieve compress - -o b.gseq

@@ -164,16 +164,6 @@ impl TileReader<'_> {
                 kept.frames = info.frames as usize;
             }
         }
-        if let [Run { gaussian_block, from: 0, to: 0, len }] = self.runs[..]
-            && len == self.len
-            && len == reader.layout().gaussian_range(gaussian_block).count()
-        {
-            // The whole tile as it is: most scans read no other.
-            reader.read_tile(TileId { column, gaussian_block, frame_block }, &mut self.buffer)?;
-            self.buffer.swap_values(&mut kept.values);
-            kept.frame_block = Some(frame_block);
-            return Ok(());
-        }
         kept.values.resize(kept.frames * width * self.len, 0.0);
         for runs in self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block) {
             let at = TileId { column, gaussian_block: runs[0].gaussian_block, frame_block };
