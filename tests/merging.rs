@@ -189,19 +189,8 @@ fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
 }
 
 fn options(output: &Path, recipe: &Recipe, only: Only) -> CompressOptions {
-    CompressOptions {
-        input: InputOptions { path: tiny(), ..InputOptions::default() },
-        output: output.to_owned(),
-        kind: None,
-        recipe: recipe.clone(),
-        only,
-        target: None,
-        keep_ids: None,
-        drop_ids: None,
-        keep_box: None,
-        dry_run: false,
-        overwrite: false,
-    }
+    let input = InputOptions { path: tiny(), ..InputOptions::default() };
+    CompressOptions { only, ..CompressOptions::new(input, output.to_owned(), recipe.clone()) }
 }
 
 /// Compresses the tiny model and compares clusters and proxies; gives how many Gaussians joined others.

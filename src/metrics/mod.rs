@@ -51,7 +51,8 @@ fn assert_same_size(a: &Image, b: &Image) {
     assert_eq!(a.data.len(), b.data.len(), "pictures of different sizes");
 }
 
-fn clamped(value: f32) -> f64 {
+/// What a screen shows of a value.
+pub(crate) fn clamped(value: f32) -> f64 {
     f64::from(value.clamp(0.0, 1.0))
 }
 

@@ -17,7 +17,7 @@ use crate::pass::FrameSource;
 use crate::recipe::{Recipe, StaticTerm};
 use crate::render::render;
 use crate::select::Ranking;
-use crate::stream::gather;
+use crate::stream::gather_all;
 
 /// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
 /// alternatives usually do from one another.
@@ -137,7 +137,6 @@ fn mean_psnr(
 ) -> Result<Vec<f64>> {
     let source = scene.input.source();
     let background = background(None, scene)?;
-    let all: Vec<u32> = (0..source.info().count as u32).collect();
     let results: Vec<Option<Box<dyn FrameSource + '_>>> = alternatives
         .iter()
         .map(|other| match other.sieved.clusters.is_empty() {
@@ -148,13 +147,13 @@ fn mean_psnr(
     let mut sums = vec![0.0; alternatives.len()];
     for of_frame in pictures.chunk_by(|a, b| a.0 == b.0) {
         let frame = of_frame[0].0;
-        let original = gather(source, &all, frame, Columns::ALL)?;
+        let original = gather_all(source, frame, Columns::ALL)?;
         let states: Vec<Gaussians> = alternatives
             .iter()
             .zip(&results)
             .map(|(other, result)| match result {
                 None => Ok(original.pick(&other.sieved.kept)),
-                Some(result) => gather(&**result, &all[..other.sieved.kept.len()], frame, Columns::ALL),
+                Some(result) => gather_all(&**result, frame, Columns::ALL),
             })
             .collect::<Result<_>>()?;
         for &(_, camera) in of_frame {

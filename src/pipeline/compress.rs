@@ -63,6 +63,25 @@ pub struct CompressOptions {
     pub overwrite: bool,
 }
 
+impl CompressOptions {
+    /// Prunes and merges `input` to the recipe's own size, keeps and drops nobody in particular, replaces nothing.
+    pub fn new(input: InputOptions, output: PathBuf, recipe: Recipe) -> Self {
+        CompressOptions {
+            input,
+            output,
+            kind: None,
+            recipe,
+            only: Only::Both,
+            target: None,
+            keep_ids: None,
+            drop_ids: None,
+            keep_box: None,
+            dry_run: false,
+            overwrite: false,
+        }
+    }
+}
+
 /// Writes a smaller model and says what was done.
 ///
 /// # Errors

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::compress::{CompressOptions, Only, compress_scene};
+use super::compress::{CompressOptions, compress_scene};
 use super::input::{Input, InputOptions, Scene};
 use super::output::{OutputKind, write_sequence};
 use super::summary::{Stages, Summary};
@@ -55,19 +55,7 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Res
     let input = Input::Container(Container::open(&packed)?);
     let schedule = rig.schedule(&input.source().info().times, Some(Split::Train))?;
     let scene = Scene { path: PathBuf::from("scene.gseq"), input, rig, schedule, has_cameras: true, notes: Vec::new() };
-    let options = CompressOptions {
-        input: InputOptions::default(),
-        output: folder.join("compressed.gseq"),
-        kind: None,
-        recipe,
-        only: Only::Both,
-        target: None,
-        keep_ids: None,
-        drop_ids: None,
-        keep_box: None,
-        dry_run: false,
-        overwrite: false,
-    };
+    let options = CompressOptions::new(InputOptions::default(), folder.join("compressed.gseq"), recipe);
     let (summary, map) = compress_scene(&scene, &options, Stages::default())?;
     let marker = folder.join(MARKER);
     fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;

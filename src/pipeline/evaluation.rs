@@ -8,6 +8,7 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
+use super::csv::known;
 use super::summary::CameraSummary;
 
 /// One value for the model before compression and one for the model after it.
@@ -235,10 +236,9 @@ impl Evaluation {
             let _ = write!(out, "\n{},{},{}", picture.frame, picture.view, picture.time);
             let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
             for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
-                let given = |error: Option<f64>| error.map_or(String::new(), |error| error.to_string());
-                let _ = write!(out, ",{},{},{}", score.psnr, score.ssim, given(score.temporal));
+                let _ = write!(out, ",{},{},{}", score.psnr, score.ssim, known(score.temporal));
                 if with_flip {
-                    let _ = write!(out, ",{}", given(score.flip));
+                    let _ = write!(out, ",{}", known(score.flip));
                 }
             }
         }

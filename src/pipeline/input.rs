@@ -15,7 +15,7 @@ use crate::model::{Column, Columns, Rig, Schedule, Split};
 use crate::pass::FrameSource;
 use crate::pipeline::summary::InputSummary;
 use crate::stats::RobustBox;
-use crate::stream::gather;
+use crate::stream::gather_all;
 
 /// What to read and from where to look.
 #[derive(Debug, Clone, Default)]
@@ -197,8 +197,7 @@ fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
     if source.info().times.is_empty() {
         return Ok(cameras::virtual_rig(DVec3::ZERO, 1.0));
     }
-    let ids: Vec<u32> = (0..source.info().count as u32).collect();
-    let state = gather(source, &ids, 0, Columns::POSITION)?;
+    let state = gather_all(source, 0, Columns::POSITION)?;
     let bounds = RobustBox::of(&state.position);
     Ok(cameras::virtual_rig(bounds.middle, bounds.extent()))
 }

@@ -5,6 +5,7 @@ pub mod baseline;
 pub mod choose;
 pub mod compress;
 pub mod container;
+pub(crate) mod csv;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluation;

@@ -25,7 +25,7 @@ use crate::ingest::ply_sequence::PlySequence;
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
 use crate::recipe::{Merge, Recipe};
-use crate::stream::{MergedSequence, Progress, gather};
+use crate::stream::{MergedSequence, Progress, gather_all};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -292,10 +292,9 @@ pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path) -
         let progress = Progress::new("emit", "Gaussian frames", info.count as u64 * info.times.len() as u64);
         return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
     }
-    let ids: Vec<u32> = (0..info.count as u32).collect();
     let progress = Progress::new("emit", "frames", info.times.len() as u64);
     for frame in 0..info.times.len() {
-        let state = gather(source, &ids, frame, Columns::ALL)?;
+        let state = gather_all(source, frame, Columns::ALL)?;
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
             _ => path.join(format!("frame_{frame:05}.ply")),

@@ -4,7 +4,7 @@ use super::input::{Input, Scene};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
 use crate::pass::FrameSource;
-use crate::stream::gather;
+use crate::stream::gather_all;
 
 /// The part of a rig's pictures that is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -123,11 +123,10 @@ pub fn for_each_batch<const S: usize>(
     pictures: &[Picture],
     mut visit: impl FnMut(&[Gaussians; S], &[Picture]) -> Result<()>,
 ) -> Result<()> {
-    let ids = sources.map(|source| (0..source.info().count as u32).collect::<Vec<u32>>());
     for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
         let mut states: [Gaussians; S] = std::array::from_fn(|_| Gaussians::default());
-        for ((state, source), ids) in states.iter_mut().zip(sources).zip(&ids) {
-            *state = gather(source, ids, frame[0].frame, Columns::ALL)?;
+        for (state, source) in states.iter_mut().zip(sources) {
+            *state = gather_all(source, frame[0].frame, Columns::ALL)?;
         }
         for batch in frame.chunks(rayon::current_num_threads()) {
             visit(&states, batch)?;

@@ -10,12 +10,12 @@ use super::scored::Scored;
 use super::summary::{LeftOut, Stages};
 use crate::error::{Error, Result};
 use crate::metrics::psnr;
-use crate::model::{Camera, Columns, Gaussians, SH_C0};
+use crate::model::{Camera, Columns, SH_C0};
 use crate::pass::FrameSource;
 use crate::recipe::Recipe;
 use crate::refit::Refit;
 use crate::render::{Image, render};
-use crate::stream::{gather, recolor};
+use crate::stream::{gather_all, recolor};
 
 /// Iterations: METHOD section 6 takes 12; not tuned here.
 const ITERATIONS: usize = 10;
@@ -101,7 +101,7 @@ fn look(
         pictures.iter().enumerate().map(|(k, &(frame, camera))| (k, frame, camera)).collect();
     for of_frame in numbered.chunk_by(|a, b| a.1 == b.1) {
         let frame = of_frame[0].1;
-        let [original, state] = [scene.input.source(), result].map(|source| all_of(source, frame));
+        let [original, state] = [scene.input.source(), result].map(|source| gather_all(source, frame, Columns::ALL));
         let (original, state) = (original?, state?);
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         for &(k, _, index) in of_frame {
@@ -119,17 +119,12 @@ fn look(
     Ok(tests)
 }
 
-fn all_of(source: &dyn FrameSource, frame: usize) -> Result<Gaussians> {
-    let ids: Vec<u32> = (0..source.info().count as u32).collect();
-    gather(source, &ids, frame, Columns::ALL)
-}
-
 /// Mean PSNR over `tests` without `change` and with it, dB.
 fn quality(scene: &Scene, result: &dyn FrameSource, tests: &[Test], change: &[[f32; 3]]) -> Result<[f64; 2]> {
     let background = background(None, scene)?;
     let mut sums = [0.0; 2];
     for of_frame in tests.chunk_by(|a, b| a.frame == b.frame) {
-        let before = all_of(result, of_frame[0].frame)?;
+        let before = gather_all(result, of_frame[0].frame, Columns::ALL)?;
         let mut after = before.clone();
         recolor(&mut after, change);
         for test in of_frame {

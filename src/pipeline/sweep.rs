@@ -77,7 +77,7 @@ impl Method {
     /// How it compresses.
     fn means(self) -> Result<Means> {
         let pruning = |coverage| {
-            let mut recipe = preset("default")?;
+            let mut recipe = Recipe::preset("default")?;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticTerm::Mean;
             // S = C without clipping, so that no two Gaussians tie that differ in C.
@@ -87,9 +87,9 @@ impl Method {
             recipe.select.choose_by_views = false;
             Ok::<_, Error>(Means::Recipe(Box::new(recipe), Only::Prune))
         };
-        let paper = |only| Ok(Means::Recipe(Box::new(preset("paper")?), only));
+        let paper = |only| Ok(Means::Recipe(Box::new(Recipe::preset("paper")?), only));
         match self {
-            Method::Default => Ok(Means::Recipe(Box::new(preset("default")?), Only::Both)),
+            Method::Default => Ok(Means::Recipe(Box::new(Recipe::preset("default")?), Only::Both)),
             Method::Paper => paper(Only::Both),
             Method::PaperPrune => paper(Only::Prune),
             Method::PaperMerge => paper(Only::Merge),
@@ -111,10 +111,6 @@ impl Method {
 enum Means {
     Recipe(Box<Recipe>, Only),
     Baseline(Baseline),
-}
-
-fn preset(name: &str) -> Result<Recipe> {
-    Recipe::preset(name)
 }
 
 /// What to sweep.
@@ -156,7 +152,8 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     fractions.sort_unstable_by(|a, b| b.total_cmp(a));
     fractions.dedup();
 
-    let mut found = start(options)?;
+    let (mut found, name) = start(options)?;
+    let scratch = staged.path().join("point");
     let points: Vec<(Method, Option<f64>)> = options
         .methods
         .iter()
@@ -168,7 +165,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     let progress = Progress::new("sweep", "points", points.len() as u64);
     for (method, asked) in points {
         if !beyond_merging(method, asked, &found) {
-            let point = measure(options, method, asked, staged.path(), &mut found)?;
+            let point = measure(options, method, asked, &scratch, name, &mut found)?;
             found.points.push(point);
         }
         progress.advance(1);
@@ -189,10 +186,11 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     Ok(found)
 }
 
-/// What all points share.
-fn start(options: &SweepOptions) -> Result<TradeOff> {
+/// What all points share, and the name by which a result is of the input's kind.
+fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&train(&options.input))?;
-    Ok(TradeOff {
+    let name = if matches!(scene.input, Input::Container(_)) { "result.gseq" } else { "result" };
+    let found = TradeOff {
         tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
         path: scene.path.display().to_string(),
         digest: scene.input.digest()?,
@@ -203,7 +201,8 @@ fn start(options: &SweepOptions) -> Result<TradeOff> {
         cameras: scene.rig.origin.clone(),
         points: Vec::new(),
         notes: scene.notes,
-    })
+    };
+    Ok((found, name))
 }
 
 fn train(input: &InputOptions) -> InputOptions {
@@ -222,38 +221,25 @@ fn beyond_merging(method: Method, asked: Option<f64>, found: &TradeOff) -> bool 
     wanted.zip(merged_alone(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// One point: compresses, measures, deletes.
+/// One point: compresses to `name` in the new folder `scratch`, measures, deletes both.
 fn measure(
     options: &SweepOptions,
     method: Method,
     asked: Option<f64>,
-    folder: &Path,
+    scratch: &Path,
+    name: &str,
     found: &mut TradeOff,
 ) -> Result<Point> {
     let input = train(&options.input);
-    let is_container = matches!(Input::open(&input.path, input.iteration)?, Input::Container(_));
-    let scratch = folder.join("point");
-    fs::create_dir(&scratch).map_err(Error::io("create", &scratch))?;
-    let output = scratch.join(if is_container { "result.gseq" } else { "result" });
+    fs::create_dir(scratch).map_err(Error::io("create", scratch))?;
+    let output = scratch.join(name);
     let resets = reset_peak_memory();
     let start = Instant::now();
     let target = asked.map(Target::Ratio);
     let bytes = match method.means()? {
         Means::Recipe(recipe, only) => {
-            let options = CompressOptions {
-                input: input.clone(),
-                output: output.clone(),
-                kind: None,
-                recipe: *recipe,
-                only,
-                target,
-                keep_ids: None,
-                drop_ids: None,
-                keep_box: None,
-                dry_run: false,
-                overwrite: false,
-            };
-            compress(&options)?.output_bytes
+            let run = CompressOptions::new(input.clone(), output.clone(), *recipe);
+            compress(&CompressOptions { only, target, ..run })?.output_bytes
         }
         Means::Baseline(baseline) => Some(prune_by(baseline, &input, target, &output)?),
     };
@@ -270,7 +256,7 @@ fn measure(
         csv: None,
         overwrite: false,
     })?;
-    fs::remove_dir_all(&scratch).map_err(Error::io("remove", &scratch))?;
+    fs::remove_dir_all(scratch).map_err(Error::io("remove", scratch))?;
     found.pictures = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(Point {

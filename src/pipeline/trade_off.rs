@@ -5,6 +5,8 @@ use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
 
+use super::csv::{known, quoted};
+
 /// Every point of a sweep, and what they share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TradeOff {
@@ -65,10 +67,11 @@ impl TradeOff {
     pub fn csv(&self) -> String {
         let mut out = String::from("method,asked,count,fraction,bytes,psnr,ssim,temporal,seconds,peak_memory_bytes\n");
         for point in &self.points {
-            let Point { method, count, bytes, psnr, ssim, seconds, .. } = point;
-            let fraction = self.fraction(point);
-            let (asked, temporal) = (text(point.asked), text(point.temporal));
-            let memory = text(point.peak_memory_bytes);
+            let Point { count, bytes, psnr, ssim, seconds, .. } = point;
+            // Quoted: a file may name methods that this program does not know.
+            let (method, fraction) = (quoted(&point.method), self.fraction(point));
+            let (asked, temporal) = (known(point.asked), known(point.temporal));
+            let memory = known(point.peak_memory_bytes);
             // Writing to a String cannot fail.
             let _ = writeln!(
                 out,
@@ -117,8 +120,4 @@ impl TradeOff {
     pub fn fraction(&self, point: &Point) -> f64 {
         if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
     }
-}
-
-fn text(value: Option<impl ToString>) -> String {
-    value.map_or(String::new(), |value| value.to_string())
 }

@@ -11,7 +11,7 @@
 use serde::Serialize;
 
 use super::traits::{Kind, Traits};
-use crate::metrics::{PSNR_CAP_DB, psnr};
+use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{Camera, Column, Gaussians, SH_C0};
 use crate::pipeline::evaluate::Taken;
 use crate::render::{Image, render};
@@ -170,14 +170,13 @@ pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Ta
 
 /// Per pixel the mean over channels of the squared difference, clamped to what a screen shows.
 pub fn squared_error(a: &Image, b: &Image) -> Vec<f64> {
-    let shown = |v: f32| f64::from(v.clamp(0.0, 1.0));
-    let square = |(a, b): (&f32, &f32)| (shown(*a) - shown(*b)).powi(2);
+    let square = |(a, b): (&f32, &f32)| (clamped(*a) - clamped(*b)).powi(2);
     let pixels = a.data.chunks_exact(3).zip(b.data.chunks_exact(3));
     pixels.map(|(a, b)| a.iter().zip(b).map(square).sum::<f64>() / 3.0).collect()
 }
 
 fn brightness(image: &Image) -> Vec<f64> {
-    image.data.chunks_exact(3).map(|p| p.iter().map(|&v| f64::from(v.clamp(0.0, 1.0))).sum::<f64>() / 3.0).collect()
+    image.data.chunks_exact(3).map(|p| p.iter().map(|&v| clamped(v)).sum::<f64>() / 3.0).collect()
 }
 
 /// Judges one kind by the pictures `seen`, whose (frame, view) are `names`.

@@ -272,7 +272,7 @@ fn write(options: &ReportOptions, report: &Report, page: &str, run: &Run) -> Res
     ];
     files.extend(report.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
     files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(of))));
-    files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", tables::trade_off(of))));
+    files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", of.csv())));
     for (name, text) in files {
         let path = staged.path().join(name);
         fs::write(&path, text).map_err(Error::io("write", &path))?;

@@ -1,10 +1,10 @@
 //! The page's tables as CSV: a line of names, then one line per row; what does not exist is empty.
 
-use std::fmt::{Display, Write as _};
+use std::fmt::Write as _;
 
 use super::failure::FailureMode;
 use super::run::Summary;
-use crate::pipeline::trade_off::TradeOff;
+use crate::pipeline::csv::{known, quoted};
 
 /// One line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
@@ -52,48 +52,4 @@ pub(super) fn stages(summary: &Summary) -> String {
         );
     }
     out
-}
-
-/// One line per point of a sweep.
-pub(super) fn trade_off(found: &TradeOff) -> String {
-    let mut out = String::from("method,asked,gaussians,bytes,psnr,ssim,temporal,seconds,peak_memory_bytes\n");
-    for of in &found.points {
-        let _ = writeln!(
-            out,
-            "{},{},{},{},{},{},{},{},{}",
-            quoted(&of.method),
-            known(of.asked),
-            of.count,
-            of.bytes,
-            of.psnr,
-            of.ssim,
-            known(of.temporal),
-            of.seconds,
-            known(of.peak_memory_bytes)
-        );
-    }
-    out
-}
-
-fn known(value: Option<impl Display>) -> String {
-    value.map_or(String::new(), |value| value.to_string())
-}
-
-/// As RFC 4180 wants text that holds what parts fields.
-fn quoted(text: &str) -> String {
-    match text.contains([',', '"', '\n', '\r']) {
-        true => format!("\"{}\"", text.replace('"', "\"\"")),
-        false => text.to_owned(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_name_with_commas_and_quotes_stays_one_field() {
-        assert_eq!(quoted("a, \"b\""), "\"a, \"\"b\"\"\"");
-        assert_eq!(quoted("plain"), "plain");
-    }
 }

@@ -29,3 +29,9 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
     }
     Ok(all)
 }
+
+/// Columns `want` of all Gaussians at `frame`; all other columns are empty.
+pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
+    let ids: Vec<u32> = (0..source.info().count as u32).collect();
+    gather(source, &ids, frame, want)
+}

@@ -14,7 +14,7 @@ mod scan;
 
 pub use contribution::{Looking, Seen, visible_contribution};
 pub use frames::Frames;
-pub use gather::gather;
+pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use look::{Sample, Sampler};
 pub use merged::MergedSequence;
