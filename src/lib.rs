@@ -5,7 +5,7 @@
 //! | layer | modules | what lives there |
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
-//! | L1 | [`error`], [`model`], [`pass`], [`recipe`] | the vocabulary |
+//! | L1 | [`error`], [`model`], [`pass`], [`plan`], [`recipe`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`refit`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
 //! | L4 | [`pipeline`], [`report`] | the order of the passes; the page about their result |
@@ -22,6 +22,7 @@ pub mod metrics;
 pub mod model;
 pub mod pass;
 pub mod pipeline;
+pub mod plan;
 pub mod recipe;
 pub mod refit;
 pub mod render;

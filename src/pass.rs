@@ -54,4 +54,8 @@ pub trait BlockReader: Send {
     /// Writes the columns `want` of the block at `frame` into `out`, which is resized to the block.
     /// Columns outside `want` are left alone.
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()>;
+
+    /// Keeps from now on at most `frames` (at least 1) of those that have to be decoded together anyway: less
+    /// memory, at the price of decoding again. Readers that keep no frames have nothing to do.
+    fn hold(&mut self, _frames: usize) {}
 }

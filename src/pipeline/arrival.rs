@@ -100,7 +100,7 @@ pub fn open_measured(
     })?;
     let input = Input::Stream(streamed);
     let opened = Opened { rig: has_cameras.then(|| rig.get().cloned()).flatten(), input, notes: Vec::new() };
-    let mut scene = scene_of(opened, &options.path, options.split)?;
+    let mut scene = scene_of(opened, options)?;
     let Some(measuring) = measuring else { return Ok((scene, None)) };
     let complete = ScanPlan::new(&recipe.scan, &scene.input.source().info().times, &scene.schedule)?;
     if let Some(why) = measuring.wrong(&complete, &scene) {

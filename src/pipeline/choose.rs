@@ -186,8 +186,7 @@ pub(super) mod tests {
         write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
         let input = Input::Container(Container::open(&path).unwrap());
         let rig = made.rig();
-        let schedule = rig.schedule(&input.source().info().times, Some(Split::Train)).unwrap();
-        Scene { path, input, rig, schedule, has_cameras: true, notes: Vec::new() }
+        Scene::new(path, input, rig, Some(Split::Train)).unwrap()
     }
 
     /// Mean PSNR over the pictures that decide.

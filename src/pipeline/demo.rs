@@ -53,8 +53,7 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Res
     fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
 
     let input = Input::Container(Container::open(&packed)?);
-    let schedule = rig.schedule(&input.source().info().times, Some(Split::Train))?;
-    let scene = Scene { path: PathBuf::from("scene.gseq"), input, rig, schedule, has_cameras: true, notes: Vec::new() };
+    let scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
     let options = CompressOptions::new(InputOptions::default(), folder.join("compressed.gseq"), recipe);
     let (summary, map) = compress_scene(&scene, &options, Stages::default())?;
     let marker = folder.join(MARKER);

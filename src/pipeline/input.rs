@@ -14,6 +14,7 @@ use crate::ingest::ply_sequence::PlySequence;
 use crate::model::{Column, Columns, Rig, Schedule, Split};
 use crate::pass::FrameSource;
 use crate::pipeline::summary::InputSummary;
+use crate::plan::Limits;
 use crate::stats::RobustBox;
 use crate::stream::gather_all;
 
@@ -77,8 +78,21 @@ pub struct Scene {
     pub schedule: Schedule,
     /// Whether the cameras were given or found; else they are a virtual rig.
     pub has_cameras: bool,
+    /// What passes over it keep in memory at a time.
+    pub limits: Limits,
+    /// Folder for scratch files while the run lasts; none: the system's for such files.
+    pub scratch: Option<PathBuf>,
     /// Things a person should know.
     pub notes: Vec<String>,
+}
+
+impl Scene {
+    /// `input` as the cameras of `rig` in `split` see it, without limits.
+    pub fn new(path: PathBuf, input: Input, rig: Rig, split: Option<Split>) -> Result<Scene> {
+        let schedule = rig.schedule(&input.source().info().times, split)?;
+        let (limits, scratch, notes) = (Limits::NONE, None, Vec::new());
+        Ok(Scene { path, input, rig, schedule, has_cameras: true, limits, scratch, notes })
+    }
 }
 
 /// An input with its frames, and the cameras if there are any.
@@ -158,12 +172,12 @@ pub(super) fn load_cameras(options: &InputOptions, path: Option<&Path>) -> Resul
 
 /// Opens an input and the cameras that look at it.
 pub fn open_scene(options: &InputOptions) -> Result<Scene> {
-    scene_of(open_input(options)?, &options.path, options.split)
+    scene_of(open_input(options)?, options)
 }
 
-/// An open input as the cameras of `split` see it.
-pub(super) fn scene_of(opened: Opened, path: &Path, split: Option<Split>) -> Result<Scene> {
-    let Opened { input, rig, mut notes } = check_frames(opened, path)?;
+/// An open input as the cameras of the split that `options` name see it.
+pub(super) fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
+    let Opened { input, rig, mut notes } = check_frames(opened, &options.path)?;
     let has_cameras = rig.is_some();
     let rig = match rig {
         Some(rig) => rig,
@@ -173,11 +187,11 @@ pub(super) fn scene_of(opened: Opened, path: &Path, split: Option<Split>) -> Res
             rig
         }
     };
-    let schedule = rig.schedule(&input.source().info().times, split)?;
-    if schedule.pairs() == 0 && !input.source().info().times.is_empty() {
-        return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
+    let scene = Scene::new(options.path.clone(), input, rig, options.split)?;
+    if scene.schedule.pairs() == 0 && !scene.input.source().info().times.is_empty() {
+        return Err(Error::usage(format!("{}: no picture in this split (--split)", scene.rig.origin)));
     }
-    Ok(Scene { path: path.to_owned(), input, rig, schedule, has_cameras, notes })
+    Ok(Scene { has_cameras, scratch: options.scratch.clone(), notes, ..scene })
 }
 
 /// Frames of a model for which neither cameras nor the user name any.

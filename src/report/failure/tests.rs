@@ -31,8 +31,7 @@ fn looked() -> Looked {
     write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
     let input = Input::Container(Container::open(&path).unwrap());
     let rig = made.rig();
-    let schedule = rig.schedule(&made.info().times, Some(Split::Train)).unwrap();
-    let scene = crate::pipeline::input::Scene { path, input, rig, schedule, has_cameras: true, notes: Vec::new() };
+    let scene = crate::pipeline::input::Scene::new(path, input, rig, Some(Split::Train)).unwrap();
     let recipe = Recipe::preset("default").unwrap();
     let scored = score_scene(&scene, &recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
     let traits = traits(scene.input.source(), &scored, recipe.scan.alpha_min).unwrap();
