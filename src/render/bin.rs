@@ -1,7 +1,8 @@
 //! Which splats reach which tile, front to back.
 //!
-//! One sort by depth over the whole picture, then a counting sort into tiles that keeps that order.
-//! Memory: 8 bytes per splat and 4 bytes per (splat, tile) pair.
+//! One sort by depth over the whole picture, then a counting sort into tiles that keeps that order, a strip of
+//! tiles at a time: how many pairs there are depends on the picture alone, how many lie ready does not.
+//! Memory: 8 bytes per splat, 4 per pair of a splat and a tile of the strip.
 
 use std::ops::Range;
 
@@ -9,20 +10,31 @@ use rayon::slice::ParallelSliceMut;
 
 use super::project::Splats;
 
+/// Pairs of a strip, unless one tile alone has more.
+pub(super) const STRIP_PAIRS: usize = 1 << 20;
+
 /// Indices of splats, grouped by tile, nearest first.
 #[derive(Debug, Default)]
 pub(super) struct Bins {
-    /// (ordered depth bits, splat) of every splat, to sort.
+    /// (ordered depth bits, splat) of every splat, sorted.
     keys: Vec<u64>,
-    /// End of each tile's pairs; tile t begins where t − 1 ends.
+    /// Tiles across.
+    across: usize,
+    /// End of each tile's pairs among those of the whole picture; tile t begins where t − 1 ends.
     ends: Vec<usize>,
+    /// Tiles whose pairs lie ready.
+    strip: Range<usize>,
     pairs: Vec<u32>,
+    /// Where in `pairs` the next pair of each tile of the strip goes, then the end of all.
+    next: Vec<usize>,
 }
 
 impl Bins {
-    /// Bins `splats` into `tiles` = (across, down) tiles, on all threads of the pool if `parallel`.
-    pub(super) fn fill(&mut self, splats: &Splats, tiles: [u32; 2], parallel: bool) {
+    /// Sorts `splats` and counts their pairs with `tiles` = (across, down) tiles, on all threads of the pool if
+    /// `parallel`; no pairs lie ready yet.
+    pub(super) fn begin(&mut self, splats: &Splats, tiles: [u32; 2], parallel: bool) {
         self.keys.clear();
+        self.keys.reserve_exact(splats.splats.len());
         // Ties fall to the lower index.
         let depths = splats.splats.iter().map(|splat| u64::from(ordered_bits(splat.order)));
         self.keys.extend(depths.enumerate().map(|(i, bits)| bits << 32 | i as u64));
@@ -32,12 +44,12 @@ impl Bins {
             self.keys.sort_unstable();
         }
 
-        let across = tiles[0] as usize;
+        self.across = tiles[0] as usize;
         self.ends.clear();
-        self.ends.resize(across * tiles[1] as usize + 1, 0);
+        self.ends.resize(self.across * tiles[1] as usize, 0);
         for rect in &splats.rects {
             for y in rect.y0 as usize..rect.y1 as usize {
-                for count in &mut self.ends[y * across + rect.x0 as usize + 1..y * across + rect.x1 as usize + 1] {
+                for count in &mut self.ends[y * self.across + rect.x0 as usize..y * self.across + rect.x1 as usize] {
                     *count += 1;
                 }
             }
@@ -47,31 +59,67 @@ impl Bins {
             total += *end;
             *end = total;
         }
-        // From here `ends[t]` is where tile t's next pair goes; once all are placed, it is the tile's end.
+        self.strip = 0..0;
+    }
+
+    /// Makes the pairs of the next strip of tiles ready: whole rows of tiles with at most `most` pairs, else part
+    /// of a row, else one tile; none after the last. `splats` are those of [`Bins::begin`].
+    pub(super) fn next_strip(&mut self, splats: &Splats, most: usize) -> Option<Range<usize>> {
+        let first = self.strip.end;
+        if first == self.ends.len() {
+            return None;
+        }
+        let before = self.start(first);
+        let fitting = self.ends[first..].partition_point(|&end| end - before <= most);
+        let end = first + fitting.max(1);
+        let whole_rows = end - end % self.across;
+        self.strip = first..if whole_rows > first { whole_rows } else { end };
+
+        self.next.clear();
+        self.next.push(0);
+        self.next.extend(self.ends[self.strip.clone()].iter().map(|end| end - before));
         self.pairs.clear();
-        self.pairs.resize(total, 0);
+        self.pairs.resize(self.next.last().map_or(0, |&total| total), 0);
+        let rows = self.strip.start / self.across..self.strip.end.div_ceil(self.across);
         for &key in &self.keys {
             let splat = key as u32;
             let rect = splats.rects[splat as usize];
-            for y in rect.y0 as usize..rect.y1 as usize {
-                for at in &mut self.ends[y * across + rect.x0 as usize..y * across + rect.x1 as usize] {
+            for y in rows.start.max(rect.y0 as usize)..rows.end.min(rect.y1 as usize) {
+                let row = y * self.across;
+                let from = (row + rect.x0 as usize).max(self.strip.start);
+                let to = (row + rect.x1 as usize).min(self.strip.end);
+                for tile in from..to {
+                    let at = &mut self.next[tile - self.strip.start];
                     self.pairs[*at] = splat;
                     *at += 1;
                 }
             }
         }
-        self.ends.pop();
+        Some(self.strip.clone())
     }
 
-    /// The splats of every (splat, tile) pair, tile after tile.
+    /// The splats of every (splat, tile) pair of the strip, tile after tile.
     pub(super) fn pairs(&self) -> &[u32] {
         &self.pairs
     }
 
-    /// Where in [`Bins::pairs`] the tiles `tiles` lie.
-    pub(super) fn range(&self, tiles: Range<usize>) -> Range<usize> {
-        let end = |tile: usize| tile.checked_sub(1).map_or(0, |before| self.ends[before]);
-        end(tiles.start)..end(tiles.end)
+    /// The rows of tiles of which the strip has some, each with the part it has, as tiles across.
+    pub(super) fn rows(&self) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
+        let (across, strip) = (self.across, self.strip.clone());
+        (strip.start / across.max(1)..strip.end.div_ceil(across.max(1))).map(move |y| {
+            let row = y * across;
+            (y, strip.start.max(row) - row..strip.end.min(row + across) - row)
+        })
+    }
+
+    /// Where in [`Bins::pairs`] tiles `x` of row `y`, of the strip, lie.
+    pub(super) fn range(&self, y: usize, x: Range<usize>) -> Range<usize> {
+        let (row, before) = (y * self.across, self.start(self.strip.start));
+        self.start(row + x.start) - before..self.start(row + x.end) - before
+    }
+
+    fn start(&self, tile: usize) -> usize {
+        tile.checked_sub(1).map_or(0, |before| self.ends[before])
     }
 }
 

@@ -3,8 +3,9 @@
 //! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend`
 //! (pixels). Data in: [`Gaussians`] in stored encoding and a [`Camera`]. Data out: an [`Image`], or the
 //! [`Contribution`] or [`RemovalError`] of every Gaussian, or a [`Sight`], the picture as a linear map from
-//! colours. Memory: 80 bytes per visible Gaussian and 4 (for contributions 12)
-//! per pair of a Gaussian and a 16×16 tile it can change.
+//! colours. Memory: [`BYTES_PER_VISIBLE`], and up to [`STRIP_BYTES`] for pairs of a Gaussian and a 16×16 tile
+//! it can change, which are made for as many tiles at a time as that takes; a tile that more Gaussians than
+//! that reach takes 12 bytes for each.
 //!
 //! Every convention is that of the original CUDA rasteriser (Kerbl et al., "3D Gaussian Splatting", 2023),
 //! decided to the sentence because each costs tens of dB; what the reach of alpha ≥ 1/255 lets us skip
@@ -21,6 +22,7 @@ mod removal;
 mod sight;
 
 use std::num::NonZeroU32;
+use std::ops::Range;
 
 use rayon::prelude::*;
 
@@ -29,7 +31,7 @@ pub use removal::RemovalError;
 pub use sight::{Pull, Sight};
 
 use crate::model::{Camera, Gaussians};
-use bin::Bins;
+use bin::{Bins, STRIP_PAIRS};
 use blend::{Blend, Colour, GROUPS, Lattice, Plane, Weight, Weights};
 use project::{BLOCK, Splat, Splats, View};
 use removal::Removal;
@@ -44,6 +46,11 @@ const MAX_ALPHA: f32 = 0.99;
 const MIN_TRANSMITTANCE: f32 = 1e-4;
 /// Gaussians projected by one task: enough to outweigh handing it out.
 const SPAN: usize = 32 * BLOCK;
+
+/// Memory of a picture in the making per Gaussian it shows: footprint, reach and place in depth.
+pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<project::TileRect>() + size_of::<u64>();
+/// Memory of a picture in the making for pairs of Gaussians and tiles, with what is summed for each.
+pub const STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Weight>());
 
 /// A picture: red, green, blue per pixel, row by row from the top, 1 = white, not clamped.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -89,6 +96,8 @@ pub struct Renderer {
     splats: Splats,
     bins: Bins,
     weights: Vec<Weight>,
+    /// Pairs of splats and tiles that lie ready at a time.
+    strip_pairs: usize,
 }
 
 impl Default for Renderer {
@@ -110,6 +119,7 @@ impl Renderer {
             splats: Splats::default(),
             bins: Bins::default(),
             weights: Vec::new(),
+            strip_pairs: STRIP_PAIRS,
         }
     }
 
@@ -119,30 +129,34 @@ impl Renderer {
         self.prepare(gaussians, &view, true);
         let row_len = camera.width as usize * 3;
         let mut data = vec![0.0; row_len * camera.height as usize];
-        let across = view.tiles[0] as usize;
-        let paint_row = |(y, rows): (usize, &mut [f32])| {
-            for x in 0..across {
-                let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
-                let pairs = &self.bins.pairs()[self.bins.range(y * across + x..y * across + x + 1)];
-                let planes = paint(self.blend, &self.splats.splats, pairs, &lattice, background);
-                for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
-                    let start = x * TILE as usize;
-                    let pixels = row[start * 3..].chunks_exact_mut(3).take(TILE as usize);
-                    for (u, pixel) in pixels.enumerate() {
-                        let (group, lane) = (v + u / 8 * TILE as usize, u % 8);
-                        for c in 0..3 {
-                            pixel[c] = planes[c][group][lane];
+        // Without pixels there are no rows, and chunks must not be empty.
+        let tile_row_len = (row_len * TILE as usize).max(1);
+        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+            let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
+            let first = bins.rows().next().map_or(0, |(y, _)| y);
+            let paint_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
+                for x in tiles {
+                    let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
+                    let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+                    let planes = paint(blend, splats, pairs, &lattice, background);
+                    for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
+                        let start = x * TILE as usize;
+                        let pixels = row[start * 3..].chunks_exact_mut(3).take(TILE as usize);
+                        for (u, pixel) in pixels.enumerate() {
+                            let (group, lane) = (v + u / 8 * TILE as usize, u % 8);
+                            for c in 0..3 {
+                                pixel[c] = planes[c][group][lane];
+                            }
                         }
                     }
                 }
+            };
+            let rows = bins.rows().zip(data[first * tile_row_len..].chunks_mut(tile_row_len));
+            if self.parallel {
+                rows.collect::<Vec<_>>().into_par_iter().for_each(paint_row);
+            } else {
+                rows.for_each(paint_row);
             }
-        };
-        // Without pixels there are no rows, and chunks must not be empty.
-        let tile_row_len = (row_len * TILE as usize).max(1);
-        if self.parallel {
-            data.par_chunks_mut(tile_row_len).enumerate().for_each(paint_row);
-        } else {
-            data.chunks_mut(tile_row_len).enumerate().for_each(paint_row);
         }
         Image { width: camera.width, height: camera.height, data }
     }
@@ -161,33 +175,35 @@ impl Renderer {
         assert_eq!(seen.len(), gaussians.len(), "contribution of another model");
         let view = View::new(camera);
         self.prepare(gaussians, &view, false);
-        self.weights.clear();
-        self.weights.resize(self.bins.pairs().len(), Weight::default());
-        let across = view.tiles[0] as usize;
-        let mut rest = &mut self.weights[..];
-        let mut rows = Vec::with_capacity(view.tiles[1] as usize);
-        for y in 0..view.tiles[1] as usize {
-            let (row, after) = rest.split_at_mut(self.bins.range(y * across..(y + 1) * across).len());
-            rows.push((y, row));
-            rest = after;
-        }
-        let weigh_row = |(y, mut weights): (usize, &mut [Weight])| {
-            for x in 0..across {
-                let lattice = Lattice::new([x as u32, y as u32], view.size, stride.get());
-                let pairs = &self.bins.pairs()[self.bins.range(y * across + x..y * across + x + 1)];
-                let (tile, after) = weights.split_at_mut(pairs.len());
-                self.blend.tile(&self.splats.splats, pairs, &lattice, &mut Weights { pairs: tile });
-                weights = after;
+        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+            let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
+            self.weights.clear();
+            self.weights.resize(bins.pairs().len(), Weight::default());
+            let mut rest = &mut self.weights[..];
+            let mut rows = Vec::new();
+            for (y, tiles) in bins.rows() {
+                let (row, after) = rest.split_at_mut(bins.range(y, tiles.clone()).len());
+                rows.push((y, tiles, row));
+                rest = after;
             }
-        };
-        if self.parallel {
-            rows.into_par_iter().for_each(weigh_row);
-        } else {
-            rows.into_iter().for_each(weigh_row);
-        }
-        for (&splat, weight) in self.bins.pairs().iter().zip(&self.weights) {
-            if weight.max > 0.0 {
-                seen.add(self.splats.splats[splat as usize].id as usize, weight.sum, weight.max);
+            let weigh_row = |(y, tiles, mut weights): (usize, Range<usize>, &mut [Weight])| {
+                for x in tiles {
+                    let lattice = Lattice::new([x as u32, y as u32], view.size, stride.get());
+                    let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+                    let (tile, after) = weights.split_at_mut(pairs.len());
+                    blend.tile(splats, pairs, &lattice, &mut Weights { pairs: tile });
+                    weights = after;
+                }
+            };
+            if self.parallel {
+                rows.into_par_iter().for_each(weigh_row);
+            } else {
+                rows.into_iter().for_each(weigh_row);
+            }
+            for (&splat, weight) in bins.pairs().iter().zip(&self.weights) {
+                if weight.max > 0.0 {
+                    seen.add(splats[splat as usize].id as usize, weight.sum, weight.max);
+                }
             }
         }
     }
@@ -206,13 +222,12 @@ impl Renderer {
         assert_eq!(errors.len(), gaussians.len(), "errors of another model");
         let view = View::new(camera);
         self.prepare(gaussians, &view, true);
-        let splats = &self.splats.splats;
         let mut sums = Vec::new();
-        for y in 0..view.tiles[1] {
-            for x in 0..view.tiles[0] {
-                let tile = (y * view.tiles[0] + x) as usize;
-                let pairs = &self.bins.pairs()[self.bins.range(tile..tile + 1)];
-                let lattice = Lattice::new([x, y], view.size, 1);
+        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+            let (bins, splats) = (&self.bins, &self.splats.splats);
+            for (y, x) in bins.rows().flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
+                let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+                let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
                 let rest = paint(self.blend, splats, pairs, &lattice, background);
                 sums.clear();
                 sums.resize(pairs.len(), 0.0);
@@ -225,7 +240,7 @@ impl Renderer {
         }
     }
 
-    /// Projects and bins.
+    /// Projects and sorts.
     fn prepare(&mut self, gaussians: &Gaussians, view: &View, coloured: bool) {
         let count = gaussians.len();
         self.splats.clear();
@@ -248,7 +263,7 @@ impl Renderer {
         } else {
             project::project(gaussians, 0..count, view, coloured, &mut self.splats);
         }
-        self.bins.fill(&self.splats, view.tiles, self.parallel);
+        self.bins.begin(&self.splats, view.tiles, self.parallel);
     }
 }
 
@@ -270,8 +285,8 @@ mod tests {
 
     use super::*;
 
-    #[test]
-    fn the_portable_blend_gives_the_bits_of_the_fastest() {
+    /// 3000 Gaussians of all sizes, and a camera among them whose picture does not end at a tile's edge.
+    fn scene() -> (Gaussians, Camera) {
         let mut scene = Gaussians::zeros(3000, 0);
         for i in 0..scene.len() {
             // Low-discrepancy steps: every Gaussian elsewhere, of another size and opacity.
@@ -292,12 +307,46 @@ mod tests {
             rotation: DMat3::IDENTITY,
             translation: DVec3::ZERO,
         };
-        let [fast, portable] = [Blend::detect(), Blend::Portable].map(|blend| {
-            let mut renderer = Renderer { blend, ..Renderer::new() };
-            let mut seen = Contribution::new(scene.len());
-            renderer.contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
-            (renderer.render(&scene, &camera, [0.3; 3]), seen)
-        });
+        (scene, camera)
+    }
+
+    /// Everything a renderer can make of the scene.
+    fn made(mut renderer: Renderer) -> (Image, Contribution, RemovalError) {
+        let (scene, camera) = scene();
+        let mut seen = Contribution::new(scene.len());
+        renderer.contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
+        let mut errors = RemovalError::new(scene.len(), 0.1);
+        renderer.removal_error(&scene, &camera, [0.3; 3], &mut errors);
+        (renderer.render(&scene, &camera, [0.3; 3]), seen, errors)
+    }
+
+    #[test]
+    fn the_portable_blend_gives_the_bits_of_the_fastest() {
+        let [fast, portable] =
+            [Blend::detect(), Blend::Portable].map(|blend| made(Renderer { blend, ..Renderer::new() }));
         assert!(fast == portable, "the instruction sets differ");
+    }
+
+    #[test]
+    fn pairs_of_as_few_tiles_at_a_time_as_one_give_the_same_bits() {
+        let whole = made(Renderer::new());
+        let (scene, camera) = scene();
+        let mut renderer = Renderer::new();
+        renderer.prepare(&scene, &View::new(&camera), true);
+        let tiles = renderer.bins.next_strip(&renderer.splats, usize::MAX).unwrap();
+        let pairs = renderer.bins.pairs().len();
+        assert_eq!(tiles, 0..7 * 5);
+        for strip_pairs in [1, pairs / 20, pairs / 3, pairs] {
+            for parallel in [false, true] {
+                assert!(made(Renderer { strip_pairs, ..Renderer::with(parallel) }) == whole, "{strip_pairs} at a time");
+            }
+            renderer.bins.begin(&renderer.splats, [7, 5], false);
+            let mut at = 0;
+            while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {
+                assert!(strip.start == at && (strip.len() == 1 || renderer.bins.pairs().len() <= strip_pairs));
+                at = strip.end;
+            }
+            assert_eq!(at, 35);
+        }
     }
 }

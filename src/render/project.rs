@@ -133,6 +133,9 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &View, col
 
 #[inline(always)]
 fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+    // Room for all at once: growing would copy, and room that is never written takes no memory.
+    out.splats.reserve_exact(ids.len());
+    out.rects.reserve_exact(ids.len());
     let mut footprints = Footprints::default();
     let mut colours: Colours = [[0.0; BLOCK]; 3];
     for start in ids.clone().step_by(BLOCK) {

@@ -23,7 +23,6 @@ pub struct Sight {
     splats: Vec<Splat>,
     bins: Bins,
     size: [u32; 2],
-    tiles: [u32; 2],
 }
 
 /// Red, green and blue of every visible Gaussian of a [`Sight`].
@@ -39,8 +38,9 @@ impl Sight {
         let view = View::new(camera);
         let mut renderer = Renderer::new();
         renderer.prepare(gaussians, &view, true);
+        renderer.bins.next_strip(&renderer.splats, usize::MAX);
         let Renderer { blend, splats: Splats { splats, .. }, bins, .. } = renderer;
-        Sight { blend, splats, bins, size: view.size, tiles: view.tiles }
+        Sight { blend, splats, bins, size: view.size }
     }
 
     /// Aᵀ·`picture`: of every visible Gaussian Σ over pixels of w · pixel, per channel; f32 within a tile,
@@ -90,17 +90,15 @@ impl Sight {
     fn per_splat(&self, mut of_tile: impl FnMut([u32; 2], &Lattice, &[u32], &mut [[f32; 3]])) -> Pull {
         let mut total = vec![[0.0; 3]; self.splats.len()];
         let mut sums = Vec::new();
-        for y in 0..self.tiles[1] {
-            for x in 0..self.tiles[0] {
-                let tile = (y * self.tiles[0] + x) as usize;
-                let pairs = &self.bins.pairs()[self.bins.range(tile..tile + 1)];
-                sums.clear();
-                sums.resize(pairs.len(), [0.0; 3]);
-                of_tile([x, y], &Lattice::new([x, y], self.size, 1), pairs, &mut sums);
-                for (&splat, sum) in pairs.iter().zip(&sums) {
-                    let total = &mut total[splat as usize];
-                    (0..3).for_each(|c| total[c] += f64::from(sum[c]));
-                }
+        for (y, x) in self.bins.rows().flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
+            let pairs = &self.bins.pairs()[self.bins.range(y, x..x + 1)];
+            let tile = [x as u32, y as u32];
+            sums.clear();
+            sums.resize(pairs.len(), [0.0; 3]);
+            of_tile(tile, &Lattice::new(tile, self.size, 1), pairs, &mut sums);
+            for (&splat, sum) in pairs.iter().zip(&sums) {
+                let total = &mut total[splat as usize];
+                (0..3).for_each(|c| total[c] += f64::from(sum[c]));
             }
         }
         for (total, splat) in total.iter_mut().zip(&self.splats) {
