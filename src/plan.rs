@@ -9,6 +9,8 @@ pub struct Limits {
     pub frames_together: usize,
     /// Pictures worked on at once; at least 1.
     pub pictures_together: usize,
+    /// Pictures that colours are fitted to whose footprints stay from one iteration to the next.
+    pub sights_together: usize,
     /// Pairs of Gaussians whose motion is measured together; at least 1.
     pub pairs_together: usize,
 }
@@ -19,6 +21,7 @@ impl Limits {
         frames_held: usize::MAX,
         frames_together: usize::MAX,
         pictures_together: usize::MAX,
+        sights_together: usize::MAX,
         pairs_together: usize::MAX,
     };
 }

@@ -4,13 +4,18 @@
 //! every Gaussian's base colour, the same at all times. A picture is linear in colour, so this is linear
 //! least squares: minimise (1/P) Σ ‖A_p·δ − lack_p‖² + ridge·‖δ‖² over P pictures by conjugate gradients
 //! with the diagonal as preconditioner (Hestenes and Stiefel, 1952; Saad, "Iterative Methods for Sparse
-//! Linear Systems", section 9.2). Memory: the sights, and 132 bytes per Gaussian. Sums go by picture, so
-//! the bits do not depend on the threads.
+//! Linear Systems", section 9.2). Memory: [`BYTES_PER_GAUSSIAN`], the sights that are to be kept, and one for each
+//! thread; every iteration makes those that are not kept again. Sums go by picture, so the bits depend neither on
+//! the threads nor on what is kept.
 
 use rayon::prelude::*;
 
 use crate::model::{Camera, Gaussians};
 use crate::render::{Image, Sight};
+
+/// Memory per Gaussian beside the sights: right-hand side, diagonal, five vectors of the iteration, one of them in f32
+/// too, and whether its colour stays.
+pub const BYTES_PER_GAUSSIAN: usize = 7 * size_of::<Rgb>() + size_of::<[f32; 3]>() + size_of::<bool>();
 
 /// Red, green and blue: three systems of equations that share their weights.
 type Rgb = [f64; 3];
@@ -18,7 +23,10 @@ type Rgb = [f64; 3];
 /// The normal equations of all pictures seen so far.
 #[derive(Debug)]
 pub struct Refit {
+    /// Of the first pictures.
     sights: Vec<Sight>,
+    most_sights: usize,
+    pictures: usize,
     /// Σ Aᵀ·lack, `[N]`.
     wanted: Vec<Rgb>,
     /// Diagonal of Σ AᵀA, `[N]`.
@@ -28,15 +36,11 @@ pub struct Refit {
 }
 
 impl Refit {
-    /// Of as many Gaussians as `fixed` has entries; those set keep their colours.
-    pub fn new(fixed: Vec<bool>) -> Self {
+    /// Of as many Gaussians as `fixed` has entries; those set keep their colours. What the cameras of the first
+    /// `most_sights` pictures see is kept.
+    pub fn new(fixed: Vec<bool>, most_sights: usize) -> Self {
         let zeros = vec![[0.0; 3]; fixed.len()];
-        Refit { sights: Vec::new(), wanted: zeros.clone(), power: zeros, fixed }
-    }
-
-    /// Number of pictures.
-    pub fn pictures(&self) -> usize {
-        self.sights.len()
+        Refit { sights: Vec::new(), most_sights, pictures: 0, wanted: zeros.clone(), power: zeros, fixed }
     }
 
     /// Adds pictures of `state`, the smaller model at one frame: each a camera, and the original's picture
@@ -46,28 +50,42 @@ impl Refit {
     /// If `state` has not N Gaussians, or a picture not its camera's size.
     pub fn add(&mut self, state: &Gaussians, lacks: &[(&Camera, Image)]) {
         assert_eq!(state.len(), self.fixed.len(), "pictures of another model");
-        let seen: Vec<_> = lacks
-            .par_iter()
-            .map(|(camera, lack)| {
-                let sight = Sight::new(state, camera);
-                let (pull, power) = (sight.pull(lack), sight.power());
-                (sight, pull, power)
-            })
-            .collect();
-        for (sight, pull, power) in seen {
-            sight.add(&pull, &mut self.wanted);
-            sight.add(&power, &mut self.power);
-            self.sights.push(sight);
+        // By batches, so that no more sights and pulls wait for their turn than threads make at a time.
+        for batch in lacks.chunks(rayon::current_num_threads()) {
+            let seen: Vec<_> = batch
+                .par_iter()
+                .map(|(camera, lack)| {
+                    let sight = Sight::new(state, camera);
+                    let (pull, power) = (sight.pull(lack), sight.power());
+                    (sight, pull, power)
+                })
+                .collect();
+            for (sight, pull, power) in seen {
+                sight.add(&pull, &mut self.wanted);
+                sight.add(&power, &mut self.power);
+                if self.sights.len() < self.most_sights {
+                    self.sights.push(sight);
+                }
+            }
         }
+        self.pictures += lacks.len();
     }
 
     /// The change of every Gaussian's colour, `[N]` in units of colour, after at most `iterations`.
     ///
     /// `ridge` is in pixels per picture: a Gaussian that covers less hardly changes. What no picture
     /// shows, and what is fixed, does not change at all.
-    pub fn solve(&self, ridge: f64, iterations: usize) -> Vec<[f32; 3]> {
+    ///
+    /// `again` is asked once per iteration, if not every sight was kept: it hands on the states and cameras of the
+    /// pictures beyond those kept, as they were added. Fails only if `again` does.
+    pub fn solve<E>(
+        &self,
+        ridge: f64,
+        iterations: usize,
+        mut again: impl FnMut(&mut dyn FnMut(&Gaussians, &[&Camera])) -> Result<(), E>,
+    ) -> Result<Vec<[f32; 3]>, E> {
         let count = self.fixed.len();
-        let ridge = ridge * self.sights.len() as f64;
+        let ridge = ridge * self.pictures as f64;
         // Without a ridge a Gaussian that is never seen would divide by 0.
         let inverse = |i: usize, c: usize| match self.power[i][c] + ridge {
             diagonal if diagonal > 0.0 && self.power[i][c] > 0.0 && !self.fixed[i] => 1.0 / diagonal,
@@ -81,7 +99,7 @@ impl Refit {
         let mut direction = preconditioned(&residual);
         let mut size = dot(&residual, &direction);
         for _ in 0..iterations {
-            let image = self.apply(&direction, ridge);
+            let image = self.apply(&direction, ridge, &mut again)?;
             let curvature = dot(&direction, &image);
             // A system that is solved has no direction left.
             let step: Rgb = std::array::from_fn(|c| if curvature[c] > 0.0 { size[c] / curvature[c] } else { 0.0 });
@@ -105,11 +123,16 @@ impl Refit {
             }
             size = next_size;
         }
-        change.into_iter().map(|change| change.map(|x| x as f32)).collect()
+        Ok(change.into_iter().map(|change| change.map(|x| x as f32)).collect())
     }
 
     /// (Σ AᵀA + ridge)·`change`.
-    fn apply(&self, change: &[Rgb], ridge: f64) -> Vec<Rgb> {
+    fn apply<E>(
+        &self,
+        change: &[Rgb],
+        ridge: f64,
+        again: &mut impl FnMut(&mut dyn FnMut(&Gaussians, &[&Camera])) -> Result<(), E>,
+    ) -> Result<Vec<Rgb>, E> {
         let narrow: Vec<[f32; 3]> = change.iter().map(|change| change.map(|x| x as f32)).collect();
         let mut total: Vec<Rgb> = change.iter().map(|change| change.map(|x| ridge * x)).collect();
         // By batches, so that no more pulls wait for their turn than threads make at a time.
@@ -117,7 +140,20 @@ impl Refit {
             let pulls: Vec<_> = batch.par_iter().map(|sight| sight.pull_of_change(&narrow)).collect();
             batch.iter().zip(&pulls).for_each(|(sight, pull)| sight.add(pull, &mut total));
         }
-        total
+        if self.sights.len() < self.pictures {
+            again(&mut |state, cameras| {
+                for batch in cameras.chunks(rayon::current_num_threads()) {
+                    let look = |camera: &&Camera| {
+                        let sight = Sight::new(state, camera);
+                        let pull = sight.pull_of_change(&narrow);
+                        (sight, pull)
+                    };
+                    let seen: Vec<_> = batch.par_iter().map(look).collect();
+                    seen.iter().for_each(|(sight, pull)| sight.add(pull, &mut total));
+                }
+            })?;
+        }
+        Ok(total)
     }
 }
 
@@ -170,12 +206,27 @@ mod tests {
 
     /// The refit of `now` towards the pictures of `wanted`.
     fn refit(now: &Gaussians, wanted: &Gaussians, cameras: &[Camera], fixed: Vec<bool>) -> Refit {
-        let mut refit = Refit::new(fixed);
+        refit_with(usize::MAX, now, wanted, cameras, fixed)
+    }
+
+    fn refit_with(
+        most_sights: usize,
+        now: &Gaussians,
+        wanted: &Gaussians,
+        cameras: &[Camera],
+        fixed: Vec<bool>,
+    ) -> Refit {
+        let mut refit = Refit::new(fixed, most_sights);
         for camera in cameras {
             let lack = minus(&render(wanted, camera, BLACK), &render(now, camera, BLACK));
             refit.add(now, &[(camera, lack)]);
         }
         refit
+    }
+
+    /// [`Refit::solve`] with every sight kept.
+    fn solve(refit: &Refit, ridge: f64, iterations: usize) -> Vec<[f32; 3]> {
+        refit.solve(ridge, iterations, |_| Err("every sight is kept")).unwrap()
     }
 
     /// Σ AᵀA + ridge and Σ Aᵀ·lack of one channel, A from pictures in which one Gaussian is 1 and all
@@ -234,7 +285,7 @@ mod tests {
         let mut wanted = now.clone();
         (0..14).for_each(|i| wanted.sh.set_row(i, [0.3, -0.4 + 0.05 * i as f32, 0.9]));
         let ridge = 0.7;
-        let got = refit(&now, &wanted, &cameras, vec![false; 14]).solve(ridge, 60);
+        let got = solve(&refit(&now, &wanted, &cameras, vec![false; 14]), ridge, 60);
         for c in 0..3 {
             let (matrix, right) = dense(&now, &wanted, &cameras, ridge, c);
             let expected = solved(matrix, right);
@@ -251,7 +302,7 @@ mod tests {
         let (original, cameras) = (cloud(300), cameras(6));
         let tint = |i: usize| [0.2, -0.15, 0.1].map(|x: f32| x * (i as f32 * 0.7).sin());
         let perturbed = recoloured(&original, &(0..300).map(tint).collect::<Vec<_>>());
-        let change = refit(&perturbed, &original, &cameras, vec![false; 300]).solve(1e-6, 200);
+        let change = solve(&refit(&perturbed, &original, &cameras, vec![false; 300]), 1e-6, 200);
         let restored = recoloured(&perturbed, &change);
         for camera in &cameras {
             let rms = |state| {
@@ -273,7 +324,7 @@ mod tests {
         let mut wanted = now.clone();
         (0..40).for_each(|i| wanted.sh.set_row(i, [1.0; 3]));
         let fixed: Vec<bool> = (0..40).map(|i| i % 5 == 0).collect();
-        for (i, change) in refit(&now, &wanted, &cameras, fixed.clone()).solve(0.0, 30).iter().enumerate() {
+        for (i, change) in solve(&refit(&now, &wanted, &cameras, fixed.clone()), 0.0, 30).iter().enumerate() {
             let stays = fixed[i] || i == 7 || i == 9;
             assert_eq!(*change == [0.0; 3], stays, "{i}: {change:?}");
         }
@@ -286,7 +337,7 @@ mod tests {
         (0..200).for_each(|i| wanted.sh.set_row(i, [0.1, 0.6, 1.1]));
         let on = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| refit(&now, &wanted, &cameras, vec![false; 200]).solve(0.01, 8))
+            pool.install(|| solve(&refit(&now, &wanted, &cameras, vec![false; 200]), 0.01, 8))
         };
         let one = on(1);
         assert!(one.iter().any(|change| *change != [0.0; 3]));
@@ -294,8 +345,26 @@ mod tests {
     }
 
     #[test]
+    fn sights_that_are_made_again_do_not_change_a_bit() {
+        let (now, cameras) = (cloud(200), cameras(5));
+        let mut wanted = now.clone();
+        (0..200).for_each(|i| wanted.sh.set_row(i, [0.1, 0.6, 1.1]));
+        let kept = solve(&refit(&now, &wanted, &cameras, vec![false; 200]), 0.01, 8);
+        for most in [0, 2, 4] {
+            let fresh = refit_with(most, &now, &wanted, &cameras, vec![false; 200]);
+            let mut asked = 0;
+            let change = fresh.solve(0.01, 8, |see| {
+                asked += 1;
+                see(&now, &cameras[most..].iter().collect::<Vec<_>>());
+                Ok::<_, ()>(())
+            });
+            assert!(change.unwrap() == kept && asked == 8, "{most} kept, asked {asked} times");
+        }
+    }
+
+    #[test]
     fn no_gaussians_and_no_pictures_give_no_change() {
-        assert!(Refit::new(Vec::new()).solve(0.1, 5).is_empty());
-        assert_eq!(Refit::new(vec![false; 2]).solve(0.0, 5), [[0.0; 3]; 2]);
+        assert!(solve(&Refit::new(Vec::new(), 9), 0.1, 5).is_empty());
+        assert_eq!(solve(&Refit::new(vec![false; 2], 9), 0.0, 5), [[0.0; 3]; 2]);
     }
 }

@@ -80,6 +80,20 @@ pub(super) struct Input {
     /// system's]
     #[arg(long, value_name = "FOLDER")]
     pub(super) scratch_dir: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) memory: Memory,
+}
+
+/// How much memory to take.
+#[derive(Debug, Args)]
+pub(super) struct Memory {
+    /// Most memory to take, such as 512MiB or 4GB; the result does not depend on it [default: a quarter of the
+    /// machine's]
+    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
+    pub(super) memory: Option<u64>,
+    /// Print, before any work, what takes how much memory and how often the frames are read
+    #[arg(long)]
+    pub(super) explain: bool,
 }
 
 /// The file of the cameras.
@@ -263,6 +277,8 @@ pub(super) struct SideBySide {
     /// Training iteration of the original, if a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
+    #[command(flatten)]
+    pub(super) memory: Memory,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
     /// Which of the cameras' pictures [default: test, or all if none is held out]
@@ -457,6 +473,13 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
     match (width.parse(), height.parse()) {
         (Ok(width @ 1..=65_535), Ok(height @ 1..=65_535)) => Ok((width, height)),
         _ => Err(expected()),
+    }
+}
+
+fn parse_bytes(text: &str) -> Result<u64, String> {
+    match text.parse::<bytesize::ByteSize>() {
+        Ok(bytes) if bytes.as_u64() > 0 => Ok(bytes.as_u64()),
+        _ => Err(format!("expected a size such as 512MiB or 4GB, found {text:?}")),
     }
 }
 

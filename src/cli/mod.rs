@@ -17,6 +17,7 @@ use crate::pipeline::arrival::scratch_beside;
 use crate::pipeline::compress::{CompressOptions, Only, Target, compress};
 use crate::pipeline::evaluate::EvaluateOptions;
 use crate::pipeline::input::InputOptions;
+use crate::pipeline::memory::Budget;
 use crate::pipeline::output::OutputKind;
 use crate::pipeline::pictures::Part;
 use crate::pipeline::render::{RenderOptions, Wanted};
@@ -24,7 +25,7 @@ use crate::pipeline::sweep::{Method, SweepOptions};
 use crate::pipeline::{container, demo, evaluate, render, score, sweep};
 use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions};
-use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Render, SideBySide, SplitArg, Sweep, Verb};
+use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, Render, SideBySide, SplitArg, Sweep, Verb};
 use recipe_flags::RecipeFlags;
 
 /// Runs the program on the arguments of this process.
@@ -226,6 +227,7 @@ fn render_options(args: Render) -> RenderOptions {
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.look_from(args.cameras);
+    original.memory = budget(args.memory);
     EvaluateOptions {
         original,
         compressed: args.compressed,
@@ -262,8 +264,13 @@ fn part_of(split: SplitArg) -> Part {
     }
 }
 
+fn budget(memory: Memory) -> Budget {
+    Budget { bytes: memory.memory, explain: memory.explain }
+}
+
 fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {
     let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
+    options.memory = budget(input.memory);
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         options.look_from(cameras.file);

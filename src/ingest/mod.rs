@@ -3,6 +3,7 @@
 pub mod cameras;
 mod cfg_args;
 pub mod container;
+mod digest;
 pub mod frame_stream;
 pub mod image;
 mod map;

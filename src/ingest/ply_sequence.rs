@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::map::FileMap;
+use super::digest::hash_file;
 use super::ply::{Ply, Property, check_ids};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
@@ -114,12 +114,13 @@ impl PlySequence {
     pub fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         for path in &self.frames {
-            let bytes = FileMap::open(path)?;
             // Lengths in front, so that no byte can pass from a name to a content or between files.
-            for part in [file_name(path).as_encoded_bytes(), &bytes] {
-                hash.update(&(part.len() as u64).to_le_bytes());
-                hash.update(part);
-            }
+            let name = file_name(path).as_encoded_bytes();
+            hash.update(&(name.len() as u64).to_le_bytes());
+            hash.update(name);
+            let length = fs::metadata(path).map_err(Error::io("read the size of", path))?.len();
+            hash.update(&length.to_le_bytes());
+            hash_file(path, &mut hash)?;
         }
         Ok(format!("{:032x}", hash.digest128()))
     }

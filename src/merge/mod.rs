@@ -30,6 +30,11 @@ use motion::{MotionGate, PairMeasure};
 use neighbors::{PointIndex, Search};
 use proxy::Importance;
 
+/// Memory per survivor beside its states, see above.
+pub const BYTES_PER_SURVIVOR: usize = 102;
+/// Memory per pair.
+pub const BYTES_PER_PAIR: usize = 152;
+
 /// Nodes whose neighbours one task looks up.
 const CHUNK: usize = 1024;
 

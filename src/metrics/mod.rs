@@ -1,7 +1,8 @@
 //! How close pictures are to one another: PSNR, SSIM, FLIP, and the error of what moves.
 //!
 //! Data in: pairs of [`Image`]s of one size. Data out: one f64 per pair. Values are clamped to [0, 1]
-//! first, as a screen does, and everything is summed in f64. Memory: for SSIM 40 bytes per pixel.
+//! first, as a screen does, and everything is summed in f64. Memory: [`BYTES_PER_PIXEL`]; for
+//! FLIP what its authors' code takes.
 
 mod flip;
 mod ssim;
@@ -10,6 +11,9 @@ pub use flip::flip;
 pub use ssim::ssim;
 
 use crate::render::Image;
+
+/// Memory of comparing two pictures, per pixel: SSIM's sums are the most.
+pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
 
 /// PSNR of pictures that agree to the last bit, and of any nearer than that: a mean over pictures then
 /// stays finite.

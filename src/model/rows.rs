@@ -45,6 +45,9 @@ pub struct Rows {
 }
 
 impl Rows {
+    /// Memory of a row that has a W.
+    pub const BYTES_PER_GAUSSIAN: usize = 7 * size_of::<f64>() + size_of::<u32>() + size_of::<Flags>();
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.d.len()

@@ -17,9 +17,11 @@ use std::path::{Path, PathBuf};
 use std::thread;
 
 use crossbeam_channel::bounded;
+use glam::DVec3;
 use gseq::Compression;
 
 use super::input::{Input, InputOptions, Opened, Scene, Streamed, load_cameras, scene_of};
+use super::memory::{Budget, Need, Plan, Workload, receiving};
 use super::scored::{Measured, looks};
 use crate::emit::atomic::ScratchFile;
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK};
@@ -29,6 +31,7 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::model::{Camera, Gaussians, Rig, Split};
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::recipe::{self, Recipe};
 use crate::stats::{RobustBox, ScanPlan};
 use crate::stream::{HeldFrames, Looking, Progress, RunningScan, Sampler};
@@ -60,28 +63,47 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<std::io::Stdin>
 }
 
 /// Packs a stream into a scratch container and opens that with its cameras.
+///
+/// # Errors
+/// What is wrong with the stream; a budget that does not hold the frames that are packed together.
 pub fn open_arriving(options: &InputOptions) -> Result<Opened> {
     let rig = load_cameras(options, options.cameras.as_deref())?;
-    let streamed = to_scratch(open_stream(options)?, options, |_| Ok(()))?;
+    let stream = open_stream(options)?;
+    check_memory(options, stream.header())?;
+    let streamed = to_scratch(stream, options, |_| Ok(()))?;
     Ok(Opened { input: Input::Stream(streamed), rig, notes: Vec::new() })
 }
 
-/// Packs a stream into a scratch container and measures it meanwhile. `check` is told the number of Gaussians
-/// before any frame is read.
+/// Packs a stream into a scratch container and measures it meanwhile, if there is memory for that beside the frames
+/// held. `check` is told the number of Gaussians before any frame is read, and `needs` what is known, for the
+/// stages to come.
 ///
 /// Gives the scene, and the statistics if what was assumed held.
 pub fn open_measured(
     options: &InputOptions,
     recipe: &Recipe,
     check: impl FnOnce(usize) -> Result<()>,
+    needs: impl Fn(&Workload, &Limits, bool) -> Vec<Need>,
 ) -> Result<(Scene, Option<Measured>)> {
     let loaded = load_cameras(options, options.cameras.as_deref())?;
     let has_cameras = loaded.is_some();
     let stream = open_stream(options)?;
     let count = stream.header().count;
     check(count)?;
+    let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
+    let work = Workload::of_stream(stream.header(), &of_rig);
+    let (held, visible) = (frame_block(stream.header()) + AHEAD, looks(has_cameras, recipe.scan.coverage));
+    let plan = |explain: bool, measuring: Option<bool>| {
+        Plan::fit(work, Budget { explain, ..options.memory }, |work, limits| {
+            let mut all = vec![receiving(work, limits, held as u64, measuring)];
+            all.extend(needs(work, limits, has_cameras));
+            all
+        })
+    };
+    let measures = plan(false, Some(visible)).is_ok();
+    let memory = plan(options.memory.explain, measures.then_some(visible))?;
     // Without cameras the rig stands around the first frame, and everything else around the rig.
-    let (rig, plan) = (OnceCell::new(), OnceCell::new());
+    let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
         let _ = rig.set(loaded);
     }
@@ -89,18 +111,19 @@ pub fn open_measured(
     let streamed = to_scratch(stream, options, |held| {
         let measuring = match &mut measuring {
             Some(measuring) => measuring,
-            none => {
+            none if measures => {
                 let rig: &Rig = rig.get_or_init(|| rig_around(held));
-                let plan = plan.get_or_init(|| ScanPlan::arriving(&recipe.scan, &rig.cameras));
-                let visible = looks(has_cameras, recipe.scan.coverage);
-                none.insert(Measuring::new(count, rig, options.split, plan, &recipe.scan, visible))
+                let plan = plan_of_scan.get_or_init(|| ScanPlan::arriving(&recipe.scan, &rig.cameras));
+                let looking = visible.then(|| Looking::new(count, recipe.scan.pixel_stride, memory.limits));
+                none.insert(Measuring::new(count, rig, options.split, plan, &recipe.scan, looking))
             }
+            _ => return Ok(()),
         };
         measuring.add(held)
     })?;
     let input = Input::Stream(streamed);
     let opened = Opened { rig: has_cameras.then(|| rig.get().cloned()).flatten(), input, notes: Vec::new() };
-    let mut scene = scene_of(opened, options)?;
+    let mut scene = Scene { limits: memory.limits, ..scene_of(opened, options)? };
     let Some(measuring) = measuring else { return Ok((scene, None)) };
     let complete = ScanPlan::new(&recipe.scan, &scene.input.source().info().times, &scene.schedule)?;
     if let Some(why) = measuring.wrong(&complete, &scene) {
@@ -108,6 +131,15 @@ pub fn open_measured(
         return Ok((scene, None));
     }
     Ok((scene, Some(measuring.finish(&complete))))
+}
+
+/// Confirms that there is memory to pack a stream.
+pub fn check_memory(options: &InputOptions, header: &StreamHeader) -> Result<()> {
+    let held = (frame_block(header) + AHEAD) as u64;
+    let nobody = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
+    let work = Workload::of_stream(header, &nobody);
+    Plan::fit(work, options.memory, |work, limits| vec![receiving(work, limits, held, None)])?;
+    Ok(())
 }
 
 /// Writes a stream to the container `path`; gives the number of bytes that arrived. `take` sees the frames
@@ -206,7 +238,7 @@ impl<'a> Measuring<'a> {
         split: Option<Split>,
         plan: &'a ScanPlan,
         scan: &recipe::Scan,
-        visible: bool,
+        looking: Option<Looking>,
     ) -> Self {
         Measuring {
             plan,
@@ -214,7 +246,7 @@ impl<'a> Measuring<'a> {
             assumed: AssumedTimes::new(rig, split),
             frames: Vec::new(),
             scan: RunningScan::new(count, plan),
-            looking: visible.then(|| (Sampler::new(scan), Looking::new(count, scan.pixel_stride))),
+            looking: looking.map(|looking| (Sampler::new(scan), looking)),
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! No rule wins everywhere, and merging pays on some scenes only (METHOD section 6: "let scoring views choose
 //! among rules").
-//! Memory: the states of the original and of the alternatives at one frame.
+//! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
 
 use super::input::Scene;
 use super::merging::Sieved;
@@ -15,13 +15,16 @@ use crate::metrics::psnr;
 use crate::model::{Columns, Gaussians};
 use crate::pass::FrameSource;
 use crate::recipe::{Recipe, StaticTerm};
-use crate::render::render;
+use crate::render::{Image, render};
 use crate::select::Ranking;
 use crate::stream::gather_all;
 
 /// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
 /// alternatives usually do from one another.
-const PICTURES: usize = 24;
+pub(super) const PICTURES: usize = 24;
+
+/// Pictures of a frame that are compared at a time.
+pub(super) const AT_ONCE: usize = 4;
 
 /// The result that was chosen, and what the summary says of the others.
 pub struct Chosen {
@@ -145,22 +148,26 @@ fn mean_psnr(
         })
         .collect::<Result<_>>()?;
     let mut sums = vec![0.0; alternatives.len()];
-    for of_frame in pictures.chunk_by(|a, b| a.0 == b.0) {
+    for of_frame in pictures.chunk_by(|a, b| a.0 == b.0).flat_map(|of_frame| of_frame.chunks(AT_ONCE)) {
         let frame = of_frame[0].0;
+        let camera = |index: u32| &scene.schedule.cameras[index as usize];
         let original = gather_all(source, frame, Columns::ALL)?;
-        let states: Vec<Gaussians> = alternatives
-            .iter()
-            .zip(&results)
-            .map(|(other, result)| match result {
-                None => Ok(original.pick(&other.sieved.kept)),
-                Some(result) => gather_all(&**result, frame, Columns::ALL),
-            })
-            .collect::<Result<_>>()?;
-        for &(_, camera) in of_frame {
-            let camera = &scene.schedule.cameras[camera as usize];
-            let expected = render(&original, camera, background);
-            for (sum, state) in sums.iter_mut().zip(&states) {
-                *sum += psnr(&render(state, camera, background), &expected);
+        let expected: Vec<Image> =
+            of_frame.iter().map(|&(_, index)| render(&original, camera(index), background)).collect();
+        let compare = |state: &Gaussians| -> f64 {
+            let of_picture = |(&(_, index), expected): (&(usize, u32), &Image)| {
+                psnr(&render(state, camera(index), background), expected)
+            };
+            of_frame.iter().zip(&expected).map(of_picture).sum()
+        };
+        let pruned = alternatives.iter().zip(&mut sums).filter(|(other, _)| other.sieved.clusters.is_empty());
+        for (other, sum) in pruned {
+            *sum += compare(&original.pick(&other.sieved.kept));
+        }
+        drop(original);
+        for (result, sum) in results.iter().zip(&mut sums) {
+            if let Some(result) = result {
+                *sum += compare(&gather_all(&**result, frame, Columns::ALL)?);
             }
         }
     }

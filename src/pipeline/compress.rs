@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use super::arrival::open_measured;
 use super::choose::{Chosen, choose};
 use super::input::{InputOptions, Scene, open_scene};
+use super::memory::{Workload, compressing, keep_to};
 use super::merging::sieve;
 use super::output::{OutputKind, check_output, write_result};
 use super::overrides::parse_ids;
@@ -13,6 +14,7 @@ use super::rounds::rank_in_rounds;
 use super::scored::{Measured, Scored, UserOverrides, measure, score_measured};
 use super::summary::{CameraSummary, LeftOut, Stages, Summary};
 use crate::error::{Error, Result};
+use crate::plan::Limits;
 use crate::recipe::{Coverage, Recipe};
 
 /// Which of pruning and merging to do.
@@ -90,12 +92,19 @@ pub fn compress(options: &CompressOptions) -> Result<Summary> {
     options.recipe.validate().map_err(Error::usage)?;
     let mut stages = Stages::default();
     let is_stream = options.input.is_stream();
+    let needs = |work: &Workload, limits: &Limits, has_cameras| {
+        compressing(work, limits, &options.recipe, options.only, has_cameras)
+    };
     let name = if is_stream { "receive" } else { "read" };
     let (scene, measured) = stages.run(name, 0, f64::from(u8::from(is_stream)), || {
-        let (scene, measured) = match is_stream {
-            true => open_measured(&options.input, &options.recipe, |count| options.check_stream(count))?,
+        let (mut scene, measured) = match is_stream {
+            true => open_measured(&options.input, &options.recipe, |count| options.check_stream(count), needs)?,
             false => (open_scene(&options.input)?, None),
         };
+        if !is_stream {
+            let has_cameras = scene.has_cameras;
+            keep_to(options.input.memory, &mut scene, |work, limits| needs(work, limits, has_cameras))?;
+        }
         let count = scene.input.source().info().count;
         Ok::<_, Error>(((scene, measured), count))
     })?;

@@ -8,8 +8,9 @@ use std::path::Path;
 use gseq::{Compression, Encoding, Reader, RecoverReport, TileId, VerifyReport};
 use serde::Serialize;
 
-use super::arrival::{open_stream, pack_stream};
+use super::arrival::{check_memory, open_stream, pack_stream};
 use super::input::{Input, InputOptions, Opened, open_input};
+use super::memory::{Plan, Workload, packing, unpacking};
 use super::output::{OutputKind, write_sequence};
 use super::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
@@ -41,7 +42,9 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     if input.is_stream() {
         let staged = StagedFile::new(output, overwrite)?;
-        pack_stream(open_stream(input)?, staged.path(), compression, |_| Ok(()))?;
+        let stream = open_stream(input)?;
+        check_memory(input, stream.header())?;
+        pack_stream(stream, staged.path(), compression, |_| Ok(()))?;
         let container = Container::open(staged.path())?;
         let (gaussians, frames) = (container.info().count, container.info().times.len());
         let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
@@ -50,6 +53,7 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
     }
     let opened = open_input(input)?;
     let source = opened.input.source();
+    Plan::fit(Workload::of_input(&opened.input), input.memory, packing)?;
     let staged = StagedFile::new(output, overwrite)?;
     let work = source.info().count as u64 * source.info().times.len() as u64;
     let progress = Progress::new("pack", "Gaussian frames", work);
@@ -64,12 +68,13 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
 
 /// Writes any input as a frame stream; gives the input.
 ///
-/// Memory per Gaussian: its reader, and twice its state at one frame.
+/// Memory: see [`unpacking`].
 pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let opened = open_input(input)?;
     let source = opened.input.source();
     let info = source.info();
     let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
+    Plan::fit(Workload::of_input(&opened.input), input.memory, unpacking)?;
     let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
@@ -92,6 +97,7 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: bool) -> Result<Op
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
     let opened = open_input(input)?;
     let source = opened.input.source();
+    Plan::fit(Workload::of_input(&opened.input), input.memory, unpacking)?;
     let staged = StagedFolder::new(output, overwrite)?;
     write_sequence(source, OutputKind::PlySequence, staged.path())?;
     let marker = serde_json::json!({

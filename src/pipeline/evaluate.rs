@@ -12,6 +12,7 @@ use rayon::prelude::*;
 
 use super::evaluation::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
 use super::input::{Input, InputOptions, Scene, open_scene};
+use super::memory::{Budget, Need, Plan, Workload, picturing_both};
 use super::pictures::{Part, Picture, background, for_each_batch, pictures, thin};
 use super::summary::CameraSummary;
 use crate::emit::atomic::{Kind, StagedFile, check_target};
@@ -20,6 +21,7 @@ use crate::ingest::image::read_png;
 use crate::metrics::{flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Rig};
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::render::{Image, render};
 use crate::stream::Progress;
 
@@ -54,7 +56,9 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
     }
-    let (evaluation, _) = SideBySide::open(options)?.evaluate(|_, _, _| ())?;
+    let mut side = SideBySide::open(options)?;
+    side.keep_to(options.original.memory, picturing_both)?;
+    let (evaluation, _) = side.evaluate(|_, _, _| ())?;
     if let Some(csv) = &options.csv {
         let staged = StagedFile::new(csv, options.overwrite)?;
         fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
@@ -114,6 +118,18 @@ impl SideBySide {
         })
     }
 
+    /// Limits what comparing keeps in memory; `needs` names what is to be done.
+    ///
+    /// # Errors
+    /// A budget that cannot work.
+    pub fn keep_to(&mut self, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
+        let of_scene = Workload::of(&self.scene);
+        let gaussians = of_scene.gaussians.max(self.compressed_count() as u64);
+        let pictures = of_scene.pictures.max(self.pictures.len() as u64);
+        self.scene.limits = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, needs)?.limits;
+        Ok(())
+    }
+
     /// Compares all pictures; `observe` sees each of them too, with the original's state, from any thread.
     /// Gives what it made of them in the order of [`Evaluation::pictures`].
     ///
@@ -169,7 +185,7 @@ impl SideBySide {
         places.dedup();
         let chosen: Vec<Picture> = places.iter().map(|&place| self.pictures[place]).collect();
         let mut found = Vec::with_capacity(chosen.len());
-        for_each_batch(self.sources(), &chosen, |states, batch| {
+        for_each_batch(self.sources(), &chosen, self.scene.limits, |states, batch| {
             for picture in batch {
                 let taken = self.take(picture, states)?;
                 found.push(see(places[found.len()], &states[0], &self.scene.rig.cameras[picture.camera], taken));
@@ -202,7 +218,7 @@ impl SideBySide {
         let mut all = Vec::with_capacity(pictures.len());
         let mut observed = Vec::with_capacity(pictures.len());
         let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
-        for_each_batch(self.sources(), pictures, |states, batch| {
+        for_each_batch(self.sources(), pictures, self.scene.limits, |states, batch| {
             let taken: Vec<_> = batch
                 .par_iter()
                 .map(|picture| {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use super::arrival::open_arriving;
+use super::memory::Budget;
 use crate::emit::atomic::ScratchFile;
 use crate::error::{Error, Result};
 use crate::ingest::ModelFolder;
@@ -35,6 +36,8 @@ pub struct InputOptions {
     pub split: Option<Split>,
     /// Folder for the packed frames of a stream while the run lasts; none: the system's for such files.
     pub scratch: Option<PathBuf>,
+    /// Memory that the run may take.
+    pub memory: Budget,
 }
 
 impl InputOptions {

@@ -10,6 +10,7 @@ pub mod demo;
 pub mod evaluate;
 pub mod evaluation;
 pub mod input;
+pub mod memory;
 pub mod merging;
 pub mod output;
 pub mod overrides;

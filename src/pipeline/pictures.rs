@@ -4,6 +4,7 @@ use super::input::{Input, Scene};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::stream::gather_all;
 
 /// The part of a rig's pictures that is asked for.
@@ -115,12 +116,13 @@ pub fn spread(schedule: &Schedule, count: usize) -> Vec<(usize, u32)> {
 }
 
 /// Hands every frame's state and its pictures to `visit`, in order, no more pictures at once than there
-/// are threads; each state is read once.
+/// are threads and `limits` allow; each state is read once.
 ///
-/// Memory: of each source twice the state of one frame.
+/// Memory: of each source the state of one frame.
 pub fn for_each_batch<const S: usize>(
     sources: [&dyn FrameSource; S],
     pictures: &[Picture],
+    limits: Limits,
     mut visit: impl FnMut(&[Gaussians; S], &[Picture]) -> Result<()>,
 ) -> Result<()> {
     for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
@@ -128,7 +130,7 @@ pub fn for_each_batch<const S: usize>(
         for (state, source) in states.iter_mut().zip(sources) {
             *state = gather_all(source, frame[0].frame, Columns::ALL)?;
         }
-        for batch in frame.chunks(rayon::current_num_threads()) {
+        for batch in frame.chunks(rayon::current_num_threads().min(limits.pictures_together)) {
             visit(&states, batch)?;
         }
     }

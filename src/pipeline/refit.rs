@@ -1,6 +1,6 @@
 //! Recolouring what is left: least squares on some scoring pictures, put to the test on others.
 //!
-//! Memory: [`Refit`], the pictures of the test, and the states of original and result at one frame.
+//! Memory: [`Refit`], the pictures of the test and of one frame, and the states of original and result at one frame.
 
 use super::input::Scene;
 use super::merging::Sieved;
@@ -61,9 +61,18 @@ pub fn refit(
     stages.run("refit", count, reads, || {
         let result = result_frames(&scene.input, scored.reference, &recipe.merge, sieved)?;
         let fixed = sieved.kept.iter().map(|id| scored.protected.binary_search(id).is_ok()).collect();
-        let mut equations = Refit::new(fixed);
+        let kept = scene.limits.sights_together;
+        let mut equations = Refit::new(fixed, kept);
         let tests = look(scene, &*result, &pictures, &mut equations)?;
-        let colors = equations.solve(recipe.refit.refit_ridge, ITERATIONS);
+        let unkept: Vec<(usize, u32)> = fitted(&pictures).skip(kept).collect();
+        let colors = equations.solve(recipe.refit.refit_ridge, ITERATIONS, |see| {
+            for of_frame in unkept.chunk_by(|a, b| a.0 == b.0) {
+                let cameras: Vec<&Camera> =
+                    of_frame.iter().map(|&(_, camera)| &scene.schedule.cameras[camera as usize]).collect();
+                see(&gather_all(&*result, of_frame[0].0, Columns::ALL)?, &cameras);
+            }
+            Ok::<_, Error>(())
+        })?;
         drop(equations);
         let change: Vec<[f32; 3]> = colors.iter().map(|rgb| rgb.map(|x| (f64::from(x) / SH_C0) as f32)).collect();
         let [before, after] = quality(scene, &*result, &tests, &change)?;
@@ -87,6 +96,17 @@ pub fn refit(
     })
 }
 
+/// Whether picture `k` of `count` is for the test; a few pictures spare one too.
+fn is_test(k: usize, count: usize) -> bool {
+    k % TEST_EVERY == TEST_EVERY - 1 || k + 1 == count.min(TEST_EVERY)
+}
+
+/// The pictures that are not for the test.
+fn fitted(pictures: &[(usize, u32)]) -> impl Iterator<Item = (usize, u32)> {
+    let of = pictures.iter().enumerate().filter(|&(k, _)| !is_test(k, pictures.len()));
+    of.map(|(_, &picture)| picture)
+}
+
 /// Adds what all but every fourth of `pictures` lack to `equations`; gives the others.
 fn look(
     scene: &Scene,
@@ -106,7 +126,7 @@ fn look(
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         for &(k, _, index) in of_frame {
             let mut picture = render(&original, camera(index), background);
-            if k % TEST_EVERY == TEST_EVERY - 1 || k + 1 == pictures.len().min(TEST_EVERY) {
+            if is_test(k, pictures.len()) {
                 tests.push(Test { frame, camera: index, original: picture });
                 continue;
             }

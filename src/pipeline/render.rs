@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::input::{InputOptions, open_scene};
+use super::memory::{keep_to, picturing};
 use super::pictures::{Part, Picture, background, for_each_batch, picture, pictures};
 use super::summary::CameraSummary;
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
@@ -13,6 +14,7 @@ use crate::emit::image::{ImageFormat, write_image};
 use crate::error::{Error, Result};
 use crate::model::Camera;
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::render;
 use crate::stream::Progress;
 
@@ -58,7 +60,7 @@ pub struct Rendered {
 
 /// Renders pictures of an input.
 ///
-/// Memory: twice one frame's state, and per thread one picture with its footprints.
+/// Memory: one frame's state, and per thread one picture with its footprints ([`super::memory::picturing`]).
 ///
 /// # Errors
 /// Whatever is wrong with input, cameras, choice or output. Nothing is left behind then.
@@ -71,7 +73,8 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     check_target(output, kind, &inputs, options.overwrite)?;
-    let scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
+    let mut scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
+    keep_to(options.input.memory, &mut scene, picturing)?;
     let source = scene.input.source();
     let times = &source.info().times;
     let background = background(options.background, &scene)?;
@@ -79,7 +82,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         Wanted::One { frame, view } => vec![picture(&scene.rig, times, options.part, frame, view)?],
         Wanted::All(_) => pictures(&scene.rig, times, options.part)?,
     };
-    let job = Job { source, cameras: &scene.rig.cameras, background, format };
+    let job = Job { source, cameras: &scene.rig.cameras, limits: scene.limits, background, format };
     if kind == Kind::File {
         let staged = StagedFile::new(output, options.overwrite)?;
         job.write(&chosen, |_| staged.path().to_owned())?;
@@ -118,6 +121,7 @@ fn format_of(output: &Path) -> Result<ImageFormat> {
 struct Job<'a> {
     source: &'a dyn FrameSource,
     cameras: &'a [Camera],
+    limits: Limits,
     background: [f32; 3],
     format: ImageFormat,
 }
@@ -125,7 +129,7 @@ struct Job<'a> {
 impl Job<'_> {
     fn write(&self, pictures: &[Picture], path: impl Fn(&Picture) -> PathBuf + Sync) -> Result<()> {
         let progress = Progress::new("render", "pictures", pictures.len() as u64);
-        for_each_batch([self.source], pictures, |[state], batch| {
+        for_each_batch([self.source], pictures, self.limits, |[state], batch| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
             batch.par_iter().try_for_each(|picture| {
                 let image = render::render(state, &self.cameras[picture.camera], self.background);

@@ -16,7 +16,7 @@ use crate::select::Ranking;
 use crate::stream::{Sample, removal_error};
 
 /// Pictures per round, the same for a longer sequence: of a scene of 780, 65 rank about as well as 130.
-const PICTURES: usize = 96;
+pub(super) const PICTURES: usize = 96;
 
 /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
 /// round, and those that stay after the last, by error, ties by the order there was. Protected Gaussians come
@@ -54,7 +54,7 @@ pub fn rank_in_rounds(
         stages.run("rounds", seen, reads, || {
             let mut ids: Vec<u32> = free.iter().chain(&protected).copied().collect();
             ids.sort_unstable();
-            let errors = removal_error(source, &ids, &sample, background, floor)?.sum;
+            let errors = removal_error(source, &ids, &sample, background, floor, scene.limits)?.sum;
             let error = |id: &u32| ids.binary_search(id).map_or(0, |row| errors[row]);
             // Stable: ties keep the order there was.
             free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));

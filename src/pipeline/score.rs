@@ -4,11 +4,13 @@ use std::path::{Path, PathBuf};
 
 use super::arrival::open_measured;
 use super::input::{InputOptions, open_scene};
+use super::memory::{Workload, keep_to, scoring};
 use super::scored::{UserOverrides, measure, score_measured};
 use super::summary::Stages;
 use crate::emit::atomic::{Kind, StagedFile, check_target};
 use crate::emit::rows::RowTable;
 use crate::error::{Error, Result};
+use crate::plan::Limits;
 use crate::recipe::Recipe;
 
 /// Writes the rows of an input as `.npz` or `.csv`, by the output's name.
@@ -20,10 +22,15 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bo
     }
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let stages = &mut Stages::default();
-    let (scene, measured) = match input.is_stream() {
-        true => open_measured(input, recipe, |_| Ok(()))?,
+    let needs = |work: &Workload, limits: &Limits, has_cameras| scoring(work, limits, recipe, has_cameras);
+    let (mut scene, measured) = match input.is_stream() {
+        true => open_measured(input, recipe, |_| Ok(()), needs)?,
         false => (open_scene(input)?, None),
     };
+    if !input.is_stream() {
+        let has_cameras = scene.has_cameras;
+        keep_to(input.memory, &mut scene, |work, limits| needs(work, limits, has_cameras))?;
+    }
     let measured = measured.map_or_else(|| measure(&scene, recipe, stages), Ok)?;
     let scored = score_measured(&scene, measured, recipe, &UserOverrides::default(), stages)?;
     let table = RowTable {

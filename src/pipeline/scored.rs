@@ -80,7 +80,7 @@ pub fn measure(scene: &Scene, recipe: &Recipe, stages: &mut Stages) -> Result<Me
         let sample = Sample::new(&scene.schedule, &recipe.scan);
         let reads = sample.frames() as f64 / info.times.len().max(1) as f64;
         seen = Some(stages.run("visible", info.count, reads, || {
-            Ok::<_, Error>((visible_contribution(source, &sample, recipe.scan.pixel_stride)?, info.count))
+            Ok::<_, Error>((visible_contribution(source, &sample, recipe.scan.pixel_stride, scene.limits)?, info.count))
         })?);
     }
     Ok(Measured { scanned, seen })

@@ -14,7 +14,7 @@ use super::project::Splats;
 pub(super) const STRIP_PAIRS: usize = 1 << 20;
 
 /// Indices of splats, grouped by tile, nearest first.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Bins {
     /// (ordered depth bits, splat) of every splat, sorted.
     keys: Vec<u64>,
@@ -65,10 +65,10 @@ impl Bins {
     /// Makes the pairs of the next strip of tiles ready: whole rows of tiles with at most `most` pairs, else part
     /// of a row, else one tile; none after the last. `splats` are those of [`Bins::begin`].
     pub(super) fn next_strip(&mut self, splats: &Splats, most: usize) -> Option<Range<usize>> {
-        let first = self.strip.end;
-        if first == self.ends.len() {
+        if self.is_last_strip() {
             return None;
         }
+        let first = self.strip.end;
         let before = self.start(first);
         let fitting = self.ends[first..].partition_point(|&end| end - before <= most);
         let end = first + fitting.max(1);
@@ -96,6 +96,11 @@ impl Bins {
             }
         }
         Some(self.strip.clone())
+    }
+
+    /// Whether no tiles come after the strip.
+    pub(super) fn is_last_strip(&self) -> bool {
+        self.strip.end == self.ends.len()
     }
 
     /// The splats of every (splat, tile) pair of the strip, tile after tile.

@@ -340,6 +340,9 @@ mod tests {
             for parallel in [false, true] {
                 assert!(made(Renderer { strip_pairs, ..Renderer::with(parallel) }) == whole, "{strip_pairs} at a time");
             }
+            let sight = |strip_pairs| Sight::with(Renderer { strip_pairs, ..Renderer::new() }, &scene, &camera);
+            let (kept, in_strips) = (sight(pairs), sight(strip_pairs));
+            assert!(in_strips.power() == kept.power() && in_strips.pull(&whole.0) == kept.pull(&whole.0));
             renderer.bins.begin(&renderer.splats, [7, 5], false);
             let mut at = 0;
             while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {

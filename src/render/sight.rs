@@ -4,7 +4,8 @@
 //! w = alpha · transmittance does not depend on colour. So a change δ of colours changes the picture by
 //! A·δ, and least squares over colours needs A·δ and Aᵀ·picture only, both of which the blend gives; A is
 //! never formed. Data in: one frame's Gaussians and a camera. Data out: sums per visible Gaussian.
-//! Memory: 72 bytes per visible Gaussian and 4 per (Gaussian, tile) pair, as long as the sight is kept.
+//! Memory: [`BYTES_PER_VISIBLE`](super::BYTES_PER_VISIBLE) and 4 bytes per (Gaussian, tile) pair of a strip, as
+//! long as the sight is kept.
 
 use super::bin::Bins;
 use super::blend::{Blend, GROUPS, Ink, Lattice, Plane, lane_sum};
@@ -20,9 +21,11 @@ use crate::model::{Camera, Gaussians};
 #[derive(Debug)]
 pub struct Sight {
     blend: Blend,
-    splats: Vec<Splat>,
+    splats: Splats,
+    /// All pairs ready if one strip holds them.
     bins: Bins,
     size: [u32; 2],
+    strip_pairs: usize,
 }
 
 /// Red, green and blue of every visible Gaussian of a [`Sight`].
@@ -35,12 +38,15 @@ impl Sight {
     /// # Panics
     /// If the columns of `gaussians` differ in length.
     pub fn new(gaussians: &Gaussians, camera: &Camera) -> Self {
+        Self::with(Renderer::new(), gaussians, camera)
+    }
+
+    pub(super) fn with(mut renderer: Renderer, gaussians: &Gaussians, camera: &Camera) -> Self {
         let view = View::new(camera);
-        let mut renderer = Renderer::new();
         renderer.prepare(gaussians, &view, true);
-        renderer.bins.next_strip(&renderer.splats, usize::MAX);
-        let Renderer { blend, splats: Splats { splats, .. }, bins, .. } = renderer;
-        Sight { blend, splats, bins, size: view.size }
+        renderer.bins.next_strip(&renderer.splats, renderer.strip_pairs);
+        let Renderer { blend, splats, bins, strip_pairs, .. } = renderer;
+        Sight { blend, splats, bins, size: view.size, strip_pairs }
     }
 
     /// Aᵀ·`picture`: of every visible Gaussian Σ over pixels of w · pixel, per channel; f32 within a tile,
@@ -52,7 +58,7 @@ impl Sight {
         assert_eq!([picture.width, picture.height], self.size, "a picture of another size");
         self.per_splat(|tile, lattice, pairs, sums| {
             let planes = self.planes(picture, tile);
-            self.blend.tile(&self.splats, pairs, lattice, &mut Weighed { planes: &planes, pairs: sums });
+            self.blend.tile(&self.splats.splats, pairs, lattice, &mut Weighed { planes: &planes, pairs: sums });
         })
     }
 
@@ -63,15 +69,15 @@ impl Sight {
     pub fn pull_of_change(&self, change: &[[f32; 3]]) -> Pull {
         self.per_splat(|_, lattice, pairs, sums| {
             let mut made = Change { change, planes: [[[0.0; LANES]; GROUPS]; 3] };
-            self.blend.tile(&self.splats, pairs, lattice, &mut made);
-            self.blend.tile(&self.splats, pairs, lattice, &mut Weighed { planes: &made.planes, pairs: sums });
+            self.blend.tile(&self.splats.splats, pairs, lattice, &mut made);
+            self.blend.tile(&self.splats.splats, pairs, lattice, &mut Weighed { planes: &made.planes, pairs: sums });
         })
     }
 
     /// The diagonal of AᵀA: of every visible Gaussian Σ over pixels of w².
     pub fn power(&self) -> Pull {
         self.per_splat(|_, lattice, pairs, sums| {
-            self.blend.tile(&self.splats, pairs, lattice, &mut Power { pairs: sums });
+            self.blend.tile(&self.splats.splats, pairs, lattice, &mut Power { pairs: sums });
         })
     }
 
@@ -80,7 +86,7 @@ impl Sight {
     /// # Panics
     /// If `total` is shorter than the Gaussians that were seen.
     pub fn add(&self, pull: &Pull, total: &mut [[f64; 3]]) {
-        for (splat, pull) in self.splats.iter().zip(&pull.0) {
+        for (splat, pull) in self.splats.splats.iter().zip(&pull.0) {
             let total = &mut total[splat.id as usize];
             (0..3).for_each(|c| total[c] += pull[c]);
         }
@@ -88,20 +94,29 @@ impl Sight {
 
     /// Sums over tiles of what `of_tile` writes for every pair of a tile, zero for channels cut off at 0.
     fn per_splat(&self, mut of_tile: impl FnMut([u32; 2], &Lattice, &[u32], &mut [[f32; 3]])) -> Pull {
-        let mut total = vec![[0.0; 3]; self.splats.len()];
+        let mut total = vec![[0.0; 3]; self.splats.splats.len()];
         let mut sums = Vec::new();
-        for (y, x) in self.bins.rows().flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
-            let pairs = &self.bins.pairs()[self.bins.range(y, x..x + 1)];
-            let tile = [x as u32, y as u32];
-            sums.clear();
-            sums.resize(pairs.len(), [0.0; 3]);
-            of_tile(tile, &Lattice::new(tile, self.size, 1), pairs, &mut sums);
-            for (&splat, sum) in pairs.iter().zip(&sums) {
-                let total = &mut total[splat as usize];
-                (0..3).for_each(|c| total[c] += f64::from(sum[c]));
+        let mut of_strip = |bins: &Bins| {
+            for (y, x) in bins.rows().flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
+                let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+                let tile = [x as u32, y as u32];
+                sums.clear();
+                sums.resize(pairs.len(), [0.0; 3]);
+                of_tile(tile, &Lattice::new(tile, self.size, 1), pairs, &mut sums);
+                for (&splat, sum) in pairs.iter().zip(&sums) {
+                    let total = &mut total[splat as usize];
+                    (0..3).for_each(|c| total[c] += f64::from(sum[c]));
+                }
+            }
+        };
+        of_strip(&self.bins);
+        if !self.bins.is_last_strip() {
+            let mut bins = self.bins.clone();
+            while bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+                of_strip(&bins);
             }
         }
-        for (total, splat) in total.iter_mut().zip(&self.splats) {
+        for (total, splat) in total.iter_mut().zip(&self.splats.splats) {
             (0..3).filter(|&c| splat.colour[c] == 0.0).for_each(|c| total[c] = 0.0);
         }
         Pull(total)

@@ -30,6 +30,7 @@ use crate::model::{Schedule, Split};
 use crate::pipeline::evaluate::{EvaluateOptions, SideBySide};
 use crate::pipeline::evaluation::{Evaluation, PictureScores};
 use crate::pipeline::input::Scene;
+use crate::pipeline::memory::{picturing_both, scoring};
 use crate::pipeline::scored::{Scored, UserOverrides, score_scene};
 use crate::pipeline::summary::Stages;
 use crate::pipeline::trade_off::TradeOff;
@@ -112,6 +113,13 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let mut notes = notes_on(&run, &side.scene)?;
 
     let recipe = recipe_to_look_with(&run)?;
+    let has_cameras = side.scene.has_cameras;
+    side.keep_to(options.evaluate.original.memory, |work, limits| {
+        let mut needs = scoring(work, limits, &recipe, has_cameras);
+        needs.push(traits::need(work));
+        needs.extend(picturing_both(work, limits));
+        needs
+    })?;
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     let scored = score_scene(&side.scene, &recipe, &UserOverrides::default(), &mut Stages::default())?;
     notes.extend(differing_terms(&run, &scored));

@@ -11,6 +11,7 @@ use crate::error::Result;
 use crate::merge::neighbors::{PointIndex, Search};
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
 use crate::pass::FrameSource;
+use crate::pipeline::memory::{Need, SCORED, Workload};
 use crate::pipeline::scored::Scored;
 use crate::stream::gather;
 
@@ -49,6 +50,18 @@ pub enum Kind {
 impl Kind {
     /// Every kind, in the paper's order; a kind's place here is that of its numbers everywhere.
     pub const ALL: [Kind; 3] = [Kind::Motion, Kind::Thin, Kind::Appearance];
+}
+
+/// Memory that finding [`traits`] takes.
+pub fn need(work: &Workload) -> Need {
+    let per_gaussian = vec![
+        ("rows", SCORED),
+        ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
+        ("colours", 88 + work.state(Columns::SH | Columns::OPACITY)),
+        ("neighbours", 190),
+    ];
+    let reads = SAMPLES.min(work.frames as usize) as f64 / work.frames.max(1) as f64;
+    Need { stage: "traits", reads: 2.0 * reads, per_gaussian, fixed: vec![("decoding", work.decoding())] }
 }
 
 /// The kinds one Gaussian is of, by [`Kind::ALL`].

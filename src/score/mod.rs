@@ -31,6 +31,11 @@ pub struct Scores {
     pub terms: Vec<Term>,
 }
 
+impl Scores {
+    /// Memory of a Gaussian's scores.
+    pub const BYTES_PER_GAUSSIAN: usize = 5 * size_of::<f64>();
+}
+
 /// How a term was normalised.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Term {

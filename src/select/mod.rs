@@ -58,6 +58,13 @@ pub struct Counts {
     pub kept: usize,
 }
 
+/// Memory of a selection per Gaussian, and of a second ranking beside its own.
+pub const BYTES_PER_GAUSSIAN: usize = size_of::<bool>() + 2 * size_of::<u32>();
+/// What selecting takes per Gaussian besides, while it lasts: fates, places in two orders, one of them being sorted,
+/// and what they are sorted by.
+pub const WORKING_BYTES_PER_GAUSSIAN: usize =
+    size_of::<bool>() + size_of::<Option<bool>>() + 4 * size_of::<u32>() + 2 * size_of::<f64>();
+
 /// Applies both stages to N scored Gaussians, then the overrides.
 ///
 /// Stage 1 takes the round(`keep_fraction`·N) best (halves up) by S, ties by hashed id. Stage 2 keeps

@@ -10,6 +10,7 @@ use super::look::{Looks, Sample};
 use crate::error::Result;
 use crate::model::{Camera, Columns};
 use crate::pass::{FrameSource, Ids};
+use crate::plan::Limits;
 use crate::render::{Contribution, Renderer};
 
 /// What contributions depend on: all but colour.
@@ -30,17 +31,23 @@ pub struct Seen {
 /// pictures at all give zeros.
 ///
 /// Memory per Gaussian: its reader, and that of [`Looking`]. Nothing grows with frames or views.
-pub fn visible_contribution(source: &dyn FrameSource, sample: &Sample<'_>, pixel_stride: NonZeroU32) -> Result<Seen> {
+pub fn visible_contribution(
+    source: &dyn FrameSource,
+    sample: &Sample<'_>,
+    pixel_stride: NonZeroU32,
+    limits: Limits,
+) -> Result<Seen> {
     let progress = Progress::new("visible", "pictures", sample.pictures() as u64);
-    let mut looking = Looking::new(source.info().count, pixel_stride);
+    let mut looking = Looking::new(source.info().count, pixel_stride, limits);
     looking.add(source, &sample.0, |pictures| progress.advance(pictures))?;
     Ok(looking.finish())
 }
 
 /// Contributions to the pictures so far.
 ///
-/// Memory per Gaussian: 44 bytes for a block's state and for each frame of a batch (frames with 4 × threads
-/// pictures between them); per thread 12 bytes of sums and a picture's buffers ([`crate::render`]).
+/// Memory per Gaussian: 44 bytes for each frame of a batch (frames with 4 × threads pictures between them, within
+/// `limits`) and for a block's state; for each picture at a time 12 bytes of sums and the picture's buffers
+/// ([`crate::render`]).
 pub struct Looking {
     count: usize,
     pixel_stride: NonZeroU32,
@@ -50,8 +57,8 @@ pub struct Looking {
 
 impl Looking {
     /// No pictures yet of `count` Gaussians.
-    pub fn new(count: usize, pixel_stride: NonZeroU32) -> Self {
-        Looking { count, pixel_stride, pictures: 0, looks: Looks::new(GEOMETRY) }
+    pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
+        Looking { count, pixel_stride, pictures: 0, looks: Looks::new(GEOMETRY, limits) }
     }
 
     /// Looks at pictures of `source`: frames, each with the cameras of its pictures. Every source that is
@@ -124,8 +131,10 @@ mod tests {
             }
             let sample = Sample::new(&schedule, &scan);
             assert_eq!((sample.pictures(), sample.frames()), (pictures, 7usize.div_ceil(frame as usize)));
-            for threads in [1, 2, 5] {
-                let seen = on_threads(threads, || visible_contribution(&scene, &sample, scan.pixel_stride)).unwrap();
+            let one = Limits { frames_held: 1, frames_together: 1, pictures_together: 1, ..Limits::NONE };
+            for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
+                let look = || visible_contribution(&scene, &sample, scan.pixel_stride, limits).unwrap();
+                let seen = on_threads(threads, look);
                 for i in 0..2500 {
                     let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
@@ -141,7 +150,8 @@ mod tests {
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let total = |pixel| {
             let scan = strides(pixel, 1, 1);
-            let seen = visible_contribution(&scene, &Sample::new(&schedule, &scan), scan.pixel_stride).unwrap();
+            let seen =
+                visible_contribution(&scene, &Sample::new(&schedule, &scan), scan.pixel_stride, Limits::NONE).unwrap();
             seen.coverage.iter().sum::<f64>()
         };
         let (all, third) = (total(1), total(3));
@@ -215,7 +225,7 @@ mod tests {
         let schedule = rig.schedule(&info.times, None).unwrap();
         let recipe = Recipe::preset("default").unwrap();
         let sample = Sample::new(&schedule, &recipe.scan);
-        let seen = visible_contribution(&Still(state, info), &sample, recipe.scan.pixel_stride).unwrap();
+        let seen = visible_contribution(&Still(state, info), &sample, recipe.scan.pixel_stride, Limits::NONE).unwrap();
         assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
@@ -241,11 +251,15 @@ mod tests {
     fn nothing_to_see_gives_zeros() {
         let scene = Scene::new(300, 2);
         let schedule = Schedule { cameras: Vec::new(), frames: vec![Vec::new(); 2] };
-        let seen = visible_contribution(&scene, &Sample::new(&schedule, &strides(1, 1, 1)), NonZeroU32::MIN).unwrap();
+        let look = |source: &dyn FrameSource, schedule: &Schedule| {
+            let sample = Sample::new(schedule, &strides(1, 1, 1));
+            visible_contribution(source, &sample, NonZeroU32::MIN, Limits::NONE).unwrap()
+        };
+        let seen = look(&scene, &schedule);
         assert_eq!(seen, Seen { coverage: vec![0.0; 300], peak: vec![0.0; 300] });
         let none = Still(Gaussians::zeros(0, 0), SequenceInfo { count: 0, ..scene.info().clone() });
         let schedule = scene.rig().schedule(&scene.info().times, None).unwrap();
-        let seen = visible_contribution(&none, &Sample::new(&schedule, &strides(1, 1, 1)), NonZeroU32::MIN).unwrap();
+        let seen = look(&none, &schedule);
         assert!(seen.coverage.is_empty() && seen.peak.is_empty());
     }
 }

@@ -3,6 +3,7 @@
 //! Frame-major, for occlusion needs all Gaussians of a frame at once: frames are read by blocks on all
 //! threads, then the pictures of a batch of frames are shared out among them.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -11,13 +12,14 @@ use super::{Frames, Progress};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Schedule};
 use crate::pass::{FrameSource, Ids};
+use crate::plan::Limits;
 use crate::recipe;
 
 /// Pictures of a batch for each thread: enough that the last ones to finish cost little.
-const PICTURES_PER_THREAD: usize = 4;
+pub const PICTURES_PER_THREAD: usize = 4;
 
 /// Views of a frame that are worth reading it for.
-const VIEWS_AT_ONCE: usize = 3;
+pub const VIEWS_AT_ONCE: usize = 3;
 
 /// Pictures to look at: frames in order, each with the cameras of its pictures, at least one.
 #[derive(Debug, Clone)]
@@ -94,19 +96,19 @@ impl<'a> Sample<'a> {
     }
 }
 
-/// Shows the Gaussians `ids` to every camera of `sample` and gives what the workers gathered, at most one per
-/// thread, in no order: fold them by what does not depend on it. Memory: see [`Looks`].
+/// Shows the Gaussians `ids` to every camera of `sample` and gives what the workers gathered, in no order: fold
+/// them by what does not depend on it. Memory: see [`Looks`].
 pub(super) fn look<W: Send>(
     source: &dyn FrameSource,
     ids: Ids<'_>,
     want: Columns,
     sample: &Sample<'_>,
-    stage: &'static str,
+    (stage, limits): (&'static str, Limits),
     new_worker: impl Fn() -> W + Sync,
     picture: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
 ) -> Result<Vec<W>> {
     let progress = Progress::new(stage, "pictures", sample.pictures() as u64);
-    let mut looks = Looks::new(want);
+    let mut looks = Looks::new(want, limits);
     looks.add(source, ids, &sample.0, new_worker, |worker, state, camera| {
         picture(worker, state, camera);
         progress.advance(1);
@@ -116,19 +118,21 @@ pub(super) fn look<W: Send>(
 
 /// Workers that have seen some pictures and may see more.
 ///
-/// Memory per Gaussian: its reader; the columns looked at for a block and for each frame of a batch (frames
-/// with 4 × threads pictures between them); what a worker holds.
+/// Memory per Gaussian: its reader; the columns looked at, those that vary once for a block and all for each
+/// frame of a batch (frames with 4 × threads pictures between them, no more than [`Limits::frames_together`]);
+/// what a worker holds, one per thread but no more than [`Limits::pictures_together`].
 pub(super) struct Looks<W> {
     want: Columns,
-    /// One per thread at most: a picture runs on the thread that took its worker.
+    limits: Limits,
+    /// Those without a picture.
     workers: Mutex<Vec<W>>,
     states: Vec<Gaussians>,
 }
 
 impl<W: Send> Looks<W> {
     /// Nothing seen yet, of the columns `want`.
-    pub(super) fn new(want: Columns) -> Self {
-        Looks { want, workers: Mutex::default(), states: Vec::new() }
+    pub(super) fn new(want: Columns, limits: Limits) -> Self {
+        Looks { want, limits, workers: Mutex::default(), states: Vec::new() }
     }
 
     /// Shows the Gaussians `ids` of `source` at `frames`, each to the cameras of its pictures. Every source that
@@ -145,7 +149,8 @@ impl<W: Send> Looks<W> {
             return Ok(());
         }
         let mut reader = Frames::open(source, ids, self.want)?;
-        for batch in batches(frames, PICTURES_PER_THREAD * rayon::current_num_threads()) {
+        let threads = rayon::current_num_threads();
+        for batch in batches(frames, PICTURES_PER_THREAD * threads, self.limits.frames_together) {
             for (slot, &(frame, _)) in batch.iter().enumerate() {
                 let want = if slot < self.states.len() { source.info().varying } else { self.want };
                 if slot == self.states.len() {
@@ -158,10 +163,14 @@ impl<W: Send> Looks<W> {
                 .zip(&self.states)
                 .flat_map(|((_, cameras), state)| cameras.iter().map(move |&camera| (state, camera)))
                 .collect();
-            jobs.par_iter().with_max_len(1).for_each(|(state, camera)| {
+            let next = AtomicUsize::new(0);
+            let workers = threads.min(self.limits.pictures_together);
+            (0..workers.min(jobs.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.workers.lock().unwrap_or_else(PoisonError::into_inner).pop();
                 let mut worker = free.unwrap_or_else(&new_worker);
-                picture(&mut worker, state, camera);
+                while let Some((state, camera)) = jobs.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    picture(&mut worker, state, camera);
+                }
                 self.workers.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
             });
         }
@@ -174,15 +183,20 @@ impl<W: Send> Looks<W> {
     }
 }
 
-/// Runs of frames with at least `pictures` pictures between them, the last one perhaps fewer.
-fn batches<T>(mut frames: &[(usize, Vec<T>)], pictures: usize) -> impl Iterator<Item = &[(usize, Vec<T>)]> {
+/// Runs of frames with at least `pictures` pictures between them, or of `most` frames; the last one perhaps of
+/// fewer.
+fn batches<T>(
+    mut frames: &[(usize, Vec<T>)],
+    pictures: usize,
+    most: usize,
+) -> impl Iterator<Item = &[(usize, Vec<T>)]> {
     std::iter::from_fn(move || {
         let mut held = 0;
         let enough = frames.iter().position(|(_, cameras)| {
             held += cameras.len();
             held >= pictures
         });
-        let (batch, rest) = frames.split_at(enough.map_or(frames.len(), |last| last + 1));
+        let (batch, rest) = frames.split_at(enough.map_or(frames.len(), |last| last + 1).min(most));
         frames = rest;
         (!batch.is_empty()).then_some(batch)
     })

@@ -16,7 +16,7 @@ pub use contribution::{Looking, Seen, visible_contribution};
 pub use frames::Frames;
 pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
-pub use look::{Sample, Sampler};
+pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};
 pub use merged::MergedSequence;
 pub use motion::measure_motion;
 pub use progress::Progress;

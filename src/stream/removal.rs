@@ -4,27 +4,29 @@ use super::look::{Sample, look};
 use crate::error::Result;
 use crate::model::Columns;
 use crate::pass::{FrameSource, Ids};
+use crate::plan::Limits;
 use crate::render::{RemovalError, Renderer};
 
 /// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over the pictures of `sample`: the same
 /// bits whatever the threads.
 ///
-/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for a block's state and for each frame of
-/// a batch (frames with 4 × threads pictures between them); per thread 8 bytes of sums and a picture's
-/// buffers. Nothing grows with frames or views.
+/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for each frame of a batch (frames with
+/// 4 × threads pictures between them, within `limits`) and for a block's state; for each picture at a time 8 bytes
+/// of sums and the picture's buffers. Nothing grows with frames or views.
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],
     sample: &Sample<'_>,
     background: [f32; 3],
     contrast_floor: f32,
+    limits: Limits,
 ) -> Result<RemovalError> {
     let found = look(
         source,
         Ids::List(ids),
         Columns::ALL,
         sample,
-        "rounds",
+        ("rounds", limits),
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| renderer.removal_error(state, camera, background, errors),
     )?;
@@ -56,9 +58,10 @@ mod tests {
         assert!(plain.sum.iter().filter(|&&sum| sum > 0).count() > 1000);
         let sample = Sample::at_most(&schedule, usize::MAX);
         assert_eq!(sample.pictures(), schedule.pairs());
-        for threads in [1, 3] {
+        let two = Limits { frames_held: 2, frames_together: 2, pictures_together: 2, ..Limits::NONE };
+        for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let found = pool.install(|| removal_error(&scene, &ids, &sample, background, 0.1)).unwrap();
+            let found = pool.install(|| removal_error(&scene, &ids, &sample, background, 0.1, limits)).unwrap();
             assert!(found == plain, "{threads} threads");
         }
     }

@@ -5,8 +5,7 @@
 //! per Gaussian), the field's tensors, and per open reader the canonical rows again plus
 //! [`Field::bytes_per_gaussian`].
 
-use std::fs::{self, File};
-use std::io::Read;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -18,6 +17,7 @@ use crate::model::{Column, Columns, Gaussians, SequenceInfo};
 use crate::pass::{BlockReader, FrameSource, Ids};
 
 use super::cfg_args::ModelConfig;
+use super::digest::hash_file;
 use super::ply::Ply;
 use super::pth::read_state_dict;
 
@@ -94,16 +94,7 @@ impl ModelPaths {
     /// xxh3-128 over the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
     pub fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
-        let mut buffer = vec![0; 1 << 18];
-        for path in self.required() {
-            let mut file = File::open(path).map_err(Error::io("open", path))?;
-            loop {
-                match file.read(&mut buffer).map_err(Error::io("read", path))? {
-                    0 => break,
-                    n => hash.update(&buffer[..n]),
-                }
-            }
-        }
+        self.required().into_iter().try_for_each(|path| hash_file(path, &mut hash))?;
         Ok(format!("{:032x}", hash.digest128()))
     }
 }

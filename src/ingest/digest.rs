@@ -1,0 +1,24 @@
+//! Files into a hash, piece by piece: a file's length is no matter of memory.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use xxhash_rust::xxh3::Xxh3;
+
+use crate::error::{Error, Result};
+
+/// Bytes read at a time.
+const PIECE: usize = 1 << 18;
+
+/// Adds the bytes of the file at `path` to `hash`.
+pub(super) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
+    let mut file = File::open(path).map_err(Error::io("open", path))?;
+    let mut piece = vec![0; PIECE];
+    loop {
+        match file.read(&mut piece).map_err(Error::io("read", path))? {
+            0 => return Ok(()),
+            read => hash.update(&piece[..read]),
+        }
+    }
+}

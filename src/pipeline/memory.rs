@@ -1,0 +1,627 @@
+//! What a run needs of memory, and how it keeps to a budget.
+//!
+//! Every stage states its bytes per Gaussian and its fixed bytes as sums of named parts; the largest stage counts.
+//! [`Plan::fit`] begins with limits that cost no time and halves the one that frees most, until all stages fit.
+//! A result never depends on the limits. Nothing grows with frames but time stamps, the cameras' pictures and
+//! the index of tiles, which are parts like any other.
+
+use std::fmt::Write as _;
+use std::fs;
+
+use bytesize::ByteSize;
+
+use super::compress::Only;
+use super::input::{Input, Scene};
+use super::scored::looks;
+use super::{choose, rounds};
+use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
+use crate::error::{Error, Result};
+use crate::ingest::frame_stream::StreamHeader;
+use crate::model::{Columns, Rig, Rows};
+use crate::plan::Limits;
+use crate::recipe::Recipe;
+use crate::score::Scores;
+use crate::stream::{BLOCK, PICTURES_PER_THREAD, VIEWS_AT_ONCE};
+use crate::{merge, metrics, refit, render, select, stats};
+
+/// Memory that a run may take, and whether it is to say beforehand what it will take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Budget {
+    /// Bytes; none: a quarter of the machine's memory.
+    pub bytes: Option<u64>,
+    /// Print the plan on standard error before any work.
+    pub explain: bool,
+}
+
+/// Resident before any Gaussian is: the program, its libraries, its threads' stacks and heaps, messages.
+const PROGRAM: u64 = 14 << 20;
+/// Per thread beyond the first.
+const PER_THREAD: u64 = 2 << 20;
+/// Resident per tile of an open container, and as much again of one that is written.
+const PER_TILE: u64 = 96;
+
+/// What the need for memory depends on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Workload {
+    /// N.
+    pub gaussians: u64,
+    /// T; of a stream 0, for nobody knows.
+    pub frames: u64,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: usize,
+    /// Columns that differ between frames.
+    pub varying: Columns,
+    /// Bytes per Gaussian that are resident while the input is open.
+    pub resident: u64,
+    /// Bytes per Gaussian of an open reader, beside the frames it holds.
+    pub reader: u64,
+    /// Whether frames are decoded together, so that a reader may hold some.
+    pub decodes: bool,
+    /// Pixels of the largest picture.
+    pub pixels: u64,
+    /// Most pictures of one frame.
+    pub views: u64,
+    /// Pictures of all frames.
+    pub pictures: u64,
+    /// Threads to work on.
+    pub threads: u64,
+}
+
+impl Workload {
+    /// Of an open scene.
+    pub fn of(scene: &Scene) -> Workload {
+        Workload {
+            pixels: most_pixels(&scene.rig),
+            views: scene.schedule.frames.iter().map(Vec::len).max().unwrap_or(0) as u64,
+            pictures: scene.rig.shots.len().max(scene.schedule.pairs()) as u64,
+            ..Workload::of_input(&scene.input)
+        }
+    }
+
+    /// Of an open input that nobody looks at.
+    pub fn of_input(input: &Input) -> Workload {
+        let info = input.source().info();
+        let whole = state_bytes(info.sh_degree, Columns::ALL);
+        let (resident, reader, decodes) = match input {
+            // Canonical values, and for each reader a copy, what is prepared of them and their changes.
+            Input::Model(model) => (whole, 2 * whole + model.field().bytes_per_gaussian() as u64 + 128, false),
+            Input::Frames(_) => (0, 4, false),
+            Input::Container(_) | Input::Stream(_) => (0, 8, true),
+        };
+        Workload {
+            gaussians: info.count as u64,
+            frames: info.times.len() as u64,
+            sh_degree: info.sh_degree,
+            varying: info.varying,
+            resident,
+            reader,
+            decodes,
+            pixels: 0,
+            views: 0,
+            pictures: 0,
+            threads: rayon::current_num_threads() as u64,
+        }
+    }
+
+    /// Of a stream of which only the header has arrived, as `rig` will see it.
+    pub fn of_stream(header: &StreamHeader, rig: &Rig) -> Workload {
+        let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
+        times.sort_by(f64::total_cmp);
+        let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
+        Workload {
+            gaussians: header.count as u64,
+            frames: 0,
+            sh_degree: header.sh_degree,
+            varying: header.varying,
+            resident: 0,
+            reader: 8,
+            decodes: true,
+            pixels: most_pixels(rig),
+            views: (together + rig.shots.len() - times.len()) as u64,
+            pictures: rig.shots.len() as u64,
+            threads: rayon::current_num_threads() as u64,
+        }
+    }
+
+    /// Bytes of one Gaussian's columns `of`.
+    pub fn state(&self, of: Columns) -> u64 {
+        state_bytes(self.sh_degree, of)
+    }
+
+    /// Frames that a reader holds of those it decodes together.
+    fn held(&self, limits: &Limits) -> u64 {
+        if self.decodes { limits.frames_held.min(FRAME_BLOCK) as u64 } else { 0 }
+    }
+
+    /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
+    pub fn decoding(&self) -> u64 {
+        let frames = |column| if self.varying.contains(column) { FRAME_BLOCK as u64 } else { 1 };
+        let largest = Columns::ALL.iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
+        self.threads * 3 * GAUSSIAN_BLOCK as u64 * largest
+    }
+
+    /// The whole input as it is known and seen, whatever its Gaussians hold.
+    fn known(&self) -> u64 {
+        let tiles = 5 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64) * self.frames.div_ceil(FRAME_BLOCK as u64);
+        let index = if self.decodes { PER_TILE * tiles } else { 0 };
+        index + 64 * self.frames + 160 * self.pictures
+    }
+}
+
+/// A named part of a stage's memory.
+type Part = (&'static str, u64);
+
+/// What a stage needs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Need {
+    /// The stage's name.
+    pub stage: &'static str,
+    /// Full reads of the frames, at most.
+    pub reads: f64,
+    /// Bytes per Gaussian.
+    pub per_gaussian: Vec<Part>,
+    /// Bytes, however many Gaussians there are.
+    pub fixed: Vec<Part>,
+}
+
+impl Need {
+    fn of_gaussian(&self) -> u64 {
+        self.per_gaussian.iter().map(|&(_, bytes)| bytes).sum()
+    }
+
+    fn bytes(&self, work: &Workload) -> u64 {
+        let fixed: u64 = self.fixed.iter().map(|&(_, bytes)| bytes).sum();
+        work.gaussians.saturating_mul(work.resident + self.of_gaussian()).saturating_add(fixed)
+    }
+}
+
+/// Every limit halved, first those that cost most time.
+const HALVINGS: [fn(&Limits) -> Limits; 5] = [
+    |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
+    |limits| Limits { sights_together: limits.sights_together / 2, ..*limits },
+    |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
+    |limits| Limits { frames_together: limits.frames_together.div_ceil(2), ..*limits },
+    |limits| Limits { frames_held: limits.frames_held.div_ceil(2), ..*limits },
+];
+
+/// How a run keeps to its budget.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    work: Workload,
+    budget: u64,
+    /// What stages keep at a time.
+    pub limits: Limits,
+    needs: Vec<Need>,
+}
+
+impl Plan {
+    /// The fastest limits by which every stage that `needs` names fits into `budget`; says so if that is asked for.
+    ///
+    /// # Errors
+    /// A budget that no limits fit; the error names the least that works.
+    pub fn fit(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<Plan> {
+        let plan = Self::closest(work, budget.limit(), needs);
+        if budget.explain {
+            eprint!("{}", plan.text());
+        }
+        if plan.excess() > 0 { Err(plan.refusal()) } else { Ok(plan) }
+    }
+
+    /// The fastest plan that fits into `budget`, else the one that takes least.
+    fn closest(work: Workload, budget: u64, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Plan {
+        let mut limits = Limits {
+            frames_held: FRAME_BLOCK,
+            frames_together: PICTURES_PER_THREAD * work.threads as usize,
+            pictures_together: work.threads as usize,
+            sights_together: usize::MAX,
+            pairs_together: 8 * work.gaussians.max(1 << 17) as usize,
+        };
+        loop {
+            let plan = Plan { work, budget, limits, needs: needs(&work, &limits) };
+            let excess = plan.excess();
+            let saved =
+                |other: &Limits| excess - Plan { limits: *other, needs: needs(&work, other), ..plan.clone() }.excess();
+            let halved = HALVINGS.iter().filter_map(|halve| {
+                let smaller = std::iter::successors(Some(limits), |limits| Some(halve(limits)));
+                smaller.take(usize::BITS as usize).find(|other| saved(other) > 0)
+            });
+            // Of equals the last one: what is cheapest to do without.
+            match halved.max_by_key(saved) {
+                Some(other) => limits = other,
+                None => return plan,
+            }
+        }
+    }
+
+    /// Bytes resident at most.
+    pub fn peak(&self) -> u64 {
+        self.base() + self.needs.iter().map(|need| need.bytes(&self.work)).max().unwrap_or(0)
+    }
+
+    fn base(&self) -> u64 {
+        PROGRAM + PER_THREAD * self.work.threads + self.work.known()
+    }
+
+    /// Bytes by which stages pass the budget, all together.
+    fn excess(&self) -> u64 {
+        let room = self.budget.saturating_sub(self.base());
+        let beyond = self.needs.iter().map(|need| need.bytes(&self.work).saturating_sub(room));
+        beyond.sum::<u64>() + self.base().saturating_sub(self.budget)
+    }
+
+    fn refusal(&self) -> Error {
+        let largest = self.needs.iter().max_by_key(|need| need.bytes(&self.work)).map_or("", |need| need.stage);
+        // Rounded up to what a person would write.
+        let least = self.peak().div_ceil(1 << 20);
+        Error::usage(format!(
+            "--memory {}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
+             give it that, or fewer --threads; --explain shows what takes how much",
+            size(self.budget),
+            self.work.gaussians
+        ))
+    }
+
+    /// The plan for a person: stages with their parts, limits, reads.
+    pub fn text(&self) -> String {
+        let Plan { work, limits, .. } = self;
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            out,
+            "memory: at most {} of {} for {} Gaussians x {} frames of {} pictures, {} threads",
+            size(self.peak()),
+            size(self.budget),
+            work.gaussians,
+            work.frames,
+            work.pictures,
+            work.threads
+        );
+        let _ = writeln!(
+            out,
+            "  = {} program and threads + {} frames, cameras, index + the largest stage:",
+            size(self.base() - work.known()),
+            size(work.known())
+        );
+        for need in &self.needs {
+            let parts = |parts: &[Part], unit: fn(u64) -> String| -> String {
+                let some = parts.iter().filter(|&&(_, bytes)| bytes > 0);
+                some.map(|&(name, bytes)| format!("{} {name}", unit(bytes))).collect::<Vec<_>>().join(" + ")
+            };
+            let input = [("input", work.resident)];
+            let per_gaussian = [&input[..], &need.per_gaussian].concat();
+            let _ = writeln!(
+                out,
+                "  {:<8} {:>11} = N x {} ({}) + {}",
+                need.stage,
+                size(need.bytes(work)),
+                work.resident + need.of_gaussian(),
+                parts(&per_gaussian, |bytes| bytes.to_string()),
+                parts(&need.fixed, size)
+            );
+        }
+        let _ = writeln!(
+            out,
+            "  at a time: {} frames held by readers, {} frames ready, {} pictures, {} pairs measured",
+            work.held(limits),
+            limits.frames_together,
+            limits.pictures_together,
+            limits.pairs_together
+        );
+        let reads = self.needs.iter().filter(|need| need.reads > 0.0);
+        let named: Vec<String> = reads.map(|need| format!("{:.2} {}", need.reads, need.stage)).collect();
+        let sum: f64 = self.needs.iter().map(|need| need.reads).sum();
+        let _ = writeln!(out, "full reads of the frames: at most {sum:.2} ({})", named.join(" + "));
+        out
+    }
+}
+
+impl Budget {
+    /// Bytes that the run may take on this machine.
+    fn limit(self) -> u64 {
+        self.bytes.or_else(|| Some(machine_memory()? / 4)).unwrap_or(u64::MAX)
+    }
+}
+
+/// Plans what is to be done with `scene` and gives it its limits.
+pub fn keep_to(budget: Budget, scene: &mut Scene, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
+    scene.limits = Plan::fit(Workload::of(scene), budget, needs)?.limits;
+    Ok(())
+}
+
+/// Memory of the machine or of the group of processes this one is confined to, bytes; none where the system does
+/// not say.
+fn machine_memory() -> Option<u64> {
+    let info = fs::read_to_string("/proc/meminfo").ok()?;
+    let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let machine = line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024;
+    let group = fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|max| max.trim().parse().ok());
+    Some(group.map_or(machine, |group: u64| group.min(machine)))
+}
+
+fn most_pixels(rig: &Rig) -> u64 {
+    rig.cameras.iter().map(|camera| u64::from(camera.width) * u64::from(camera.height)).max().unwrap_or(0)
+}
+
+fn size(bytes: u64) -> String {
+    ByteSize(bytes).display().iec().to_string()
+}
+
+fn state_bytes(sh_degree: usize, columns: Columns) -> u64 {
+    columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
+}
+
+/// Statistics while they are gathered: no W yet.
+const ROWS: u64 = Rows::BYTES_PER_GAUSSIAN as u64;
+/// Statistics, scores and a selection, as they stay until the end.
+pub const SCORED: u64 = ROWS + (Scores::BYTES_PER_GAUSSIAN + select::BYTES_PER_GAUSSIAN) as u64;
+
+/// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
+const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
+
+/// Stages that look at pictures, at most `views` of a frame: states that lie ready, what is on its way to them, and
+/// pictures in the making with `sums` bytes per Gaussian.
+fn looking(work: &Workload, limits: &Limits, columns: Columns, views: u64, sums: u64) -> (Vec<Part>, Vec<Part>) {
+    let pictures = work.threads.min(limits.pictures_together as u64);
+    let ready = (PICTURES_PER_THREAD as u64 * work.threads).div_ceil(views.max(1));
+    let varying = work.state(columns & work.varying);
+    let per_gaussian = vec![
+        ("states", ready.min(limits.frames_together as u64) * work.state(columns)),
+        ("arriving", varying),
+        ("readers", work.reader),
+        ("held", work.held(limits) * varying),
+        ("pictures", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
+    ];
+    let fixed =
+        vec![("decoding", work.decoding()), ("pictures", pictures * (render::STRIP_BYTES as u64 + 12 * work.pixels))];
+    (per_gaussian, fixed)
+}
+
+/// What scoring takes: the scan, the look at pictures that `recipe` asks for, the scores.
+pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: bool) -> Vec<Need> {
+    let block = work.state(Columns::ALL)
+        + stats::BYTES_PER_GAUSSIAN as u64
+        + work.reader
+        + FRAME_BLOCK as u64 * work.state(work.varying);
+    let decoding = ("decoding", work.decoding());
+    let mut needs = vec![Need {
+        stage: "scan",
+        reads: 1.0,
+        per_gaussian: vec![("rows", ROWS)],
+        fixed: vec![("blocks", work.threads * BLOCK as u64 * block), decoding],
+    }];
+    if looks(has_cameras, recipe.scan.coverage) {
+        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL.without(Columns::SH), work.views, 12);
+        per_gaussian.insert(0, ("rows", ROWS + 16));
+        needs.push(Need { stage: "visible", reads: 1.0, per_gaussian, fixed });
+    }
+    needs.push(Need {
+        stage: "score",
+        reads: 0.0,
+        per_gaussian: vec![
+            ("rows", SCORED),
+            ("sorting", select::WORKING_BYTES_PER_GAUSSIAN as u64),
+            ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
+        ],
+        fixed: vec![decoding],
+    });
+    needs
+}
+
+/// What compressing takes: [`scoring`], and the stages that `recipe` and `only` ask for.
+pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only, has_cameras: bool) -> Vec<Need> {
+    let mut needs = scoring(work, limits, recipe, has_cameras);
+    let looks = looks(has_cameras, recipe.scan.coverage);
+    let whole = work.state(Columns::ALL);
+    let decoding = ("decoding", work.decoding());
+    let sampled = |pictures: usize| (pictures as u64).min(work.pictures) as f64 / work.frames.max(1) as f64;
+    if looks && only != Only::Merge && recipe.select.round_fraction < 1.0 {
+        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL, work.views.min(VIEWS_AT_ONCE as u64), 8);
+        per_gaussian.insert(0, ("rows", SCORED));
+        per_gaussian.insert(1, ("ranking", 32));
+        // Each round reads what the round before left.
+        let rounds = 1.0 / (1.0 - recipe.select.round_fraction);
+        needs.push(Need { stage: "rounds", reads: rounds * sampled(rounds::PICTURES), per_gaussian, fixed });
+    }
+    if only != Only::Prune && !recipe.merge.passes.is_empty() {
+        let pairs = (limits.pairs_together as u64).saturating_mul(merge::BYTES_PER_PAIR as u64);
+        needs.push(Need {
+            stage: "merge",
+            reads: 1.0,
+            per_gaussian: vec![
+                ("rows", SCORED),
+                ("states", 2 * whole),
+                ("survivors", merge::BYTES_PER_SURVIVOR as u64),
+                ("readers", work.reader),
+                ("held", work.held(limits) * work.state(work.varying & (Columns::POSITION | Columns::OPACITY))),
+            ],
+            fixed: vec![("pairs", pairs), decoding],
+        });
+    }
+    // A model with a field is moved as a whole: its canonical values once more.
+    let result = if work.resident > 0 { 2 * whole } else { 0 };
+    if looks && only != Only::Merge && recipe.select.choose_by_views {
+        needs.push(Need {
+            stage: "choose",
+            reads: 2.0 * sampled(choose::PICTURES),
+            per_gaussian: vec![
+                ("rows", SCORED + 24),
+                ("states", 2 * whole),
+                ("result", result),
+                ("pictures", PICTURE_ON_ALL_THREADS),
+            ],
+            fixed: vec![
+                decoding,
+                ("pictures", render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + choose::AT_ONCE as u64)),
+            ],
+        });
+    }
+    let fitted = u64::from(recipe.refit.refit_pictures);
+    if looks && fitted > 0 {
+        let tests = fitted.div_ceil(3);
+        needs.push(Need {
+            stage: "refit",
+            reads: sampled((fitted + 2 * tests) as usize),
+            per_gaussian: vec![
+                ("rows", SCORED + 24),
+                ("states", 2 * whole),
+                ("result", result),
+                ("equations", refit::BYTES_PER_GAUSSIAN as u64),
+                ("sights", fitted.min(limits.sights_together as u64) * render::BYTES_PER_VISIBLE as u64),
+                // Made at a time, with what they pull at: twice three f64.
+                ("pictures", work.threads * (render::BYTES_PER_VISIBLE as u64 + 48)),
+            ],
+            fixed: vec![
+                decoding,
+                ("pictures", (tests + work.views) * 12 * work.pixels),
+                ("pairs", (fitted.min(limits.sights_together as u64) + work.threads) * render::STRIP_BYTES as u64 / 3),
+            ],
+        });
+    }
+    needs.push(Need {
+        stage: "emit",
+        reads: if work.resident > 0 { 0.0 } else { 1.0 },
+        per_gaussian: vec![("rows", SCORED + 24), ("result", result)],
+        fixed: writing(work),
+    });
+    needs
+}
+
+/// Buffers of a container, or of a frame's file, in the making.
+fn writing(work: &Workload) -> Vec<Part> {
+    let block = GAUSSIAN_BLOCK as u64
+        * (2 * work.state(Columns::ALL) + 3 * FRAME_BLOCK as u64 * work.state(work.varying) + work.reader);
+    vec![("blocks", 2 * work.threads * block), ("decoding", work.decoding())]
+}
+
+/// What it takes to pack a stream of which `held` frames are in memory together, and to scan it on the way unless
+/// `measuring` is none; if it says so, to look at pictures too.
+pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<bool>) -> Need {
+    let whole = work.state(Columns::ALL);
+    let mut per_gaussian =
+        vec![("frames", held * work.state(work.varying)), ("constant columns", whole - work.state(work.varying))];
+    let mut fixed = writing(work);
+    if let Some(visible) = measuring {
+        per_gaussian.push(("accumulators", stats::BYTES_PER_GAUSSIAN as u64));
+        fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
+        if visible {
+            let nothing_held = Workload { decodes: false, ..*work };
+            let (more, pictures) = looking(&nothing_held, limits, Columns::ALL.without(Columns::SH), work.views, 12);
+            per_gaussian.extend(more);
+            fixed.extend(pictures);
+        }
+    }
+    Need { stage: "receive", reads: 0.0, per_gaussian, fixed }
+}
+
+/// What it takes to write every frame as a container.
+pub fn packing(work: &Workload, _: &Limits) -> Vec<Need> {
+    vec![Need { stage: "pack", reads: 1.0, per_gaussian: Vec::new(), fixed: writing(work) }]
+}
+
+/// What it takes to write every frame by itself.
+pub fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
+    let varying = work.state(work.varying);
+    let per_gaussian = vec![
+        ("states", work.state(Columns::ALL)),
+        ("arriving", varying),
+        ("readers", work.reader),
+        ("held", work.held(limits) * varying),
+    ];
+    vec![Need { stage: "unpack", reads: 1.0, per_gaussian, fixed: vec![("decoding", work.decoding())] }]
+}
+
+/// What it takes to make pictures of a model.
+pub fn picturing(work: &Workload, limits: &Limits) -> Vec<Need> {
+    vec![of_pictures(work, limits, "render", 1, 12)]
+}
+
+/// What it takes to make pictures of two models, each of as many Gaussians at most, and to compare them.
+pub fn picturing_both(work: &Workload, limits: &Limits) -> Vec<Need> {
+    // Both models' and the photograph, and what they are compared with.
+    let mut need = of_pictures(work, limits, "evaluate", 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
+    need.per_gaussian.push(("other model", work.resident));
+    need.fixed.push(("pictures before", 3 * 12 * work.views * work.pixels));
+    vec![need]
+}
+
+/// Pictures of `models` models, each picture with `pixel` bytes per pixel.
+fn of_pictures(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> Need {
+    let pictures = work.threads.min(limits.pictures_together as u64);
+    Need {
+        stage,
+        reads: models as f64,
+        per_gaussian: vec![
+            ("states", models * work.state(Columns::ALL)),
+            ("pictures", pictures * PICTURE_ON_ALL_THREADS),
+        ],
+        fixed: vec![
+            ("decoding", work.decoding()),
+            ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
+        ],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn work(gaussians: u64) -> Workload {
+        Workload {
+            gaussians,
+            frames: 600,
+            sh_degree: 3,
+            varying: Columns::ALL.without(Columns::SH),
+            resident: 0,
+            reader: 8,
+            decodes: true,
+            pixels: 320 * 240,
+            views: 2,
+            pictures: 1200,
+            threads: 2,
+        }
+    }
+
+    fn budget(bytes: u64) -> Budget {
+        Budget { bytes: Some(bytes), explain: false }
+    }
+
+    /// Everything compressing does under `preset`, colours fitted too.
+    fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<Need> {
+        let mut recipe = Recipe::preset(preset).unwrap();
+        recipe.refit.refit_pictures = 36;
+        move |work, limits| compressing(work, limits, &recipe, Only::Both, true)
+    }
+
+    #[test]
+    fn every_plan_keeps_to_its_budget_down_to_the_least_and_no_further() {
+        for preset in ["default", "strong"] {
+            let least = Plan::closest(work(200_000), 1, everything(preset)).peak();
+            let mut before = 0;
+            for bytes in [least, least + (8 << 20), 2 * least, 4 * least, 64 * least] {
+                let plan = Plan::fit(work(200_000), budget(bytes), everything(preset)).unwrap();
+                assert!((before..=bytes).contains(&plan.peak()), "{bytes}: {}", plan.text());
+                before = plan.peak();
+            }
+            let message = Plan::fit(work(200_000), budget(least - 1), everything(preset)).unwrap_err().to_string();
+            assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
+        }
+    }
+
+    #[test]
+    fn ten_times_the_gaussians_take_ten_times_the_stated_bytes_and_ten_times_the_frames_next_to_nothing() {
+        let peak = |work: Workload| Plan::closest(work, 1, everything("default"));
+        let (few, many) = (peak(work(100_000)), peak(work(1_000_000)));
+        let most = many.needs.iter().max_by_key(|need| need.bytes(&many.work)).unwrap();
+        assert_eq!(many.peak() - many.base() - (few.peak() - few.base()), 900_000 * most.of_gaussian());
+        let longer = peak(Workload { frames: 6000, ..work(100_000) });
+        assert!(longer.peak() as f64 / few.peak() as f64 <= 1.15, "{} {}", longer.text(), few.text());
+    }
+
+    #[test]
+    fn what_a_recipe_does_not_do_takes_nothing() {
+        let mut recipe = Recipe::preset("paper").unwrap();
+        recipe.merge.passes.clear();
+        let needs = compressing(&work(1000), &Limits::NONE, &recipe, Only::Both, true);
+        assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
+    }
+}
