@@ -18,8 +18,9 @@ pub struct Frames<'a> {
 }
 
 impl<'a> Frames<'a> {
-    /// Opens readers for the columns `columns` of the Gaussians `ids`.
-    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns) -> Result<Frames<'a>> {
+    /// Opens readers for the columns `columns` of the Gaussians `ids`, which hold at most `held` frames each
+    /// ([`BlockReader::hold`]).
+    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns, held: usize) -> Result<Frames<'a>> {
         let (info, count) = (source.info(), ids.len());
         let sh_degree = degree(info, columns);
         let blocks = (0..count.div_ceil(BLOCK))
@@ -31,7 +32,9 @@ impl<'a> Frames<'a> {
                     Ids::Range(range) => Ids::Range(range.start + rows.start..range.start + rows.end),
                     Ids::List(list) => Ids::List(&list[rows]),
                 };
-                Ok((source.open(ids)?, state))
+                let mut reader = source.open(ids)?;
+                reader.hold(held);
+                Ok((reader, state))
             })
             .collect::<Result<_>>()?;
         Ok(Frames { info, columns, count, blocks })

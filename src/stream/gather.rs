@@ -13,7 +13,9 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
         .par_chunks(BLOCK)
         .map(|ids| {
             let mut block = Gaussians::zeros(0, source.info().sh_degree);
-            source.open(Ids::List(ids))?.read(frame, want, &mut block)?;
+            let mut reader = source.open(Ids::List(ids))?;
+            reader.hold(1);
+            reader.read(frame, want, &mut block)?;
             Ok(block)
         })
         .collect::<Result<_>>()?;

@@ -144,7 +144,7 @@ impl<W: Send> Looks<W> {
         if frames.is_empty() {
             return Ok(());
         }
-        let mut reader = Frames::open(source, ids, self.want)?;
+        let mut reader = Frames::open(source, ids, self.want, usize::MAX)?;
         for batch in batches(frames, PICTURES_PER_THREAD * rayon::current_num_threads()) {
             for (slot, &(frame, _)) in batch.iter().enumerate() {
                 let want = if slot < self.states.len() { source.info().varying } else { self.want };
