@@ -10,6 +10,7 @@
 //! [component][gaussian][frame] 1%.
 
 use xxhash_rust::xxh3::xxh3_64;
+use zstd::bulk::Decompressor;
 
 use crate::error::{Error, Result};
 use crate::layout::MAX_TILE_BYTES;
@@ -124,37 +125,94 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
     Ok(EncodedTile { frames, width, len, constant, encoding, stats: stats(bits), checksum, bytes })
 }
 
-/// Decodes `stored` into `out`, which is resized to `frames · plane` values. `shuffled` is scratch of
-/// the same size. The error says what was found instead of that many values.
-pub(crate) fn decode_tile(
-    stored: &[u8],
-    encoding: Encoding,
-    frames: usize,
-    plane: usize,
-    shuffled: &mut Vec<u8>,
-    out: &mut Vec<f32>,
-) -> std::result::Result<(), String> {
-    out.resize(frames * plane, 0.0);
-    let out: &mut [u32] = bytemuck::cast_slice_mut(out);
-    let expected = 4 * out.len();
-    match encoding {
-        Encoding::Raw if stored.len() != expected => Err(format!("{} bytes", stored.len())),
-        Encoding::Raw => {
-            for (value, bytes) in out.iter_mut().zip(stored.as_chunks().0) {
-                *value = u32::from_le_bytes(*bytes);
-            }
-            Ok(())
+/// The frames of one stored tile, decoded one after the other.
+///
+/// Memory: of a filtered tile its values shuffled, as large as the values themselves, and two frames; of a raw one
+/// nothing.
+#[derive(Debug, Default)]
+pub(crate) struct Unfilter {
+    order: u8,
+    /// Four planes of bytes, each with one byte of every value.
+    shuffled: Vec<u8>,
+    /// The frame before `next` and the one before that, as [`ordered`] integers.
+    recent: [Vec<u32>; 2],
+    next: usize,
+}
+
+impl Unfilter {
+    /// Takes over a filtered tile of `frames` frames of `plane` values. The error says what was found instead of that
+    /// many values.
+    pub(crate) fn load(
+        &mut self,
+        stored: &[u8],
+        order: u8,
+        frames: usize,
+        plane: usize,
+        zstd: &mut Decompressor<'_>,
+    ) -> std::result::Result<(), String> {
+        let expected = 4 * frames * plane;
+        self.order = order;
+        self.next = 0;
+        self.shuffled.resize(expected, 0);
+        self.recent.iter_mut().for_each(|frame| frame.resize(plane, 0));
+        // The target has a fixed size: a frame that wants more is refused, whatever it claims.
+        match zstd.decompress_to_buffer(stored, self.shuffled.as_mut_slice()) {
+            Ok(len) if len == expected => Ok(()),
+            Ok(len) => Err(format!("{len} bytes after decompression")),
+            Err(error) => Err(format!("a zstd frame that does not decompress to them ({error})")),
         }
-        Encoding::Filtered { order } => {
-            shuffled.resize(expected, 0);
-            // The target has a fixed size: a frame that wants more is refused, whatever it claims.
-            match zstd::bulk::decompress_to_buffer(stored, shuffled.as_mut_slice()) {
-                Ok(len) if len == expected => {
-                    unfilter(shuffled, plane, order, out);
-                    Ok(())
+    }
+
+    /// Decodes frame `frame` into `out`, which has one value for each of a plane. A frame after the last one decoded
+    /// costs those between; any other, those from the first.
+    pub(crate) fn frame(&mut self, frame: usize, out: &mut [u32]) {
+        if self.order == 0 || frame < self.next {
+            self.next = if self.order == 0 { frame } else { 0 };
+        }
+        while self.next <= frame {
+            self.step(out);
+            self.next += 1;
+        }
+    }
+
+    /// Bytes it holds.
+    pub(crate) fn memory(&self) -> usize {
+        let [a, b] = &self.recent;
+        self.shuffled.capacity() + 4 * (a.capacity() + b.capacity())
+    }
+
+    /// Decodes frame `next`.
+    fn step(&mut self, out: &mut [u32]) {
+        let plane = out.len();
+        let [b0, b1, b2, b3]: [&[u8]; 4] = std::array::from_fn(|weight| {
+            &self.shuffled[weight * (self.shuffled.len() / 4) + self.next * plane..][..plane]
+        });
+        let stored = |i: usize| u32::from_le_bytes([b0[i], b1[i], b2[i], b3[i]]);
+        let [before, before_that] = &mut self.recent;
+        let (before, before_that) = (&mut before[..plane], &mut before_that[..plane]);
+        match order_at(self.order, self.next) {
+            0 => {
+                for i in 0..plane {
+                    out[i] = stored(i);
+                    before[i] = ordered(out[i]);
                 }
-                Ok(len) => Err(format!("{len} bytes after decompression")),
-                Err(error) => Err(format!("a zstd frame that does not decompress to them ({error})")),
+            }
+            1 => {
+                for i in 0..plane {
+                    let rank = unzigzag(stored(i)).wrapping_add(before[i]);
+                    before_that[i] = before[i];
+                    before[i] = rank;
+                    out[i] = unordered(rank);
+                }
+            }
+            _ => {
+                for i in 0..plane {
+                    let rank = unzigzag(stored(i)).wrapping_add(predict(2, before[i], before_that[i]));
+                    // It becomes the frame before below.
+                    before_that[i] = rank;
+                    out[i] = unordered(rank);
+                }
+                self.recent.swap(0, 1);
             }
         }
     }
@@ -184,11 +242,12 @@ fn unzigzag(code: u32) -> u32 {
     (code >> 1) ^ (code & 1).wrapping_neg()
 }
 
-/// What the frames before say a value will be: the last one, or the straight line through two.
+/// What the frames before say a value will be: the last one, or the straight line through two. All are
+/// [`ordered`] integers.
 fn predict(order: u8, before: u32, before_that: u32) -> u32 {
     match order {
-        1 => ordered(before),
-        _ => ordered(before).wrapping_mul(2).wrapping_sub(ordered(before_that)),
+        1 => before,
+        _ => before.wrapping_mul(2).wrapping_sub(before_that),
     }
 }
 
@@ -209,7 +268,8 @@ fn best_order(bits: &[u32], plane: usize) -> u8 {
         for frame in 2..frames {
             let at = |back: usize| &bits[(frame - back) * plane..][..plane];
             for i in (0..plane).step_by(4) {
-                let residual = ordered(at(0)[i]).wrapping_sub(predict(order, at(1)[i], at(2)[i]));
+                let predicted = predict(order, ordered(at(1)[i]), ordered(at(2)[i]));
+                let residual = ordered(at(0)[i]).wrapping_sub(predicted);
                 bits_needed += u64::from(32 - zigzag(residual).leading_zeros());
             }
         }
@@ -232,7 +292,8 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
             order => {
                 let (now, before, before_that) = (at(0), at(1), at(order.into()));
                 for (i, residual) in residuals.iter_mut().enumerate() {
-                    *residual = zigzag(ordered(now[i]).wrapping_sub(predict(order, before[i], before_that[i])));
+                    let predicted = predict(order, ordered(before[i]), ordered(before_that[i]));
+                    *residual = zigzag(ordered(now[i]).wrapping_sub(predicted));
                 }
             }
         }
@@ -243,29 +304,6 @@ fn filter(bits: &[u32], plane: usize, order: u8) -> Vec<u8> {
         }
     }
     out
-}
-
-/// The inverse of [`filter`]; `shuffled` holds four bytes for each of `out`.
-fn unfilter(shuffled: &[u8], plane: usize, order: u8, out: &mut [u32]) {
-    let count = out.len();
-    for frame in 0..count / plane {
-        let (done, rest) = out.split_at_mut(frame * plane);
-        let now = &mut rest[..plane];
-        let bytes = |weight: usize| &shuffled[weight * count + frame * plane..][..plane];
-        let (b0, b1, b2, b3) = (bytes(0), bytes(1), bytes(2), bytes(3));
-        for (i, value) in now.iter_mut().enumerate() {
-            *value = u32::from_le_bytes([b0[i], b1[i], b2[i], b3[i]]);
-        }
-        let order = order_at(order, frame);
-        if order == 0 {
-            continue;
-        }
-        let before = &done[(frame - 1) * plane..][..plane];
-        let before_that = &done[(frame - usize::from(order)) * plane..][..plane];
-        for (i, value) in now.iter_mut().enumerate() {
-            *value = unordered(unzigzag(*value).wrapping_add(predict(order, before[i], before_that[i])));
-        }
-    }
 }
 
 /// [`Stats`] of values given as bits. Compared as ordered integers, which is associative: the
@@ -304,12 +342,31 @@ mod tests {
     }
 
     fn decode(tile: &EncodedTile) -> Vec<u32> {
-        let (mut shuffled, mut out) = (Vec::new(), Vec::new());
         let frames = if tile.constant { 1 } else { tile.frames as usize };
         let plane = tile.width as usize * tile.len as usize;
-        decode_tile(&tile.bytes, tile.encoding, frames, plane, &mut shuffled, &mut out).unwrap();
-        let once: Vec<u32> = out.iter().map(|v| v.to_bits()).collect();
+        let once: Vec<u32> = match tile.encoding {
+            Encoding::Raw => tile.bytes.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect(),
+            Encoding::Filtered { order } => {
+                let mut unfilter = Unfilter::default();
+                unfilter.load(&tile.bytes, order, frames, plane, &mut Decompressor::new().unwrap()).unwrap();
+                decode_frames(&mut unfilter, plane, 0..frames)
+            }
+        };
         if tile.constant { once.repeat(tile.frames as usize) } else { once }
+    }
+
+    fn decode_frames(unfilter: &mut Unfilter, plane: usize, frames: impl Iterator<Item = usize>) -> Vec<u32> {
+        let mut one = vec![0; plane];
+        frames
+            .flat_map(|frame| {
+                unfilter.frame(frame, &mut one);
+                one.clone()
+            })
+            .collect()
+    }
+
+    fn loaded(values: &[u32], plane: usize, order: u8) -> Unfilter {
+        Unfilter { order, shuffled: filter(values, plane, order), recent: [vec![0; plane], vec![0; plane]], next: 0 }
     }
 
     proptest! {
@@ -327,9 +384,22 @@ mod tests {
                 .prop_flat_map(|(t, p)| (Just(t), Just(p), prop::collection::vec(bits(), t * p))),
         ) {
             for order in 0..=2 {
-                let mut out = vec![0; values.len()];
-                unfilter(&filter(&values, plane, order), plane, order, &mut out);
+                let out = decode_frames(&mut loaded(&values, plane, order), plane, 0..frames);
                 prop_assert_eq!(&out, &values, "order {}, {} frames", order, frames);
+            }
+        }
+
+        #[test]
+        fn frames_come_back_in_whatever_order_they_are_asked_for(
+            (plane, values, asked) in (1usize..9, 1usize..9).prop_flat_map(|(t, p)| {
+                (Just(p), prop::collection::vec(bits(), t * p), prop::collection::vec(0..t, 1..12))
+            }),
+        ) {
+            for order in 0..=2 {
+                let got = decode_frames(&mut loaded(&values, plane, order), plane, asked.iter().copied());
+                let expected: Vec<u32> =
+                    asked.iter().flat_map(|frame| values[frame * plane..][..plane].to_vec()).collect();
+                prop_assert_eq!(got, expected, "order {}, frames {:?}", order, &asked);
             }
         }
 
@@ -375,13 +445,13 @@ mod tests {
 
     #[test]
     fn decompressed_size_must_be_exact() {
-        let (mut shuffled, mut out) = (Vec::new(), Vec::new());
+        let mut unfilter = Unfilter::default();
         for len in [0usize, 39, 41, 1 << 24] {
             let bomb = zstd::bulk::compress(&vec![0; len], 1).unwrap();
-            let got = decode_tile(&bomb, Encoding::Filtered { order: 0 }, 1, 10, &mut shuffled, &mut out);
+            let got = unfilter.load(&bomb, 0, 1, 10, &mut Decompressor::new().unwrap());
             assert!(got.is_err(), "{len} bytes passed for 40");
         }
-        assert!(shuffled.len() <= 40);
+        assert!(unfilter.shuffled.capacity() <= 40);
     }
 
     #[test]

@@ -68,6 +68,20 @@ impl MappedFile {
         }
     }
 
+    /// Tells the system that the bytes of `range` will be read soon.
+    #[cfg(unix)]
+    pub(crate) fn expect(&self, range: std::ops::Range<u64>) {
+        if !range.is_empty() {
+            let len = (range.end - range.start) as usize;
+            // Advice: where it is not taken, reading just waits for the disk.
+            _ = self.map.advise_range(memmap2::Advice::WillNeed, range.start as usize, len);
+        }
+    }
+
+    /// Elsewhere the system is left to guess.
+    #[cfg(not(unix))]
+    pub(crate) fn expect(&self, _range: std::ops::Range<u64>) {}
+
     fn too_short(&self, offset: u64, len: u64) -> Error {
         let now = self.file.metadata().map_or(0, |metadata| metadata.len());
         Fault::new(offset, format!("{len} bytes"), format!("the end of the file at byte {now}")).at(&self.path)

@@ -3,14 +3,20 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use xxhash_rust::xxh3::xxh3_64;
+use xxhash_rust::xxh3::{Xxh3, xxh3_64};
+use zstd::bulk::Decompressor;
 
-use crate::codec::{Encoding, Stats, decode_tile};
-use crate::error::{Fault, Result};
+use crate::codec::{Encoding, Stats, Unfilter};
+use crate::error::{Error, Fault, Result};
 use crate::file::MappedFile;
 use crate::layout::{FIXED_HEADER, Layout, TileId};
 use crate::record::{FooterRecord, RECORD, Record, TRAILER, TileRecord, align, digest, trailer_from_bytes};
 use crate::writer::check_times;
+
+/// Bytes of a raw tile that are verified at a time.
+const PIECE: u64 = 1 << 16;
+/// Tiles closer than this are expected together.
+const NEAR: u64 = 1 << 12;
 
 /// A finished container. Memory: 64 bytes per tile and 8 per frame, three times that while opening; the values
 /// stay on disk.
@@ -27,12 +33,24 @@ pub struct Reader {
     digest: u64,
 }
 
-/// Room for a tile that has to be decoded; reuse it. Grows to three times the largest decoded tile.
-#[derive(Debug, Default)]
+/// Room for tiles that have to be read and decoded; reuse it. Grows to three times the largest decoded tile.
+#[derive(Default)]
 pub struct TileBuffer {
     stored: Vec<u8>,
-    shuffled: Vec<u8>,
+    unfilter: Unfilter,
     values: Vec<f32>,
+    /// Made when the first compressed tile comes.
+    zstd: Option<Decompressor<'static>>,
+}
+
+/// The frames of one tile, one at a time and best in order: see [`Reader::load`].
+///
+/// Memory: of a packed tile 4 bytes per value of all its frames and 8 per value of one; of a raw tile nothing.
+#[derive(Debug, Default)]
+pub struct TileFrames {
+    /// Place in the index.
+    tile: usize,
+    unfilter: Unfilter,
 }
 
 /// The values of one tile.
@@ -218,7 +236,7 @@ impl Reader {
             let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
             // Relaxed: the flag guards nothing but repeated work.
             if !self.verified[index].load(Ordering::Relaxed) {
-                check_payload(tile, bytes).map_err(|fault| fault.at(self.file.path()))?;
+                check_payload(tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
                 self.verified[index].store(true, Ordering::Relaxed);
             }
             // Offsets are multiples of 64 and maps start at a page: the bytes are aligned.
@@ -235,11 +253,84 @@ impl Reader {
         self.read_record(&self.tiles[self.index(at)?], buffer)
     }
 
+    /// Makes `frames` give the frames of a tile: decompresses it, or, if it is raw, verifies it unless it has been.
+    /// Nothing of it stays in `buffer`. By ordinary reads, like [`Reader::read_tile`].
+    pub fn load(&self, at: TileId, buffer: &mut TileBuffer, frames: &mut TileFrames) -> Result<()> {
+        let index = self.index(at)?;
+        let tile = &self.tiles[index];
+        frames.tile = index;
+        match tile.encoding {
+            Encoding::Raw => self.verify_raw(index, &mut buffer.stored),
+            Encoding::Filtered { order } => {
+                read_stored(&self.file, tile, &mut buffer.stored)?;
+                let TileBuffer { stored, zstd, .. } = buffer;
+                unfilter(&self.file, &self.layout, tile, order, stored, zstd, &mut frames.unfilter)
+            }
+        }
+    }
+
+    /// Writes the values of a frame, counted from the tile's first, into `out`: `[width, len]` of the tile that was
+    /// loaded. Of a raw tile just these bytes are read from the file.
+    ///
+    /// # Panics
+    /// If `out` is of another size, or the tile that this reader loaded last into `frames` has no such frame.
+    pub fn read_frame(&self, frames: &mut TileFrames, frame: usize, out: &mut [f32]) -> Result<()> {
+        let tile = &self.tiles[frames.tile];
+        let plane = plane_of(&self.layout, tile);
+        assert!(frame < tile.frames as usize && out.len() == plane, "frame {frame}, {} values of {tile:?}", out.len());
+        let frame = if tile.constant { 0 } else { frame };
+        match tile.encoding {
+            Encoding::Raw => {
+                self.file.read_at(tile.offset + 4 * (frame * plane) as u64, bytemuck::cast_slice_mut(out))?;
+                out.iter_mut().for_each(|value| *value = f32::from_bits(u32::from_le(value.to_bits())));
+            }
+            Encoding::Filtered { .. } => frames.unfilter.frame(frame, bytemuck::cast_slice_mut(out)),
+        }
+        Ok(())
+    }
+
+    /// Tells the system that tiles will be read soon, so that the disk brings them while others are worked on.
+    /// Costs no memory of this process; that the file cannot be read shows when it is.
+    pub fn expect(&self, tiles: impl IntoIterator<Item = TileId>) {
+        let mut ahead = 0..0;
+        for tile in tiles.into_iter().filter_map(|at| self.index(at).ok()).map(|index| &self.tiles[index]) {
+            let end = tile.offset + u64::from(tile.stored_bytes);
+            // Columns of a block lie side by side, with a record between.
+            if tile.offset < ahead.end || tile.offset - ahead.end > NEAR {
+                self.file.expect(ahead);
+                ahead = tile.offset..end;
+            }
+            ahead.end = end;
+        }
+        self.file.expect(ahead);
+    }
+
+    /// Verifies a raw tile, through `piece`, unless it has been: its frames are read one by one afterwards.
+    fn verify_raw(&self, index: usize, piece: &mut Vec<u8>) -> Result<()> {
+        // Relaxed: the flag guards nothing but repeated work.
+        if self.verified[index].load(Ordering::Relaxed) {
+            return Ok(());
+        }
+        let tile = &self.tiles[index];
+        let mut hash = Xxh3::new();
+        let mut offset = tile.offset;
+        let end = offset + u64::from(tile.stored_bytes);
+        while offset < end {
+            piece.resize((end - offset).min(PIECE) as usize, 0);
+            self.file.read_at(offset, piece)?;
+            hash.update(piece);
+            offset += piece.len() as u64;
+        }
+        check_payload(tile, hash.digest()).map_err(|fault| fault.at(self.file.path()))?;
+        self.verified[index].store(true, Ordering::Relaxed);
+        Ok(())
+    }
+
     fn index(&self, at: TileId) -> Result<usize> {
         let index = self.layout.index_of(at).filter(|&index| index < self.tiles.len() as u64);
         index.map(|index| index as usize).ok_or_else(|| {
             let frames = self.frames();
-            crate::Error::usage(format!("{}: there is no {at:?} in {frames} frames", self.file.path().display()))
+            Error::usage(format!("{}: there is no {at:?} in {frames} frames", self.file.path().display()))
         })
     }
 
@@ -259,6 +350,13 @@ impl Reader {
     }
 }
 
+impl TileFrames {
+    /// Bytes it holds.
+    pub fn memory(&self) -> usize {
+        self.unfilter.memory()
+    }
+}
+
 impl TileBuffer {
     /// The values of the tile that was read last.
     pub(crate) fn values(&self) -> &[f32] {
@@ -273,15 +371,56 @@ impl TileBuffer {
 
 /// Reads, verifies and decodes the tile of a checked record.
 pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, buffer: &mut TileBuffer) -> Result<()> {
-    buffer.stored.resize(tile.stored_bytes as usize, 0);
-    file.read_at(tile.offset, &mut buffer.stored)?;
-    check_payload(tile, &buffer.stored).map_err(|fault| fault.at(file.path()))?;
-    let plane =
-        layout.columns[tile.id.column as usize].width as usize * layout.block_len(tile.id.gaussian_block) as usize;
+    let TileBuffer { stored, unfilter: frames, values, zstd } = buffer;
+    read_stored(file, tile, stored)?;
+    values.resize(tile.values(layout), 0.0);
+    match tile.encoding {
+        Encoding::Raw => {
+            for (value, bytes) in values.iter_mut().zip(stored.as_chunks().0) {
+                *value = f32::from_le_bytes(*bytes);
+            }
+        }
+        Encoding::Filtered { order } => {
+            unfilter(file, layout, tile, order, stored, zstd, frames)?;
+            for (frame, out) in values.chunks_exact_mut(plane_of(layout, tile)).enumerate() {
+                frames.frame(frame, bytemuck::cast_slice_mut(out));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Reads and verifies the stored bytes of a tile.
+fn read_stored(file: &MappedFile, tile: &TileRecord, stored: &mut Vec<u8>) -> Result<()> {
+    stored.resize(tile.stored_bytes as usize, 0);
+    file.read_at(tile.offset, stored)?;
+    check_payload(tile, xxh3_64(stored)).map_err(|fault| fault.at(file.path()))
+}
+
+/// Decompresses the stored bytes of a filtered tile.
+fn unfilter(
+    file: &MappedFile,
+    layout: &Layout,
+    tile: &TileRecord,
+    order: u8,
+    stored: &[u8],
+    zstd: &mut Option<Decompressor<'static>>,
+    frames: &mut Unfilter,
+) -> Result<()> {
+    let zstd = match zstd {
+        Some(zstd) => zstd,
+        None => zstd.insert(Decompressor::new().map_err(Error::io("decompress", file.path()))?),
+    };
+    let plane = plane_of(layout, tile);
     let values = tile.values(layout);
-    decode_tile(&buffer.stored, tile.encoding, values / plane, plane, &mut buffer.shuffled, &mut buffer.values).map_err(
-        |found| Fault::new(tile.offset, format!("{} bytes of {:?}", 4 * values, tile.id), found).at(file.path()),
-    )
+    frames.load(stored, order, values / plane, plane, zstd).map_err(|found| {
+        Fault::new(tile.offset, format!("{} bytes of {:?}", 4 * values, tile.id), found).at(file.path())
+    })
+}
+
+/// Values of a tile in one frame.
+fn plane_of(layout: &Layout, tile: &TileRecord) -> usize {
+    layout.columns[tile.id.column as usize].width as usize * layout.block_len(tile.id.gaussian_block) as usize
 }
 
 /// Reads and checks the header: the layout, and the header's bytes.
@@ -295,16 +434,12 @@ pub(crate) fn read_header(file: &MappedFile) -> Result<(Layout, Vec<u8>)> {
     Ok((Layout::from_header(&header).map_err(fault)?, header))
 }
 
-fn check_payload(tile: &TileRecord, bytes: &[u8]) -> std::result::Result<(), Fault> {
-    let computed = xxh3_64(bytes);
+fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fault> {
     if computed == tile.checksum {
         return Ok(());
     }
-    Err(Fault::new(
-        tile.offset,
-        format!("{:?} with checksum {:016x}", tile.id, tile.checksum),
-        format!("{computed:016x}"),
-    ))
+    let expected = format!("{:?} with checksum {:016x}", tile.id, tile.checksum);
+    Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 
 fn check_footer(

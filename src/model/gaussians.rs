@@ -161,6 +161,13 @@ impl Gaussians {
         }
     }
 
+    /// The columns `which`, to write, in the order of [`Columns::ALL`].
+    pub fn columns_mut(&mut self, which: Columns) -> impl Iterator<Item = &mut Column> {
+        let Gaussians { position, rotation, log_scale, opacity_logit, sh } = self;
+        let all = [position, rotation, log_scale, opacity_logit, sh];
+        Columns::ALL.iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
+    }
+
     /// The column of a single-column set, to write.
     ///
     /// # Panics

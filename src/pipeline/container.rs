@@ -74,8 +74,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let source = opened.input.source();
     let info = source.info();
     let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
-    Plan::fit(Workload::of_input(&opened.input), input.memory, unpacking)?;
-    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL)?;
+    let held = Plan::fit(Workload::of_input(&opened.input), input.memory, unpacking)?.limits.frames_held;
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, held)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
         frames.read(0, Columns::ALL, &mut state)?;

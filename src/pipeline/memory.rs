@@ -128,9 +128,21 @@ impl Workload {
         state_bytes(self.sh_degree, of)
     }
 
-    /// Frames that a reader holds of those it decodes together.
-    fn held(&self, limits: &Limits) -> u64 {
-        if self.decodes { limits.frames_held.min(FRAME_BLOCK) as u64 } else { 0 }
+    /// Bytes per Gaussian of the frames that a reader of the columns `of` holds: one frame is not worth holding, and
+    /// a whole block takes two frames more.
+    fn held(&self, limits: &Limits, of: Columns) -> u64 {
+        let frames = match limits.frames_held {
+            _ if !self.decodes => 0,
+            0..=1 => 0,
+            FRAME_BLOCK.. => FRAME_BLOCK as u64 + 2,
+            some => some as u64,
+        };
+        frames * self.state(of & self.varying)
+    }
+
+    /// One block of each thread on its way from a reader, and what decoding it takes.
+    fn arriving(&self) -> Part {
+        ("arriving", self.decoding() + self.threads * BLOCK as u64 * (self.state(Columns::ALL) + self.reader))
     }
 
     /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
@@ -363,12 +375,10 @@ const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 fn looking(work: &Workload, limits: &Limits, columns: Columns, views: u64, sums: u64) -> (Vec<Part>, Vec<Part>) {
     let pictures = work.threads.min(limits.pictures_together as u64);
     let ready = (PICTURES_PER_THREAD as u64 * work.threads).div_ceil(views.max(1));
-    let varying = work.state(columns & work.varying);
     let per_gaussian = vec![
         ("states", ready.min(limits.frames_together as u64) * work.state(columns)),
-        ("arriving", varying),
         ("readers", work.reader),
-        ("held", work.held(limits) * varying),
+        ("held", work.held(limits, columns)),
         ("pictures", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
     ];
     let fixed =

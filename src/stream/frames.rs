@@ -3,43 +3,45 @@
 use rayon::prelude::*;
 
 use super::BLOCK;
-use crate::error::{Error, Result};
+use super::parts::Parts;
+use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{BlockReader, FrameSource, Ids};
 
 /// Open readers over Gaussians of a source.
 ///
-/// Memory per Gaussian: its reader and its state at one frame.
+/// Memory: per Gaussian its reader; per thread one block's state at one frame.
 pub struct Frames<'a> {
     info: &'a SequenceInfo,
     columns: Columns,
     count: usize,
-    blocks: Vec<(Box<dyn BlockReader + 'a>, Gaussians)>,
+    readers: Vec<Box<dyn BlockReader + 'a>>,
 }
 
 impl<'a> Frames<'a> {
-    /// Opens readers for the columns `columns` of the Gaussians `ids`.
-    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns) -> Result<Frames<'a>> {
-        let (info, count) = (source.info(), ids.len());
-        let sh_degree = degree(info, columns);
-        let blocks = (0..count.div_ceil(BLOCK))
+    /// Opens readers for the columns `columns` of the Gaussians `ids`, which hold at most `held` frames each
+    /// ([`BlockReader::hold`]).
+    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns, held: usize) -> Result<Frames<'a>> {
+        let count = ids.len();
+        let readers = (0..count.div_ceil(BLOCK))
             .into_par_iter()
             .map(|block| {
                 let rows = block * BLOCK..count.min((block + 1) * BLOCK);
-                let state = Gaussians::zeros(rows.len(), sh_degree);
                 let ids = match &ids {
                     Ids::Range(range) => Ids::Range(range.start + rows.start..range.start + rows.end),
                     Ids::List(list) => Ids::List(&list[rows]),
                 };
-                Ok((source.open(ids)?, state))
+                let mut reader = source.open(ids)?;
+                reader.hold(held);
+                Ok(reader)
             })
             .collect::<Result<_>>()?;
-        Ok(Frames { info, columns, count, blocks })
+        Ok(Frames { info: source.info(), columns, count, readers })
     }
 
     /// A state to read into.
     pub fn state(&self) -> Gaussians {
-        Gaussians::zeros(self.count, degree(self.info, self.columns))
+        Gaussians::zeros(self.count, self.sh_degree())
     }
 
     /// Reads the columns `want`, of those that were opened, at `frame` into `state`.
@@ -48,20 +50,19 @@ impl<'a> Frames<'a> {
         if want.is_empty() {
             return Ok(());
         }
-        self.blocks.par_iter_mut().try_for_each(|(reader, block)| reader.read(frame, want, block))?;
-        for column in want.iter() {
-            let target = state.column_mut(column);
-            for c in 0..target.width() {
-                for (to, (_, block)) in target.plane_mut(c).chunks_mut(BLOCK).zip(&self.blocks) {
-                    to.copy_from_slice(block.column(column).plane(c));
-                }
-            }
-        }
-        Ok::<_, Error>(())
+        let sh_degree = self.sh_degree();
+        self.readers.par_iter_mut().zip(Parts::of(state, want, self.count)).try_for_each_init(
+            || Gaussians::zeros(0, sh_degree),
+            |block, (reader, parts)| {
+                reader.read(frame, want, block)?;
+                parts.write(block, want);
+                Ok(())
+            },
+        )
     }
-}
 
-/// No room for colours that nobody reads.
-fn degree(info: &SequenceInfo, columns: Columns) -> usize {
-    if columns.contains(Columns::SH) { info.sh_degree } else { 0 }
+    /// No room for colours that nobody reads.
+    fn sh_degree(&self) -> usize {
+        if self.columns.contains(Columns::SH) { self.info.sh_degree } else { 0 }
+    }
 }

@@ -3,30 +3,28 @@
 use rayon::prelude::*;
 
 use super::BLOCK;
-use crate::error::Result;
+use super::parts::Parts;
+use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
 
 /// Columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
+///
+/// Memory: what it gives, and per thread a reader over one block and that block's state.
 pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns) -> Result<Gaussians> {
-    let blocks: Vec<Gaussians> = ids
-        .par_chunks(BLOCK)
-        .map(|ids| {
-            let mut block = Gaussians::zeros(0, source.info().sh_degree);
-            source.open(Ids::List(ids))?.read(frame, want, &mut block)?;
-            Ok(block)
-        })
-        .collect::<Result<_>>()?;
-    let mut all = Gaussians::zeros(0, source.info().sh_degree);
-    for column in want.iter() {
-        let target = all.column_mut(column);
-        target.resize(ids.len());
-        for c in 0..target.width() {
-            for (to, block) in target.plane_mut(c).chunks_mut(BLOCK).zip(&blocks) {
-                to.copy_from_slice(block.column(column).plane(c));
-            }
-        }
-    }
+    let sh_degree = source.info().sh_degree;
+    let mut all = Gaussians::zeros(0, sh_degree);
+    let parts = Parts::of(&mut all, want, ids.len());
+    ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
+        || Gaussians::zeros(0, sh_degree),
+        |block, (ids, parts)| {
+            let mut reader = source.open(Ids::List(ids))?;
+            reader.hold(1);
+            reader.read(frame, want, block)?;
+            parts.write(block, want);
+            Ok::<_, Error>(())
+        },
+    )?;
     Ok(all)
 }
 

@@ -148,7 +148,7 @@ impl<W: Send> Looks<W> {
         if frames.is_empty() {
             return Ok(());
         }
-        let mut reader = Frames::open(source, ids, self.want)?;
+        let mut reader = Frames::open(source, ids, self.want, self.limits.frames_held)?;
         let threads = rayon::current_num_threads();
         for batch in batches(frames, PICTURES_PER_THREAD * threads, self.limits.frames_together) {
             for (slot, &(frame, _)) in batch.iter().enumerate() {

@@ -71,6 +71,7 @@ impl FrameSource for MergedSequence<'_> {
             sequence: self,
             reader: self.source.open(Ids::List(&rows))?,
             state,
+            known: Columns::NONE,
             len: places.len(),
             proxies,
         }))
@@ -88,6 +89,8 @@ struct MergedReader<'a> {
     sequence: &'a MergedSequence<'a>,
     reader: Box<dyn BlockReader + 'a>,
     state: Gaussians,
+    /// What `state` holds of columns that are the same at every frame.
+    known: Columns,
     len: usize,
     proxies: Vec<Proxy>,
 }
@@ -96,7 +99,8 @@ impl BlockReader for MergedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         // Moments mix position, rotation and scale, and opacity follows from areas.
         let needed = if self.proxies.is_empty() { want } else { Columns::ALL };
-        self.reader.read(frame, needed, &mut self.state)?;
+        self.reader.read(frame, needed.without(self.known), &mut self.state)?;
+        self.known = self.known | needed.without(self.sequence.source.info().varying);
         for column in want.iter() {
             let (from, to) = (self.state.column(column), out.column_mut(column));
             to.resize(self.len);
@@ -110,5 +114,9 @@ impl BlockReader for MergedReader<'_> {
             merge_state(&members, &self.state, proxy.leader, &self.sequence.merge).write(want, proxy.row, out);
         }
         Ok(())
+    }
+
+    fn hold(&mut self, frames: usize) {
+        self.reader.hold(frames);
     }
 }

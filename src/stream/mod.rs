@@ -7,6 +7,7 @@ mod held;
 mod look;
 mod merged;
 mod motion;
+mod parts;
 mod progress;
 mod recolored;
 mod removal;

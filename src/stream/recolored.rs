@@ -45,6 +45,10 @@ impl BlockReader for RecoloredReader<'_> {
         }
         Ok(())
     }
+
+    fn hold(&mut self, frames: usize) {
+        self.reader.hold(frames);
+    }
 }
 
 /// Adds `change` to the first coefficients of every Gaussian.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileId, Writer, encode_tile};
+use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, Writer, encode_tile};
 
 /// A temporary folder, in memory where the system has one: thousands of files are synced in these tests,
 /// which costs milliseconds each on a disk.
@@ -115,7 +115,7 @@ impl Scene {
         }
     }
 
-    /// Compares the first `frames` frames through both ways of reading; an error of the reader is passed on.
+    /// Compares the first `frames` frames through all ways of reading; an error of the reader is passed on.
     pub(crate) fn compare(&self, reader: &Reader, frames: usize) -> gseq::Result<()> {
         assert_eq!(*reader.layout(), self.layout);
         assert_eq!(reader.times(), &self.times[..frames]);
@@ -128,6 +128,16 @@ impl Scene {
                 let planes = (0..tile.frames()).flat_map(|f| (0..tile.width()).map(move |c| (f, c)));
                 let got: Vec<u32> = planes.flat_map(|(f, c)| tile.plane(f, c)).map(|v| v.to_bits()).collect();
                 assert!(got == bits, "{id:?}, in place {in_place}: wrong data");
+            }
+            let mut one_by_one = TileFrames::default();
+            reader.load(id, &mut buffer, &mut one_by_one)?;
+            let mut values = vec![0.0; (width * len) as usize];
+            for (frame, bits) in bits.chunks_exact(values.len()).enumerate() {
+                reader.read_frame(&mut one_by_one, frame, &mut values)?;
+                assert!(
+                    values.iter().map(|v| v.to_bits()).eq(bits.iter().copied()),
+                    "{id:?}, frame {frame}: wrong data"
+                );
             }
         }
         Ok(())

@@ -1,0 +1,142 @@
+use std::collections::BTreeMap;
+
+use gseq::Compression;
+
+use super::*;
+use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
+use crate::select::hash_id;
+
+const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;
+const FRAMES: usize = 2 * FRAME_BLOCK + 5;
+
+/// Every way of storing a tile: positions are noise in the first block of Gaussians (no zstd shrinks it) and curves
+/// in the others; opacities move in the second frame block alone; rotations stand still in the last block of
+/// Gaussians; scales and colours never change.
+struct Made(SequenceInfo);
+
+impl Made {
+    fn new() -> Made {
+        let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
+        Made(SequenceInfo { count: COUNT, times: (0..FRAMES).map(|t| t as f64).collect(), sh_degree: 1, varying })
+    }
+
+    fn pack(&self, compression: Compression) -> (tempfile::TempDir, Container) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("made.gseq");
+        write_container(self, &path, compression, BTreeMap::new(), |_| ()).unwrap();
+        let container = Container::open(&path).unwrap();
+        (folder, container)
+    }
+
+    fn value(column: Columns, id: usize, component: usize, frame: usize) -> f32 {
+        let noise = |k: usize| (hash_id(k as u64) >> 32) as u32;
+        let key = 64 * id + component;
+        let moves = match column {
+            Columns::POSITION if id < GAUSSIAN_BLOCK => return f32::from_bits(noise(key | frame << 32) & 0xbfff_ffff),
+            Columns::POSITION => true,
+            Columns::ROTATION => id < 2 * GAUSSIAN_BLOCK,
+            Columns::OPACITY => frame / FRAME_BLOCK == 1,
+            _ => false,
+        };
+        (noise(key) as f32 * 1e-9 + if moves { 0.05 * frame as f32 } else { 0.0 }).sin()
+    }
+
+    /// What reading `want` of `ids` at `frame` must give, by the formula.
+    fn expected(&self, ids: &Ids<'_>, frame: usize, want: Columns) -> Gaussians {
+        let mut out = Gaussians::zeros(0, 1);
+        for column in want.iter() {
+            let to = out.column_mut(column);
+            to.resize(ids.len());
+            for c in 0..to.width() {
+                to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(x, id)| *x = Made::value(column, id, c, frame));
+            }
+        }
+        out
+    }
+}
+
+impl FrameSource for Made {
+    fn info(&self) -> &SequenceInfo {
+        &self.0
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        Ok(Box::new(MadeReader(self, ids.iter().map(|id| id as u32).collect())))
+    }
+}
+
+struct MadeReader<'a>(&'a Made, Vec<u32>);
+
+impl BlockReader for MadeReader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let made = self.0.expected(&Ids::List(&self.1), frame, want);
+        want.iter().for_each(|column| *out.column_mut(column) = made.column(column).clone());
+        Ok(())
+    }
+}
+
+/// A tile, the short last one, a part of one, parts of two, and Gaussians from everywhere in no order.
+fn blocks(scattered: &[u32]) -> [Ids<'_>; 5] {
+    let tile = GAUSSIAN_BLOCK;
+    [
+        Ids::Range(0..tile),
+        Ids::Range(2 * tile..COUNT),
+        Ids::Range(3..9),
+        Ids::Range(tile - 4..tile + 4),
+        Ids::List(scattered),
+    ]
+}
+
+#[test]
+fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
+    let made = Made::new();
+    let scattered = [COUNT as u32 - 1, 5, 6, 7, 2000, 4, 1024, 1023];
+    for compression in [Compression::Zstd(1), Compression::Raw] {
+        let (_folder, container) = made.pack(compression);
+        for ids in blocks(&scattered) {
+            for held in [1, 3, FRAME_BLOCK, usize::MAX] {
+                let mut reader = container.open(ids.clone()).unwrap();
+                reader.hold(held);
+                for k in 0..3 * FRAMES / 2 {
+                    let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
+                    let want = if k % 7 == 0 { Columns::ALL } else { made.info().varying };
+                    let mut got = Gaussians::zeros(0, 1);
+                    reader.read(frame, want, &mut got).unwrap();
+                    let expected = made.expected(&ids, frame, want);
+                    assert!(got == expected, "{compression:?}, {ids:?}, holding {held}: frame {frame} is wrong");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
+    let made = Made::new();
+    let varying = made.info().varying.width(1);
+    let scattered: Vec<u32> = (0..COUNT as u32).step_by(3).collect();
+    let (_folder, container) = made.pack(Compression::Zstd(1));
+    for ids in blocks(&scattered) {
+        for held in [1, 3, FRAME_BLOCK] {
+            let mut reader = container.tile_reader(&ids);
+            reader.hold(held);
+            let mut state = Gaussians::zeros(0, 1);
+            for frame in 0..FRAMES {
+                reader.read(frame, Columns::ALL, &mut state).unwrap();
+                let values = |kept: &Kept| match kept {
+                    Kept::Nothing => 0,
+                    Kept::Tile(_, frames) => frames.memory() / 4,
+                    Kept::Values(_, values) => values.capacity(),
+                };
+                let kept: usize = reader.kept.iter().map(values).sum();
+                let frames = match held {
+                    1 => 0,
+                    FRAME_BLOCK if reader.whole => FRAME_BLOCK + 2,
+                    _ => held,
+                };
+                let most = frames * varying * ids.len();
+                assert!(kept <= most, "{ids:?}, holding {held}, frame {frame}: {kept} values kept, {most} allowed");
+            }
+        }
+    }
+}

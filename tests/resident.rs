@@ -1,0 +1,65 @@
+//! Reading leaves nothing of a file resident. One test, as what is resident belongs to the whole process.
+#![cfg(target_os = "linux")]
+
+use std::collections::BTreeMap;
+use std::fs;
+
+use gseq::{Compression, TileBuffer, TileId};
+use splatsieve::demo::Scene;
+use splatsieve::emit::container::write_container;
+use splatsieve::ingest::container::Container;
+use splatsieve::model::{Columns, Gaussians};
+use splatsieve::pass::{FrameSource, Ids};
+use splatsieve::stream::Frames;
+
+const COUNT: usize = 20_000;
+const FRAMES: usize = 200;
+
+/// A line of `/proc/self/status`, in bytes.
+fn status(line: &str) -> usize {
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|found| found.strip_prefix(line)).unwrap();
+    1024 * line.trim().trim_end_matches(" kB").parse::<usize>().unwrap()
+}
+
+#[test]
+fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("raw.gseq");
+    write_container(&Scene::new(COUNT, FRAMES), &path, Compression::Raw, BTreeMap::new(), |_| ()).unwrap();
+    let file = fs::metadata(&path).unwrap().len() as usize;
+    let container = Container::open(&path).unwrap();
+    let varying = container.info().varying;
+    let before = status("RssFile:");
+    let mut most = 0;
+
+    // Block by block, as a scan does.
+    let mut state = Gaussians::zeros(0, container.info().sh_degree);
+    for start in (0..COUNT).step_by(1024) {
+        let mut reader = container.open(Ids::Range(start..COUNT.min(start + 1024))).unwrap();
+        for frame in 0..FRAMES {
+            reader.read(frame, if frame == 0 { Columns::ALL } else { varying }, &mut state).unwrap();
+        }
+        most = most.max(status("RssFile:"));
+    }
+    // Frame by frame.
+    let mut frames = Frames::open(&container, Ids::Range(0..COUNT), varying, 1).unwrap();
+    let mut state = frames.state();
+    for frame in 0..FRAMES {
+        frames.read(frame, varying, &mut state).unwrap();
+        most = most.max(status("RssFile:"));
+    }
+    let grown = most.saturating_sub(before);
+    assert!(grown < 4 << 20, "{grown} bytes more of files resident while reading {file}");
+
+    // The measure sees what stays mapped.
+    let reader = container.reader();
+    for gaussian_block in 0..reader.layout().gaussian_blocks() {
+        for frame_block in 0..reader.frame_blocks() {
+            reader.tile(TileId { column: 0, gaussian_block, frame_block }, &mut TileBuffer::default()).unwrap();
+        }
+    }
+    let positions = 12 * COUNT * FRAMES;
+    let mapped = status("RssFile:") - before;
+    assert!(mapped > positions / 2, "{mapped} bytes resident of {positions} touched in the map");
+}
