@@ -122,7 +122,7 @@ fn bending(
     if ids.is_empty() {
         return Ok(Vec::new());
     }
-    let index = PointIndex::new(&reference.position, visible);
+    let index = PointIndex::new(reference.len(), |i| visible(i).then(|| reference.position.row(i)));
     let near: Vec<Vec<u32>> = ids
         .par_iter()
         .map_init(Search::default, |search, &id| {
