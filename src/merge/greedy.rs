@@ -7,8 +7,8 @@
 //! set and matching are parallel on average", 2012): in synchronous rounds a node reads only what
 //! earlier rounds decided, so threads cannot change the outcome.
 //!
-//! In: ranks and directed pairs. Out: a leader for every node. Memory: 24 bytes per node and 4 per
-//! pair, beside the input.
+//! In: ranks and directed pairs. Out: a leader for every node. Memory: 24 bytes per node beside the
+//! input; the pairs are sorted where they lie.
 
 use rayon::prelude::*;
 
@@ -56,7 +56,7 @@ const UNDECIDED: u32 = u32::MAX;
 ///
 /// With `limit`, merging stops after exactly that many joins in sequential order: by the leader's
 /// rank, then by the member's. Members cut off stay alone.
-pub fn cluster(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> Clustering {
+pub fn cluster(rank: &[u32], pairs: Vec<(u32, u32)>, limit: Option<usize>) -> Clustering {
     let predecessors = Predecessors::new(rank, pairs);
     let mut leader_of = vec![UNDECIDED; rank.len()];
     let mut undecided: Vec<u32> = (0..rank.len() as u32).collect();
@@ -85,35 +85,28 @@ pub fn cluster(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> Clus
 /// The leaders that could take a node, for every node, by rank.
 struct Predecessors {
     start: Vec<usize>,
-    list: Vec<u32>,
+    /// (leader, member), by member.
+    pairs: Vec<(u32, u32)>,
 }
 
 impl Predecessors {
-    fn new(rank: &[u32], pairs: &[(u32, u32)]) -> Self {
+    fn new(rank: &[u32], mut pairs: Vec<(u32, u32)>) -> Self {
+        pairs.par_sort_unstable_by_key(|&(leader, member)| (member, rank[leader as usize]));
         let mut start = vec![0; rank.len() + 1];
-        for &(_, member) in pairs {
+        for &(_, member) in &pairs {
             start[member as usize + 1] += 1;
         }
         for node in 0..rank.len() {
             start[node + 1] += start[node];
         }
-        let mut list = vec![0; pairs.len()];
-        let mut next = start.clone();
-        for &(leader, member) in pairs {
-            list[next[member as usize]] = leader;
-            next[member as usize] += 1;
-        }
-        for node in 0..rank.len() {
-            list[start[node]..start[node + 1]].sort_unstable_by_key(|&leader| rank[leader as usize]);
-        }
-        Predecessors { start, list }
+        Predecessors { start, pairs }
     }
 
     /// The leader of `node` (itself if it leads) as far as `leader_of` tells; none while an earlier
     /// predecessor that might take it is undecided.
     fn decide(&self, node: u32, leader_of: &[u32]) -> Option<u32> {
-        let list = &self.list[self.start[node as usize]..self.start[node as usize + 1]];
-        for &predecessor in list {
+        let of_node = &self.pairs[self.start[node as usize]..self.start[node as usize + 1]];
+        for &(predecessor, _) in of_node {
             match leader_of[predecessor as usize] {
                 UNDECIDED => return None,
                 leader if leader == predecessor => return Some(leader),
@@ -184,7 +177,7 @@ mod tests {
     }
 
     fn assert_sequential(rank: &[u32], pairs: &[(u32, u32)], limit: Option<usize>) -> Clustering {
-        let got = cluster(rank, pairs, limit);
+        let got = cluster(rank, pairs.to_vec(), limit);
         let (leader_of, joins) = one_by_one(rank, pairs, limit);
         assert_eq!((&got.leader_of, got.joins), (&leader_of, joins), "limit {limit:?}");
         got
@@ -200,7 +193,7 @@ mod tests {
         fn the_order_of_pairs_does_not_matter((rank, pairs) in graph()) {
             let mut reversed = pairs.clone();
             reversed.reverse();
-            prop_assert_eq!(cluster(&rank, &pairs, None), cluster(&rank, &reversed, None));
+            prop_assert_eq!(cluster(&rank, pairs, None), cluster(&rank, reversed, None));
         }
     }
 
@@ -224,16 +217,16 @@ mod tests {
         let star: Vec<(u32, u32)> = (1..n).map(|i| (0, i)).collect();
         assert_eq!(assert_sequential(&rank, &star, None).leader_of, vec![0; n as usize]);
         let crowd: Vec<(u32, u32)> = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect();
-        let got = cluster(&rank, &crowd, None);
+        let got = cluster(&rank, crowd, None);
         assert_eq!((got.leader_of, got.sequential), (vec![0; n as usize], false));
     }
 
     #[test]
     fn a_member_does_not_lead_and_the_earliest_leader_wins() {
         // 0 takes 1; 1 could take 2 but was taken; 3 passes with 2 only, so 2 leads it.
-        let got = cluster(&[0, 1, 2, 3], &[(0, 1), (1, 2), (2, 3)], None);
+        let got = cluster(&[0, 1, 2, 3], vec![(0, 1), (1, 2), (2, 3)], None);
         assert_eq!(got.leader_of, [0, 0, 2, 2]);
-        let got = cluster(&[1, 0, 2], &[(0, 2), (1, 2)], None);
+        let got = cluster(&[1, 0, 2], vec![(0, 2), (1, 2)], None);
         assert_eq!(got.leader_of, [0, 1, 1]);
     }
 

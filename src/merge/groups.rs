@@ -1,19 +1,17 @@
 //! A partition of survivors into groups, each with a leader.
 
-/// Groups of the rows 0..M, in the order of their leaders' rows. Memory: 16 bytes per row.
+/// Groups of some rows, in the order of their leaders' rows. Memory: 12 bytes per row at most.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Groups {
     leaders: Vec<u32>,
     start: Vec<u32>,
     members: Vec<u32>,
-    group_of: Vec<u32>,
 }
 
 impl Groups {
-    /// Every row for itself.
-    pub fn alone(rows: usize) -> Self {
-        let all: Vec<u32> = (0..rows as u32).collect();
-        Groups { leaders: all.clone(), start: (0..=rows as u32).collect(), members: all.clone(), group_of: all }
+    /// Each of `rows` (increasing) for itself.
+    pub fn alone(rows: &[u32]) -> Self {
+        Groups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
     /// These groups after group g joined group `leader_of[g]`, which stayed its own; the joined
@@ -27,23 +25,25 @@ impl Groups {
                 leaders.push(self.leaders[group]);
             }
         }
-        let group_of: Vec<u32> =
-            self.group_of.iter().map(|&group| number[leader_of[group as usize] as usize]).collect();
+        let joined = |group: usize| number[leader_of[group] as usize] as usize;
         let mut start = vec![0; leaders.len() + 1];
-        for &group in &group_of {
-            start[group as usize + 1] += 1;
+        for group in 0..self.len() {
+            start[joined(group) + 1] += self.members(group).len() as u32;
         }
         for group in 0..leaders.len() {
             start[group + 1] += start[group];
         }
         let mut next = start.clone();
-        let mut members = vec![0; group_of.len()];
-        for (row, &group) in group_of.iter().enumerate() {
-            let place = &mut next[group as usize];
-            members[*place as usize] = row as u32;
-            *place += 1;
+        let mut members = vec![0; self.members.len()];
+        for group in 0..self.len() {
+            let (place, of_group) = (&mut next[joined(group)], self.members(group));
+            members[*place as usize..][..of_group.len()].copy_from_slice(of_group);
+            *place += of_group.len() as u32;
         }
-        Groups { leaders, start, members, group_of }
+        for group in start.windows(2) {
+            members[group[0] as usize..group[1] as usize].sort_unstable();
+        }
+        Groups { leaders, start, members }
     }
 
     /// Number of groups.
@@ -66,9 +66,9 @@ impl Groups {
         &self.members[self.start[group] as usize..self.start[group + 1] as usize]
     }
 
-    /// The group of every row: the index map from old to new.
-    pub fn group_of(&self) -> &[u32] {
-        &self.group_of
+    /// The groups of more than one member.
+    pub fn clusters(&self) -> impl Iterator<Item = u32> {
+        (0..self.len() as u32).filter(|&group| self.members(group as usize).len() > 1)
     }
 }
 
@@ -78,13 +78,13 @@ mod tests {
 
     #[test]
     fn joining_twice_flattens_to_original_rows() {
-        // Rows 1 and 3 join 4; then group of 4 joins that of 0.
-        let once = Groups::alone(5).joined(&[0, 4, 2, 4, 4]);
-        assert_eq!(once.leaders(), [0, 2, 4]);
-        assert_eq!((once.members(0), once.members(1), once.members(2)), (&[0][..], &[2][..], &[1, 3, 4][..]));
+        // Rows 2 and 4 join 5; then group of 5 joins that of 1.
+        let once = Groups::alone(&[1, 2, 3, 4, 5]).joined(&[0, 4, 2, 4, 4]);
+        assert_eq!(once.leaders(), [1, 3, 5]);
+        assert_eq!((once.members(0), once.members(1), once.members(2)), (&[1][..], &[3][..], &[2, 4, 5][..]));
         let twice = once.joined(&[0, 1, 0]);
-        assert_eq!((twice.leaders(), twice.group_of()), (&[0, 2][..], &[0, 0, 1, 0, 0][..]));
-        assert_eq!(twice.members(0), [0, 1, 3, 4]);
-        assert!(Groups::alone(0).joined(&[]).is_empty());
+        assert_eq!((twice.leaders(), twice.len()), (&[1, 3][..], 2));
+        assert_eq!((twice.members(0), twice.members(1)), (&[1, 2, 4, 5][..], &[3][..]));
+        assert!(Groups::alone(&[]).joined(&[]).is_empty());
     }
 }

@@ -6,53 +6,76 @@
 //! ```
 //!
 //! In: the survivors' states at the reference frame, and whoever can measure the motion of pairs. Out:
-//! groups of survivors and one state per group. Memory per survivor: 30 bytes for the neighbour index,
-//! 24 for the clustering, 48 for groups and ranks, and its state twice; per candidate pair (at most
-//! `max_neighbors` per survivor, 3.5 measured among evenly strewn Gaussians) 28 bytes, [`motion::PAIR_BYTES`] and a
-//! [`PairMeasure`].
+//! groups of survivors and one state per group of several.
+//!
+//! Memory, all of it resident at once at the worst: per survivor its state, which the caller holds, the states of
+//! proxies, of which there are half as many at most, before a pass and after it, and [`BYTES_PER_SURVIVOR`]; per
+//! candidate pair [`BYTES_PER_PAIR`]. Candidate pairs are at most `max_neighbors` per survivor, 3.5 measured among
+//! evenly strewn Gaussians. Whoever measures motion needs more, for as many pairs at a time as it likes;
+//! [`voxels`] says which pairs to take together.
 
 pub mod gates;
 pub mod greedy;
 mod groups;
+pub mod known;
 pub mod moments;
 pub mod motion;
 pub mod neighbors;
 pub mod proxy;
+pub mod voxels;
 
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::model::{Columns, Gaussians};
 use crate::recipe;
+use crate::select::hash_id;
 use gates::{Gates, Look};
 pub use groups::Groups;
-use motion::{MotionGate, PairMeasure};
+use known::KNOWN_BYTES;
 use neighbors::{PointIndex, Search};
 use proxy::Importance;
 
-/// Memory per survivor beside its states, see above.
-pub const BYTES_PER_SURVIVOR: usize = 102;
-/// Memory per pair.
-pub const BYTES_PER_PAIR: usize = 152;
+/// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
+/// rank 4, and the larger of the neighbour index, 30 and a flag, and the clustering, 24.
+pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 31;
+
+/// Memory per candidate pair beside what measuring it takes: the pair, the same pair as one to be measured, and what is
+/// known of it ([`known::KnownPairs`]).
+pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + KNOWN_BYTES;
 
 /// Nodes whose neighbours one task looks up.
 const CHUNK: usize = 1024;
 
-/// The Gaussians to merge, in the order of their ids.
+/// The Gaussians to merge: some rows of a table of states.
 #[derive(Debug, Clone, Copy)]
 pub struct Survivors<'a> {
-    /// M states at the reference frame.
+    /// States at the reference frame. Of the harmonics only the first band is read; proxies get as many as there are.
     pub states: &'a Gaussians,
-    /// C `[M]`: the size that ranks leaders, and part of the weights.
-    pub coverage: &'a [f64],
-    /// Vis `[M]`.
-    pub visibility: &'a [f64],
-    /// Hashed ids `[M]`, which break ties of size.
-    pub hash: &'a [u64],
-    /// Whether each of the M may merge. A row that is not finite never does.
+    /// The M rows that survive, increasing.
+    pub rows: &'a [u32],
+    /// Ids of all rows, whose hashes break ties of size; C by id, the size that ranks leaders; and Vis by id.
+    pub importance: Importance<'a>,
+    /// Whether each of the rows may merge. One whose state is not finite never does.
     pub mergeable: &'a [bool],
-    /// Scene extent, the unit of [`LengthUnit::Extent`].
+    /// Scene extent, the unit of [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
     pub extent: f64,
+}
+
+/// Pairs of a pass whose motion is asked for.
+#[derive(Debug, Clone, Copy)]
+pub struct Asked<'a> {
+    pairs: &'a [(u32, u32)],
+    row: &'a [u32],
+    /// ε of the pass, scene units: the nodes of a pair lie within it.
+    pub reach: f64,
+}
+
+impl<'a> Asked<'a> {
+    /// The pairs, as rows of the states.
+    pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
+        self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
+    }
 }
 
 /// What merging made of the survivors.
@@ -60,8 +83,8 @@ pub struct Survivors<'a> {
 pub struct Merged {
     /// Who stands for whom.
     pub groups: Groups,
-    /// One state per group at the reference frame; groups of one are unchanged to the byte.
-    pub states: Gaussians,
+    /// State at the reference frame of every group of more than one member, in their order.
+    pub proxies: Gaussians,
     /// What each pass did; passes after the limit was met are not made.
     pub passes: Vec<PassCounts>,
 }
@@ -83,24 +106,12 @@ pub struct PassCounts {
     pub sequential: bool,
 }
 
-/// Pairs that pass tests 1 and 2.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Candidates {
-    /// Rank of every node, see [`greedy::ranks`].
-    pub rank: Vec<u32>,
-    /// (leader, member): the member is among the leader's nearest neighbours and ranks behind it. By
-    /// leader, then by distance.
-    pub pairs: Vec<(u32, u32)>,
-    /// Nodes with more neighbours within ε than were looked at.
-    pub truncated: usize,
-}
-
 /// All passes of `recipe` over `survivors`.
 ///
-/// `measure` answers test 3: for pairs of survivors (rows of `survivors.states`) it returns their
-/// [`PairMeasure`]s in the same order. It is asked once per pass, unless no pair is left. A measure
-/// depends on the pair alone, so the caller may remember it by ids. In later passes nodes are groups:
-/// state = proxy over all original members, size = ΣC, trajectory, life and hash = the leader's.
+/// `measure` answers test 3: for every pair, in order, how alike it moves; a pair passes where that exceeds the pass's
+/// τ_m. It is asked once per pass, unless no pair is left. The answer depends on the pair alone, so the caller may
+/// remember it. In later passes nodes are groups: state = proxy over all original members, size = ΣC, trajectory,
+/// life and hash = the leader's.
 ///
 /// With `limit`, merging stops after exactly that many joins over all passes, or fewer if there are
 /// not so many; the joins kept are the first ones in sequential order. Fails only if `measure` does.
@@ -108,94 +119,140 @@ pub fn run<E>(
     survivors: &Survivors<'_>,
     recipe: &recipe::Merge,
     limit: Option<usize>,
-    mut measure: impl FnMut(&[(u32, u32)]) -> Result<Vec<PairMeasure>, E>,
+    mut measure: impl FnMut(Asked<'_>) -> Result<Vec<f64>, E>,
 ) -> Result<Merged, E> {
-    let importance = Importance { coverage: survivors.coverage, visibility: survivors.visibility };
+    let importance = &survivors.importance;
     let unit = recipe.length_unit.in_scene_units(survivors.extent);
-    let mut groups = Groups::alone(survivors.states.len());
-    let mut states = survivors.states.clone();
+    let mut groups = Groups::alone(survivors.rows);
+    let mut proxies = survivors.states.pick(&[]);
     let (mut passes, mut left) = (Vec::new(), limit);
     for pass in &recipe.passes {
         if left == Some(0) {
             break;
         }
-        let sizes: Vec<f64> = (0..groups.len())
-            .map(|group| groups.members(group).iter().map(|&row| survivors.coverage[row as usize]).sum())
-            .collect();
-        let hashes: Vec<u64> = groups.leaders().iter().map(|&row| survivors.hash[row as usize]).collect();
-        let mergeable: Vec<bool> = groups.leaders().iter().map(|&row| survivors.mergeable[row as usize]).collect();
-        let rank = greedy::ranks(&sizes, &hashes);
-        let candidates = candidates(&states, rank, &mergeable, recipe, pass, unit);
-        let row = |node: u32| groups.leaders()[node as usize];
-        let rows: Vec<(u32, u32)> = candidates.pairs.iter().map(|&(i, j)| (row(i), row(j))).collect();
-        let measures = if rows.is_empty() { Vec::new() } else { measure(&rows)? };
-        debug_assert_eq!(measures.len(), rows.len(), "one measure per pair");
-        let gate = MotionGate::new(recipe, pass, unit);
-        let passing: Vec<(u32, u32)> = candidates
-            .pairs
-            .iter()
-            .zip(&measures)
-            .filter(|(_, measure)| gate.passes(measure))
-            .map(|(&pair, _)| pair)
-            .collect();
-        let clustering = greedy::cluster(&candidates.rank, &passing, left);
+        let rank = ranks(&groups, importance);
+        let nodes = Nodes::new(survivors, &groups, &proxies);
+        let (mut pairs, truncated) = candidates(&nodes, &rank, recipe, pass, unit);
+        let candidates = pairs.len();
+        if candidates > 0 {
+            let likeness = measure(Asked { pairs: &pairs, row: groups.leaders(), reach: pass.epsilon * unit })?;
+            debug_assert_eq!(likeness.len(), candidates, "one likeness per pair");
+            let mut likeness = likeness.into_iter();
+            pairs.retain(|_| likeness.next().is_some_and(|likeness| likeness > pass.tau_m));
+        }
+        let passing = pairs.len();
+        let clustering = greedy::cluster(&rank, pairs, left);
         left = left.map(|left| left - clustering.joins);
         passes.push(PassCounts {
-            truncated: candidates.truncated,
-            candidates: candidates.pairs.len(),
-            passing: passing.len(),
+            truncated,
+            candidates,
+            passing,
             joins: clustering.joins,
             rounds: clustering.rounds,
             sequential: clustering.sequential,
         });
         groups = groups.joined(&clustering.leader_of);
-        states = proxy::merge_groups(&groups, &importance, survivors.states, recipe);
+        proxies = proxy::merge_groups(&groups, importance, survivors.states, recipe);
     }
-    Ok(Merged { groups, states, passes })
+    Ok(Merged { groups, proxies, passes })
 }
 
-/// The pairs of nodes that pass tests 1 and 2 of `pass`, `unit` being the length of one unit of the
-/// recipe. A node that is not `mergeable` or not finite leads nobody, joins nobody and takes no place
-/// among the nearest neighbours of others.
-pub fn candidates(
-    states: &Gaussians,
-    rank: Vec<u32>,
-    mergeable: &[bool],
+/// The rank of every group: by ΣC, ties by the hash of the leader's id.
+fn ranks(groups: &Groups, importance: &Importance<'_>) -> Vec<u32> {
+    let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
+    let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
+    let hash = |&row: &u32| hash_id(importance.ids[row as usize].into());
+    let hashes: Vec<u64> = groups.leaders().iter().map(hash).collect();
+    greedy::ranks(&sizes, &hashes)
+}
+
+/// The groups of a pass: Gaussians that are alone, and proxies.
+struct Nodes<'a> {
+    survivors: &'a Survivors<'a>,
+    groups: &'a Groups,
+    proxies: &'a Gaussians,
+    /// Row of the survivors' states, or of the proxies.
+    place: Vec<u32>,
+}
+
+impl<'a> Nodes<'a> {
+    fn new(survivors: &'a Survivors<'a>, groups: &'a Groups, proxies: &'a Gaussians) -> Self {
+        let mut place = groups.leaders().to_vec();
+        for (proxy, group) in groups.clusters().enumerate() {
+            place[group as usize] = proxy as u32;
+        }
+        Nodes { survivors, groups, proxies, place }
+    }
+
+    fn len(&self) -> usize {
+        self.place.len()
+    }
+
+    /// The states among which that of `node` is, and its row.
+    fn state(&self, node: usize) -> (&Gaussians, usize) {
+        let alone = self.groups.members(node).len() == 1;
+        (if alone { self.survivors.states } else { self.proxies }, self.place[node] as usize)
+    }
+
+    fn is_usable(&self, node: usize) -> bool {
+        let (states, row) = self.state(node);
+        self.survivors.mergeable[self.groups.leaders()[node] as usize] && is_finite(states, row)
+    }
+
+    fn position(&self, node: usize) -> [f32; 3] {
+        let (states, row) = self.state(node);
+        states.position.row(row)
+    }
+
+    fn look(&self, node: usize) -> Look {
+        let (states, row) = self.state(node);
+        Look::new(states, row)
+    }
+}
+
+/// The pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`, `unit` being the length of one unit of the
+/// recipe: the member is among the leader's nearest neighbours and ranks behind it. By leader, then by distance. Also
+/// the number of nodes with more neighbours within ε than were looked at.
+///
+/// A node that is not mergeable or not finite leads nobody, joins nobody and takes no place among the nearest
+/// neighbours of others.
+fn candidates(
+    nodes: &Nodes<'_>,
+    rank: &[u32],
     recipe: &recipe::Merge,
     pass: &recipe::MergePass,
     unit: f64,
-) -> Candidates {
-    let usable: Vec<bool> =
-        mergeable.iter().zip(finite_rows(states)).map(|(&wanted, finite)| wanted && finite).collect();
-    let index = PointIndex::new(&states.position, |i| usable[i]);
+) -> (Vec<(u32, u32)>, usize) {
+    let usable: Vec<bool> = (0..nodes.len()).map(|node| nodes.is_usable(node)).collect();
+    let index = PointIndex::new(nodes.len(), |node| usable[node].then(|| nodes.position(node)));
     let gates = Gates::new(recipe, pass);
     let epsilon = pass.epsilon * unit;
     let of_chunk = |search: &mut Search, chunk: usize| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
-        for i in (chunk * CHUNK..((chunk + 1) * CHUNK).min(states.len())).filter(|&i| usable[i]) {
-            let look = Look::new(states, i);
-            let (near, cut) = index.nearest(i as u32, states.position.row(i), recipe.max_neighbors, epsilon, search);
+        for i in (chunk * CHUNK..((chunk + 1) * CHUNK).min(nodes.len())).filter(|&i| usable[i]) {
+            let look = nodes.look(i);
+            let (near, cut) = index.nearest(i as u32, nodes.position(i), recipe.max_neighbors, epsilon, search);
             truncated += usize::from(cut);
             let behind = near.filter(|&j| rank[i] < rank[j as usize]);
-            pairs.extend(behind.filter(|&j| gates.pass(&look, &Look::new(states, j as usize))).map(|j| (i as u32, j)));
+            pairs.extend(behind.filter(|&j| gates.pass(&look, &nodes.look(j as usize))).map(|j| (i as u32, j)));
         }
         (pairs, truncated)
     };
     let chunks: Vec<(Vec<(u32, u32)>, usize)> =
-        (0..states.len().div_ceil(CHUNK)).into_par_iter().map_init(Search::default, of_chunk).collect();
-    let truncated = chunks.iter().map(|(_, truncated)| truncated).sum();
-    Candidates { rank, pairs: chunks.into_iter().flat_map(|(pairs, _)| pairs).collect(), truncated }
+        (0..nodes.len().div_ceil(CHUNK)).into_par_iter().map_init(Search::default, of_chunk).collect();
+    let mut pairs = Vec::with_capacity(chunks.iter().map(|(pairs, _)| pairs.len()).sum());
+    let mut truncated = 0;
+    for (of_chunk, cut) in chunks {
+        pairs.extend(of_chunk);
+        truncated += cut;
+    }
+    (pairs, truncated)
 }
 
-/// Whether every value of each row is finite.
-fn finite_rows(states: &Gaussians) -> Vec<bool> {
-    let mut finite = vec![true; states.len()];
-    for column in Columns::ALL.iter().map(|column| states.column(column)) {
-        for plane in (0..column.width()).map(|c| column.plane(c)) {
-            finite.iter_mut().zip(plane).for_each(|(finite, value)| *finite &= value.is_finite());
-        }
-    }
-    finite
+/// Whether every value of a row is finite.
+pub fn is_finite(states: &Gaussians, row: usize) -> bool {
+    let columns = Columns::ALL.iter().map(|column| states.column(column));
+    columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))
 }
 
 #[cfg(test)]

@@ -1,14 +1,13 @@
 //! Test 3: whether two Gaussians move alike over their common life, measured as frames stream by.
 //!
 //! In: pairs, then the positions and liveness of every node frame by frame. Out: a [`PairMeasure`]
-//! for each pair, independent of any threshold. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`]
-//! per node; nothing grows with the number of frames. A pair is summed by one thread in frame
-//! order, so threads do not change the sums.
+//! for each pair, independent of any threshold, which a [`MotionGate`] turns into the one number that passes
+//! compare with their τ_m. Memory: [`PAIR_BYTES`] per pair and [`NODE_BYTES`] per node; nothing grows with the
+//! number of frames. A pair is summed by one thread in frame order, so threads do not change the sums.
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::model::Column;
 use crate::recipe::{self, Motion, Trajectory};
 
 /// Memory of one pair while frames stream by.
@@ -55,37 +54,37 @@ impl PairMeasure {
     }
 }
 
-/// The thresholds of test 3, lengths in scene units.
+/// What every pass asks of a pair in test 3, lengths in scene units; how alike is enough is the pass's τ_m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionGate {
     trajectory: Trajectory,
-    tau: f64,
     noise: f64,
     max_drift: f64,
     max_dead_time: f64,
 }
 
 impl MotionGate {
-    /// The thresholds of `pass` and of `merge`; `unit` is the length of one unit of the recipe.
-    pub fn new(merge: &recipe::Merge, pass: &recipe::MergePass, unit: f64) -> Self {
+    /// The thresholds of `merge`; `unit` is the length of one unit of the recipe.
+    pub fn new(merge: &recipe::Merge, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of no extent.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
         MotionGate {
             trajectory: merge.trajectory,
-            tau: pass.tau_m,
             noise: merge.motion_noise * unit,
             max_drift,
             max_dead_time: merge.max_dead_time,
         }
     }
 
-    /// Whether the pair moves alike: lives that never meet do not.
-    pub fn passes(&self, pair: &PairMeasure) -> bool {
-        let alike = match self.trajectory {
+    /// How alike the pair moves, in [−1, 1]: it passes test 3 where this exceeds τ_m. NaN, which exceeds no τ_m
+    /// whatever, for lives that never meet, that have too much dead time together, and for pairs that drift apart.
+    pub fn likeness(&self, pair: &PairMeasure) -> f64 {
+        let together = pair.common > 0 && pair.drift <= self.max_drift && pair.dead_time() <= self.max_dead_time;
+        match self.trajectory {
+            _ if !together => f64::NAN,
             Trajectory::Cosine => pair.cosine,
             Trajectory::Alignment => pair.alignment(self.noise),
-        };
-        pair.common > 0 && alike > self.tau && pair.drift <= self.max_drift && pair.dead_time() <= self.max_dead_time
+        }
     }
 }
 
@@ -121,14 +120,16 @@ pub struct PairMotion {
 }
 
 impl PairMotion {
-    /// Starts measuring `pairs` of nodes whose positions at the reference frame are `reference`
-    /// `[3, N]`. `motion` says which steps count: `Literal` those that end in the common life,
-    /// `Runs` those that begin there too.
-    pub fn new(pairs: &[(u32, u32)], reference: &Column, motion: Motion) -> Self {
-        let track = |i| {
-            let reference = reference.row(i);
-            Track { reference, now: reference, before: reference, alive: false, alive_before: false }
-        };
+    /// Starts measuring `pairs` of nodes; `reference` gives the position of each of the N nodes at the reference
+    /// frame. `motion` says which steps count: `Literal` those that end in the common life, `Runs` those
+    /// that begin there too.
+    pub fn new(
+        pairs: impl ExactSizeIterator<Item = (u32, u32)>,
+        reference: impl ExactSizeIterator<Item = [f32; 3]>,
+        motion: Motion,
+    ) -> Self {
+        let track =
+            |reference| Track { reference, now: reference, before: reference, alive: false, alive_before: false };
         let fresh = Pair {
             nodes: (0, 0),
             cosines: 0.0,
@@ -142,16 +143,16 @@ impl PairMotion {
         PairMotion {
             motion,
             frames: 0,
-            tracks: (0..reference.len()).map(track).collect(),
-            pairs: pairs.iter().map(|&nodes| Pair { nodes, ..fresh }).collect(),
+            tracks: reference.map(track).collect(),
+            pairs: pairs.map(|nodes| Pair { nodes, ..fresh }).collect(),
         }
     }
 
-    /// Takes the next frame: positions `[3, N]` and whether each of the N nodes is alive.
-    pub fn frame(&mut self, position: &Column, alive: &[bool]) {
+    /// Takes the next frame: `state` gives position and liveness of each of the N nodes.
+    pub fn frame(&mut self, state: impl Fn(usize) -> ([f32; 3], bool) + Sync) {
         self.tracks.par_iter_mut().enumerate().for_each(|(i, track)| {
             (track.before, track.alive_before) = (track.now, track.alive);
-            (track.now, track.alive) = (position.row(i), alive[i]);
+            (track.now, track.alive) = state(i);
         });
         let steps_end_here = self.frames > 0;
         let (tracks, motion) = (&self.tracks, self.motion);
@@ -171,9 +172,9 @@ impl PairMotion {
     }
 
     /// What the frames so far say of each pair, in the order given.
-    pub fn finish(self) -> Vec<PairMeasure> {
+    pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
         let motion = self.motion;
-        let measure = |pair: Pair| {
+        let measure = move |pair: Pair| {
             let terms = match motion {
                 Motion::Literal => pair.common,
                 Motion::Runs => pair.steps,
@@ -188,7 +189,7 @@ impl PairMotion {
                 drift: pair.drift_squared.sqrt(),
             }
         };
-        self.pairs.into_iter().map(measure).collect()
+        self.pairs.into_iter().map(measure)
     }
 }
 
@@ -231,16 +232,16 @@ mod tests {
 
     /// Measures the pair (0, 1) of nodes that move along x; reference frame 0.
     fn measure(a: &Path, b: &Path, motion: Motion) -> PairMeasure {
-        let column = |t: usize| {
-            let mut column = Column::zeros(3, 2);
-            column.plane_mut(0).copy_from_slice(&[a[t].0, b[t].0]);
-            column
+        let state = |t: usize, node: usize| {
+            let (x, alive) = [a, b][node][t];
+            ([x, 0.0, 0.0], alive)
         };
-        let mut pairs = PairMotion::new(&[(0, 1)], &column(0), motion);
+        let reference = (0..2).map(|node| state(0, node).0);
+        let mut pairs = PairMotion::new([(0, 1)].into_iter(), reference, motion);
         for t in 0..a.len() {
-            pairs.frame(&column(t), &[a[t].1, b[t].1]);
+            pairs.frame(|node| state(t, node));
         }
-        pairs.finish()[0]
+        pairs.finish().next().unwrap()
     }
 
     fn path(x: impl Fn(usize) -> f32) -> Path {
@@ -250,12 +251,12 @@ mod tests {
     /// Verdict of the default recipe in a scene of extent `extent`.
     fn merges(a: &Path, b: &Path, extent: f64) -> bool {
         let merge = Recipe::preset("default").unwrap().merge;
-        MotionGate::new(&merge, &merge.passes[0], extent).passes(&measure(a, b, Motion::Runs))
+        MotionGate::new(&merge, extent).likeness(&measure(a, b, Motion::Runs)) > merge.passes[0].tau_m
     }
 
     fn merges_in_paper(a: &Path, b: &Path) -> bool {
         let merge = Recipe::preset("paper").unwrap().merge;
-        MotionGate::new(&merge, &merge.passes[0], 1.0).passes(&measure(a, b, Motion::Literal))
+        MotionGate::new(&merge, 1.0).likeness(&measure(a, b, Motion::Literal)) > merge.passes[0].tau_m
     }
 
     #[test]
@@ -303,10 +304,13 @@ mod tests {
         let mut merge = Recipe::preset("default").unwrap().merge;
         merge.max_dead_time = f64::INFINITY;
         merge.max_drift = f64::INFINITY;
-        let gate = MotionGate::new(&merge, &merge.passes[0], 1.0);
-        assert!(!gate.passes(&measure(&first, &last, Motion::Runs)));
+        // No threshold lets them through, not even one that all alignments exceed.
+        let exceeds =
+            |a: &Path, b: &Path, tau: f64| MotionGate::new(&merge, 1.0).likeness(&measure(a, b, Motion::Runs)) > tau;
+        assert!(!exceeds(&first, &last, f64::NEG_INFINITY));
         let never: Path = vec![(0.0, false); 20];
-        assert!(!gate.passes(&measure(&never, &never, Motion::Runs)));
+        assert!(!exceeds(&never, &never, f64::NEG_INFINITY));
+        assert!(exceeds(&first, &first, -2.0));
     }
 
     #[test]

@@ -12,8 +12,6 @@
 
 use std::collections::BinaryHeap;
 
-use crate::model::Column;
-
 /// Points in a leaf, at most.
 const LEAF: usize = 8;
 /// Subtrees smaller than this are built by one thread.
@@ -51,13 +49,12 @@ pub struct Search {
 }
 
 impl PointIndex {
-    /// Indexes those points of `position` `[3, N]` that `include` accepts and that are finite.
-    pub fn new(position: &Column, include: impl Fn(usize) -> bool) -> Self {
-        let mut points: Vec<Point> = (0..position.len())
-            .filter(|&i| include(i))
-            .map(|i| Point { at: position.row(i), index: i as u32 })
-            .filter(|point| point.at.iter().all(|x| x.is_finite()))
-            .collect();
+    /// Indexes those of `count` points that `position` has a place for and that are finite.
+    pub fn new(count: usize, position: impl Fn(usize) -> Option<[f32; 3]>) -> Self {
+        let mut points: Vec<Point> = Vec::with_capacity(count);
+        let finite = |at: &[f32; 3]| at.iter().all(|x| x.is_finite());
+        let point = |i| Some(Point { at: position(i).filter(finite)?, index: i as u32 });
+        points.extend((0..count).filter_map(point));
         let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
         let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
         let mut nodes = vec![empty; (2usize << depth) - 1];
@@ -199,6 +196,7 @@ mod tests {
     use rayon::prelude::*;
 
     use super::*;
+    use crate::model::Column;
 
     fn column(points: &[[f32; 3]]) -> Column {
         let mut column = Column::zeros(3, points.len());
@@ -209,7 +207,7 @@ mod tests {
     }
 
     fn indexed(position: &Column, k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
-        let index = PointIndex::new(position, |_| true);
+        let index = PointIndex::new(position.len(), |i| Some(position.row(i)));
         let mut search = Search::default();
         (0..position.len())
             .map(|i| {
@@ -268,7 +266,7 @@ mod tests {
     #[test]
     fn excluded_points_do_not_take_a_place_among_the_k() {
         let points = column(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
-        let index = PointIndex::new(&points, |i| i != 1);
+        let index = PointIndex::new(3, |i| (i != 1).then(|| points.row(i)));
         let mut search = Search::default();
         let (found, truncated) = index.nearest(0, [0.0; 3], 1, 5.0, &mut search);
         assert_eq!((found.collect::<Vec<_>>(), truncated), (vec![2], false));
@@ -278,7 +276,7 @@ mod tests {
     fn timed(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
         let position = column(points);
         let start = Instant::now();
-        let index = PointIndex::new(&position, |_| true);
+        let index = PointIndex::new(points.len(), |i| Some(points[i]));
         let cut = (0..points.len())
             .into_par_iter()
             .map_init(Search::default, |search, i| {

@@ -1,7 +1,7 @@
 //! The proxy: the one Gaussian that stands for a cluster.
 //!
 //! In: states of all members at the reference frame and their weights. Out: a state in the stored
-//! encoding, one row per group. Memory: 1 KiB per group for at most 4096 groups at a time, beside
+//! encoding, one row per cluster. Memory: 1 KiB per cluster for at most 4096 of them at a time, beside
 //! the output.
 
 use glam::{DQuat, DVec3};
@@ -13,7 +13,7 @@ use super::moments::{Ellipsoid, Part, align_axes, moments};
 use crate::model::{self, Columns, Gaussians};
 use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
 
-/// Groups merged between two writes into the output planes.
+/// Clusters merged between two writes into the output planes.
 const BATCH: usize = 4096;
 /// Opacities of proxies stay within [this, 1 − this], where the logit is finite in f32.
 const OPACITY_MARGIN: f64 = 1.0 / (1u32 << 24) as f64;
@@ -55,19 +55,33 @@ impl ProxyState {
     }
 }
 
-/// What makes a member weigh, for every row of the states.
+/// What makes a member weigh.
 #[derive(Debug, Clone, Copy)]
 pub struct Importance<'a> {
-    /// C.
+    /// Id of every row of the states.
+    pub ids: &'a [u32],
+    /// C by id.
     pub coverage: &'a [f64],
-    /// Vis.
+    /// Vis by id.
     pub visibility: &'a [f64],
+}
+
+impl Importance<'_> {
+    /// C of a row.
+    pub(super) fn coverage(&self, row: u32) -> f64 {
+        self.coverage[self.ids[row as usize] as usize]
+    }
+
+    /// C·Vis of a row.
+    fn seen(&self, row: u32) -> f64 {
+        self.coverage(row) * self.visibility[self.ids[row as usize] as usize]
+    }
 }
 
 /// Weights of the rows `members`, w ∝ C·Vis, summing to 1. Where that sum is not positive and finite
 /// w ∝ opacity × area, and where that fails too all weigh the same.
 pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians) -> Vec<f64> {
-    let seen = |&i: &u32| importance.coverage[i as usize] * importance.visibility[i as usize];
+    let seen = |&i: &u32| importance.seen(i);
     let covered = |&i: &u32| opacity(states, i) * mean_area(scales(states, i));
     let share = |weights: Vec<f64>| {
         let total: f64 = weights.iter().sum();
@@ -117,27 +131,29 @@ pub fn merge_state(members: &[(u32, f64)], states: &Gaussians, leader: u32, merg
     }
 }
 
-/// One row per group: the proxy of its members, or the very bytes of a Gaussian that is alone.
+/// One row per group of more than one member, in their order: its proxy.
 pub fn merge_groups(
     groups: &Groups,
     importance: &Importance<'_>,
     states: &Gaussians,
     merge: &recipe::Merge,
 ) -> Gaussians {
-    let mut out = states.pick(groups.leaders());
-    let clusters: Vec<usize> = (0..groups.len()).filter(|&group| groups.members(group).len() > 1).collect();
-    for batch in clusters.chunks(BATCH) {
+    let clusters: Vec<u32> = groups.clusters().collect();
+    let mut out = states.pick(&[]);
+    out.resize(clusters.len());
+    for (batch, first) in clusters.chunks(BATCH).zip((0..).step_by(BATCH)) {
         let proxies: Vec<ProxyState> = batch
             .par_iter()
             .map(|&group| {
+                let group = group as usize;
                 let rows = groups.members(group);
                 let weights = weights(rows, importance, states);
                 let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
                 merge_state(&members, states, groups.leaders()[group], merge)
             })
             .collect();
-        for (&group, proxy) in batch.iter().zip(&proxies) {
-            proxy.write(Columns::ALL, group, &mut out);
+        for (row, proxy) in (first..).zip(&proxies) {
+            proxy.write(Columns::ALL, row, &mut out);
         }
     }
     out
@@ -330,7 +346,7 @@ mod tests {
         let mut states = copies(3, [0.0; 3], [1.0, 0.0, 0.0, 0.0]);
         states.log_scale.set_row(2, [2f32.sqrt().ln(); 3]);
         let by = |coverage: &[f64], states: &Gaussians| {
-            weights(&[0, 1, 2], &Importance { coverage, visibility: &[1.0, 0.5, 0.0] }, states)
+            weights(&[0, 1, 2], &Importance { ids: &[0, 1, 2], coverage, visibility: &[1.0, 0.5, 0.0] }, states)
         };
         assert_eq!(by(&[1.0, 6.0, 9.0], &states), [0.25, 0.75, 0.0]);
         for unusable in [[0.0, 0.0, 9.0], [f64::NAN, 1.0, 1.0], [f64::INFINITY, 1.0, 1.0]] {

@@ -141,12 +141,12 @@ impl Workload {
     }
 
     /// One block of each thread on its way from a reader, and what decoding it takes.
-    fn arriving(&self) -> Part {
+    pub fn arriving(&self) -> Part {
         ("arriving", self.decoding() + self.threads * BLOCK as u64 * (self.state(Columns::ALL) + self.reader))
     }
 
     /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
-    pub fn decoding(&self) -> u64 {
+    fn decoding(&self) -> u64 {
         let frames = |column| if self.varying.contains(column) { FRAME_BLOCK as u64 } else { 1 };
         let largest = Columns::ALL.iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
         self.threads * 3 * GAUSSIAN_BLOCK as u64 * largest
@@ -161,7 +161,7 @@ impl Workload {
 }
 
 /// A named part of a stage's memory.
-type Part = (&'static str, u64);
+pub type Part = (&'static str, u64);
 
 /// What a stage needs.
 #[derive(Debug, Clone, PartialEq)]
@@ -314,7 +314,7 @@ impl Plan {
         let _ = writeln!(
             out,
             "  at a time: {} frames held by readers, {} frames ready, {} pictures, {} pairs measured",
-            work.held(limits),
+            if work.decodes { limits.frames_held } else { 0 },
             limits.frames_together,
             limits.pictures_together,
             limits.pairs_together
@@ -381,23 +381,18 @@ fn looking(work: &Workload, limits: &Limits, columns: Columns, views: u64, sums:
         ("held", work.held(limits, columns)),
         ("pictures", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
     ];
-    let fixed =
-        vec![("decoding", work.decoding()), ("pictures", pictures * (render::STRIP_BYTES as u64 + 12 * work.pixels))];
+    let fixed = vec![work.arriving(), ("pictures", pictures * (render::STRIP_BYTES as u64 + 12 * work.pixels))];
     (per_gaussian, fixed)
 }
 
 /// What scoring takes: the scan, the look at pictures that `recipe` asks for, the scores.
 pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: bool) -> Vec<Need> {
-    let block = work.state(Columns::ALL)
-        + stats::BYTES_PER_GAUSSIAN as u64
-        + work.reader
-        + FRAME_BLOCK as u64 * work.state(work.varying);
-    let decoding = ("decoding", work.decoding());
+    let block = stats::BYTES_PER_GAUSSIAN as u64 + work.held(&Limits::NONE, Columns::ALL);
     let mut needs = vec![Need {
         stage: "scan",
         reads: 1.0,
         per_gaussian: vec![("rows", ROWS)],
-        fixed: vec![("blocks", work.threads * BLOCK as u64 * block), decoding],
+        fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving()],
     }];
     if looks(has_cameras, recipe.scan.coverage) {
         let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL.without(Columns::SH), work.views, 12);
@@ -412,7 +407,7 @@ pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: b
             ("sorting", select::WORKING_BYTES_PER_GAUSSIAN as u64),
             ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
         ],
-        fixed: vec![decoding],
+        fixed: vec![work.arriving()],
     });
     needs
 }
@@ -422,7 +417,6 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
     let mut needs = scoring(work, limits, recipe, has_cameras);
     let looks = looks(has_cameras, recipe.scan.coverage);
     let whole = work.state(Columns::ALL);
-    let decoding = ("decoding", work.decoding());
     let sampled = |pictures: usize| (pictures as u64).min(work.pictures) as f64 / work.frames.max(1) as f64;
     if looks && only != Only::Merge && recipe.select.round_fraction < 1.0 {
         let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL, work.views.min(VIEWS_AT_ONCE as u64), 8);
@@ -442,9 +436,9 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
                 ("states", 2 * whole),
                 ("survivors", merge::BYTES_PER_SURVIVOR as u64),
                 ("readers", work.reader),
-                ("held", work.held(limits) * work.state(work.varying & (Columns::POSITION | Columns::OPACITY))),
+                ("held", work.held(limits, Columns::POSITION | Columns::OPACITY)),
             ],
-            fixed: vec![("pairs", pairs), decoding],
+            fixed: vec![("pairs", pairs), work.arriving()],
         });
     }
     // A model with a field is moved as a whole: its canonical values once more.
@@ -460,7 +454,7 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
                 ("pictures", PICTURE_ON_ALL_THREADS),
             ],
             fixed: vec![
-                decoding,
+                work.arriving(),
                 ("pictures", render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + choose::AT_ONCE as u64)),
             ],
         });
@@ -481,7 +475,7 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
                 ("pictures", work.threads * (render::BYTES_PER_VISIBLE as u64 + 48)),
             ],
             fixed: vec![
-                decoding,
+                work.arriving(),
                 ("pictures", (tests + work.views) * 12 * work.pixels),
                 ("pairs", (fitted.min(limits.sights_together as u64) + work.threads) * render::STRIP_BYTES as u64 / 3),
             ],
@@ -500,7 +494,7 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
 fn writing(work: &Workload) -> Vec<Part> {
     let block = GAUSSIAN_BLOCK as u64
         * (2 * work.state(Columns::ALL) + 3 * FRAME_BLOCK as u64 * work.state(work.varying) + work.reader);
-    vec![("blocks", 2 * work.threads * block), ("decoding", work.decoding())]
+    vec![("blocks", 2 * work.threads * block), work.arriving()]
 }
 
 /// What it takes to pack a stream of which `held` frames are in memory together, and to scan it on the way unless
@@ -530,14 +524,9 @@ pub fn packing(work: &Workload, _: &Limits) -> Vec<Need> {
 
 /// What it takes to write every frame by itself.
 pub fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
-    let varying = work.state(work.varying);
-    let per_gaussian = vec![
-        ("states", work.state(Columns::ALL)),
-        ("arriving", varying),
-        ("readers", work.reader),
-        ("held", work.held(limits) * varying),
-    ];
-    vec![Need { stage: "unpack", reads: 1.0, per_gaussian, fixed: vec![("decoding", work.decoding())] }]
+    let per_gaussian =
+        vec![("states", work.state(Columns::ALL)), ("readers", work.reader), ("held", work.held(limits, Columns::ALL))];
+    vec![Need { stage: "unpack", reads: 1.0, per_gaussian, fixed: vec![work.arriving()] }]
 }
 
 /// What it takes to make pictures of a model.
@@ -564,10 +553,7 @@ fn of_pictures(work: &Workload, limits: &Limits, stage: &'static str, models: u6
             ("states", models * work.state(Columns::ALL)),
             ("pictures", pictures * PICTURE_ON_ALL_THREADS),
         ],
-        fixed: vec![
-            ("decoding", work.decoding()),
-            ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
-        ],
+        fixed: vec![work.arriving(), ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels))],
     }
 }
 

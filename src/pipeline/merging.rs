@@ -1,19 +1,29 @@
 //! From a selection to the output's Gaussians: how many survive pruning, which of them merge.
-
-use hashbrown::HashMap;
+//!
+//! Memory while merging, of every Gaussian that may survive [`BYTES_PER_SURVIVOR`], what [`crate::merge`] says of
+//! survivors and candidate pairs, and what [`crate::stream::motion`] says of the pairs it measures together.
 
 use super::compress::Only;
 use super::input::Scene;
 use super::scored::Scored;
 use super::summary::{MergeSummary, Stages};
 use crate::error::{Error, Result};
-use crate::merge::motion::PairMeasure;
+use crate::merge::known::KnownPairs;
+use crate::merge::motion::MotionGate;
 use crate::merge::proxy::{Importance, weights};
 use crate::merge::{self, Merged, Survivors};
 use crate::model::{Columns, Gaussians};
+use crate::pass::FrameSource;
 use crate::recipe::{self, Recipe};
-use crate::select::hash_id;
-use crate::stream::{gather, measure_motion};
+use crate::stream::motion::PairMeter;
+use crate::stream::{BLOCK, gather};
+
+/// Memory of a Gaussian that may survive: its id, its state with base colours only, and whether it may merge. Twice
+/// the ids while merging is tried on some of them.
+pub const BYTES_PER_SURVIVOR: usize = 2 * 4 + 4 * 14 + 1;
+
+/// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
+const GATHERED: usize = 16 * BLOCK;
 
 /// Several Gaussians of the input that became one of the output.
 #[derive(Debug, Clone, PartialEq)]
@@ -33,8 +43,6 @@ pub struct Sieved {
     pub kept: Vec<u32>,
     /// The proxies among them, by place in the output.
     pub clusters: Vec<Cluster>,
-    /// State at the reference frame of every proxy, in the order of `clusters`.
-    pub proxies: Gaussians,
     /// What merging did; none where it was left out.
     pub summary: Option<MergeSummary>,
     /// What is added to the base colours (`f_dc`), by place in the output; empty: nothing.
@@ -44,7 +52,7 @@ pub struct Sieved {
 impl Sieved {
     /// The Gaussians `kept` (increasing) as they are.
     pub fn pruned(kept: Vec<u32>) -> Self {
-        Sieved { kept, clusters: Vec::new(), proxies: Gaussians::default(), summary: None, recolor: Vec::new() }
+        Sieved { kept, clusters: Vec::new(), summary: None, recolor: Vec::new() }
     }
 
     /// For every Gaussian of an input of `count` its place in the output, if it has one.
@@ -148,29 +156,40 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
 
 /// Everything merging reads, so that it can be tried on many sets of survivors.
 struct Job<'a> {
-    scene: &'a Scene,
     scored: &'a Scored,
-    recipe: &'a Recipe,
     /// The recipe's, with a noise floor no lower than that of the positions.
     merge: recipe::Merge,
-    /// Ids whose states are known, increasing, and these states at the reference frame.
+    /// Ids whose states are known, increasing.
     pool: Vec<u32>,
+    /// Their states at the reference frame, of the harmonics the first band.
     states: Gaussians,
-    /// How pairs move, by ids: it does not depend on who else survives.
-    measured: HashMap<(u32, u32), PairMeasure>,
+    /// Whether each may merge.
+    mergeable: Vec<bool>,
+    meter: PairMeter<'a>,
+    /// How pairs of the pool move: it does not depend on who else survives.
+    known: KnownPairs,
 }
 
 impl<'a> Job<'a> {
     fn new(scene: &'a Scene, scored: &'a Scored, recipe: &'a Recipe, pool: Vec<u32>) -> Result<Self> {
         let source = scene.input.source();
-        let states = match source.info().times.is_empty() {
-            true => Gaussians::zeros(pool.len(), source.info().sh_degree),
-            false => gather(source, &pool, scored.reference.frame, Columns::ALL)?,
-        };
+        let (states, mut mergeable) = states_of(source, &pool, scored.reference.frame)?;
+        for id in &scored.protected {
+            if let Ok(row) = pool.binary_search(id) {
+                mergeable[row] = false;
+            }
+        }
         let mut merge = recipe.merge.clone();
         let unit = merge.length_unit.in_scene_units(scored.reference.extent);
         merge.motion_noise = merge.motion_noise.max(2.0 * scored.position_ulp / unit);
-        Ok(Job { scene, scored, recipe, merge, pool, states, measured: HashMap::new() })
+        let meter = PairMeter {
+            source,
+            scan: &recipe.scan,
+            gate: MotionGate::new(&merge, unit),
+            limits: scene.limits,
+            scratch: scene.scratch.clone().unwrap_or_else(std::env::temp_dir),
+        };
+        Ok(Job { scored, merge, pool, states, mergeable, meter, known: KnownPairs::default() })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -187,53 +206,71 @@ impl<'a> Job<'a> {
 
     /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Sieved> {
-        let Job { scene, scored, recipe, .. } = *self;
-        let places: Vec<u32> = places_of(survivors, &self.pool);
-        let states = self.states.pick(&places);
-        let column = |values: &[f64]| -> Vec<f64> { survivors.iter().map(|&id| values[id as usize]).collect() };
-        let (coverage, visibility) = (column(&scored.rows.c), column(&scored.rows.vis));
-        let hash: Vec<u64> = survivors.iter().map(|&id| hash_id(id.into())).collect();
-        let mergeable: Vec<bool> = survivors.iter().map(|id| scored.protected.binary_search(id).is_err()).collect();
-        let merged = merge::run(
-            &Survivors {
-                states: &states,
-                coverage: &coverage,
-                visibility: &visibility,
-                hash: &hash,
-                mergeable: &mergeable,
-                extent: scored.reference.extent,
-            },
-            &self.merge,
-            limit,
-            |pairs| measure(scene, recipe, survivors, &states, pairs, &mut self.measured),
-        )?;
-        let importance = Importance { coverage: &coverage, visibility: &visibility };
-        Ok(self.sieved(survivors, &states, &importance, merged))
-    }
-
-    fn sieved(&self, survivors: &[u32], states: &Gaussians, importance: &Importance<'_>, merged: Merged) -> Sieved {
-        let groups = &merged.groups;
-        let kept: Vec<u32> = groups.leaders().iter().map(|&row| survivors[row as usize]).collect();
-        let grouped: Vec<u32> = (0..groups.len() as u32).filter(|&g| groups.members(g as usize).len() > 1).collect();
-        let clusters: Vec<Cluster> = grouped
-            .iter()
-            .map(|&group| {
-                let rows = groups.members(group as usize);
-                let ids = rows.iter().map(|&row| survivors[row as usize]);
-                let members = ids.zip(weights(rows, importance, states)).collect();
-                Cluster { output: group, leader: kept[group as usize], members }
-            })
-            .collect();
-        let summary = MergeSummary {
-            reference_frame: self.scored.reference.frame,
-            proxies: clusters.len(),
-            members: clusters.iter().map(|cluster| cluster.members.len()).sum(),
-            opacity: self.recipe.merge.opacity,
-            passes: merged.passes.clone(),
-            deviation: None,
+        let Job { scored, merge, pool, states, mergeable, meter, known, .. } = self;
+        let survivors = Survivors {
+            states,
+            rows: &places_of(survivors, pool),
+            importance: Importance { ids: pool, coverage: &scored.rows.c, visibility: &scored.rows.vis },
+            mergeable,
+            extent: scored.reference.extent,
         };
-        Sieved { proxies: merged.states.pick(&grouped), kept, clusters, summary: Some(summary), recolor: Vec::new() }
+        let merged = merge::run(&survivors, merge, limit, |asked| {
+            let missing = known.missing(asked.pairs());
+            if !missing.is_empty() {
+                known.add(meter.measure(pool, &states.position, missing, asked.reach)?);
+            }
+            Ok::<_, Error>(asked.pairs().map(|pair| known.likeness(pair)).collect())
+        })?;
+        Ok(sieved(&survivors, &merged, scored.reference.frame, merge))
     }
+}
+
+/// What `merged` leaves of `survivors`.
+fn sieved(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::Merge) -> Sieved {
+    let (groups, importance) = (&merged.groups, &survivors.importance);
+    let id = |row: u32| importance.ids[row as usize];
+    let clusters: Vec<Cluster> = groups
+        .clusters()
+        .map(|group| {
+            let rows = groups.members(group as usize);
+            let ids = rows.iter().map(|&row| id(row));
+            let members = ids.zip(weights(rows, importance, survivors.states)).collect();
+            Cluster { output: group, leader: id(groups.leaders()[group as usize]), members }
+        })
+        .collect();
+    let summary = MergeSummary {
+        reference_frame,
+        proxies: clusters.len(),
+        members: clusters.iter().map(|cluster| cluster.members.len()).sum(),
+        opacity: merge.opacity,
+        passes: merged.passes.clone(),
+        deviation: None,
+    };
+    let kept = groups.leaders().iter().map(|&row| id(row)).collect();
+    Sieved { kept, clusters, summary: Some(summary), recolor: Vec::new() }
+}
+
+/// States of the Gaussians `ids` (increasing) at `frame`, of the harmonics the first band; and whether the whole state
+/// is finite. Without frames all is zero.
+fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gaussians, Vec<bool>)> {
+    let mut states = Gaussians::zeros(ids.len(), 0);
+    let mut finite = vec![true; ids.len()];
+    if source.info().times.is_empty() {
+        return Ok((states, finite));
+    }
+    for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
+        let whole = gather(source, ids, frame, Columns::ALL)?;
+        for column in Columns::ALL.iter() {
+            let (from, to) = (whole.column(column), states.column_mut(column));
+            for c in 0..to.width() {
+                to.plane_mut(c)[start..][..ids.len()].copy_from_slice(from.plane(c));
+            }
+        }
+        for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
+            *finite = merge::is_finite(&whole, row);
+        }
+    }
+    Ok((states, finite))
 }
 
 /// Place of each of `ids` in `pool`, both increasing, the first part of the second.
@@ -247,38 +284,6 @@ fn places_of(ids: &[u32], pool: &[u32]) -> Vec<u32> {
             place as u32
         })
         .collect()
-}
-
-/// Motion of pairs of survivors, from memory where it was measured before.
-fn measure(
-    scene: &Scene,
-    recipe: &Recipe,
-    survivors: &[u32],
-    states: &Gaussians,
-    pairs: &[(u32, u32)],
-    measured: &mut HashMap<(u32, u32), PairMeasure>,
-) -> Result<Vec<PairMeasure>> {
-    let key = |&(a, b): &(u32, u32)| {
-        let (a, b) = (survivors[a as usize], survivors[b as usize]);
-        (a.min(b), a.max(b))
-    };
-    let mut unknown: Vec<(u32, u32)> =
-        pairs.iter().filter(|pair| !measured.contains_key(&key(pair))).map(|&(a, b)| (a.min(b), a.max(b))).collect();
-    unknown.sort_unstable();
-    unknown.dedup();
-    if !unknown.is_empty() {
-        // Only Gaussians in a pair need to be followed.
-        let mut rows: Vec<u32> = unknown.iter().flat_map(|&(a, b)| [a, b]).collect();
-        rows.sort_unstable();
-        rows.dedup();
-        let ids: Vec<u32> = rows.iter().map(|&row| survivors[row as usize]).collect();
-        let place = |row: u32| rows.binary_search(&row).unwrap_or_default() as u32;
-        let local: Vec<(u32, u32)> = unknown.iter().map(|&(a, b)| (place(a), place(b))).collect();
-        let reference = states.position.pick(&rows);
-        let found = measure_motion(scene.input.source(), &ids, &local, &reference, &recipe.scan)?;
-        measured.extend(unknown.iter().map(key).zip(found));
-    }
-    Ok(pairs.iter().map(|pair| measured[&key(pair)]).collect())
 }
 
 #[cfg(test)]

@@ -6,10 +6,11 @@ use super::scored::Reference;
 use crate::deform::Deltas;
 use crate::error::Result;
 use crate::ingest::ModelFolder;
+use crate::merge::proxy::merge_state;
 use crate::model::{Columns, Gaussians};
 use crate::pass::FrameSource;
 use crate::recipe::{Merge, Placement};
-use crate::stream::{gather, recolor};
+use crate::stream::{BLOCK, gather, recolor};
 
 /// Frames at which proxies are compared with their members.
 const SAMPLED_FRAMES: usize = 16;
@@ -50,7 +51,8 @@ pub fn canonical_proxies(
         Placement::Mean => Columns::ALL,
         Placement::Leader => Columns::ALL.without(Columns::POSITION),
     };
-    deltas.solve(&with_leader_lengths(&deltas, &of_leaders, &sieved.proxies), solved, &mut raw);
+    let merged = merged_states(model, reference, sieved, merge)?;
+    deltas.solve(&with_leader_lengths(&deltas, &of_leaders, merged), solved, &mut raw);
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
     if unsolved > 0 {
         notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
@@ -70,12 +72,28 @@ pub fn canonical_proxies(
     Ok(CanonicalProxies { raw, deviation: deviations.into_iter().reduce(f64::max), notes })
 }
 
+/// State of every proxy at the reference frame.
+fn merged_states(model: &ModelFolder, reference: Reference, sieved: &Sieved, merge: &Merge) -> Result<Gaussians> {
+    let mut states = Gaussians::zeros(sieved.clusters.len(), model.info().sh_degree);
+    for (clusters, first) in sieved.clusters.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
+        let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
+        let of_members = gather(model, &ids, reference.frame, Columns::ALL)?;
+        let mut rows = 0..ids.len() as u32;
+        for (cluster, proxy) in clusters.iter().zip(first..) {
+            let members: Vec<(u32, f64)> =
+                cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
+            let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
+            merge_state(&members, &of_members, members[leader].0, merge).write(Columns::ALL, proxy, &mut states);
+        }
+    }
+    Ok(states)
+}
+
 /// The merged states with rotations as long as their leaders' at that frame: the field adds its change of
 /// rotation to the raw quaternion, so how far it turns depends on the length.
-fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, proxies: &Gaussians) -> Gaussians {
-    let mut leaders = of_leaders.clone();
+fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
+    let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
     deltas.apply(of_leaders, Columns::ROTATION, &mut leaders);
-    let mut states = proxies.clone();
     for row in 0..states.len() {
         let length = leaders.rotation.row::<4>(row).iter().map(|x| x * x).sum::<f32>().sqrt();
         // A leader without a direction leaves the proxy its unit quaternion.

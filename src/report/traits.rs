@@ -61,7 +61,7 @@ pub fn need(work: &Workload) -> Need {
         ("neighbours", 190),
     ];
     let reads = SAMPLES.min(work.frames as usize) as f64 / work.frames.max(1) as f64;
-    Need { stage: "traits", reads: 2.0 * reads, per_gaussian, fixed: vec![("decoding", work.decoding())] }
+    Need { stage: "traits", reads: 2.0 * reads, per_gaussian, fixed: vec![work.arriving()] }
 }
 
 /// The kinds one Gaussian is of, by [`Kind::ALL`].
@@ -135,7 +135,7 @@ fn bending(
     if ids.is_empty() {
         return Ok(Vec::new());
     }
-    let index = PointIndex::new(&reference.position, visible);
+    let index = PointIndex::new(reference.len(), |i| visible(i).then(|| reference.position.row(i)));
     let near: Vec<Vec<u32>> = ids
         .par_iter()
         .map_init(Search::default, |search, &id| {

@@ -6,12 +6,13 @@ mod gather;
 mod held;
 mod look;
 mod merged;
-mod motion;
+pub mod motion;
 mod parts;
 mod progress;
 mod recolored;
 mod removal;
 mod scan;
+mod trajectories;
 
 pub use contribution::{Looking, Seen, visible_contribution};
 pub use frames::Frames;
@@ -19,11 +20,11 @@ pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};
 pub use merged::MergedSequence;
-pub use motion::measure_motion;
 pub use progress::Progress;
 pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;
 pub use scan::{RunningScan, Scanned, scan};
+pub use trajectories::Trajectories;
 
 /// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.
 /// Results do not depend on it.
