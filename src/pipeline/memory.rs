@@ -21,7 +21,7 @@ use crate::model::{Columns, Rig, Rows};
 use crate::plan::Limits;
 use crate::recipe::Recipe;
 use crate::score::Scores;
-use crate::stream::{BLOCK, PICTURES_PER_THREAD, VIEWS_AT_ONCE};
+use crate::stream::{self, BLOCK, PICTURES_PER_THREAD, VIEWS_AT_ONCE};
 use crate::{merge, metrics, refit, render, select, stats};
 
 /// Memory that a run may take, and whether it is to say beforehand what it will take.
@@ -427,18 +427,23 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
         needs.push(Need { stage: "rounds", reads: rounds * sampled(rounds::PICTURES), per_gaussian, fixed });
     }
     if only != Only::Prune && !recipe.merge.passes.is_empty() {
-        let pairs = (limits.pairs_together as u64).saturating_mul(merge::BYTES_PER_PAIR as u64);
+        let measured = (limits.pairs_together as u64)
+            .saturating_mul(merge::BYTES_PER_PAIR as u64 + stream::motion::BYTES_PER_PAIR as u64);
+        // Of the colours the first band.
+        let states = state_bytes(0, Columns::ALL);
         needs.push(Need {
             stage: "merge",
             reads: 1.0,
             per_gaussian: vec![
                 ("rows", SCORED),
-                ("states", 2 * whole),
+                ("states", 2 * states),
+                // At most one for every two.
+                ("proxies", whole.div_ceil(2)),
                 ("survivors", merge::BYTES_PER_SURVIVOR as u64),
                 ("readers", work.reader),
-                ("held", work.held(limits, Columns::POSITION | Columns::OPACITY)),
+                ("followed", stream::motion::bytes_per_gaussian(limits.frames_held) as u64),
             ],
-            fixed: vec![("pairs", pairs), work.arriving()],
+            fixed: vec![("pairs", measured), work.arriving()],
         });
     }
     // A model with a field is moved as a whole: its canonical values once more.
