@@ -7,17 +7,20 @@
 
 use std::cmp::Ordering;
 use std::ffi::OsStr;
-use std::fs;
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::map::FileMap;
 use super::ply::{Ply, Property, check_ids};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{BlockReader, FrameSource, Ids};
+
+/// Bytes read at a time for a digest.
+const PIECE: usize = 1 << 16;
 
 /// A sequence of PLY files.
 #[derive(Debug)]
@@ -114,11 +117,29 @@ impl PlySequence {
     pub fn digest(&self) -> Result<String> {
         let mut hash = Xxh3::new();
         for path in &self.frames {
-            let bytes = FileMap::open(path)?;
+            let file = File::open(path).map_err(Error::io("open", path))?;
+            let len = file.metadata().map_err(Error::io("read the size of", path))?.len();
+            let name = file_name(path).as_encoded_bytes();
             // Lengths in front, so that no byte can pass from a name to a content or between files.
-            for part in [file_name(path).as_encoded_bytes(), &bytes] {
-                hash.update(&(part.len() as u64).to_le_bytes());
-                hash.update(part);
+            hash.update(&(name.len() as u64).to_le_bytes());
+            hash.update(name);
+            hash.update(&len.to_le_bytes());
+            // Read, not mapped: a map would have the whole file resident at the end.
+            let mut file = BufReader::with_capacity(PIECE, file);
+            let mut hashed = 0;
+            loop {
+                let piece = file.fill_buf().map_err(Error::io("read", path))?;
+                if piece.is_empty() {
+                    break;
+                }
+                hash.update(piece);
+                let len = piece.len();
+                file.consume(len);
+                hashed += len as u64;
+            }
+            if hashed != len {
+                let expected = format!("{len} bytes, as when it was opened");
+                return Err(Error::input(path, "end of file", expected, format!("{hashed} bytes")));
             }
         }
         Ok(format!("{:032x}", hash.digest128()))
