@@ -1,7 +1,9 @@
 //! How much does the scan of a container cost beyond reading it, per Gaussian and frame, on one thread?
 //!
-//! Without views, so that life span, motion and the search for NaN are all there is. `packed/*`: the rival
-//! decodes the same tiles and drops them; the scan should run at 80% of its speed. `raw/*`: the tiles lie in the
+//! Without views, so that life span, motion and the search for NaN are all there is. `packed/*`: the rival `decode`
+//! decodes the same tiles and drops them; the scan should run at 80% of its speed. How good a rival that is, show
+//! `zstd`, which decompresses the same values, compressed without a filter at the same level, and `copy`, which
+//! copies them. `raw/*`: the tiles lie in the
 //! page cache, and the rivals are plain sums over the same bytes: of f32 one after the other, and of u32, which
 //! is as fast as memory; the scan should run at half the speed of the first. `position` varies alone, or with
 //! rotation, scale and opacity; the constant columns are read once.
@@ -105,6 +107,28 @@ fn benches(criterion: &mut Criterion) {
             if kind == "packed" {
                 group.bench_function(BenchmarkId::new("decode", name), |bencher| {
                     bencher.iter(|| each_tile(reader, varying, |values| _ = black_box(values)));
+                });
+                let mut tiles = Vec::new();
+                each_tile(reader, varying, |values| tiles.push(values.to_vec()));
+                let plain: Vec<Vec<u8>> =
+                    tiles.iter().map(|values| zstd::bulk::compress(bytemuck::cast_slice(values), 1).unwrap()).collect();
+                let mut room = vec![0; tiles.iter().map(|values| 4 * values.len()).max().unwrap()];
+                let mut zstd = zstd::bulk::Decompressor::new().unwrap();
+                group.bench_function(BenchmarkId::new("zstd", name), |bencher| {
+                    bencher.iter(|| {
+                        for tile in &plain {
+                            black_box(zstd.decompress_to_buffer(tile, &mut room[..]).unwrap());
+                        }
+                    });
+                });
+                group.bench_function(BenchmarkId::new("copy", name), |bencher| {
+                    bencher.iter(|| {
+                        for values in &tiles {
+                            let bytes: &[u8] = bytemuck::cast_slice(values);
+                            room[..bytes.len()].copy_from_slice(bytes);
+                            black_box(&mut room);
+                        }
+                    });
                 });
                 continue;
             }

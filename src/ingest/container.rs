@@ -8,7 +8,10 @@
 //! by positioned reads; 5.8 mapped and released tile by tile, 2.0 frame by frame; 14 left mapped).
 //!
 //! The disk works ahead by advice: when a reader that decodes whole frame blocks enters one, the system is told of
-//! the next. COLD
+//! the next. Measured on 32,768 Gaussians × 320 frames on two threads, from a cold page cache: 1.1 to 1.7 s with the
+//! advice, 2.5 to 3.2 without, 0.8 to 0.9 from a warm one (raw); 2.4 to 2.5, 2.8 to 3.1, 2.0 to 2.1 (packed). What is left
+//! is mostly the first frame block of each block of Gaussians. Threads that fetch, over channels, could win no
+//! more than that, and would need a copy of their own of what they fetched.
 
 use std::ops::{Deref, DerefMut, Range};
 use std::path::{Path, PathBuf};

@@ -12,18 +12,30 @@ pub(super) struct Life {
     sum: Vec<f64>,
     sum_of_squares: Vec<f64>,
     frames: Vec<u32>,
+    /// Living Gaussians in the last frame.
+    alive: u32,
+    /// Frames after the first that were like it and are not in `frames` yet.
+    repeats: u32,
 }
 
 impl Life {
     pub(super) const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<f64>() + size_of::<u32>();
 
     pub(super) fn new(len: usize) -> Self {
-        Life { first: vec![0.0; len], sum: vec![0.0; len], sum_of_squares: vec![0.0; len], frames: vec![0; len] }
+        Life {
+            first: vec![0.0; len],
+            sum: vec![0.0; len],
+            sum_of_squares: vec![0.0; len],
+            frames: vec![0; len],
+            alive: 0,
+            repeats: 0,
+        }
     }
 
     /// Adds a frame of opacities in [0, 1]; says how many Gaussians are alive in it.
     #[inline(always)]
     pub(super) fn frame(&mut self, opacity: &[f64], alpha_min: f64) -> u32 {
+        self.settle();
         let n = opacity.len();
         let (first, sum, sum_of_squares) = (&mut self.first[..n], &mut self.sum[..n], &mut self.sum_of_squares[..n]);
         let frames = &mut self.frames[..n];
@@ -37,7 +49,25 @@ impl Life {
             frames[i] += u32::from(alive);
             all += u32::from(alive);
         }
+        self.alive = all;
         all
+    }
+
+    /// Adds a frame like the first, when all since were like it: every α − α₁ is 0. Says how many Gaussians are alive.
+    #[inline(always)]
+    pub(super) fn repeat(&mut self) -> u32 {
+        self.repeats += 1;
+        self.alive
+    }
+
+    /// Counts the frames that were repeats; call before reading results.
+    #[inline(always)]
+    pub(super) fn settle(&mut self) {
+        if self.repeats > 0 {
+            // One frame is counted so far, for those that are alive.
+            self.frames.iter_mut().for_each(|frames| *frames *= 1 + self.repeats);
+            self.repeats = 0;
+        }
     }
 
     /// Life frames of every Gaussian so far.
@@ -59,7 +89,7 @@ impl Life {
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let Life { first, sum, sum_of_squares, frames } = self;
+        let Life { first, sum, sum_of_squares, frames, alive: _, repeats: _ } = self;
         size_of_val(&first[..]) + size_of_val(&sum[..]) + size_of_val(&sum_of_squares[..]) + size_of_val(&frames[..])
     }
 }

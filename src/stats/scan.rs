@@ -31,6 +31,8 @@ pub struct BlockScan<'a> {
     plan: &'a ScanPlan,
     first_id: usize,
     next_frame: usize,
+    /// Whether opacities are those of the first frame.
+    steady: bool,
     state: State,
     life: Life,
     motion: Motion,
@@ -65,6 +67,7 @@ impl<'a> BlockScan<'a> {
             plan,
             first_id,
             next_frame: 0,
+            steady: true,
             state: State::new(len),
             life: Life::new(len),
             motion: Motion::new(len, plan.motion),
@@ -132,9 +135,14 @@ impl<'a> BlockScan<'a> {
     fn advance_plainly(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
         self.state.update(gaussians, changed, self.plan.projects);
         let alpha_min = self.plan.alpha_min;
-        self.alive_per_frame.push(self.life.frame(&self.state.opacity, alpha_min));
-        let (step, step_before) = (self.plan.step(t), self.plan.step(t.saturating_sub(1)));
-        self.motion.frame(&gaussians.position, &self.state.opacity, alpha_min, step, step_before);
+        // The first frame is what the others may be like; named or not, its opacities are new.
+        self.steady &= t == 0 || !changed.contains(Columns::OPACITY);
+        let repeats = t > 0 && self.steady;
+        let opacity = &self.state.opacity;
+        let alive = if repeats { self.life.repeat() } else { self.life.frame(opacity, alpha_min) };
+        self.alive_per_frame.push(alive);
+        let steps = [self.plan.step(t), self.plan.step(t.saturating_sub(1))];
+        self.motion.frame(&gaussians.position, opacity, alpha_min, steps, repeats);
     }
 
     fn project(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
@@ -173,7 +181,9 @@ impl<'a> BlockScan<'a> {
     ///
     /// # Panics
     /// If frames are missing, or `plan` does not finish the one this scan began with.
-    pub fn finish_by(self, plan: &ScanPlan) -> BlockStatistics {
+    pub fn finish_by(mut self, plan: &ScanPlan) -> BlockStatistics {
+        self.life.settle();
+        self.motion.settle();
         assert_eq!(self.next_frame, plan.frames, "every frame is scanned");
         assert!(std::ptr::eq(plan, self.plan) || plan.finishes(self.plan), "the plan is that of another scan");
         let pairs = f64::from(plan.pairs.max(1));
@@ -219,6 +229,45 @@ mod tests {
 
     fn random(k: usize) -> f32 {
         (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
+    }
+
+    /// Positions and opacities of frame `t`; opacities follow `opacity_of`.
+    fn made(t: usize, opacity_of: usize) -> Gaussians {
+        let mut frame = Gaussians::zeros(77, 0);
+        for (column, t) in [(Columns::POSITION, t), (Columns::OPACITY, opacity_of), (Columns::ROTATION, 0)] {
+            for (i, x) in frame.column_mut(column).planes_mut().iter_mut().enumerate() {
+                // About half of the opacities are below 1/255.
+                *x = 10.0 * random(1000 * t + i) - if column == Columns::OPACITY { 10.5 } else { 7.0 };
+            }
+        }
+        frame
+    }
+
+    #[test]
+    fn opacities_that_are_not_named_as_changed_count_as_if_they_were() {
+        for motion in [Motion::Literal, Motion::Runs] {
+            let scan = Scan { motion, ..Recipe::preset("default").unwrap().scan };
+            // The frame whose opacities each frame has: for ever the first's; changed late, and steady again; from the
+            // second frame on; one frame.
+            let cases: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
+            for opacities in cases {
+                let times: Vec<f64> = (0..opacities.len()).map(|t| t as f64 + f64::from(t > 4)).collect();
+                let schedule = Schedule { cameras: vec![], frames: vec![vec![]; times.len()] };
+                let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
+                let [mut all, mut named] = [BlockScan::new(77, 0, &plan), BlockScan::new(77, 0, &plan)];
+                for (t, &of) in opacities.iter().enumerate() {
+                    let frame = made(t, of);
+                    let changed = t > 0 && of != opacities[t - 1];
+                    all.frame(t, &frame, &[], NEEDED);
+                    let opacity = if changed { Columns::OPACITY } else { Columns::NONE };
+                    named.frame(t, &frame, &[], Columns::POSITION | opacity);
+                }
+                let (all, named) = (all.finish(), named.finish());
+                let living = all.rows.life.iter().filter(|&&life| life > 0).count();
+                assert!((9..77).contains(&living), "some must live and some not, {living} do");
+                assert_eq!(all, named, "{motion:?}, {opacities:?}");
+            }
+        }
     }
 
     #[test]
