@@ -1,10 +1,10 @@
 //! Measuring how alike pairs of Gaussians move, over all frames.
 //!
 //! As long as all pairs fit, they are measured in one read of the source. Else the trajectories of every Gaussian in a
-//! pair are gathered once in voxel order, and the pairs are cut into partitions of that order: a
-//! partition is so many consecutive pairs, and reads the Gaussians that lead them and their ghosts, the partners
-//! within ε that other partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is
-//! split. Every pair is summed whole in one partition, so no cut changes a bit.
+//! pair are gathered once in voxel order, and the pairs are cut into partitions of that order: a partition is so many
+//! consecutive pairs, and reads the Gaussians that lead them and their ghosts, the partners within ε that other
+//! partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is split. Every pair is
+//! summed whole in one partition, so no cut changes a bit.
 
 use std::path::PathBuf;
 
