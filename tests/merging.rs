@@ -6,13 +6,14 @@ mod scene;
 use std::path::Path;
 
 use glam::{DMat3, DQuat, DVec3};
-use scene::{PlyRows, by_formula, state, tiny};
+use scene::{PlyRows, by_formula, lasting_files, state, tiny};
 use splatsieve::merge::proxy::merge_state;
 use splatsieve::model::{Gaussians, SH_C0};
-use splatsieve::pipeline::compress::{CompressOptions, Only, compress_scene};
+use splatsieve::pipeline::compress::{CompressOptions, Only, Target, compress_scene};
 use splatsieve::pipeline::input::{InputOptions, Scene};
 use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
 use splatsieve::pipeline::summary::Stages;
+use splatsieve::plan::Limits;
 use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
 
 /// Tightens a gate.
@@ -330,5 +331,32 @@ fn every_gate_binds_as_the_sequential_rule() {
         edit(&mut recipe.merge);
         let joined = merges_as_method_says(&recipe, Only::Merge);
         assert!(joined < all, "{gate} binds nothing: {joined} joined, {all} without");
+    }
+}
+
+#[test]
+fn partitions_of_the_pairs_change_no_byte() {
+    // Two passes, so that the second asks for pairs of which some are known; and a target, so that many sets of
+    // survivors are tried.
+    let mut recipe = by_formula("default");
+    recipe.merge.passes.push(MergePass { epsilon: 0.2, d0: 4.0, rho: 0.5, tau_m: 0.3 });
+    for target in [None, Some(Target::Count(180))] {
+        let folder = tempfile::tempdir().unwrap();
+        let merge = |pairs_together: usize| {
+            let (output, scratch) = (folder.path().join(format!("out{pairs_together}")), tempfile::tempdir().unwrap());
+            let mut scene = scene::scene(&tiny());
+            scene.limits = Limits { pairs_together, frames_held: 3, ..Limits::NONE };
+            scene.scratch = Some(scratch.path().to_owned());
+            let options = CompressOptions { target, ..options(&output, &recipe, Only::Both) };
+            let (summary, map) = compress_scene(&scene, &options, Stages::default()).unwrap();
+            assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "scratch files are left");
+            (lasting_files(&output), map, summary.merge.unwrap().passes)
+        };
+        let whole = merge(usize::MAX);
+        let pairs = whole.2[0].candidates;
+        assert!(pairs > 64 && whole.2.iter().all(|pass| pass.joins > 0), "{:?}", whole.2);
+        for partitions in [1, 7, 64] {
+            assert!(merge(pairs.div_ceil(partitions)) == whole, "{partitions} partitions, target {target:?}");
+        }
     }
 }

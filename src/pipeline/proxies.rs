@@ -1,7 +1,7 @@
 //! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is
 //! the merged one (METHOD section 5, "Motion").
 
-use super::merging::Sieved;
+use super::merging::{Cluster, Sieved};
 use super::scored::Reference;
 use crate::deform::Deltas;
 use crate::error::Result;
@@ -44,15 +44,24 @@ pub fn canonical_proxies(
     if leaders.is_empty() {
         return Ok(CanonicalProxies { raw, deviation: None, notes });
     }
-    let info = model.info();
-    let deltas = model.deltas_at(&of_leaders.position, info.times[reference.frame])?;
     // At the leader, the canonical position is the leader's to the bit, and so is the path.
     let solved = match merge.placement {
         Placement::Mean => Columns::ALL,
         Placement::Leader => Columns::ALL.without(Columns::POSITION),
     };
-    let merged = merged_states(model, reference, sieved, merge)?;
-    deltas.solve(&with_leader_lengths(&deltas, &of_leaders, merged), solved, &mut raw);
+    for (clusters, first) in sieved.clusters.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
+        let of_leaders = model.canonical().pick(&leaders[first..first + clusters.len()]);
+        let deltas = model.deltas_at(&of_leaders.position, model.info().times[reference.frame])?;
+        let states = merged_states(model, reference, clusters, merge)?;
+        let mut of_block = of_leaders.clone();
+        deltas.solve(&with_leader_lengths(&deltas, &of_leaders, states), solved, &mut of_block);
+        for column in Columns::ALL.iter() {
+            for c in 0..of_block.column(column).width() {
+                let block = of_block.column(column).plane(c);
+                raw.column_mut(column).plane_mut(c)[first..][..block.len()].copy_from_slice(block);
+            }
+        }
+    }
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
     if unsolved > 0 {
         notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
@@ -72,19 +81,17 @@ pub fn canonical_proxies(
     Ok(CanonicalProxies { raw, deviation: deviations.into_iter().reduce(f64::max), notes })
 }
 
-/// State of every proxy at the reference frame.
-fn merged_states(model: &ModelFolder, reference: Reference, sieved: &Sieved, merge: &Merge) -> Result<Gaussians> {
-    let mut states = Gaussians::zeros(sieved.clusters.len(), model.info().sh_degree);
-    for (clusters, first) in sieved.clusters.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
-        let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
-        let of_members = gather(model, &ids, reference.frame, Columns::ALL)?;
-        let mut rows = 0..ids.len() as u32;
-        for (cluster, proxy) in clusters.iter().zip(first..) {
-            let members: Vec<(u32, f64)> =
-                cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
-            let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
-            merge_state(&members, &of_members, members[leader].0, merge).write(Columns::ALL, proxy, &mut states);
-        }
+/// States of the proxies of `clusters` at the reference frame.
+fn merged_states(model: &ModelFolder, reference: Reference, clusters: &[Cluster], merge: &Merge) -> Result<Gaussians> {
+    let mut states = Gaussians::zeros(clusters.len(), model.info().sh_degree);
+    let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
+    let of_members = gather(model, &ids, reference.frame, Columns::ALL)?;
+    let mut rows = 0..;
+    for (proxy, cluster) in clusters.iter().enumerate() {
+        let members: Vec<(u32, f64)> =
+            cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
+        let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
+        merge_state(&members, &of_members, members[leader].0, merge).write(Columns::ALL, proxy, &mut states);
     }
     Ok(states)
 }

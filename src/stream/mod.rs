@@ -24,7 +24,6 @@ pub use progress::Progress;
 pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;
 pub use scan::{RunningScan, Scanned, scan};
-pub use trajectories::Trajectories;
 
 /// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.
 /// Results do not depend on it.

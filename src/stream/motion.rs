@@ -1,28 +1,26 @@
 //! Measuring how alike pairs of Gaussians move, over all frames.
 //!
 //! As long as all pairs fit, they are measured in one read of the source. Else the trajectories of every Gaussian in a
-//! pair are gathered once in voxel order ([`Trajectories`]), and the pairs are cut into partitions of that order: a
-//! partition is so many consecutive pairs, and reads the Gaussians that lead them and their ghosts, the partners
-//! within ε that other partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is
-//! split. Every pair is summed whole in one partition, so no cut changes a bit.
+//! pair are gathered once in voxel order, and the pairs are cut into partitions of that order: a partition is so many
+//! consecutive pairs, and reads the Gaussians that lead them and their ghosts, the partners within ε that other
+//! partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is split. Every pair is
+//! summed whole in one partition, so no cut changes a bit.
 
 use std::path::PathBuf;
 
 use rayon::prelude::*;
 
-use super::{BLOCK, Progress, Trajectories};
+use super::trajectories::{NEEDED, Trajectories};
+use super::{BLOCK, Progress};
 use crate::emit::container::FRAME_BLOCK;
 use crate::error::{Error, Result};
 use crate::merge::known::Likeness;
 use crate::merge::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merge::voxels::voxel_order;
-use crate::model::{Column, Columns, Gaussians, opacity};
+use crate::model::{Column, Gaussians, opacity};
 use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::plan::Limits;
 use crate::recipe;
-
-/// What test 3 reads of a Gaussian.
-const NEEDED: Columns = Columns::POSITION.with(Columns::OPACITY);
 
 /// Memory of one pair while it is measured: its sums, its two Gaussians while they are counted, its result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
@@ -52,8 +50,8 @@ impl PairMeter<'_> {
     /// positions of `ids` at the reference frame; partners lie within about `reach` of each other there.
     ///
     /// Memory: [`BYTES_PER_PAIR`] and [`bytes_per_gaussian`] for the pairs measured together; 16 bytes for every pair; and
-    /// where not all fit, 12 bytes for each of `ids` and what [`Trajectories`] needs for those in a pair. Nothing grows
-    /// with the number of frames. A sequence in which neither positions nor opacities vary is measured by its first.
+    /// where not all fit, 12 bytes for each of `ids` and what gathering trajectories needs for those in a pair. Nothing
+    /// grows with the number of frames. A sequence in which neither positions nor opacities vary is measured by its first.
     pub fn measure(
         &self,
         ids: &[u32],
@@ -64,17 +62,16 @@ impl PairMeter<'_> {
         let mut found = Vec::with_capacity(pairs.len());
         if pairs.len() <= self.limits.pairs_together {
             let rows = members(&pairs);
-            let of_rows: Vec<u32> = rows.iter().map(|&row| ids[row as usize]).collect();
-            let progress = Progress::new("motion", "Gaussian frames", self.work(self.source, rows.len()));
             let places = rows.iter().map(|&row| reference.row(row as usize));
-            let measured = self.follow(self.source, &of_rows, places, local(&pairs, &rows), |n| progress.advance(n))?;
+            let mut motion = PairMotion::new(local(&pairs, &rows), places, self.scan.motion);
+            self.play_source(&rows.iter().map(|&row| ids[row as usize]).collect::<Vec<u32>>(), &mut motion)?;
+            let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
             found.extend(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)));
             return Ok(found);
         }
         let order = voxel_order(&members(&pairs), reference, reach);
         let of_order: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
-        let trajectories =
-            Trajectories::gather(self.source, &of_order, NEEDED, self.limits.frames_held, &self.scratch)?;
+        let mut trajectories = Trajectories::gather(self.source, &of_order, self.limits.frames_held, &self.scratch)?;
         drop(of_order);
         let mut place = vec![0; ids.len()];
         for (&row, k) in order.iter().zip(0u32..) {
@@ -92,7 +89,14 @@ impl PairMeter<'_> {
         for of_partition in pairs.chunks(pairs.len().div_ceil(partitions)) {
             let places = members(of_partition);
             let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
-            let measured = self.follow(trajectories.source(), &places, at, local(of_partition, &places), |_| ())?;
+            let mut motion = PairMotion::new(local(of_partition, &places), at, self.scan.motion);
+            trajectories.play(&places, |moments| {
+                motion.frame(|node| {
+                    let [x, y, z, logit] = moments[node];
+                    ([x, y, z], self.is_alive(logit))
+                });
+            })?;
+            let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
             found.extend(of_partition.iter().zip(measured).map(|(&(i, j), likeness)| {
                 let (a, b) = (order[i as usize], order[j as usize]);
                 (a.min(b), a.max(b), likeness)
@@ -102,53 +106,39 @@ impl PairMeter<'_> {
         Ok(found)
     }
 
-    /// Likeness of `pairs` of places in `ids`, whose positions at the reference frame are `reference`.
-    fn follow(
-        &self,
-        source: &dyn FrameSource,
-        ids: &[u32],
-        reference: impl ExactSizeIterator<Item = [f32; 3]>,
-        pairs: impl ExactSizeIterator<Item = (u32, u32)>,
-        advance: impl Fn(u64) + Sync,
-    ) -> Result<impl Iterator<Item = f64>> {
-        let info = source.info();
+    /// Shows `motion` every frame of the Gaussians `ids`; the first alone if nothing varies.
+    fn play_source(&self, ids: &[u32], motion: &mut PairMotion) -> Result<()> {
+        let info = self.source.info();
         let varying = info.varying & NEEDED;
+        let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
+        let progress = Progress::new("motion", "Gaussian frames", (ids.len() * frames) as u64);
         let mut readers: Vec<Box<dyn BlockReader + '_>> = ids
             .par_chunks(BLOCK)
             .map(|ids| {
-                let mut reader = source.open(Ids::List(ids))?;
+                let mut reader = self.source.open(Ids::List(ids))?;
                 reader.hold(self.limits.frames_held);
                 Ok(reader)
             })
             .collect::<Result<_>>()?;
         let mut states: Vec<Gaussians> = readers.iter().map(|_| Gaussians::zeros(0, info.sh_degree)).collect();
-        let mut motion = PairMotion::new(pairs, reference, self.scan.motion);
-        for frame in 0..frames(source) {
+        for frame in 0..frames {
             let want = if frame == 0 { NEEDED } else { varying };
             readers.par_iter_mut().zip(&mut states).try_for_each(|(reader, state)| {
                 reader.read(frame, want, state)?;
-                advance(state.position.len() as u64);
+                progress.advance(state.position.len() as u64);
                 Ok::<_, Error>(())
             })?;
             motion.frame(|node| {
                 let (state, row) = (&states[node / BLOCK], node % BLOCK);
-                (state.position.row(row), opacity(state.opacity_logit.plane(0)[row]) >= self.scan.alpha_min)
+                (state.position.row(row), self.is_alive(state.opacity_logit.plane(0)[row]))
             });
         }
-        Ok(motion.finish().map(|pair| self.gate.likeness(&pair)))
+        Ok(())
     }
 
-    /// Gaussian frames to read for `gaussians` of a source.
-    fn work(&self, source: &dyn FrameSource, gaussians: usize) -> u64 {
-        (gaussians * frames(source)) as u64
+    fn is_alive(&self, logit: f32) -> bool {
+        opacity(logit) >= self.scan.alpha_min
     }
-}
-
-/// Frames that say everything about the motion in a source.
-fn frames(source: &dyn FrameSource) -> usize {
-    let info = source.info();
-    let all = info.times.len();
-    if (info.varying & NEEDED).is_empty() { all.min(1) } else { all }
 }
 
 /// Everybody in a pair, increasing.
@@ -165,4 +155,138 @@ fn members(pairs: &[(u32, u32)]) -> Vec<u32> {
 fn local<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
     let place = |member: u32| members.binary_search(&member).unwrap_or_default() as u32;
     pairs.iter().map(move |&(a, b)| (place(a), place(b)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::demo::Scene;
+    use crate::model::{Columns, SequenceInfo};
+    use crate::recipe::Recipe;
+    use crate::stream::gather;
+
+    /// The reference frame of all tests.
+    const REFERENCE: usize = 3;
+
+    /// Every third Gaussian of a demo scene, and all pairs of them within `reach`.
+    struct Case {
+        scene: Scene,
+        recipe: Recipe,
+        ids: Vec<u32>,
+        reference: Column,
+        pairs: Vec<(u32, u32)>,
+    }
+
+    impl Case {
+        fn new(reach: f64) -> Case {
+            let scene = Scene::new(1500, 9);
+            let ids: Vec<u32> = (0..1500).step_by(3).collect();
+            let reference = gather(&scene, &ids, REFERENCE, Columns::POSITION).unwrap().position;
+            let at = |i: u32| glam::DVec3::from(reference.row::<3>(i as usize).map(f64::from));
+            let count = ids.len() as u32;
+            let pairs = (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b)));
+            let pairs = pairs.filter(|&(a, b)| at(a).distance(at(b)) <= reach).collect();
+            Case { recipe: Recipe::preset("default").unwrap(), ids, pairs, reference, scene }
+        }
+
+        fn measure(&self, source: &dyn FrameSource, pairs_together: usize, reach: f64) -> Result<Vec<(u32, u32, u64)>> {
+            let folder = tempfile::tempdir().unwrap();
+            let meter = PairMeter {
+                source,
+                scan: &self.recipe.scan,
+                gate: MotionGate::new(&self.recipe.merge, 4.0),
+                limits: Limits { pairs_together, frames_held: 4, ..Limits::NONE },
+                scratch: folder.path().to_owned(),
+            };
+            let found = meter.measure(&self.ids, &self.reference, self.pairs.clone(), reach);
+            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
+            // NaN is a finding too, so bits are compared.
+            let mut found: Vec<(u32, u32, u64)> = found?.into_iter().map(|(a, b, x)| (a, b, x.to_bits())).collect();
+            found.sort_unstable();
+            Ok(found)
+        }
+
+        /// All frames of all Gaussians at once.
+        fn plainly(&self) -> Vec<(u32, u32, u64)> {
+            let gate = MotionGate::new(&self.recipe.merge, 4.0);
+            let reference = (0..self.ids.len()).map(|i| self.reference.row(i));
+            let mut motion = PairMotion::new(self.pairs.iter().copied(), reference, self.recipe.scan.motion);
+            for frame in 0..self.scene.info().times.len() {
+                let state = gather(&self.scene, &self.ids, frame, NEEDED).unwrap();
+                let alive = |i| opacity(state.opacity_logit.plane(0)[i]) >= self.recipe.scan.alpha_min;
+                motion.frame(|i| (state.position.row(i), alive(i)));
+            }
+            let likeness = motion.finish().map(|pair| gate.likeness(&pair).to_bits());
+            self.pairs.iter().zip(likeness).map(|(&(a, b), likeness)| (a, b, likeness)).collect()
+        }
+    }
+
+    #[test]
+    fn any_number_of_partitions_finds_what_one_look_at_everything_finds() {
+        let reach = 0.5;
+        let case = Case::new(reach);
+        let (all, expected) = (case.pairs.len(), case.plainly());
+        assert!(all > 1000, "{all} pairs");
+        let apart = expected.iter().filter(|(.., likeness)| f64::from_bits(*likeness).is_nan()).count();
+        assert!(apart > 0 && apart + 100 < all, "{apart} of {all} drift apart");
+        for partitions in [1, 7, 64, all] {
+            let got = case.measure(&case.scene, all.div_ceil(partitions), reach).unwrap();
+            assert!(got == expected, "{partitions} partitions");
+        }
+    }
+
+    #[test]
+    fn a_voxel_with_more_pairs_than_a_partition_holds_is_split() {
+        let case = Case::new(0.3);
+        // Voxels wider than the scene: all pairs are led from one.
+        let got = case.measure(&case.scene, case.pairs.len() / 5, 1e6).unwrap();
+        assert!(got == case.plainly());
+    }
+
+    #[test]
+    fn no_pair_reads_nothing() {
+        let case = Case { pairs: Vec::new(), ..Case::new(0.0) };
+        let unreadable = Failing { scene: &case.scene, from: 0 };
+        assert!(case.measure(&unreadable, 1, 0.3).unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_source_that_fails_midway_leaves_no_scratch_file() {
+        let case = Case::new(0.3);
+        let failing = Failing { scene: &case.scene, from: 6 };
+        for pairs_together in [usize::MAX, 10] {
+            let error = case.measure(&failing, pairs_together, 0.3).unwrap_err();
+            assert!(error.to_string().contains("frame 6 is gone"), "{error}");
+        }
+    }
+
+    /// A scene whose frames cannot be read from one on.
+    struct Failing<'a> {
+        scene: &'a Scene,
+        from: usize,
+    }
+
+    impl FrameSource for Failing<'_> {
+        fn info(&self) -> &SequenceInfo {
+            self.scene.info()
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(FailingReader { reader: self.scene.open(ids)?, from: self.from }))
+        }
+    }
+
+    struct FailingReader<'a> {
+        reader: Box<dyn BlockReader + 'a>,
+        from: usize,
+    }
+
+    impl BlockReader for FailingReader<'_> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            if frame >= self.from {
+                return Err(Error::usage(format!("frame {frame} is gone")));
+            }
+            self.reader.read(frame, want, out)
+        }
+    }
 }

@@ -1,215 +1,258 @@
-//! Trajectories of some Gaussians in a scratch container, in an order of their own: what is read together lies
+//! Positions and opacities of some Gaussians in a scratch file, in an order of their own: what is read together lies
 //! together, so that a piece is read without the rest.
 //!
 //! The source is read once, block of Gaussians by block of Gaussians in the order of ids, some frames at a time:
 //! what holds tiles decodes each once if they span no more frames, and opening a file costs once per block.
-//! Memory while they are gathered: per Gaussian 8 bytes, and those of its columns for every frame taken together; for
-//! every thread two blocks of as many frames. Nothing grows with the number of frames.
+//! The file is read by the calling thread with plain reads: it has no index and leaves no mapped pages, either of which
+//! would grow with the number of frames.
+//!
+//! The file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block of F frames,
+//! of which the last may be shorter, what varies of these, `[N, F, W]` with W = 4, 3 or 1, or nothing. All f32 as this
+//! machine has them.
+//!
+//! Memory while gathering, per Gaussian: 8 bytes, and what varies of 16 for each of F frames; for every thread two
+//! blocks of as many frames.
 
-use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::Path;
 
-use gseq::Compression;
 use rayon::prelude::*;
 
 use super::{BLOCK, Progress};
 use crate::emit::atomic::ScratchFile;
-use crate::emit::container::{ContainerWriter, FRAME_BLOCK};
-use crate::error::Result;
-use crate::ingest::container::Container;
-use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::emit::container::FRAME_BLOCK;
+use crate::error::{Error, Result};
+use crate::model::{Columns, Gaussians};
+use crate::pass::{FrameSource, Ids};
 
-/// Packed by the fastest level: a fraction of the disk that raw trajectories take, and the container then keeps no
-/// mapped pages of the size of what it holds.
-const COMPRESSION: Compression = Compression::Zstd(1);
+/// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
+pub(super) type Moment = [f32; 4];
+
+/// The columns of a [`Moment`].
+pub(super) const NEEDED: Columns = Columns::POSITION.with(Columns::OPACITY);
+
+/// Gaussians between two that are wanted which are rather read than skipped.
+const GAP: u32 = 32;
+/// Gaussians read at a time.
+const RUN: usize = 2048;
 
 /// Trajectories in a file that lasts as long as this.
-pub struct Trajectories {
-    container: Container,
-    _scratch: ScratchFile,
+pub(super) struct Trajectories {
+    file: File,
+    scratch: ScratchFile,
+    count: usize,
+    frames: usize,
+    /// Frames of a block.
+    block: usize,
+    /// Which numbers of a moment vary.
+    varying: Range<usize>,
 }
 
 impl Trajectories {
-    /// Gathers the columns `want` of the Gaussians `ids` of `source`, all different, in a file in `folder`; all other
-    /// columns are zero. Takes at most `frames_together` frames at a time.
+    /// Gathers the Gaussians `ids` of `source`, all different and in that order, in a file in `folder`. Takes at most
+    /// `frames_together` frames at a time.
     ///
     /// # Errors
     /// Those of reading `source` and of writing the file, which is gone then.
-    pub fn gather(
+    pub(super) fn gather(
         source: &dyn FrameSource,
         ids: &[u32],
-        want: Columns,
         frames_together: usize,
         folder: &Path,
     ) -> Result<Trajectories> {
-        let of_source = source.info();
-        let info =
-            SequenceInfo { count: ids.len(), times: Vec::new(), sh_degree: 0, varying: of_source.varying & want };
-        let mut by_id: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
-        by_id.par_sort_unstable();
-        let mut rows = vec![0; ids.len()];
-        for (row, &(_, place)) in by_id.iter().enumerate() {
-            rows[place as usize] = row as u32;
-        }
-        let sorted: Vec<u32> = by_id.into_iter().map(|(id, _)| id).collect();
-
+        let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
+        let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
+        places.par_sort_unstable();
         let scratch = ScratchFile::new(folder)?;
+        let io = |what| Error::io(what, scratch.path());
+        let mut file =
+            OpenOptions::new().read(true).write(true).create_new(true).open(scratch.path()).map_err(io("create"))?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
-        let mut writer = ContainerWriter::create(scratch.path(), ids.len(), 0, block, COMPRESSION, BTreeMap::new())?;
-        let progress = Progress::new("gather", "Gaussian frames", (ids.len() * of_source.times.len()) as u64);
-        let mut gathered = Gathered { info, want, rows, frames: Vec::new() };
-        for start in (0..of_source.times.len()).step_by(block) {
-            let frames = start..of_source.times.len().min(start + block);
-            gathered.take(source, &sorted, frames.clone())?;
-            writer.append(&gathered, 0..frames.len(), |done| progress.advance(done))?;
+        let progress = Progress::new("gather", "frames", frames as u64);
+        let mut values = Vec::new();
+        if frames > 0 {
+            take(source, &places, 0..1, NEEDED, &mut values)?;
+            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write"))?;
         }
-        writer.finish()?;
-        Ok(Trajectories { container: Container::open(scratch.path())?, _scratch: scratch })
+        for start in (0..frames).step_by(block).take_while(|_| !columns.is_empty()) {
+            let of_block = start..frames.min(start + block);
+            take(source, &places, of_block.clone(), columns, &mut values)?;
+            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write"))?;
+            progress.advance(of_block.len() as u64);
+        }
+        let varying = numbers(columns);
+        Ok(Trajectories { file, scratch, count: ids.len(), frames, block, varying })
     }
 
-    /// The trajectories as a source: Gaussian k is the k-th that was asked for.
-    pub fn source(&self) -> &dyn FrameSource {
-        &self.container
-    }
-}
-
-/// Some frames of the Gaussians, as they are to be written.
-struct Gathered {
-    info: SequenceInfo,
-    want: Columns,
-    /// Row in the frames of every Gaussian.
-    rows: Vec<u32>,
-    /// By increasing id; columns that do not vary are in the first alone.
-    frames: Vec<Gaussians>,
-}
-
-impl Gathered {
-    /// Takes `frames` of `source` in place of those before; `ids` increase.
-    fn take(&mut self, source: &dyn FrameSource, ids: &[u32], frames: Range<usize>) -> Result<()> {
-        let of_source = source.info();
-        self.info.times = of_source.times[frames.clone()].to_vec();
-        self.frames.resize_with(frames.len().max(self.frames.len()), || Gaussians::zeros(0, 0));
-        let columns = |frame: usize| if frame == 0 { self.want } else { self.info.varying };
-        if columns(frames.end - 1).is_empty() && columns(frames.start).is_empty() {
+    /// Shows the moments of the Gaussians at `places` (increasing) frame after frame; only once if none varies.
+    ///
+    /// Memory: of every one its moment, what varies of it for the frames of a block, and a bounded buffer.
+    ///
+    /// # Errors
+    /// Those of reading the file.
+    pub(super) fn play(&mut self, places: &[u32], mut show: impl FnMut(&[Moment])) -> Result<()> {
+        if self.frames == 0 {
             return Ok(());
         }
-        for (state, frame) in self.frames.iter_mut().zip(frames.clone()) {
-            columns(frame).iter().for_each(|column| state.column_mut(column).resize(ids.len()));
+        let mut now: Vec<Moment> = vec![Moment::default(); places.len()];
+        self.read(0, 4, places, bytemuck::cast_slice_mut(&mut now))?;
+        if self.varying.is_empty() {
+            show(&now);
+            return Ok(());
         }
-        let read = |ids: &[u32]| -> Result<Vec<Gaussians>> {
-            let mut reader = source.open(Ids::List(ids))?;
-            reader.hold(frames.len());
-            let at = |frame| {
-                let mut state = Gaussians::zeros(0, of_source.sh_degree);
-                reader.read(frame, columns(frame), &mut state)?;
-                Ok(state)
-            };
-            frames.clone().map(at).collect()
+        let (width, mut values) = (self.varying.len(), Vec::new());
+        for start in (0..self.frames).step_by(self.block) {
+            let frames = self.block.min(self.frames - start);
+            values.resize(places.len() * frames * width, 0.0);
+            let first = self.count * (4 + start * width);
+            self.read(first, frames * width, places, &mut values)?;
+            for frame in 0..frames {
+                for (now, values) in now.iter_mut().zip(values.chunks_exact(frames * width)) {
+                    now[self.varying.clone()].copy_from_slice(&values[frame * width..][..width]);
+                }
+                show(&now);
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads rows of `width` numbers at `places` of a table that begins with number `first` of the file.
+    fn read(&mut self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
+        let mut values: Vec<f32> = Vec::new();
+        for near in places.chunk_by(|a, b| b - a <= GAP).flat_map(|near| near.chunks(RUN)) {
+            let low = near[0] as usize;
+            let rows = near[near.len() - 1] as usize + 1 - low;
+            values.resize(rows * width, 0.0);
+            let at = SeekFrom::Start(4 * (first + low * width) as u64);
+            let bytes = bytemuck::cast_slice_mut(&mut values);
+            self.file
+                .seek(at)
+                .and_then(|_| self.file.read_exact(bytes))
+                .map_err(Error::io("read", self.scratch.path()))?;
+            let (of_run, rest) = out.split_at_mut(near.len() * width);
+            for (to, &place) in of_run.chunks_exact_mut(width).zip(near) {
+                to.copy_from_slice(&values[(place as usize - low) * width..][..width]);
+            }
+            out = rest;
+        }
+        Ok(())
+    }
+}
+
+/// The numbers of a [`Moment`] that `columns` are.
+fn numbers(columns: Columns) -> Range<usize> {
+    let start = if columns.contains(Columns::POSITION) { 0 } else { 3 };
+    start..if columns.contains(Columns::OPACITY) { 4 } else { 3 }
+}
+
+/// Reads `frames` of `columns` of the Gaussians (id, place), which come by id, into `values`: `[N, frames, W]` by place.
+fn take(
+    source: &dyn FrameSource,
+    places: &[(u32, u32)],
+    frames: Range<usize>,
+    columns: Columns,
+    values: &mut Vec<f32>,
+) -> Result<()> {
+    let width = columns.width(0);
+    values.resize(places.len() * frames.len() * width, 0.0);
+    let read = |block: &[(u32, u32)]| -> Result<Vec<Gaussians>> {
+        let ids: Vec<u32> = block.iter().map(|&(id, _)| id).collect();
+        let mut reader = source.open(Ids::List(&ids))?;
+        reader.hold(frames.len());
+        let at = |frame| {
+            let mut state = Gaussians::zeros(0, source.info().sh_degree);
+            reader.read(frame, columns, &mut state)?;
+            Ok(state)
         };
-        // One batch of blocks at a time bounds what waits to be put in its place.
-        let batch = 2 * rayon::current_num_threads() * BLOCK;
-        for (ids, start) in ids.chunks(batch).zip((0..).step_by(batch)) {
-            let blocks: Vec<Vec<Gaussians>> = ids.par_chunks(BLOCK).map(read).collect::<Result<_>>()?;
-            for (of_block, start) in blocks.iter().zip((start..).step_by(BLOCK)) {
-                for ((state, block), frame) in self.frames.iter_mut().zip(of_block).zip(frames.clone()) {
-                    for column in columns(frame).iter() {
-                        let (from, to) = (block.column(column), state.column_mut(column));
-                        for c in 0..from.width() {
-                            to.plane_mut(c)[start..][..from.len()].copy_from_slice(from.plane(c));
-                        }
+        frames.clone().map(at).collect()
+    };
+    // One batch of blocks at a time bounds what waits to be put in its place.
+    for batch in places.chunks(2 * rayon::current_num_threads() * BLOCK) {
+        let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(BLOCK).map(read).collect::<Result<_>>()?;
+        for (block, states) in batch.chunks(BLOCK).zip(&blocks) {
+            for (frame, state) in states.iter().enumerate() {
+                let planes = columns.iter().flat_map(|column| state.column(column).planes().chunks_exact(block.len()));
+                for (c, plane) in planes.enumerate() {
+                    for (&(_, place), &value) in block.iter().zip(plane) {
+                        values[(place as usize * states.len() + frame) * width + c] = value;
                     }
                 }
             }
         }
-        Ok(())
     }
-}
-
-impl FrameSource for Gathered {
-    fn info(&self) -> &SequenceInfo {
-        &self.info
-    }
-
-    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        Ok(Box::new(GatheredReader { gathered: self, rows: ids.iter().map(|id| self.rows[id]).collect() }))
-    }
-}
-
-struct GatheredReader<'a> {
-    gathered: &'a Gathered,
-    rows: Vec<u32>,
-}
-
-impl BlockReader for GatheredReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let Gathered { info, want: known, frames, .. } = self.gathered;
-        for column in want.iter() {
-            let to = out.column_mut(column);
-            to.resize(self.rows.len());
-            if !known.contains(column) {
-                to.planes_mut().fill(0.0);
-                continue;
-            }
-            let from = frames[if info.varying.contains(column) { frame } else { 0 }].column(column);
-            for c in 0..to.width() {
-                let plane = from.plane(c);
-                to.plane_mut(c).iter_mut().zip(&self.rows).for_each(|(to, &row)| *to = plane[row as usize]);
-            }
-        }
-        Ok(())
-    }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::demo::Scene;
+    use crate::model::SequenceInfo;
+    use crate::pass::BlockReader;
 
-    fn states(source: &dyn FrameSource, ids: &[u32], frame: usize) -> (Vec<u32>, Vec<u32>) {
+    /// A scene that says of fewer columns that they vary, and keeps the others as they are at frame 0.
+    struct Still(Scene, SequenceInfo);
+
+    impl Still {
+        fn new(varying: Columns) -> Still {
+            let scene = Scene::new(3000, 7);
+            let info = SequenceInfo { varying, ..scene.info().clone() };
+            Still(scene, info)
+        }
+    }
+
+    impl FrameSource for Still {
+        fn info(&self) -> &SequenceInfo {
+            &self.1
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(StillReader { reader: self.0.open(ids)?, varying: self.1.varying }))
+        }
+    }
+
+    struct StillReader<'a> {
+        reader: Box<dyn BlockReader + 'a>,
+        varying: Columns,
+    }
+
+    impl BlockReader for StillReader<'_> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            self.reader.read(0, want, out)?;
+            self.reader.read(frame, want & self.varying, out)
+        }
+    }
+
+    fn moments(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Vec<Moment> {
         let mut state = Gaussians::zeros(0, source.info().sh_degree);
-        let mut reader = source.open(Ids::List(ids)).unwrap();
-        reader.read(frame, Columns::POSITION | Columns::OPACITY, &mut state).unwrap();
-        let bits = |planes: &[f32]| planes.iter().map(|x| x.to_bits()).collect();
-        (bits(state.position.planes()), bits(state.opacity_logit.planes()))
+        source.open(Ids::List(ids)).unwrap().read(frame, NEEDED, &mut state).unwrap();
+        let moment = |i| {
+            let [x, y, z] = state.position.row(i);
+            [x, y, z, state.opacity_logit.plane(0)[i]]
+        };
+        (0..ids.len()).map(moment).collect()
     }
 
     #[test]
-    fn gathered_trajectories_are_those_of_the_source_in_any_order_however_many_frames_are_taken_together() {
+    fn played_trajectories_are_those_of_the_source_whatever_varies_and_however_many_frames_are_taken_together() {
         let folder = tempfile::tempdir().unwrap();
-        let scene = Scene::new(3000, 7);
         let ids: Vec<u32> = (0..2500).map(|k| (k * 1171 + 5) % 3000).collect();
-        for frames_together in [1, 3, usize::MAX] {
-            let gathered = Trajectories::gather(
-                &scene,
-                &ids,
-                Columns::POSITION | Columns::OPACITY,
-                frames_together,
-                folder.path(),
-            )
-            .unwrap();
-            assert_eq!(gathered.source().info().times, scene.info().times);
-            let places = [0, 1, 999, 1024, 2499, 7];
-            let of_places = places.map(|place| ids[place as usize]);
-            for frame in [0, 2, 3, 6] {
-                let (got, expected) = (states(gathered.source(), &places, frame), states(&scene, &of_places, frame));
-                assert_eq!(got, expected, "frame {frame}, {frames_together} together");
+        // Neighbours, gaps narrow and wide, both ends.
+        let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
+        let of_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
+        for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::NONE] {
+            let source = Still::new(varying);
+            for frames_together in [1, 3, usize::MAX] {
+                let mut gathered = Trajectories::gather(&source, &ids, frames_together, folder.path()).unwrap();
+                let mut shown = Vec::new();
+                gathered.play(&places, |moments| shown.push(moments.to_vec())).unwrap();
+                let frames = if varying.is_empty() { 1 } else { 7 };
+                let expected: Vec<Vec<Moment>> = (0..frames).map(|t| moments(&source, &of_places, t)).collect();
+                assert!(shown == expected, "{varying:?} vary, {frames_together} frames together");
             }
         }
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
-    }
-
-    #[test]
-    fn what_does_not_vary_is_stored_once() {
-        let folder = tempfile::tempdir().unwrap();
-        let scene = Scene::new(100, 70);
-        let gathered = Trajectories::gather(&scene, &[3, 99], Columns::LOG_SCALE, 4, folder.path()).unwrap();
-        assert!(gathered.source().info().varying.is_empty());
-        let mut state = Gaussians::zeros(0, 0);
-        gathered.source().open(Ids::Range(0..2)).unwrap().read(69, Columns::LOG_SCALE, &mut state).unwrap();
-        let mut expected = Gaussians::zeros(0, scene.info().sh_degree);
-        scene.open(Ids::List(&[3, 99])).unwrap().read(0, Columns::LOG_SCALE, &mut expected).unwrap();
-        assert_eq!(state.log_scale, expected.log_scale);
     }
 }

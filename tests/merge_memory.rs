@@ -1,0 +1,99 @@
+//! What measuring pairs of Gaussians keeps in memory, counted in bytes allocated: bounded by the pairs measured
+//! together, whatever the number of frames.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+use splatsieve::demo::Scene;
+use splatsieve::emit::container::write_container;
+use splatsieve::ingest::container::Container;
+use splatsieve::merge::known::KNOWN_BYTES;
+use splatsieve::merge::motion::MotionGate;
+use splatsieve::merge::neighbors::{PointIndex, Search};
+use splatsieve::model::Columns;
+use splatsieve::plan::Limits;
+use splatsieve::recipe::Recipe;
+use splatsieve::stream::gather;
+use splatsieve::stream::motion::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
+
+/// The system's allocator, counting.
+struct Counting;
+
+static NOW: AtomicUsize = AtomicUsize::new(0);
+static PEAK: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: every call is passed on to the system's allocator as it came; counting allocates nothing.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        PEAK.fetch_max(NOW.fetch_add(layout.size(), Relaxed) + layout.size(), Relaxed);
+        // SAFETY: the caller's promises are those that `System` asks for.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
+        NOW.fetch_sub(layout.size(), Relaxed);
+        // SAFETY: the caller's promises are those that `System` asks for.
+        unsafe { System.dealloc(at, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+const COUNT: usize = 20_000;
+const FRAMES_HELD: usize = 2;
+
+/// Most bytes allocated at once while the six nearest neighbours of every Gaussian are measured, beyond what was
+/// before; and the number of pairs.
+fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
+    let path = folder.join(format!("{frames}.gseq"));
+    if !path.exists() {
+        let scene = Scene::new(COUNT, frames);
+        write_container(&scene, &path, gseq::Compression::Zstd(1), BTreeMap::new(), |_| ()).unwrap();
+    }
+    let container = Container::open(&path).unwrap();
+    let ids: Vec<u32> = (0..COUNT as u32).collect();
+    let reference = gather(&container, &ids, 0, Columns::POSITION).unwrap().position;
+    let index = PointIndex::new(COUNT, |i| Some(reference.row(i)));
+    let mut search = Search::default();
+    let mut pairs = Vec::new();
+    for &i in &ids {
+        let (near, _) = index.nearest(i, reference.row(i as usize), 6, f64::INFINITY, &mut search);
+        pairs.extend(near.filter(|&j| i < j).map(|j| (i, j)));
+    }
+    let recipe = Recipe::preset("default").unwrap();
+    let meter = PairMeter {
+        source: &container,
+        scan: &recipe.scan,
+        gate: MotionGate::new(&recipe.merge, 4.0),
+        limits: Limits { pairs_together: pairs.len().div_ceil(partitions), frames_held: FRAMES_HELD, ..Limits::NONE },
+        scratch: folder.to_owned(),
+    };
+    let (count, before) = (pairs.len(), NOW.load(Relaxed));
+    PEAK.store(before, Relaxed);
+    let found = meter.measure(&ids, &reference, pairs, 0.1).unwrap();
+    assert_eq!(found.len(), count);
+    (PEAK.load(Relaxed) - before, count)
+}
+
+#[test]
+fn memory_of_measuring_is_what_is_stated_and_does_not_grow_with_frames() {
+    let folder = tempfile::tempdir().unwrap();
+    // A few threads, as their buffers count too.
+    rayon::ThreadPoolBuilder::new().num_threads(2).build_global().unwrap();
+    let (whole, pairs) = peak(folder.path(), 40, 1);
+    let (short, _) = peak(folder.path(), 40, 64);
+    let (long, _) = peak(folder.path(), 160, 64);
+    eprintln!("{pairs} pairs: {whole} bytes at once; in 64 partitions {short}, with four times the frames {long}");
+    let together = pairs / 64 + 1;
+    // What is found; order and place of everybody and what gathering holds; one partition; buffers of two threads.
+    let stated = KNOWN_BYTES * pairs
+        + (12 + 8 + 16 * FRAMES_HELD) * COUNT
+        + (BYTES_PER_PAIR + 2 * bytes_per_gaussian(FRAMES_HELD)) * together;
+    let buffers = 3 << 20;
+    assert!(short <= stated + buffers, "{short} bytes, {stated} stated and {buffers} for buffers");
+    assert!(long.abs_diff(short) <= short / 20, "{long} bytes for four times the frames, {short} before");
+    assert!(3 * short < whole, "{short} bytes in partitions, {whole} at once");
+}
