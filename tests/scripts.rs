@@ -210,3 +210,46 @@ fn the_4dgaussians_exporter_streams_what_the_repository_evaluates_whatever_it_pr
         }
     }
 }
+
+#[test]
+fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again() {
+    let Some(python) = python("numpy") else { return };
+    let workplace = Workplace::new();
+    let exporter = |arguments: &[&str]| {
+        let mut command = Command::new(&python);
+        command.arg(script("generate_stream.py")).args(arguments);
+        command
+    };
+    let found = packed(&workplace, &mut exporter(&["500", "70"]), "a.gseq");
+    let again = packed(&workplace, &mut exporter(&["500", "70"]), "b.gseq");
+    let info = found.info();
+    assert_eq!((info.count, info.times.len(), info.sh_degree), (500, 70, 3));
+    assert_eq!(info.varying, Columns::ALL.without(Columns::SH));
+    // A period apart the curves are where they were, but for the noise.
+    for (frame, other) in [(0, 1), (33, 34), (5, 65)] {
+        let (one, two) = (state(&found, frame), state(&found, other));
+        assert!(one == state(&again, frame), "frame {frame}");
+        for column in info.varying.iter() {
+            let values = one.column(column).planes().iter().zip(two.column(column).planes());
+            let (all, equal) = values.fold((0, 0), |(all, equal), (a, b)| (all + 1, equal + usize::from(a == b)));
+            // Noise of 2e-5 falls on the same float of size 4 once in a hundred.
+            assert!(equal * 50 < all, "{}: {equal} of {all} values of frames {frame} and {other}", column.name());
+        }
+    }
+    let moved = packed(&workplace, &mut exporter(&["40", "3", "--varying", "position", "--sh-degree", "0"]), "c.gseq");
+    assert_eq!((moved.info().varying, moved.info().sh_degree), (Columns::POSITION, 0));
+}
+
+#[test]
+fn the_scale_script_compresses_every_size_and_says_what_it_took() {
+    let Some(python) = python("numpy") else { return };
+    let workplace = Workplace::new();
+    let mut scale = Command::new(python);
+    scale.arg(script("scale.py")).arg(assert_cmd::cargo::cargo_bin("splatsieve")).arg("here");
+    scale.args(["--sizes", "300x20", "3000x20", "--budgets", "none", "--preset", "paper"]);
+    let printed = String::from_utf8(run(&mut scale, &workplace)).unwrap();
+    assert!(printed.contains("\n| 3,000 | 20 |"), "{printed}");
+    assert!(printed.contains("bytes of peak for each further one"), "{printed}");
+    let kept: Vec<_> = fs::read_dir(workplace.path("here")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(kept.len(), 2, "only cameras.json and scale.json stay, not {kept:?}");
+}

@@ -1,0 +1,161 @@
+//! Which filter should stand before zstd, by column, on what trained models give?
+//!
+//! Candidates: the bits as they are, or zigzagged differences of their ranks to the frame before (`order1`) or to the line
+//! through two (`order2`); in place, or bytes of equal weight gathered (`shuffled`); zstd level 1 or 3. `gseq` takes
+//! the better order of each tile, shuffled, at the level asked for; its choices rest on this. Sizes in percent of the raw
+//! bytes are printed as a Markdown table, a row for every model and column; times are taken over all models.
+//!
+//! `cargo bench --bench filters`; `-- decode/position` measures one column only.
+
+mod trajectories;
+
+use std::hint::black_box;
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use splatsieve::model::Columns;
+use splatsieve::pass::FrameSource;
+
+struct Filter {
+    order: usize,
+    shuffled: bool,
+    level: i32,
+}
+
+/// Every candidate.
+fn filters() -> impl Iterator<Item = Filter> {
+    let with = |order| {
+        [(false, 1), (false, 3), (true, 1), (true, 3)].map(|(shuffled, level)| Filter { order, shuffled, level })
+    };
+    (0..3).flat_map(with)
+}
+
+impl Filter {
+    fn name(&self) -> String {
+        let layout = if self.shuffled { "shuffled" } else { "plain" };
+        format!("order{}_{layout}_zstd{}", self.order, self.level)
+    }
+
+    /// `bits` are frames of `plane` values.
+    fn encode(&self, bits: &[u32], plane: usize) -> Vec<u8> {
+        let mut residuals = bits.to_vec();
+        if self.order > 0 {
+            residuals.iter_mut().for_each(|bits| *bits = rank(*bits));
+            // From the end, so that what predicts is still itself.
+            for frame in (1..bits.len() / plane).rev() {
+                let (before, rest) = residuals.split_at_mut(frame * plane);
+                let (one, two) = predictors(before, frame, plane, self.order);
+                for (i, value) in rest[..plane].iter_mut().enumerate() {
+                    let difference = value.wrapping_sub(predict(one[i], two[i]));
+                    *value = difference << 1 ^ ((difference as i32) >> 31) as u32;
+                }
+            }
+        }
+        let mut bytes = bytemuck::cast_slice(&residuals).to_vec();
+        if self.shuffled {
+            for (weight, bytes) in bytes.chunks_exact_mut(residuals.len()).enumerate() {
+                bytes.iter_mut().zip(&residuals).for_each(|(byte, residual)| *byte = (residual >> (8 * weight)) as u8);
+            }
+        }
+        zstd::bulk::compress(&bytes, self.level).unwrap()
+    }
+
+    fn decode(&self, stored: &[u8], plane: usize, bytes: &mut [u8], out: &mut [u32]) {
+        let len = zstd::bulk::decompress_to_buffer(stored, bytes).unwrap();
+        if self.shuffled {
+            let (low, high) = bytes[..len].split_at(len / 2);
+            let ((b0, b1), (b2, b3)) = (low.split_at(len / 4), high.split_at(len / 4));
+            for (i, value) in out.iter_mut().enumerate() {
+                *value = u32::from_le_bytes([b0[i], b1[i], b2[i], b3[i]]);
+            }
+        } else {
+            bytemuck::cast_slice_mut(out).copy_from_slice(&bytes[..len]);
+        }
+        if self.order > 0 {
+            for frame in 1..out.len() / plane {
+                let (before, rest) = out.split_at_mut(frame * plane);
+                let (one, two) = predictors(before, frame, plane, self.order);
+                for (i, value) in rest[..plane].iter_mut().enumerate() {
+                    let difference = *value >> 1 ^ (*value & 1).wrapping_neg();
+                    *value = difference.wrapping_add(predict(one[i], two[i]));
+                }
+            }
+            out.iter_mut().for_each(|value| *value ^= !((*value as i32) >> 31) as u32 | 0x8000_0000);
+        }
+    }
+}
+
+/// f32 bits as integers in numeric order.
+fn rank(bits: u32) -> u32 {
+    bits ^ (((bits as i32) >> 31) as u32 | 0x8000_0000)
+}
+
+/// The line through two frames at the next; through one twice it is that one.
+fn predict(one: u32, two: u32) -> u32 {
+    one.wrapping_mul(2).wrapping_sub(two)
+}
+
+/// The frame before `frame` and the one before that, which of order 1 is the same.
+fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u32], &[u32]) {
+    let back = |k: usize| &before[(frame - k) * plane..][..plane];
+    (back(1), back(order.min(frame)))
+}
+
+/// Tiles of one column of all models: bits, and the values of one frame.
+type Tiles = Vec<(Vec<u32>, usize)>;
+
+fn benches(criterion: &mut Criterion) {
+    let mut columns: Vec<(Columns, Tiles)> = Columns::ALL.iter().map(|column| (column, Vec::new())).collect();
+    let names: Vec<String> = filters().map(|filter| filter.name()).collect();
+    eprintln!("| scene | column | {} |\n|---|---|{}", names.join(" | "), "---|".repeat(names.len()));
+    for (name, scene) in trajectories::scenes() {
+        for (column, all) in columns.iter_mut().filter(|(column, _)| scene.info().varying.contains(*column)) {
+            let tiles = trajectories::tiles(&scene, *column).into_iter();
+            let tiles: Tiles =
+                tiles.map(|tile| (bytemuck::cast_slice(&tile).to_vec(), tile.len() / scene.len())).collect();
+            let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
+            let percent = |filter: Filter| {
+                let stored: usize = tiles.iter().map(|(bits, plane)| filter.encode(bits, *plane).len()).sum();
+                format!("{:.1}", 100.0 * stored as f64 / raw as f64)
+            };
+            let sizes: Vec<String> = filters().map(percent).collect();
+            eprintln!("| {name} | {} | {} |", column.name(), sizes.join(" | "));
+            // Curves with noise say nothing about what models give.
+            if name != "curves" {
+                all.extend(tiles);
+            }
+        }
+    }
+    for (column, tiles) in columns.iter().filter(|(_, tiles)| !tiles.is_empty()) {
+        let values = tiles.iter().map(|(bits, _)| bits.len()).sum::<usize>();
+        let most = tiles.iter().map(|(bits, _)| bits.len()).max().unwrap_or(0);
+        let (mut bytes, mut out) = (vec![0; 4 * most], vec![0; most]);
+        for filter in filters() {
+            let stored: Vec<Vec<u8>> = tiles.iter().map(|(bits, plane)| filter.encode(bits, *plane)).collect();
+            let mut decode_all = |check: bool| {
+                for ((bits, plane), stored) in tiles.iter().zip(&stored) {
+                    let out = &mut out[..bits.len()];
+                    filter.decode(stored, *plane, &mut bytes, out);
+                    assert!(!check || out == bits, "{} loses bits", filter.name());
+                }
+            };
+            decode_all(true);
+            let mut group = |verb: &str, work: &mut dyn FnMut()| {
+                let mut group = criterion.benchmark_group(format!("{verb}/{}", column.name()));
+                group.sample_size(10).throughput(Throughput::Bytes(4 * values as u64));
+                group.bench_function(BenchmarkId::from_parameter(filter.name()), |bencher| bencher.iter(&mut *work));
+            };
+            group("encode", &mut || {
+                tiles.iter().for_each(|(bits, plane)| _ = black_box(filter.encode(bits, *plane)));
+            });
+            group("decode", &mut || decode_all(false));
+        }
+    }
+}
+
+criterion_group! {
+    name = all;
+    // Over a hundred benchmarks.
+    config = Criterion::default().warm_up_time(std::time::Duration::from_millis(200)).measurement_time(std::time::Duration::from_millis(800));
+    targets = benches
+}
+criterion_main!(all);

@@ -1,0 +1,104 @@
+//! How fast do tiles of a container become bytes and values again, per (Gaussian, frame), on one thread?
+//!
+//! On made-up curves and on what the trained models give (skipped where they are absent), all columns that vary. The
+//! rivals in each group: zstd at the same level on the same bytes without a filter, and copying them. `encode/tile` is
+//! the codec alone, `encode/container` all of packing: states gathered into tiles, encoded, written, synced.
+//! `decode/tile` reads, verifies and decodes from the page cache, `decode/raw` copies raw tiles from there. The
+//! stored sizes are printed before each scene.
+//!
+//! `cargo bench --bench pack`; invert the throughput for the time per (Gaussian, frame).
+
+mod trajectories;
+
+use std::collections::BTreeMap;
+use std::hint::black_box;
+use std::path::Path;
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
+use splatsieve::emit::container::{GAUSSIAN_BLOCK, write_container};
+use splatsieve::model::Columns;
+use splatsieve::pass::FrameSource;
+use splatsieve::stream::HeldFrames;
+
+const LEVEL: i32 = 1;
+
+/// Every tile of the varying columns, with its width.
+fn tiles_of(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
+    let info = scene.info();
+    let of = |column: Columns| {
+        trajectories::tiles(scene, column).into_iter().map(move |tile| (column.width(info.sh_degree) as u32, tile))
+    };
+    info.varying.iter().flat_map(of).collect()
+}
+
+fn write(scene: &HeldFrames, path: &Path, compression: Compression) {
+    write_container(scene, path, compression, BTreeMap::new(), |_| ()).unwrap();
+}
+
+fn decode_all(reader: &Reader, varying: Columns, buffer: &mut TileBuffer) {
+    for gaussian_block in 0..reader.layout().gaussian_blocks() {
+        for (column, of) in Columns::ALL.iter().enumerate() {
+            if varying.contains(of) {
+                let at = TileId { column: column as u32, gaussian_block, frame_block: 0 };
+                black_box(reader.read_tile(at, buffer).unwrap().values());
+            }
+        }
+    }
+}
+
+fn benches(criterion: &mut Criterion) {
+    let folder = tempfile::tempdir().unwrap();
+    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    for (name, scene) in trajectories::scenes() {
+        let (frames, varying) = (scene.len() as u32, scene.info().varying);
+        let tiles = tiles_of(&scene);
+        let bytes = |(_, tile): &(u32, Vec<f32>)| bytemuck::cast_slice::<f32, u8>(tile).to_vec();
+        let raw: Vec<Vec<u8>> = tiles.iter().map(bytes).collect();
+        let plain: Vec<Vec<u8>> = raw.iter().map(|raw| zstd::bulk::compress(raw, LEVEL).unwrap()).collect();
+        let encode = |(width, tile): &(u32, Vec<f32>)| {
+            encode_tile(tile, frames, *width, GAUSSIAN_BLOCK as u32, Compression::Zstd(LEVEL)).unwrap()
+        };
+        let percent = |stored: usize| 100.0 * stored as f64 / raw.iter().map(Vec::len).sum::<usize>() as f64;
+        eprintln!(
+            "{name}: tiles take {:.1}% of their raw bytes, plain zstd {:.1}%",
+            percent(tiles.iter().map(|tile| encode(tile).stored_bytes()).sum()),
+            percent(plain.iter().map(Vec::len).sum())
+        );
+        let path = folder.path().join("scene.gseq");
+        let raw_path = folder.path().join("raw.gseq");
+        write(&scene, &path, Compression::Zstd(LEVEL));
+        write(&scene, &raw_path, Compression::Raw);
+        let (reader, raw_reader) = (Reader::open(&path).unwrap(), Reader::open(&raw_path).unwrap());
+        let most = raw.iter().map(Vec::len).max().unwrap_or(0);
+        let (mut copy, mut buffer) = (vec![0; most], TileBuffer::default());
+        let mut group = |verb: &str, rival: &str, work: &mut dyn FnMut()| {
+            let mut group = criterion.benchmark_group(verb);
+            group.sample_size(10).throughput(Throughput::Elements((scene.info().count * scene.len()) as u64));
+            group.bench_function(BenchmarkId::new(rival, name), |bencher| bencher.iter(&mut *work));
+        };
+        group("encode", "tile", &mut || tiles.iter().for_each(|tile| _ = black_box(encode(tile))));
+        group("encode", "container", &mut || {
+            one_thread.install(|| write(&scene, &folder.path().join("again.gseq"), Compression::Zstd(LEVEL)));
+        });
+        group("encode", "plain_zstd", &mut || {
+            raw.iter().for_each(|raw| _ = black_box(zstd::bulk::compress(raw, LEVEL).unwrap()));
+        });
+        group("encode", "memcpy", &mut || {
+            raw.iter().for_each(|raw| black_box(&mut copy)[..raw.len()].copy_from_slice(raw));
+        });
+        group("decode", "tile", &mut || decode_all(&reader, varying, &mut buffer));
+        group("decode", "raw", &mut || decode_all(&raw_reader, varying, &mut buffer));
+        group("decode", "plain_zstd", &mut || {
+            for stored in &plain {
+                zstd::bulk::decompress_to_buffer(stored, black_box(&mut copy)).unwrap();
+            }
+        });
+        group("decode", "memcpy", &mut || {
+            raw.iter().for_each(|raw| black_box(&mut copy)[..raw.len()].copy_from_slice(raw));
+        });
+    }
+}
+
+criterion_group!(all, benches);
+criterion_main!(all);

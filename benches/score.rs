@@ -1,0 +1,69 @@
+//! What does a value cost on its way into the percentiles that normalise a score, on one thread?
+//!
+//! `sketch` counts N values and finds P1 and P99; `sketch_exact` finds them exactly, by a second look. The rivals sort a
+//! copy of the values, and select both ranks in it without sorting. Values are log-normal, as scores are, with a tenth of
+//! zeros. `merge` adds one sketch to another, which costs the same for any N.
+//!
+//! `cargo bench --bench score`; invert the throughput for the time per value.
+
+use std::hint::black_box;
+
+use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use splatsieve::score::FloatSketch;
+use splatsieve::select::hash_id;
+
+fn value(k: usize) -> f64 {
+    let uniform = |salt: u64| ((hash_id(k as u64 | salt << 48) >> 11) as f64 + 0.5) / (1u64 << 53) as f64;
+    if uniform(0) < 0.1 {
+        return 0.0;
+    }
+    let normal = (-2.0 * uniform(1).ln()).sqrt() * (std::f64::consts::TAU * uniform(2)).cos();
+    (2.0 * normal - 5.0).exp()
+}
+
+/// Place of the `p`-th percentile of `len` values in order.
+fn place(p: usize, len: usize) -> usize {
+    (p * len).div_ceil(100).max(1) - 1
+}
+
+fn benches(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("percentiles");
+    group.sample_size(20);
+    for len in [10_000, 200_000, 2_000_000] {
+        let values: Vec<f64> = (0..len).map(value).collect();
+        let all = || values.iter().copied();
+        group.throughput(Throughput::Elements(len as u64));
+        group.bench_function(BenchmarkId::new("sketch", len), |bencher| {
+            bencher.iter(|| {
+                let sketch = FloatSketch::of(all());
+                (sketch.percentile(1.0), sketch.percentile(99.0))
+            });
+        });
+        group.bench_function(BenchmarkId::new("sketch_exact", len), |bencher| {
+            bencher.iter(|| {
+                let sketch = FloatSketch::of(all());
+                (sketch.exact_percentile(1.0, all()), sketch.exact_percentile(99.0, all()))
+            });
+        });
+        group.bench_function(BenchmarkId::new("sort", len), |bencher| {
+            bencher.iter(|| {
+                let mut sorted = values.clone();
+                sorted.sort_unstable_by(f64::total_cmp);
+                (sorted[place(1, len)], sorted[place(99, len)])
+            });
+        });
+        group.bench_function(BenchmarkId::new("select", len), |bencher| {
+            bencher.iter(|| {
+                let mut part = values.clone();
+                let p99 = *part.select_nth_unstable_by(place(99, len), f64::total_cmp).1;
+                (*part.select_nth_unstable_by(place(1, len), f64::total_cmp).1, p99)
+            });
+        });
+    }
+    let (mut sketch, other) = (FloatSketch::default(), FloatSketch::of((0..200_000).map(value)));
+    group.throughput(Throughput::Elements(1));
+    group.bench_function("merge", |bencher| bencher.iter(|| black_box(&mut sketch).merge(&other)));
+}
+
+criterion_group!(all, benches);
+criterion_main!(all);

@@ -1,0 +1,77 @@
+//! What the container's benches store: states of Gaussians over some frames, of the trained models and made up.
+
+use std::path::Path;
+
+use splatsieve::ingest::ModelFolder;
+use splatsieve::model::{Columns, Gaussians};
+use splatsieve::pass::{FrameSource, Ids};
+use splatsieve::select::hash_id;
+use splatsieve::stream::HeldFrames;
+
+#[path = "../../tests/models/mod.rs"]
+mod models;
+
+const GAUSSIANS: usize = 4096;
+/// Those of one tile, at the sampling the models were trained with.
+const FRAMES: usize = 32;
+const TIMES: usize = 60;
+
+/// Every scene by name: made-up curves, and the trained models where they are.
+pub(crate) fn scenes() -> Vec<(&'static str, HeldFrames)> {
+    let models =
+        models::folder().into_iter().flat_map(|folder| models::NAMES.map(|name| (name, trained(&folder, name))));
+    std::iter::once(("curves", curves())).chain(models).collect()
+}
+
+/// What the field of a trained model gives to Gaussians evenly spread over the cloud, columns that do not vary left out.
+fn trained(folder: &Path, name: &str) -> HeldFrames {
+    let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
+    let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
+    let info = model.info();
+    // Runs of 64 keep what neighbours in the file have in common.
+    let runs = GAUSSIANS / 64;
+    let ids = (0..GAUSSIANS).map(|i| ((i / 64) * (info.count - 64) / runs + i % 64) as u32).collect::<Vec<_>>();
+    let mut reader = model.open(Ids::List(&ids)).unwrap();
+    let constant = Gaussians::zeros(GAUSSIANS, info.sh_degree);
+    let mut held = HeldFrames::new(GAUSSIANS, info.sh_degree, info.varying, constant);
+    for frame in 0..FRAMES {
+        let mut state = Gaussians::zeros(GAUSSIANS, info.sh_degree);
+        reader.read(frame, info.varying, &mut state).unwrap();
+        held.push(info.times[frame], state);
+    }
+    held
+}
+
+/// Smooth curves with 1e-4 of noise in every column but the harmonics.
+fn curves() -> HeldFrames {
+    let random = |k: usize| (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32;
+    let varying = Columns::ALL.without(Columns::SH);
+    let mut held = HeldFrames::new(GAUSSIANS, 0, varying, Gaussians::zeros(GAUSSIANS, 0));
+    for frame in 0..FRAMES {
+        let mut state = Gaussians::zeros(GAUSSIANS, 0);
+        for (c, column) in varying.iter().enumerate() {
+            for (k, x) in state.column_mut(column).planes_mut().iter_mut().enumerate() {
+                let k = c << 20 | k;
+                *x = (6.0 * random(k) + 0.05 * frame as f32).sin() + 1e-4 * random(k | (frame + 1) << 32);
+            }
+        }
+        held.push(frame as f64, state);
+    }
+    held
+}
+
+/// The values of a column in tiles as the container has them: for each block of Gaussians `[frames][width][len]`.
+pub(crate) fn tiles(scene: &HeldFrames, column: Columns) -> Vec<Vec<f32>> {
+    const BLOCK: usize = splatsieve::emit::container::GAUSSIAN_BLOCK;
+    let mut state = Gaussians::zeros(0, scene.info().sh_degree);
+    let block = |start: usize| {
+        let mut reader = scene.open(Ids::Range(start..start + BLOCK)).unwrap();
+        let mut values = Vec::new();
+        for frame in 0..scene.len() {
+            reader.read(frame, column, &mut state).unwrap();
+            values.extend_from_slice(state.column(column).planes());
+        }
+        values
+    };
+    (0..GAUSSIANS).step_by(BLOCK).map(block).collect()
+}
