@@ -167,7 +167,7 @@ def main():
     args = parser.parse_args()
 
     args.folder.mkdir(parents=True, exist_ok=True)
-    print("| Gaussians | frames | raw → packed | --memory | kept | time | peak | peak up to each stage, MiB |")
+    print("| Gaussians | frames | state → stored | --memory | kept | time | peak | peak up to each stage, MiB |")
     print("|---" * 8 + "|")
     done = []
     for gaussians, frames in args.sizes:
