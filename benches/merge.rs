@@ -173,15 +173,19 @@ fn motion(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("measure");
     group.sample_size(10).throughput(Throughput::Elements((48 * pairs.len()) as u64));
     for partitions in [1, 8] {
-        let meter = PairMeter {
-            source: &container,
-            scan: &recipe.scan,
-            gate: MotionGate::new(&recipe.merge, 4.0),
-            limits: Limits { pairs_together: pairs.len().div_ceil(partitions), ..Limits::NONE },
-            scratch: folder.path().to_owned(),
+        let measure = || {
+            let mut meter = PairMeter {
+                source: &container,
+                scan: &recipe.scan,
+                gate: MotionGate::new(&recipe.merge, 4.0),
+                limits: Limits { pairs_together: pairs.len().div_ceil(partitions), ..Limits::NONE },
+                scratch: folder.path().to_owned(),
+                gathered: None,
+            };
+            meter.measure(&ids, &reference, pairs.clone(), 0.05, false).unwrap()
         };
         group.bench_function(BenchmarkId::new("partitions", partitions), |bencher| {
-            bencher.iter(|| one_thread.install(|| meter.measure(&ids, &reference, pairs.clone(), 0.05).unwrap()));
+            bencher.iter(|| one_thread.install(measure));
         });
     }
 }
@@ -206,7 +210,7 @@ fn whole(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("merge");
     group.sample_size(10).throughput(Throughput::Elements(n as u64));
     group.bench_function("pass", |bencher| {
-        bencher.iter(|| one_thread.install(|| merge::run(&survivors, &recipe, None, alike)));
+        bencher.iter(|| one_thread.install(|| merge::run(&survivors, &recipe, None, usize::MAX, alike)));
     });
 }
 

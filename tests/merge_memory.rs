@@ -64,16 +64,17 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
         pairs.extend(near.filter(|&j| i < j).map(|j| (i, j)));
     }
     let recipe = Recipe::preset("default").unwrap();
-    let meter = PairMeter {
+    let mut meter = PairMeter {
         source: &container,
         scan: &recipe.scan,
         gate: MotionGate::new(&recipe.merge, 4.0),
         limits: Limits { pairs_together: pairs.len().div_ceil(partitions), frames_held: FRAMES_HELD, ..Limits::NONE },
         scratch: folder.to_owned(),
+        gathered: None,
     };
     let (count, before) = (pairs.len(), NOW.load(Relaxed));
     PEAK.store(before, Relaxed);
-    let found = meter.measure(&ids, &reference, pairs, 0.1).unwrap();
+    let found = meter.measure(&ids, &reference, pairs, 0.1, false).unwrap();
     assert_eq!(found.len(), count);
     (PEAK.load(Relaxed) - before, count)
 }

@@ -22,20 +22,26 @@ impl KnownPairs {
         missing
     }
 
-    /// Adds pairs that were missing, in any order.
-    pub fn add(&mut self, mut found: Vec<Likeness>) {
-        if self.0.is_empty() {
-            self.0 = found;
-        } else {
-            self.0.reserve_exact(found.len());
-            self.0.append(&mut found);
-        }
-        self.0.sort_unstable_by_key(|&(a, b, _)| (a, b));
+    /// Pairs that were found, in any order, none twice.
+    pub fn new(mut found: Vec<Likeness>) -> Self {
+        found.sort_unstable_by_key(|&(a, b, _)| (a, b));
+        KnownPairs(found)
     }
 
-    /// How alike a pair moves, in either order; NaN if that is not known.
-    pub fn likeness(&self, (a, b): (u32, u32)) -> f64 {
-        self.place((a.min(b), a.max(b))).map_or(f64::NAN, |place| self.0[place].2)
+    /// Adds pairs that were missing, unless more than `most` would be known then.
+    pub fn add(&mut self, mut found: KnownPairs, most: usize) {
+        if self.0.is_empty() {
+            *self = found;
+        } else if self.0.len() + found.0.len() <= most {
+            self.0.reserve_exact(found.0.len());
+            self.0.append(&mut found.0);
+            self.0.sort_unstable_by_key(|&(a, b, _)| (a, b));
+        }
+    }
+
+    /// How alike a pair moves, in either order, if that is known.
+    pub fn likeness(&self, (a, b): (u32, u32)) -> Option<f64> {
+        self.place((a.min(b), a.max(b))).ok().map(|place| self.0[place].2)
     }
 
     fn place(&self, pair: (u32, u32)) -> Result<usize, usize> {
@@ -52,19 +58,21 @@ mod tests {
         let mut known = KnownPairs::default();
         let asked = [(7, 2), (2, 7), (1, 2), (7, 2)];
         assert_eq!(known.missing(asked.into_iter()), [(1, 2), (2, 7)]);
-        known.add(vec![(2, 7, 0.5), (1, 2, f64::NAN)]);
+        known.add(KnownPairs::new(vec![(2, 7, 0.5), (1, 2, f64::NAN)]), 3);
         assert_eq!(known.missing([(7, 2), (9, 1)].into_iter()), [(1, 9)]);
-        known.add(vec![(1, 9, -1.0)]);
-        assert_eq!([(7, 2), (2, 7), (9, 1)].map(|pair| known.likeness(pair)), [0.5, 0.5, -1.0]);
-        assert!(known.likeness((2, 1)).is_nan() && known.likeness((4, 5)).is_nan());
+        known.add(KnownPairs::new(vec![(1, 9, -1.0)]), 3);
+        assert_eq!([(7, 2), (2, 7), (9, 1)].map(|pair| known.likeness(pair)), [0.5, 0.5, -1.0].map(Some));
+        assert!(known.likeness((2, 1)).unwrap().is_nan() && known.likeness((4, 5)).is_none());
         assert!(known.missing(asked.into_iter()).is_empty());
+        known.add(KnownPairs::new(vec![(4, 5, 1.0)]), 3);
+        assert!(known.likeness((4, 5)).is_none(), "a fourth pair is known");
     }
 
     #[test]
     fn a_known_pair_takes_no_more_than_is_stated() {
         let mut known = KnownPairs::default();
-        known.add((0..1000).map(|i| (i, i + 1, 0.0)).collect());
-        known.add((0..777).map(|i| (i, i + 2, 0.0)).collect());
+        known.add(KnownPairs::new((0..1000).map(|i| (i, i + 1, 0.0)).collect()), 1777);
+        known.add(KnownPairs::new((0..777).map(|i| (i, i + 2, 0.0)).collect()), 1777);
         assert!(known.0.capacity() * KNOWN_BYTES <= 1777 * 16, "{}", known.0.capacity());
     }
 }

@@ -10,9 +10,9 @@
 //!
 //! Memory, all of it resident at once at the worst: per survivor its state, which the caller holds, the states of
 //! proxies, of which there are half as many at most, before a pass and after it, and [`BYTES_PER_SURVIVOR`]; per
-//! candidate pair [`BYTES_PER_PAIR`]. Candidate pairs are at most `max_neighbors` per survivor, 3.5 measured among
-//! evenly strewn Gaussians. Whoever measures motion needs more, for as many pairs at a time as it likes;
-//! [`voxels`] says which pairs to take together.
+//! candidate pair of those that are measured together [`BYTES_PER_PAIR`], and per pair that passed all tests
+//! [`BYTES_PER_PASSING`]. Pairs are at most `max_neighbors` per survivor, 3.5 measured among evenly strewn Gaussians.
+//! Whoever measures motion needs more.
 
 pub mod gates;
 pub mod greedy;
@@ -35,14 +35,18 @@ pub use groups::Groups;
 use known::KNOWN_BYTES;
 use neighbors::{PointIndex, Search};
 use proxy::Importance;
+use voxels::voxel_order;
 
 /// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
-/// rank 4, and the larger of the neighbour index, 30 and a flag, and the clustering, 24.
-pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 31;
+/// rank 4, the larger of the neighbour index, 30 and a flag, and the clustering, 24; and the voxel order, 20.
+pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 31 + 20;
 
-/// Memory per candidate pair beside what measuring it takes: the pair, the same pair as one to be measured, and what is
-/// known of it ([`known::KnownPairs`]).
-pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + KNOWN_BYTES;
+/// Memory per candidate pair of those handed on together, beside what measuring takes: the pair, the same pair as one
+/// to be measured, what is known of it and of another of earlier passes ([`known::KnownPairs`]), and its likeness.
+pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * KNOWN_BYTES + size_of::<f64>();
+
+/// Memory per pair that passed all tests of a pass: the pair, and its place among its member's.
+pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
 /// Nodes whose neighbours one task looks up.
 const CHUNK: usize = 1024;
@@ -69,6 +73,8 @@ pub struct Asked<'a> {
     row: &'a [u32],
     /// ε of the pass, scene units: the nodes of a pair lie within it.
     pub reach: f64,
+    /// Whether there are more in this pass, asked for before or after.
+    pub is_part: bool,
 }
 
 impl<'a> Asked<'a> {
@@ -109,7 +115,8 @@ pub struct PassCounts {
 /// All passes of `recipe` over `survivors`.
 ///
 /// `measure` answers test 3: for every pair, in order, how alike it moves; a pair passes where that exceeds the pass's
-/// τ_m. It is asked once per pass, unless no pair is left. The answer depends on the pair alone, so the caller may
+/// τ_m. It is asked once per pass, unless no pair is left, and more often if there are more than `most_pairs`: then for
+/// so many at a time, in the voxel order of those that lead. The answer depends on the pair alone, so the caller may
 /// remember it. In later passes nodes are groups: state = proxy over all original members, size = ΣC, trajectory,
 /// life and hash = the leader's.
 ///
@@ -119,6 +126,7 @@ pub fn run<E>(
     survivors: &Survivors<'_>,
     recipe: &recipe::Merge,
     limit: Option<usize>,
+    most_pairs: usize,
     mut measure: impl FnMut(Asked<'_>) -> Result<Vec<f64>, E>,
 ) -> Result<Merged, E> {
     let importance = &survivors.importance;
@@ -132,14 +140,16 @@ pub fn run<E>(
         }
         let rank = ranks(&groups, importance);
         let nodes = Nodes::new(survivors, &groups, &proxies);
-        let (mut pairs, truncated) = candidates(&nodes, &rank, recipe, pass, unit);
-        let candidates = pairs.len();
-        if candidates > 0 {
-            let likeness = measure(Asked { pairs: &pairs, row: groups.leaders(), reach: pass.epsilon * unit })?;
-            debug_assert_eq!(likeness.len(), candidates, "one likeness per pair");
-            let mut likeness = likeness.into_iter();
-            pairs.retain(|_| likeness.next().is_some_and(|likeness| likeness > pass.tau_m));
-        }
+        let (mut pairs, mut candidates) = (Vec::new(), 0);
+        let truncated = each_candidate(&nodes, &rank, recipe, (pass, unit), most_pairs, |some, is_part| {
+            let asked = Asked { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
+            let likeness = measure(asked)?;
+            debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
+            let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
+            pairs.extend(alike.map(|(&pair, _)| pair));
+            candidates += some.len();
+            Ok(())
+        })?;
         let passing = pairs.len();
         let clustering = greedy::cluster(&rank, pairs, left);
         left = left.map(|left| left - clustering.joins);
@@ -210,43 +220,57 @@ impl<'a> Nodes<'a> {
     }
 }
 
-/// The pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`, `unit` being the length of one unit of the
-/// recipe: the member is among the leader's nearest neighbours and ranks behind it. By leader, then by distance. Also
-/// the number of nodes with more neighbours within ε than were looked at.
+/// Hands on the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`, `unit` being the length of one unit
+/// of the recipe: the member is among the leader's nearest neighbours and ranks behind it. By leader in voxel order,
+/// then by distance; `most` (at least 1) at a time, and whether that is a part of them. Gives the number of nodes with
+/// more neighbours within ε than were looked at.
 ///
 /// A node that is not mergeable or not finite leads nobody, joins nobody and takes no place among the nearest
 /// neighbours of others.
-fn candidates(
+fn each_candidate<E>(
     nodes: &Nodes<'_>,
     rank: &[u32],
     recipe: &recipe::Merge,
-    pass: &recipe::MergePass,
-    unit: f64,
-) -> (Vec<(u32, u32)>, usize) {
+    (pass, unit): (&recipe::MergePass, f64),
+    most: usize,
+    mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
+) -> Result<usize, E> {
     let usable: Vec<bool> = (0..nodes.len()).map(|node| nodes.is_usable(node)).collect();
     let index = PointIndex::new(nodes.len(), |node| usable[node].then(|| nodes.position(node)));
     let gates = Gates::new(recipe, pass);
     let epsilon = pass.epsilon * unit;
-    let of_chunk = |search: &mut Search, chunk: usize| {
+    let of_chunk = |search: &mut Search, leaders: &[u32]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
-        for i in (chunk * CHUNK..((chunk + 1) * CHUNK).min(nodes.len())).filter(|&i| usable[i]) {
-            let look = nodes.look(i);
-            let (near, cut) = index.nearest(i as u32, nodes.position(i), recipe.max_neighbors, epsilon, search);
+        for &i in leaders {
+            let (look, at) = (nodes.look(i as usize), nodes.position(i as usize));
+            let (near, cut) = index.nearest(i, at, recipe.max_neighbors, epsilon, search);
             truncated += usize::from(cut);
-            let behind = near.filter(|&j| rank[i] < rank[j as usize]);
-            pairs.extend(behind.filter(|&j| gates.pass(&look, &nodes.look(j as usize))).map(|j| (i as u32, j)));
+            let behind = near.filter(|&j| rank[i as usize] < rank[j as usize]);
+            pairs.extend(behind.filter(|&j| gates.pass(&look, &nodes.look(j as usize))).map(|j| (i, j)));
         }
         (pairs, truncated)
     };
-    let chunks: Vec<(Vec<(u32, u32)>, usize)> =
-        (0..nodes.len().div_ceil(CHUNK)).into_par_iter().map_init(Search::default, of_chunk).collect();
-    let mut pairs = Vec::with_capacity(chunks.iter().map(|(pairs, _)| pairs.len()).sum());
-    let mut truncated = 0;
-    for (of_chunk, cut) in chunks {
-        pairs.extend(of_chunk);
-        truncated += cut;
+    let leaders: Vec<u32> = (0..nodes.len() as u32).filter(|&node| usable[node as usize]).collect();
+    let leaders = voxel_order(&leaders, |node| nodes.position(node as usize), epsilon);
+    let (mut pairs, mut truncated, mut is_part) = (Vec::new(), 0, false);
+    // One batch of chunks at a time bounds the pairs that wait beside those that are handed on.
+    for batch in leaders.chunks(2 * CHUNK * rayon::current_num_threads()) {
+        let chunks: Vec<(Vec<(u32, u32)>, usize)> =
+            batch.par_chunks(CHUNK).map_init(Search::default, of_chunk).collect();
+        for (of_chunk, cut) in chunks {
+            pairs.extend(of_chunk);
+            truncated += cut;
+        }
+        while pairs.len() > most {
+            is_part = true;
+            take(&pairs[..most], is_part)?;
+            pairs.drain(..most);
+        }
     }
-    (pairs, truncated)
+    if !pairs.is_empty() {
+        take(&pairs, is_part)?;
+    }
+    Ok(truncated)
 }
 
 /// Whether every value of a row is finite.

@@ -68,17 +68,31 @@ impl Scene {
 
     /// [`Scene::merge_moving`] of some rows.
     fn merge_rows(&self, rows: &[u32], recipe: &Merge, limit: Option<usize>, frames: &[Column]) -> Merged {
+        self.merge_in_parts(rows, recipe, limit, frames, usize::MAX).0
+    }
+
+    /// [`Scene::merge_rows`], `most_pairs` measured at a time; and how many were, each time.
+    fn merge_in_parts(
+        &self,
+        rows: &[u32],
+        recipe: &Merge,
+        limit: Option<usize>,
+        frames: &[Column],
+        most_pairs: usize,
+    ) -> (Merged, Vec<usize>) {
         let Scene { states, mergeable, extent, .. } = self;
         let survivors = Survivors { states, rows, importance: self.importance(), mergeable, extent: *extent };
         let gate = MotionGate::new(recipe, recipe.length_unit.in_scene_units(*extent));
+        let mut parts = Vec::new();
         let measure = |asked: Asked<'_>| {
+            parts.push(asked.pairs().len());
             let reference = (0..states.len()).map(|i| frames[0].row(i));
             let mut motion = PairMotion::new(asked.pairs(), reference, Motion::Runs);
             frames.iter().for_each(|frame| motion.frame(|i| (frame.row(i), true)));
             Ok::<_, Infallible>(motion.finish().map(|pair| gate.likeness(&pair)).collect())
         };
-        match run(&survivors, recipe, limit, measure) {
-            Ok(merged) => merged,
+        match run(&survivors, recipe, limit, most_pairs, measure) {
+            Ok(merged) => (merged, parts),
             Err(never) => match never {},
         }
     }
@@ -109,6 +123,22 @@ fn joins(merged: &Merged) -> usize {
 /// The group of `row`.
 fn group_of(groups: &Groups, row: u32) -> usize {
     (0..groups.len()).find(|&group| groups.members(group).contains(&row)).unwrap()
+}
+
+#[test]
+fn pairs_measured_in_parts_merge_to_the_same_bits() {
+    let scene = Scene::strewn(3000);
+    let recipe = scene.recipe();
+    let rows: Vec<u32> = (0..3000).collect();
+    let frames = std::slice::from_ref(&scene.states.position);
+    let (whole, parts) = scene.merge_in_parts(&rows, &recipe, None, frames, usize::MAX);
+    let [pairs] = parts[..] else { panic!("{parts:?}") };
+    assert!(joins(&whole) > 300);
+    for (most, expected) in [(pairs, 1), (pairs.div_ceil(7), 7), (pairs.div_ceil(64), 64)] {
+        let (merged, parts) = scene.merge_in_parts(&rows, &recipe, None, frames, most);
+        assert!(parts.len() == expected && parts.iter().all(|&of_part| of_part <= most), "{most}: {parts:?}");
+        assert!(merged.groups == whole.groups && merged.proxies == whole.proxies && merged.passes == whole.passes);
+    }
 }
 
 #[test]

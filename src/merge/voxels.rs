@@ -7,17 +7,15 @@
 
 use rayon::prelude::*;
 
-use crate::model::Column;
-
 /// Voxels along an axis, at most: three of their numbers make up 63 bits.
 const MOST: u32 = 1 << 21;
 
-/// `rows` by the voxel of their `position` `[3, N]`, scene units; ties by row.
+/// `rows` by the voxel they lie in, `at` telling their positions, scene units; ties by row.
 ///
 /// Voxels are `side` wide, or wider where there would be more than 2²¹ along an axis. Edges: all at one place, and a
 /// side of zero: one voxel. A position that is not finite lies in any voxel.
-pub fn voxel_order(rows: &[u32], position: &Column, side: f64) -> Vec<u32> {
-    let at = |row: u32| position.row::<3>(row as usize).map(f64::from);
+pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
+    let at = |row: u32| at(row).map(f64::from);
     let (mut low, mut widest) = ([0.0; 3], 0.0f64);
     for (c, low) in low.iter_mut().enumerate() {
         let plane = rows.iter().map(|&row| at(row)[c]);
@@ -48,13 +46,6 @@ fn spread(x: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn column(points: &[[f32; 3]]) -> Column {
-        let mut column = Column::zeros(3, points.len());
-        points.iter().enumerate().for_each(|(i, &point)| column.set_row(i, point));
-        column
-    }
-
     #[test]
     fn spreading_moves_every_bit_to_its_place() {
         for k in 0..21 {
@@ -68,7 +59,7 @@ mod tests {
         let lattice = |i: usize| [i % 4, i / 4 % 4, i / 16 % 4].map(|k| k as f32 + 0.25);
         let points: Vec<[f32; 3]> = (0..128).map(lattice).collect();
         let rows: Vec<u32> = (0..128).rev().collect();
-        let order = voxel_order(&rows, &column(&points), 1.0);
+        let order = voxel_order(&rows, |row| points[row as usize], 1.0);
         for (cube, of_cube) in order.chunks(16).enumerate() {
             let corner = [cube & 1, cube >> 1 & 1, cube >> 2].map(|k| 2.0 * k as f32);
             for pair in of_cube.chunks(2) {
@@ -81,13 +72,14 @@ mod tests {
 
     #[test]
     fn any_extent_and_side_give_an_order_of_all_rows() {
-        let far = column(&[[0.0; 3], [f32::MAX; 3], [f32::MIN, 0.0, 1.0], [0.0; 3]]);
+        let points = [[0.0; 3], [f32::MAX; 3], [f32::MIN, 0.0, 1.0], [0.0; 3]];
+        let far = |row: u32| points[row as usize];
         for side in [0.0, 1e-30, 1.0, f64::INFINITY] {
-            let mut order = voxel_order(&[0, 1, 2, 3], &far, side);
+            let mut order = voxel_order(&[0, 1, 2, 3], far, side);
             order.sort_unstable();
             assert_eq!(order, [0, 1, 2, 3], "side {side}");
-            assert_eq!(voxel_order(&[3, 0], &far, side), [0, 3], "one place, side {side}");
-            assert!(voxel_order(&[], &far, side).is_empty());
+            assert_eq!(voxel_order(&[3, 0], far, side), [0, 3], "one place, side {side}");
+            assert!(voxel_order(&[], far, side).is_empty());
         }
     }
 }

@@ -13,7 +13,7 @@ use bytesize::ByteSize;
 use super::compress::Only;
 use super::input::{Input, Scene};
 use super::scored::looks;
-use super::{choose, rounds};
+use super::{choose, merging, rounds};
 use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::error::{Error, Result};
 use crate::ingest::frame_stream::StreamHeader;
@@ -427,8 +427,7 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
         needs.push(Need { stage: "rounds", reads: rounds * sampled(rounds::PICTURES), per_gaussian, fixed });
     }
     if only != Only::Prune && !recipe.merge.passes.is_empty() {
-        let measured = (limits.pairs_together as u64)
-            .saturating_mul(merge::BYTES_PER_PAIR as u64 + stream::motion::BYTES_PER_PAIR as u64);
+        let pairs = merge::BYTES_PER_PAIR + stream::motion::BYTES_PER_PAIR;
         // Of the colours the first band.
         let states = state_bytes(0, Columns::ALL);
         needs.push(Need {
@@ -436,14 +435,15 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
             reads: 1.0,
             per_gaussian: vec![
                 ("rows", SCORED),
-                ("states", 2 * states),
-                // At most one for every two.
-                ("proxies", whole.div_ceil(2)),
+                ("pool", merging::BYTES_PER_SURVIVOR as u64),
+                // At most one for every two, before a pass and after it; then with all colours.
+                ("proxies", states.max(whole.div_ceil(2))),
                 ("survivors", merge::BYTES_PER_SURVIVOR as u64),
+                ("passing", (recipe.merge.max_neighbors * merge::BYTES_PER_PASSING) as u64),
                 ("readers", work.reader),
                 ("followed", stream::motion::bytes_per_gaussian(limits.frames_held) as u64),
             ],
-            fixed: vec![("pairs", measured), work.arriving()],
+            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs as u64)), work.arriving()],
         });
     }
     // A model with a field is moved as a whole: its canonical values once more.

@@ -188,6 +188,7 @@ impl<'a> Job<'a> {
             gate: MotionGate::new(&merge, unit),
             limits: scene.limits,
             scratch: scene.scratch.clone().unwrap_or_else(std::env::temp_dir),
+            gathered: None,
         };
         Ok(Job { scored, merge, pool, states, mergeable, meter, known: KnownPairs::default() })
     }
@@ -214,12 +215,18 @@ impl<'a> Job<'a> {
             mergeable,
             extent: scored.reference.extent,
         };
-        let merged = merge::run(&survivors, merge, limit, |asked| {
+        let most = meter.limits.pairs_together;
+        let merged = merge::run(&survivors, merge, limit, most, |asked| {
             let missing = known.missing(asked.pairs());
-            if !missing.is_empty() {
-                known.add(meter.measure(pool, &states.position, missing, asked.reach)?);
-            }
-            Ok::<_, Error>(asked.pairs().map(|pair| known.likeness(pair)).collect())
+            let found = match missing.is_empty() {
+                true => Vec::new(),
+                false => meter.measure(pool, &states.position, missing, asked.reach, asked.is_part)?,
+            };
+            let found = KnownPairs::new(found);
+            let likeness = |pair| known.likeness(pair).or_else(|| found.likeness(pair)).unwrap_or(f64::NAN);
+            let answer = asked.pairs().map(likeness).collect();
+            known.add(found, most);
+            Ok::<_, Error>(answer)
         })?;
         Ok(sieved(&survivors, &merged, scored.reference.frame, merge))
     }

@@ -1,7 +1,7 @@
 //! Measuring how alike pairs of Gaussians move, over all frames.
 //!
-//! As long as all pairs fit, they are measured in one read of the source. Else the trajectories of every Gaussian in a
-//! pair are gathered once in voxel order, and the pairs are cut into partitions of that order: a partition is so many
+//! As long as all pairs fit, they are measured in one read of the source. Else the trajectories of all survivors are
+//! gathered once in voxel order, and the pairs are cut into partitions of that order: a partition is so many
 //! consecutive pairs, and reads the Gaussians that lead them and their ghosts, the partners within ε that other
 //! partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is split. Every pair is
 //! summed whole in one partition, so no cut changes a bit.
@@ -43,24 +43,41 @@ pub struct PairMeter<'a> {
     pub limits: Limits,
     /// Folder for trajectories that have to wait.
     pub scratch: PathBuf,
+    /// None at first.
+    pub gathered: Option<Gathered>,
+}
+
+/// Trajectories that wait in voxel order.
+pub struct Gathered {
+    trajectories: Trajectories,
+    /// Row of every place.
+    order: Vec<u32>,
+    /// Place of every row.
+    place: Vec<u32>,
 }
 
 impl PairMeter<'_> {
     /// How alike each of `pairs` (rows of `ids`, which increase) moves, in some order. `reference` `[3, M]` holds the
-    /// positions of `ids` at the reference frame; partners lie within about `reach` of each other there.
+    /// positions of `ids` at the reference frame; partners lie within about `reach` of each other there. Both are the
+    /// same at every call. `is_part`: other pairs were or will be asked for, so that gathering pays.
     ///
     /// Memory: [`BYTES_PER_PAIR`] and [`bytes_per_gaussian`] for the pairs measured together; 16 bytes for every pair; and
-    /// where not all fit, 12 bytes for each of `ids` and what gathering trajectories needs for those in a pair. Nothing
-    /// grows with the number of frames. A sequence in which neither positions nor opacities vary is measured by its first.
+    /// where not all fit, 8 bytes for each of `ids` and, while they are gathered, 12 more and their moments at the
+    /// frames held. Nothing grows with the number of frames. A sequence in which neither positions nor opacities vary is
+    /// measured by its first.
+    ///
+    /// # Errors
+    /// Those of reading the source, and of writing and reading the scratch file, which is gone then.
     pub fn measure(
-        &self,
+        &mut self,
         ids: &[u32],
         reference: &Column,
         mut pairs: Vec<(u32, u32)>,
         reach: f64,
+        is_part: bool,
     ) -> Result<Vec<Likeness>> {
         let mut found = Vec::with_capacity(pairs.len());
-        if pairs.len() <= self.limits.pairs_together {
+        if self.gathered.is_none() && !is_part && pairs.len() <= self.limits.pairs_together {
             let rows = members(&pairs);
             let places = rows.iter().map(|&row| reference.row(row as usize));
             let mut motion = PairMotion::new(local(&pairs, &rows), places, self.scan.motion);
@@ -69,31 +86,26 @@ impl PairMeter<'_> {
             found.extend(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)));
             return Ok(found);
         }
-        let order = voxel_order(&members(&pairs), reference, reach);
-        let of_order: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
-        let mut trajectories = Trajectories::gather(self.source, &of_order, self.limits.frames_held, &self.scratch)?;
-        drop(of_order);
-        let mut place = vec![0; ids.len()];
-        for (&row, k) in order.iter().zip(0u32..) {
-            place[row as usize] = k;
+        let alpha_min = self.scan.alpha_min;
+        if self.gathered.is_none() {
+            self.gathered = Some(self.gather(ids, reference, reach)?);
         }
+        let Some(Gathered { trajectories, order, place }) = &mut self.gathered else { return Ok(found) };
         for (a, b) in &mut pairs {
             let (i, j) = (place[*a as usize], place[*b as usize]);
             (*a, *b) = (i.min(j), i.max(j));
         }
-        drop(place);
         pairs.par_sort_unstable();
-        let progress = Progress::new("motion", "pairs", pairs.len() as u64);
         // Partitions of equal size: as few as the limit allows.
         let partitions = pairs.len().div_ceil(self.limits.pairs_together);
-        for of_partition in pairs.chunks(pairs.len().div_ceil(partitions)) {
+        for of_partition in pairs.chunks(pairs.len().div_ceil(partitions.max(1)).max(1)) {
             let places = members(of_partition);
             let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
             let mut motion = PairMotion::new(local(of_partition, &places), at, self.scan.motion);
             trajectories.play(&places, |moments| {
                 motion.frame(|node| {
                     let [x, y, z, logit] = moments[node];
-                    ([x, y, z], self.is_alive(logit))
+                    ([x, y, z], opacity(logit) >= alpha_min)
                 });
             })?;
             let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
@@ -101,9 +113,21 @@ impl PairMeter<'_> {
                 let (a, b) = (order[i as usize], order[j as usize]);
                 (a.min(b), a.max(b), likeness)
             }));
-            progress.advance(of_partition.len() as u64);
         }
         Ok(found)
+    }
+
+    /// The trajectories of all of `ids` in voxels of side `reach`.
+    fn gather(&self, ids: &[u32], reference: &Column, reach: f64) -> Result<Gathered> {
+        let rows: Vec<u32> = (0..ids.len() as u32).collect();
+        let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
+        let of_order: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
+        let trajectories = Trajectories::gather(self.source, &of_order, self.limits.frames_held, &self.scratch)?;
+        let mut place = rows;
+        for (&row, k) in order.iter().zip(0u32..) {
+            place[row as usize] = k;
+        }
+        Ok(Gathered { trajectories, order, place })
     }
 
     /// Shows `motion` every frame of the Gaussians `ids`; the first alone if nothing varies.
@@ -130,14 +154,10 @@ impl PairMeter<'_> {
             })?;
             motion.frame(|node| {
                 let (state, row) = (&states[node / BLOCK], node % BLOCK);
-                (state.position.row(row), self.is_alive(state.opacity_logit.plane(0)[row]))
+                (state.position.row(row), opacity(state.opacity_logit.plane(0)[row]) >= self.scan.alpha_min)
             });
         }
         Ok(())
-    }
-
-    fn is_alive(&self, logit: f32) -> bool {
-        opacity(logit) >= self.scan.alpha_min
     }
 }
 
@@ -191,14 +211,16 @@ mod tests {
 
         fn measure(&self, source: &dyn FrameSource, pairs_together: usize, reach: f64) -> Result<Vec<(u32, u32, u64)>> {
             let folder = tempfile::tempdir().unwrap();
-            let meter = PairMeter {
+            let mut meter = PairMeter {
                 source,
                 scan: &self.recipe.scan,
                 gate: MotionGate::new(&self.recipe.merge, 4.0),
                 limits: Limits { pairs_together, frames_held: 4, ..Limits::NONE },
                 scratch: folder.path().to_owned(),
+                gathered: None,
             };
-            let found = meter.measure(&self.ids, &self.reference, self.pairs.clone(), reach);
+            let found = meter.measure(&self.ids, &self.reference, self.pairs.clone(), reach, false);
+            drop(meter);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
             // NaN is a finding too, so bits are compared.
             let mut found: Vec<(u32, u32, u64)> = found?.into_iter().map(|(a, b, x)| (a, b, x.to_bits())).collect();
