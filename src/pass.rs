@@ -47,6 +47,11 @@ pub trait FrameSource: Send + Sync {
     /// A reader over the Gaussians `ids`, in that order. What does not change with time is prepared
     /// here once.
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>>;
+
+    /// The columns `want` of all Gaussians at `frame`, if reading them together costs less than block by block.
+    fn whole(&self, _frame: usize, _want: Columns) -> Option<Result<Gaussians>> {
+        None
+    }
 }
 
 /// Reads one block of Gaussians at any frame.

@@ -11,6 +11,8 @@ pub struct Limits {
     pub pictures_together: usize,
     /// Pictures that colours are fitted to whose footprints stay from one iteration to the next.
     pub sights_together: usize,
+    /// Gaussians of a result whose frames wait together to be written.
+    pub gaussians_together: usize,
     /// Pairs of Gaussians whose motion is measured together; at least 1.
     pub pairs_together: usize,
 }
@@ -22,6 +24,7 @@ impl Limits {
         frames_together: usize::MAX,
         pictures_together: usize::MAX,
         sights_together: usize::MAX,
+        gaussians_together: usize::MAX,
         pairs_together: usize::MAX,
     };
 }

@@ -76,12 +76,32 @@ impl ContainerWriter {
         frames: Range<usize>,
         advance: impl Fn(u64) + Sync,
     ) -> Result<()> {
-        let info = source.info();
-        let frame_block = self.writer.append_times(&info.times[frames.clone()])?;
-        // A column that never varies is encoded for the first block alone.
-        let columns = if self.frame_blocks == 0 { Columns::ALL } else { info.varying };
+        self.begin(&source.info().times[frames.clone()])?;
+        self.add(source, 0, frames, advance)
+    }
+
+    /// Begins the next frame block, to which [`ContainerWriter::add`] adds all Gaussians, part by part.
+    pub fn begin(&mut self, times: &[f64]) -> Result<()> {
+        self.writer.append_times(times)?;
         self.frame_blocks += 1;
-        let blocks: Vec<u32> = (0..self.writer.layout().gaussian_blocks()).collect();
+        Ok(())
+    }
+
+    /// Adds to the frame block the Gaussians of `source` at its `frames`: they are those of the container from number
+    /// `first` on, a multiple of [`GAUSSIAN_BLOCK`].
+    pub fn add(
+        &mut self,
+        source: &dyn FrameSource,
+        first: usize,
+        frames: Range<usize>,
+        advance: impl Fn(u64) + Sync,
+    ) -> Result<()> {
+        let info = source.info();
+        let frame_block = self.frame_blocks as u32 - 1;
+        // A column that never varies is encoded for the first block alone.
+        let columns = if frame_block == 0 { Columns::ALL } else { info.varying };
+        let first = (first / GAUSSIAN_BLOCK) as u32;
+        let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
         // One batch of blocks at a time bounds the tiles that wait for the writer.
         for batch in blocks.chunks(2 * rayon::current_num_threads()) {
             let tiles: Vec<Vec<Option<EncodedTile>>> = batch
@@ -94,9 +114,9 @@ impl ContainerWriter {
                     tiles
                 })
                 .collect::<Result<_>>()?;
-            for (&gaussian_block, tiles) in batch.iter().zip(&tiles) {
+            for (&block, tiles) in batch.iter().zip(&tiles) {
                 for (column, tile) in tiles.iter().enumerate() {
-                    let at = TileId { column: column as u32, gaussian_block, frame_block };
+                    let at = TileId { column: column as u32, gaussian_block: first + block, frame_block };
                     match tile {
                         Some(tile) => self.writer.write_tile(at, tile)?,
                         None => self.writer.repeat_tile(at)?,

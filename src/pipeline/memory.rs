@@ -188,10 +188,11 @@ impl Need {
 }
 
 /// Every limit halved, first those that cost most time.
-const HALVINGS: [fn(&Limits) -> Limits; 5] = [
+const HALVINGS: [fn(&Limits) -> Limits; 6] = [
     |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
     |limits| Limits { sights_together: limits.sights_together / 2, ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
+    |limits| Limits { gaussians_together: (limits.gaussians_together / 2).max(GAUSSIAN_BLOCK), ..*limits },
     |limits| Limits { frames_together: limits.frames_together.div_ceil(2), ..*limits },
     |limits| Limits { frames_held: limits.frames_held.div_ceil(2), ..*limits },
 ];
@@ -226,6 +227,7 @@ impl Plan {
             frames_together: PICTURES_PER_THREAD * work.threads as usize,
             pictures_together: work.threads as usize,
             sights_together: usize::MAX,
+            gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1 << 17) as usize,
         };
         loop {
@@ -486,12 +488,21 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
             ],
         });
     }
-    needs.push(Need {
+    let mut emit = Need {
         stage: "emit",
         reads: if work.resident > 0 { 0.0 } else { 1.0 },
         per_gaussian: vec![("rows", SCORED + 24), ("result", result)],
         fixed: writing(work),
-    });
+    };
+    if work.resident == 0 && only != Only::Prune && !recipe.merge.passes.is_empty() {
+        // Of each that is merged and of each that comes of it the frames of a block, and a state.
+        let mixed = Columns::ALL.without(Columns::SH) | work.varying;
+        let waiting = work.held(&Limits::NONE, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
+        let together = (limits.gaussians_together as u64).min(work.gaussians);
+        emit.per_gaussian.push(("members", 40));
+        emit.fixed.push(("merged", together * (waiting + 2 * whole + work.reader + 24)));
+    }
+    needs.push(emit);
     needs
 }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use gseq::Compression;
@@ -16,16 +17,16 @@ use super::result::{merged, result_frames};
 use super::scored::{Reference, Scored};
 use super::summary::{Stages, Summary};
 use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
-use crate::emit::container::write_container;
+use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::emit::index_map::write_index_map;
 use crate::emit::ply::{OutRow, write_inria, write_like};
 use crate::error::{Error, Result};
 use crate::ingest::ply::Ply;
 use crate::ingest::ply_sequence::PlySequence;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{FrameSource, Ids};
 use crate::recipe::{Merge, Recipe};
-use crate::stream::{MergedSequence, Progress, gather_all};
+use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, gather_all};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -128,7 +129,13 @@ pub fn write_result(
     let kept = sieved.kept.len();
     // Sequences are baked from a result that holds each of its frames: one more read of the kept.
     let reads = if matches!(kind, OutputKind::Gseq | OutputKind::PlySequence) { 1.0 } else { 0.0 };
-    let job = Emission { input: &scene.input, reference: scored.reference, sieved, merge: &options.recipe.merge };
+    let job = Emission {
+        input: &scene.input,
+        reference: scored.reference,
+        sieved,
+        merge: &options.recipe.merge,
+        gaussians_together: scene.limits.gaussians_together,
+    };
     let text = recipe_text(&options.recipe, &summary.input.digest);
     let map = sieved.index_map(summary.input.gaussians);
     if kind.is_folder() {
@@ -160,7 +167,8 @@ pub fn write_result(
 /// Writes the Gaussians `kept` (increasing) of an input as a result of `kind`, without anything beside it;
 /// gives the bytes that grow with them.
 pub fn write_kept(input: &Input, kept: Vec<u32>, merge: &Merge, kind: OutputKind, path: &Path) -> Result<u64> {
-    let job = Emission { input, reference: Reference::default(), sieved: &Sieved::pruned(kept), merge };
+    let sieved = &Sieved::pruned(kept);
+    let job = Emission { input, reference: Reference::default(), sieved, merge, gaussians_together: usize::MAX };
     if kind.is_folder() {
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
@@ -196,6 +204,7 @@ struct Emission<'a> {
     reference: Reference,
     sieved: &'a Sieved,
     merge: &'a Merge,
+    gaussians_together: usize,
 }
 
 impl Emission<'_> {
@@ -232,9 +241,43 @@ impl Emission<'_> {
             Input::Frames(frames) if kind != OutputKind::Gseq => {
                 self.write_like_frames(frames, &merged(self.input, self.sieved, self.merge), kind, path)?;
             }
+            _ if kind == OutputKind::Gseq && !self.sieved.clusters.is_empty() => self.write_merged(path)?,
             _ => write_sequence(&*result_frames(self.input, self.reference, self.merge, self.sieved)?, kind, path)?,
         }
         Ok((Vec::new(), None))
+    }
+
+    /// A container with proxies, whose members lie anywhere: a frame block at a time, of as many Gaussians together
+    /// as the limits allow.
+    fn write_merged(&self, path: &Path) -> Result<()> {
+        let merged = merged(self.input, self.sieved, self.merge);
+        let SequenceInfo { count, times, sh_degree, varying } = merged.info();
+        let compression = Compression::Zstd(LEVEL);
+        let mut writer = ContainerWriter::create(path, *count, *sh_degree, FRAME_BLOCK, compression, BTreeMap::new())?;
+        let progress = Progress::new("emit", "Gaussian frames", (count * times.len()) as u64);
+        let parts = parts(&merged, self.gaussians_together);
+        for start in (0..times.len()).step_by(FRAME_BLOCK) {
+            let of_block = start..times.len().min(start + FRAME_BLOCK);
+            writer.begin(&times[of_block.clone()])?;
+            for part in &parts {
+                let mut frames = merged.frames(part.clone(), FRAME_BLOCK)?;
+                let mut constant = Gaussians::zeros(0, *sh_degree);
+                if start == 0 {
+                    frames.read(start, Columns::ALL.without(*varying), &mut constant)?;
+                }
+                let mut held = HeldFrames::new(part.len(), *sh_degree, *varying, constant);
+                for frame in of_block.clone() {
+                    let mut state = Gaussians::zeros(0, *sh_degree);
+                    frames.read(frame, *varying, &mut state)?;
+                    held.push(times[frame], state);
+                }
+                drop(frames);
+                let change = self.sieved.recolor.get(part.clone()).unwrap_or(&[]);
+                let held = Recolored::new(Box::new(held), change);
+                writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
+            }
+        }
+        writer.finish()
     }
 
     fn write_like(&self, template: &Path, proxies: &Gaussians, path: &Path) -> Result<()> {
@@ -275,6 +318,23 @@ impl Emission<'_> {
         }
         rows
     }
+}
+
+/// The Gaussians of `merged` in whole blocks, each part made of about `most` Gaussians of the source at most.
+fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
+    let count = merged.info().count;
+    let (mut parts, mut start, mut made_of) = (Vec::new(), 0, 0);
+    for block in (0..count).step_by(GAUSSIAN_BLOCK) {
+        let of_block = block..count.min(block + GAUSSIAN_BLOCK);
+        let members: usize = of_block.map(|place| merged.members(place)).sum();
+        if made_of > 0 && made_of + members > most {
+            parts.push(start..block);
+            (start, made_of) = (block, 0);
+        }
+        made_of += members;
+    }
+    parts.push(start..count);
+    parts
 }
 
 /// Copies the bytes, not the permissions: a result of a read-only model can be replaced.

@@ -30,6 +30,9 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
 
 /// Columns `want` of all Gaussians at `frame`; all other columns are empty.
 pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
+    if let Some(found) = source.whole(frame, want) {
+        return found;
+    }
     let ids: Vec<u32> = (0..source.info().count as u32).collect();
     gather(source, &ids, frame, want)
 }

@@ -1,15 +1,23 @@
 //! A sequence of explicit trajectories with its clusters merged, frame by frame as it is read.
 //!
 //! At every frame a proxy is the moment match of its members at that frame, with the weights of the
-//! reference frame: Σ w_i x_i(t) is its path. Nothing is stored; memory is that of the members read.
+//! reference frame: Σ w_i x_i(t) is its path. Nothing is stored; memory is that of the members read. Members lie
+//! anywhere in the source: whoever reads many Gaussians reads them together ([`MergedFrames`]), so that what is
+//! decoded for one serves all.
 
 use std::ops::Range;
 
+use rayon::prelude::*;
+
+use super::Frames;
 use crate::error::Result;
-use crate::merge::proxy::merge_state;
+use crate::merge::proxy::{ProxyState, merge_state};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::recipe::{Merge, Placement};
+
+/// Proxies made at a time.
+const BATCH: usize = 4096;
 
 /// What is kept of a source.
 pub struct MergedSequence<'a> {
@@ -35,15 +43,28 @@ impl<'a> MergedSequence<'a> {
         for (place, of_cluster) in clusters {
             members[place as usize] = of_cluster;
         }
-        // A proxy of members of which one moves moves.
-        let varying = if source.info().varying.is_empty() { Columns::NONE } else { Columns::ALL };
-        let some = members.iter().any(|members| !members.is_empty());
-        let info = SequenceInfo {
-            count: kept.len(),
-            varying: if some { varying } else { source.info().varying },
-            ..source.info().clone()
-        };
+        // Moments mix position, rotation and scale, and opacity follows from areas; colours have weights of their own.
+        let mixed = Columns::ALL.without(Columns::SH);
+        let mut varying = source.info().varying;
+        if !(varying & mixed).is_empty() && members.iter().any(|members| !members.is_empty()) {
+            varying = varying | mixed;
+        }
+        let info = SequenceInfo { count: kept.len(), varying, ..source.info().clone() };
         MergedSequence { source, info, kept, members, merge: Merge { placement: Placement::Mean, ..merge.clone() } }
+    }
+}
+
+impl<'a> MergedSequence<'a> {
+    /// The Gaussians `places`, frame by frame, best in order; readers of the source hold `held` frames.
+    pub fn frames(&self, places: Range<usize>, held: usize) -> Result<MergedFrames<'_>> {
+        let merging = Merging::new(self, places);
+        let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::ALL, held)?;
+        Ok(MergedFrames { sequence: self, state: frames.state(), frames, known: Columns::NONE, merging })
+    }
+
+    /// How many Gaussians of the source that at `place` is made of.
+    pub fn members(&self, place: usize) -> usize {
+        self.members[place].len().max(1)
     }
 }
 
@@ -53,36 +74,79 @@ impl FrameSource for MergedSequence<'_> {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        let places: Vec<usize> = ids.iter().collect();
-        // First one row per Gaussian, then the rows of all members.
-        let mut rows: Vec<u32> = places.iter().map(|&place| self.kept[place]).collect();
-        let mut proxies = Vec::new();
-        for (row, &place) in places.iter().enumerate() {
-            let members = self.members[place];
-            if !members.is_empty() {
-                let first = rows.len();
-                rows.extend(members.iter().map(|&(id, _)| id));
-                let leader = members.iter().position(|&(id, _)| id == self.kept[place]).unwrap_or(0);
-                proxies.push(Proxy { row, members: first..rows.len(), leader: (first + leader) as u32, place });
-            }
-        }
-        let state = Gaussians::zeros(rows.len(), self.info.sh_degree);
-        Ok(Box::new(MergedReader {
-            sequence: self,
-            reader: self.source.open(Ids::List(&rows))?,
-            state,
-            known: Columns::NONE,
-            len: places.len(),
-            proxies,
+        let merging = Merging::new(self, ids.iter());
+        let reader = self.source.open(Ids::List(&merging.ids))?;
+        let state = Gaussians::zeros(merging.ids.len(), self.info.sh_degree);
+        Ok(Box::new(MergedReader { sequence: self, reader, state, known: Columns::NONE, merging }))
+    }
+
+    fn whole(&self, frame: usize, want: Columns) -> Option<Result<Gaussians>> {
+        Some(self.frames(0..self.kept.len(), 1).and_then(|mut frames| {
+            let mut state = Gaussians::zeros(0, self.info.sh_degree);
+            frames.read(frame, want, &mut state)?;
+            Ok(state)
         }))
     }
 }
 
+/// What some Gaussians are made of.
+struct Merging {
+    /// Everybody needed, by id in the source.
+    ids: Vec<u32>,
+    /// For every Gaussian the row of its own id in `ids`.
+    rows: Vec<u32>,
+    proxies: Vec<Proxy>,
+    /// Row in `ids` and weight of the members of all proxies.
+    members: Vec<(u32, f64)>,
+}
+
 struct Proxy {
+    /// Which of the Gaussians it is.
     row: usize,
     members: Range<usize>,
-    leader: u32,
-    place: usize,
+}
+
+impl Merging {
+    fn new(sequence: &MergedSequence<'_>, places: impl IntoIterator<Item = usize>) -> Merging {
+        let places: Vec<usize> = places.into_iter().collect();
+        let mut ids: Vec<u32> = places.iter().map(|&place| sequence.kept[place]).collect();
+        ids.extend(places.iter().flat_map(|&place| sequence.members[place].iter().map(|&(id, _)| id)));
+        ids.sort_unstable();
+        ids.dedup();
+        let row_of = |id: u32| ids.binary_search(&id).unwrap_or_default() as u32;
+        let rows = places.iter().map(|&place| row_of(sequence.kept[place])).collect();
+        let (mut proxies, mut members) = (Vec::new(), Vec::new());
+        for (row, &place) in places.iter().enumerate().filter(|&(_, &place)| !sequence.members[place].is_empty()) {
+            let first = members.len();
+            members.extend(sequence.members[place].iter().map(|&(id, weight)| (row_of(id), weight)));
+            proxies.push(Proxy { row, members: first..members.len() });
+        }
+        Merging { ids, rows, proxies, members }
+    }
+
+    /// Columns of the members that `want` takes.
+    fn needed(&self, want: Columns) -> Columns {
+        if self.proxies.is_empty() { want } else { Columns::ALL }
+    }
+
+    /// Writes the columns `want` of the Gaussians, made of `state`, to `out`.
+    fn write(&self, state: &Gaussians, want: Columns, merge: &Merge, out: &mut Gaussians) {
+        for column in want.iter() {
+            let (from, to) = (state.column(column), out.column_mut(column));
+            to.resize(self.rows.len());
+            for c in 0..from.width() {
+                let plane = from.plane(c);
+                to.plane_mut(c).iter_mut().zip(&self.rows).for_each(|(to, &row)| *to = plane[row as usize]);
+            }
+        }
+        for batch in self.proxies.chunks(BATCH) {
+            let made: Vec<ProxyState> = batch
+                .par_iter()
+                .map(|proxy| merge_state(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge))
+                .collect();
+            batch.iter().zip(&made).for_each(|(proxy, made)| made.write(want, proxy.row, out));
+        }
+    }
 }
 
 struct MergedReader<'a> {
@@ -91,32 +155,41 @@ struct MergedReader<'a> {
     state: Gaussians,
     /// What `state` holds of columns that are the same at every frame.
     known: Columns,
-    len: usize,
-    proxies: Vec<Proxy>,
+    merging: Merging,
 }
 
 impl BlockReader for MergedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        // Moments mix position, rotation and scale, and opacity follows from areas.
-        let needed = if self.proxies.is_empty() { want } else { Columns::ALL };
+        let needed = self.merging.needed(want);
         self.reader.read(frame, needed.without(self.known), &mut self.state)?;
         self.known = self.known | needed.without(self.sequence.source.info().varying);
-        for column in want.iter() {
-            let (from, to) = (self.state.column(column), out.column_mut(column));
-            to.resize(self.len);
-            for c in 0..from.width() {
-                to.plane_mut(c).copy_from_slice(&from.plane(c)[..self.len]);
-            }
-        }
-        for proxy in &self.proxies {
-            let weights = self.sequence.members[proxy.place].iter().map(|&(_, weight)| weight);
-            let members: Vec<(u32, f64)> = proxy.members.clone().map(|row| row as u32).zip(weights).collect();
-            merge_state(&members, &self.state, proxy.leader, &self.sequence.merge).write(want, proxy.row, out);
-        }
+        self.merging.write(&self.state, want, &self.sequence.merge, out);
         Ok(())
     }
 
     fn hold(&mut self, frames: usize) {
         self.reader.hold(frames);
+    }
+}
+
+/// Many Gaussians of a merged sequence, frame after frame.
+///
+/// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
+pub struct MergedFrames<'a> {
+    sequence: &'a MergedSequence<'a>,
+    frames: Frames<'a>,
+    state: Gaussians,
+    known: Columns,
+    merging: Merging,
+}
+
+impl MergedFrames<'_> {
+    /// Reads the columns `want` at `frame` into `out`, which is resized.
+    pub fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let needed = self.merging.needed(want);
+        self.frames.read(frame, needed.without(self.known), &mut self.state)?;
+        self.known = self.known | needed.without(self.sequence.source.info().varying);
+        self.merging.write(&self.state, want, &self.sequence.merge, out);
+        Ok(())
     }
 }

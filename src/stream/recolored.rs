@@ -30,6 +30,16 @@ impl FrameSource for Recolored<'_> {
         let change = ids.iter().map(|id| self.change[id]).collect();
         Ok(Box::new(RecoloredReader { reader: self.source.open(ids)?, change }))
     }
+
+    fn whole(&self, frame: usize, want: Columns) -> Option<Result<Gaussians>> {
+        let mut found = self.source.whole(frame, want)?;
+        if let Ok(state) = &mut found
+            && want.contains(Columns::SH)
+        {
+            recolor(state, self.change);
+        }
+        Some(found)
+    }
 }
 
 struct RecoloredReader<'a> {
