@@ -176,7 +176,7 @@ fn a_run_killed_at_any_moment_leaves_nothing_that_the_next_one_does_not_clean_up
         _ = std::fs::remove_file(workplace.path("small.gseq.summary.json"));
     };
     remove();
-    const KILLS: u32 = 12;
+    const KILLS: u32 = 8;
     let mut dirty = 0;
     for kill in 0..KILLS {
         let mut child = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))

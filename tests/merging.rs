@@ -8,7 +8,7 @@ use std::path::Path;
 use glam::{DMat3, DQuat, DVec3};
 use scene::{PlyRows, by_formula, lasting_files, state, tiny};
 use splatsieve::merge::proxy::merge_state;
-use splatsieve::model::{Gaussians, SH_C0};
+use splatsieve::model::{Columns, Gaussians, SH_C0};
 use splatsieve::pipeline::compress::{CompressOptions, Only, Target, compress_scene};
 use splatsieve::pipeline::input::{InputOptions, Scene};
 use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
@@ -137,8 +137,8 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
         let mut nodes = whole.frames[whole.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
         for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
             let members = weighted(scored, group);
-            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge).write(
-                splatsieve::model::Columns::ALL,
+            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge, Columns::ALL).write(
+                Columns::ALL,
                 node,
                 &mut nodes,
             );
@@ -235,7 +235,7 @@ fn proxies_are_solved_at_their_leaders(
     let at_reference = &whole.frames[whole.reference];
     for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
         let leader = group[0];
-        let merged = merge_state(&weighted(scored, group), at_reference, leader as u32, merge);
+        let merged = merge_state(&weighted(scored, group), at_reference, leader as u32, merge, Columns::ALL);
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
         // (property, merged state, state of the leader), then the state found in the result.
         let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();

@@ -100,7 +100,15 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
 /// heaviest member's (ties to the first). Opacity: [`ProxyOpacity`], an area being the mean over all
 /// directions of the ellipsoid's shadow. Exact duplicates give the leader's own position, axes,
 /// scales and colour. A zero quaternion is the identity.
-pub fn merge_state(members: &[(u32, f64)], states: &Gaussians, leader: u32, merge: &recipe::Merge) -> ProxyState {
+///
+/// Colours are left out unless `want` names them: they lie far apart, and most sequences have the same at every frame.
+pub fn merge_state(
+    members: &[(u32, f64)],
+    states: &Gaussians,
+    leader: u32,
+    merge: &recipe::Merge,
+    want: Columns,
+) -> ProxyState {
     // All in the leader's frame: coordinates far from the origin cancel once, and Jacobi starts from
     // the leader's axes, so it turns them only as far as the other members ask.
     let origin = position(states, leader);
@@ -127,7 +135,10 @@ pub fn merge_state(members: &[(u32, f64)], states: &Gaussians, leader: u32, merg
         // A scale that underflowed is still a finite one.
         log_scale: local.scales.to_array().map(|scale| scale.max(f64::MIN_POSITIVE).ln()),
         opacity_logit: logit(merged_opacity(members, states, &local, merge.opacity)),
-        sh: merged_sh(members, states, leader, merge.sh_high),
+        sh: match want.contains(Columns::SH) {
+            true => merged_sh(members, states, leader, merge.sh_high),
+            false => Vec::new(),
+        },
     }
 }
 
@@ -149,7 +160,7 @@ pub fn merge_groups(
                 let rows = groups.members(group);
                 let weights = weights(rows, importance, states);
                 let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
-                merge_state(&members, states, groups.leaders()[group], merge)
+                merge_state(&members, states, groups.leaders()[group], merge, Columns::ALL)
             })
             .collect();
         for (row, proxy) in (first..).zip(&proxies) {
@@ -265,7 +276,7 @@ mod tests {
                 for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
                     let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
                     states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
-                    let got = merge_state(&alike(3), &states, 1, &recipe(placement, rule));
+                    let got = merge_state(&alike(3), &states, 1, &recipe(placement, rule), Columns::ALL);
                     assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(1));
                     assert_eq!(got.log_scale.map(|x| x as f32), scale);
                     assert_eq!(got.sh.iter().map(|&x| x as f32).collect::<Vec<_>>(), states.sh.row::<12>(1));
@@ -286,7 +297,8 @@ mod tests {
             for logit in [f32::MIN, -200.0, 0.0, 200.0, f32::MAX, f32::INFINITY, f32::NEG_INFINITY] {
                 let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
                 states.opacity_logit.plane_mut(0).fill(logit);
-                let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, rule)).opacity_logit;
+                let got =
+                    merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, rule), Columns::ALL).opacity_logit;
                 assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
             }
         }
@@ -299,7 +311,7 @@ mod tests {
             [needle, [1e-12f32.ln(); 3], [1e6f32.ln(); 3], [1e6f32.ln(), 1e-12f32.ln(), 1e-12f32.ln()], [-800.0; 3]]
         {
             let states = copies(2, scale, [0.9, -1.3, 0.2, 0.4]);
-            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area));
+            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::ALL);
             for (got, expected) in got.log_scale.iter().zip(scale.map(|x| f64::from(x).max(f64::MIN_POSITIVE.ln()))) {
                 assert!((got - expected).abs() < 1e-12, "got {got}, expected {expected}");
             }
@@ -309,7 +321,7 @@ mod tests {
     #[test]
     fn a_zero_quaternion_is_the_identity() {
         let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
-        let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum));
+        let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Columns::ALL);
         assert_eq!(got.rotation, [1.0, 0.0, 0.0, 0.0]);
     }
 
@@ -318,13 +330,20 @@ mod tests {
         // The second axis is the longest: canonical order would rename it.
         let mut states = copies(2, [-3.0, -1.0, -5.0], [-0.9, 0.2, 0.1, 0.3]);
         states.position.set_row(1, [1000.3, -7.1, 0.12]);
-        let got = merge_state(&[(0, 0.3), (1, 0.7)], &states, 0, &recipe(Placement::Leader, ProxyOpacity::Area));
+        let got = merge_state(
+            &[(0, 0.3), (1, 0.7)],
+            &states,
+            0,
+            &recipe(Placement::Leader, ProxyOpacity::Area),
+            Columns::ALL,
+        );
         assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(0));
         let leader = unit_rotation(states.rotation.row(0));
         let rotation = DQuat::from_xyzw(got.rotation[1], got.rotation[2], got.rotation[3], got.rotation[0]);
         assert!(rotation.dot(leader) > 0.8, "{rotation:?} for {leader:?}");
         assert!(got.log_scale[1] > got.log_scale[0] && got.log_scale[0] > got.log_scale[2]);
-        let mean = merge_state(&[(0, 0.3), (1, 0.7)], &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area));
+        let mean =
+            merge_state(&[(0, 0.3), (1, 0.7)], &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::ALL);
         assert!((mean.position.x - (1000.25 * 0.3 + f64::from(1000.3f32) * 0.7)).abs() < 1e-9);
         assert!(mean.log_scale[1] < got.log_scale[1], "moments about the leader exceed those about the mean");
     }
@@ -377,7 +396,7 @@ mod tests {
             let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
             states.position.set_row(1, [1000.25 + spread[0], -7.125 + spread[1], 0.1 + spread[2]]);
             states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
-            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area));
+            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::ALL);
             let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
             let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
             prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");

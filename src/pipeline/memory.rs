@@ -399,7 +399,8 @@ pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: b
     if looks(has_cameras, recipe.scan.coverage) {
         let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL.without(Columns::SH), work.views, 12);
         per_gaussian.insert(0, ("rows", ROWS + 16));
-        needs.push(Need { stage: "visible", reads: 1.0, per_gaussian, fixed });
+        let reads = 1.0 / f64::from(recipe.scan.frame_stride.get());
+        needs.push(Need { stage: "visible", reads, per_gaussian, fixed });
     }
     needs.push(Need {
         stage: "score",

@@ -91,7 +91,11 @@ fn merged_states(model: &ModelFolder, reference: Reference, clusters: &[Cluster]
         let members: Vec<(u32, f64)> =
             cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
         let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
-        merge_state(&members, &of_members, members[leader].0, merge).write(Columns::ALL, proxy, &mut states);
+        merge_state(&members, &of_members, members[leader].0, merge, Columns::ALL).write(
+            Columns::ALL,
+            proxy,
+            &mut states,
+        );
     }
     Ok(states)
 }

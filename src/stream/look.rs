@@ -148,7 +148,10 @@ impl<W: Send> Looks<W> {
         if frames.is_empty() {
             return Ok(());
         }
-        let mut reader = Frames::open(source, ids, self.want, self.limits.frames_held)?;
+        // Frames are held for those that follow them soon.
+        let nearest = frames.windows(2).map(|pair| pair[1].0 - pair[0].0).min().unwrap_or(usize::MAX);
+        let held = if nearest < self.limits.frames_held { self.limits.frames_held } else { 1 };
+        let mut reader = Frames::open(source, ids, self.want, held)?;
         let threads = rayon::current_num_threads();
         for batch in batches(frames, PICTURES_PER_THREAD * threads, self.limits.frames_together) {
             for (slot, &(frame, _)) in batch.iter().enumerate() {

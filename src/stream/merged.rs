@@ -142,7 +142,9 @@ impl Merging {
         for batch in self.proxies.chunks(BATCH) {
             let made: Vec<ProxyState> = batch
                 .par_iter()
-                .map(|proxy| merge_state(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge))
+                .map(|proxy| {
+                    merge_state(&self.members[proxy.members.clone()], state, self.rows[proxy.row], merge, want)
+                })
                 .collect();
             batch.iter().zip(&made).for_each(|(proxy, made)| made.write(want, proxy.row, out));
         }
