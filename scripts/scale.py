@@ -7,7 +7,7 @@
 
 Without `--sizes` the series varies one thing at a time: the frames, the Gaussians, the budget (`--memory`). Below its
 table stands what must hold, and it exits 1 if something does not: the same bytes under every budget; no peak above its
-budget; ten times the frames with the same peak (5%) in at most 10.5 times the time.
+budget; ten times the frames with at most 5% more peak, in at most 10.5 times the time.
 
 generate_stream.py makes the sequences, `pack` stores each in FOLDER, and it is removed after its last run
 (`--keep`: stays, and is not made again). Peaks of a run are the system's (`ru_maxrss` of the process, which is VmHWM:
@@ -127,7 +127,8 @@ def claims(runs):
         under = f"({few['gaussians']} x {few['frames']}, --memory {few['budget']})"
         more = {key: many[key] / few[key] for key in ("gaussians", "frames", "peak_bytes", "seconds")}
         if (more["gaussians"], more["frames"]) == (1, 10):
-            yield f"10 times the frames: peak x {more['peak_bytes']:.3f} {under}", abs(more["peak_bytes"] - 1) <= 0.05
+            # Of a short sequence the frames looked at lie so near each other that some are held.
+            yield f"10 times the frames: peak x {more['peak_bytes']:.3f} {under}", more["peak_bytes"] <= 1.05
             yield f"10 times the frames: time x {more['seconds']:.2f} {under}", more["seconds"] <= 10.5
         if (more["gaussians"], more["frames"]) == (10, 1):
             each = (many["peak_bytes"] - few["peak_bytes"]) / (many["gaussians"] - few["gaussians"])

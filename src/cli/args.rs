@@ -444,6 +444,8 @@ pub(super) struct Demo {
     /// Frames of the scene
     #[arg(long, value_name = "T", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub(super) frames: u32,
+    #[command(flatten)]
+    pub(super) memory: Memory,
     /// Replace an earlier output
     #[arg(long)]
     pub(super) overwrite: bool,

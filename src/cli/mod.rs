@@ -160,7 +160,8 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Demo(args) => {
             let recipe = args.recipe.recipe()?;
             let output = args.output.as_deref();
-            let report = demo::run(args.gaussians as usize, args.frames as usize, recipe, output, args.overwrite)?;
+            let (gaussians, frames) = (args.gaussians as usize, args.frames as usize);
+            let report = demo::run(gaussians, frames, recipe, output, args.overwrite, budget(args.memory))?;
             print(&report.text())?;
             if let Some(folder) = output {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));

@@ -4,8 +4,9 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::compress::{CompressOptions, compress_scene};
+use super::compress::{CompressOptions, Only, compress_scene};
 use super::input::{Input, InputOptions, Scene};
+use super::memory::{Budget, compressing, keep_to};
 use super::output::{OutputKind, write_sequence};
 use super::summary::{Stages, Summary};
 use crate::demo::{self, Family};
@@ -32,19 +33,20 @@ pub fn run(
     recipe: Recipe,
     output: Option<&Path>,
     overwrite: bool,
+    memory: Budget,
 ) -> Result<DemoReport> {
     if let Some(output) = output {
         check_target(output, Kind::Folder, &[], overwrite)?;
         let staged = StagedFolder::new(output, overwrite)?;
-        let report = run_in(staged.path(), gaussians, frames, recipe)?;
+        let report = run_in(staged.path(), gaussians, frames, recipe, memory)?;
         staged.commit()?;
         return Ok(report);
     }
     let folder = tempfile::tempdir().map_err(Error::io("create a folder in", &std::env::temp_dir()))?;
-    run_in(folder.path(), gaussians, frames, recipe)
+    run_in(folder.path(), gaussians, frames, recipe, memory)
 }
 
-fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Result<DemoReport> {
+fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory: Budget) -> Result<DemoReport> {
     let made = demo::Scene::new(gaussians, frames);
     let packed = folder.join("scene.gseq");
     write_sequence(&made, OutputKind::Gseq, &packed)?;
@@ -53,7 +55,8 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe) -> Res
     fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
 
     let input = Input::Container(Container::open(&packed)?);
-    let scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
+    let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
+    keep_to(memory, &mut scene, |work, limits| compressing(work, limits, &recipe, Only::Both, true))?;
     let options = CompressOptions::new(InputOptions::default(), folder.join("compressed.gseq"), recipe);
     let (summary, map) = compress_scene(&scene, &options, Stages::default())?;
     let marker = folder.join(MARKER);
