@@ -248,7 +248,7 @@ impl TileReader<'_> {
         let of_block = of_block.start as usize..of_block.end as usize;
         if self.whole {
             let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
-            if self.held >= of_block.len() || reader.tile_info(at)?.encoding == Encoding::Raw {
+            if (self.held > 1 && self.held >= of_block.len()) || reader.tile_info(at)?.encoding == Encoding::Raw {
                 let mut frames = match std::mem::replace(&mut self.kept[index], Kept::Nothing) {
                     Kept::Tile(_, frames) => frames,
                     _ => TileFrames::default(),

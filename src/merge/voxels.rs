@@ -18,7 +18,7 @@ pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64)
     let at = |row: u32| at(row).map(f64::from);
     let (mut low, mut widest) = ([0.0; 3], 0.0f64);
     for (c, low) in low.iter_mut().enumerate() {
-        let plane = rows.iter().map(|&row| at(row)[c]);
+        let plane = rows.iter().map(|&row| at(row)[c]).filter(|x| x.is_finite());
         let (least, most) = plane.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
         (*low, widest) = (least, widest.max(most - least));
     }

@@ -91,8 +91,9 @@ pub fn open_measured(
     let count = stream.header().count;
     check(count)?;
     let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
-    let work = Workload::of_stream(stream.header(), &of_rig);
-    let (held, visible) = (frame_block(stream.header()) + AHEAD, looks(has_cameras, recipe.scan.coverage));
+    let block = frame_block(stream.header());
+    let work = Workload::of_stream(stream.header(), block, &of_rig);
+    let (held, visible) = (block + AHEAD, looks(has_cameras, recipe.scan.coverage));
     let plan = |explain: bool, measuring: Option<bool>| {
         Plan::fit(work, Budget { explain, ..options.memory }, |work, limits| {
             let mut all = vec![receiving(work, limits, held as u64, measuring)];
@@ -124,6 +125,11 @@ pub fn open_measured(
     let input = Input::Stream(streamed);
     let opened = Opened { rig: has_cameras.then(|| rig.get().cloned()).flatten(), input, notes: Vec::new() };
     let mut scene = Scene { limits: memory.limits, ..scene_of(opened, options)? };
+    // Now that the frames are counted; what they add is small, and no reason to throw away what has arrived.
+    let counted = Budget { explain: false, ..options.memory };
+    if let Ok(plan) = Plan::fit(Workload::of(&scene), counted, |work, limits| needs(work, limits, has_cameras)) {
+        scene.limits = plan.limits;
+    }
     let Some(measuring) = measuring else { return Ok((scene, None)) };
     let complete = ScanPlan::new(&recipe.scan, &scene.input.source().info().times, &scene.schedule)?;
     if let Some(why) = measuring.wrong(&complete, &scene) {
@@ -135,9 +141,10 @@ pub fn open_measured(
 
 /// Confirms that there is memory to pack a stream.
 pub fn check_memory(options: &InputOptions, header: &StreamHeader) -> Result<()> {
-    let held = (frame_block(header) + AHEAD) as u64;
+    let block = frame_block(header);
+    let held = (block + AHEAD) as u64;
     let nobody = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
-    let work = Workload::of_stream(header, &nobody);
+    let work = Workload::of_stream(header, block, &nobody);
     Plan::fit(work, options.memory, |work, limits| vec![receiving(work, limits, held, None)])?;
     Ok(())
 }
@@ -145,7 +152,7 @@ pub fn check_memory(options: &InputOptions, header: &StreamHeader) -> Result<()>
 /// Writes a stream to the container `path`; gives the number of bytes that arrived. `take` sees the frames
 /// of every frame block, in order.
 pub fn pack_stream(
-    stream: FrameStream<impl Read + Send + 'static>,
+    mut stream: FrameStream<impl Read + Send + 'static>,
     path: &Path,
     compression: Compression,
     mut take: impl FnMut(&HeldFrames) -> Result<()>,
@@ -153,7 +160,7 @@ pub fn pack_stream(
     let StreamHeader { count, sh_degree, varying } = *stream.header();
     let block = frame_block(stream.header());
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, compression, BTreeMap::new())?;
-    let mut held = HeldFrames::new(count, sh_degree, varying, stream.constant().clone());
+    let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());
     let progress = Progress::counting("receive", "frames");
     let mut put = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {
         writer.append(held, 0..held.len(), |_| ())?;
@@ -169,7 +176,6 @@ pub fn pack_stream(
     let (filled, arrived) = bounded(AHEAD);
     // Not joined on failure: it may wait for a program that writes nothing more, and ends at its next frame.
     let reader = thread::spawn(move || {
-        let mut stream = stream;
         while let Ok(mut state) = empty.recv() {
             let frame = stream.next_frame(&mut state).map(|time| time.map(|time| (time, state)));
             let last = !matches!(frame, Ok(Some(_)));

@@ -93,7 +93,8 @@ pub fn compress(options: &CompressOptions) -> Result<Summary> {
     let mut stages = Stages::default();
     let is_stream = options.input.is_stream();
     let needs = |work: &Workload, limits: &Limits, has_cameras| {
-        compressing(work, limits, &options.recipe, options.only, has_cameras)
+        let kind = OutputKind::planned(&options.output, options.kind, work.resident > 0);
+        compressing(work, limits, &options.recipe, options.only, kind, has_cameras)
     };
     let name = if is_stream { "receive" } else { "read" };
     let (scene, measured) = stages.run(name, 0, f64::from(u8::from(is_stream)), || {

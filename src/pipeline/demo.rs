@@ -56,7 +56,7 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory
 
     let input = Input::Container(Container::open(&packed)?);
     let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
-    keep_to(memory, &mut scene, |work, limits| compressing(work, limits, &recipe, Only::Both, true))?;
+    keep_to(memory, &mut scene, |work, limits| compressing(work, limits, &recipe, Only::Both, OutputKind::Gseq, true))?;
     let options = CompressOptions::new(InputOptions::default(), folder.join("compressed.gseq"), recipe);
     let (summary, map) = compress_scene(&scene, &options, Stages::default())?;
     let marker = folder.join(MARKER);

@@ -12,16 +12,18 @@ use bytesize::ByteSize;
 
 use super::compress::Only;
 use super::input::{Input, Scene};
+use super::output::OutputKind;
 use super::scored::looks;
 use super::{choose, merging, rounds};
 use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::error::{Error, Result};
+use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
-use crate::model::{Columns, Rig, Rows};
+use crate::model::{Camera, Columns, Rig, Rows};
 use crate::plan::Limits;
 use crate::recipe::Recipe;
 use crate::score::Scores;
-use crate::stream::{self, BLOCK, PICTURES_PER_THREAD, VIEWS_AT_ONCE};
+use crate::stream::{self, BLOCK, PICTURES_PER_THREAD};
 use crate::{merge, metrics, refit, render, select, stats};
 
 /// Memory that a run may take, and whether it is to say beforehand what it will take.
@@ -37,8 +39,11 @@ pub struct Budget {
 const PROGRAM: u64 = 14 << 20;
 /// Per thread beyond the first.
 const PER_THREAD: u64 = 2 << 20;
-/// Resident per tile of an open container, and as much again of one that is written.
-const PER_TILE: u64 = 96;
+/// Resident per tile of an open container.
+const PER_TILE: u64 = 72;
+/// Resident per tile of a container that is written: what the writer knows of it, and that once more, ordered and as
+/// bytes, when it finishes.
+const PER_WRITTEN_TILE: u64 = 240;
 
 /// What the need for memory depends on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,8 +60,16 @@ pub struct Workload {
     pub resident: u64,
     /// Bytes per Gaussian of an open reader, beside the frames it holds.
     pub reader: u64,
-    /// Whether frames are decoded together, so that a reader may hold some.
-    pub decodes: bool,
+    /// Frames that are decoded together, so that a reader may hold some; 0 where each is read by itself.
+    pub frame_block: u64,
+    /// Gaussians that are decoded together.
+    pub gaussian_block: u64,
+    /// Bytes of the input that are resident however many Gaussians there are.
+    pub field: u64,
+    /// Bytes per Gaussian of a file that is mapped while it is read whole.
+    pub file: u64,
+    /// Different views of the cameras.
+    pub viewpoints: u64,
     /// Pixels of the largest picture.
     pub pixels: u64,
     /// Most pictures of one frame.
@@ -70,57 +83,89 @@ pub struct Workload {
 impl Workload {
     /// Of an open scene.
     pub fn of(scene: &Scene) -> Workload {
-        Workload {
-            pixels: most_pixels(&scene.rig),
-            views: scene.schedule.frames.iter().map(Vec::len).max().unwrap_or(0) as u64,
-            pictures: scene.rig.shots.len().max(scene.schedule.pairs()) as u64,
-            ..Workload::of_input(&scene.input)
-        }
+        Workload::of_input(&scene.input).seen_by(
+            &scene.rig,
+            scene.schedule.frames.iter().map(Vec::len).max().unwrap_or(0) as u64,
+            scene.schedule.pairs() as u64,
+        )
     }
 
     /// Of an open input that nobody looks at.
     pub fn of_input(input: &Input) -> Workload {
         let info = input.source().info();
         let whole = state_bytes(info.sh_degree, Columns::ALL);
-        let (resident, reader, decodes) = match input {
-            // Canonical values, and for each reader a copy, what is prepared of them and their changes.
-            Input::Model(model) => (whole, 2 * whole + model.field().bytes_per_gaussian() as u64 + 128, false),
-            Input::Frames(_) => (0, 4, false),
-            Input::Container(_) | Input::Stream(_) => (0, 8, true),
-        };
-        Workload {
+        // Normals and the like.
+        let row = whole + 24;
+        let unseen = Workload {
             gaussians: info.count as u64,
             frames: info.times.len() as u64,
             sh_degree: info.sh_degree,
             varying: info.varying,
-            resident,
-            reader,
-            decodes,
+            resident: 0,
+            reader: 4,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            field: 0,
+            file: row,
             pixels: 0,
             views: 0,
+            viewpoints: 0,
             pictures: 0,
             threads: rayon::current_num_threads() as u64,
+        };
+        match input {
+            Input::Model(model) => Workload {
+                resident: whole,
+                // A copy of the canonical values, what is prepared of them, and their changes.
+                reader: 2 * whole + model.field().bytes_per_gaussian() as u64 + 128,
+                // Tensors as they are read and as they are used.
+                field: 2 * fs::metadata(&model.paths().deformation).map_or(0, |file| file.len()),
+                ..unseen
+            },
+            Input::Frames(_) => unseen,
+            Input::Container(container) => of_container(container, unseen),
+            Input::Stream(streamed) => of_container(&streamed.container, unseen),
+        }
+    }
+
+    fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
+        let mut numbers: Vec<u32> = rig.shots.iter().map(|shot| shot.view).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        let pixels = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
+        Workload {
+            pixels: rig.cameras.iter().map(pixels).max().unwrap_or(0),
+            views,
+            viewpoints: numbers.len() as u64,
+            pictures: pairs.max(rig.shots.len() as u64),
+            ..self
         }
     }
 
     /// Of a stream of which only the header has arrived, as `rig` will see it.
-    pub fn of_stream(header: &StreamHeader, rig: &Rig) -> Workload {
+    pub fn of_stream(header: &StreamHeader, frame_block: usize, rig: &Rig) -> Workload {
         let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
         let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
-        Workload {
+        let views = (together + rig.shots.len() - times.len()) as u64;
+        let unseen = Workload {
             gaussians: header.count as u64,
             frames: 0,
             sh_degree: header.sh_degree,
             varying: header.varying,
             resident: 0,
             reader: 8,
-            decodes: true,
-            pixels: most_pixels(rig),
-            views: (together + rig.shots.len() - times.len()) as u64,
-            pictures: rig.shots.len() as u64,
+            frame_block: frame_block as u64,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            field: 0,
+            file: 0,
+            pixels: 0,
+            views: 0,
+            viewpoints: 0,
+            pictures: 0,
             threads: rayon::current_num_threads() as u64,
-        }
+        };
+        unseen.seen_by(rig, views, 0)
     }
 
     /// Bytes of one Gaussian's columns `of`.
@@ -131,11 +176,9 @@ impl Workload {
     /// Bytes per Gaussian of the frames that a reader of the columns `of` holds: one frame is not worth holding, and
     /// a whole block takes two frames more.
     fn held(&self, limits: &Limits, of: Columns) -> u64 {
-        let frames = match limits.frames_held {
-            _ if !self.decodes => 0,
+        let frames = match (limits.frames_held as u64).min(self.frame_block) {
             0..=1 => 0,
-            FRAME_BLOCK.. => FRAME_BLOCK as u64 + 2,
-            some => some as u64,
+            some => some + 2,
         };
         frames * self.state(of & self.varying)
     }
@@ -147,16 +190,36 @@ impl Workload {
 
     /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
     fn decoding(&self) -> u64 {
-        let frames = |column| if self.varying.contains(column) { FRAME_BLOCK as u64 } else { 1 };
+        let frames = |column| if self.varying.contains(column) { self.frame_block } else { 1 };
         let largest = Columns::ALL.iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
-        self.threads * 3 * GAUSSIAN_BLOCK as u64 * largest
+        if self.frame_block == 0 { 0 } else { self.threads * 3 * self.gaussian_block * largest }
     }
 
     /// The whole input as it is known and seen, whatever its Gaussians hold.
     fn known(&self) -> u64 {
-        let tiles = 5 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64) * self.frames.div_ceil(FRAME_BLOCK as u64);
-        let index = if self.decodes { PER_TILE * tiles } else { 0 };
-        index + 64 * self.frames + 160 * self.pictures
+        let tiles = |gaussian_block: u64, frame_block: u64| {
+            5 * self.gaussians.div_ceil(gaussian_block) * self.frames.div_ceil(frame_block)
+        };
+        let index = if self.frame_block == 0 { 0 } else { PER_TILE * tiles(self.gaussian_block, self.frame_block) };
+        index + self.field + 64 * self.frames + 160 * self.pictures
+    }
+
+    /// Index of a container that is written.
+    fn written_index(&self) -> u64 {
+        let blocks = self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64) * self.frames.div_ceil(FRAME_BLOCK as u64);
+        5 * PER_WRITTEN_TILE * blocks
+    }
+}
+
+/// The tiles of a container decide what is decoded together.
+fn of_container(container: &Container, unseen: Workload) -> Workload {
+    let layout = container.reader().layout();
+    Workload {
+        reader: 8,
+        frame_block: layout.frame_block.into(),
+        gaussian_block: layout.gaussian_block.into(),
+        file: 0,
+        ..unseen
     }
 }
 
@@ -228,13 +291,18 @@ impl Plan {
             pictures_together: work.threads as usize,
             sights_together: usize::MAX,
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
-            pairs_together: 8 * work.gaussians.max(1 << 17) as usize,
+            pairs_together: 8 * work.gaussians.max(1) as usize,
+        };
+        // A model is read whole before anything else.
+        let read = Need { stage: "read", reads: 0.0, per_gaussian: vec![("file", work.file)], fixed: Vec::new() };
+        let all = |limits: &Limits| {
+            let first = Some(read.clone()).filter(|_| work.resident > 0);
+            first.into_iter().chain(needs(&work, limits)).collect::<Vec<Need>>()
         };
         loop {
-            let plan = Plan { work, budget, limits, needs: needs(&work, &limits) };
+            let plan = Plan { work, budget, limits, needs: all(&limits) };
             let excess = plan.excess();
-            let saved =
-                |other: &Limits| excess - Plan { limits: *other, needs: needs(&work, other), ..plan.clone() }.excess();
+            let saved = |other: &Limits| excess - Plan { limits: *other, needs: all(other), ..plan.clone() }.excess();
             let halved = HALVINGS.iter().filter_map(|halve| {
                 let smaller = std::iter::successors(Some(limits), |limits| Some(halve(limits)));
                 smaller.take(usize::BITS as usize).find(|other| saved(other) > 0)
@@ -316,7 +384,7 @@ impl Plan {
         let _ = writeln!(
             out,
             "  at a time: {} frames held by readers, {} frames ready, {} pictures, {} pairs measured",
-            if work.decodes { limits.frames_held } else { 0 },
+            limits.frames_held.min(work.frame_block as usize),
             limits.frames_together,
             limits.pictures_together,
             limits.pairs_together
@@ -352,10 +420,6 @@ fn machine_memory() -> Option<u64> {
     Some(group.map_or(machine, |group: u64| group.min(machine)))
 }
 
-fn most_pixels(rig: &Rig) -> u64 {
-    rig.cameras.iter().map(|camera| u64::from(camera.width) * u64::from(camera.height)).max().unwrap_or(0)
-}
-
 fn size(bytes: u64) -> String {
     ByteSize(bytes).display().iec().to_string()
 }
@@ -369,14 +433,17 @@ const ROWS: u64 = Rows::BYTES_PER_GAUSSIAN as u64;
 /// Statistics, scores and a selection, as they stay until the end.
 pub const SCORED: u64 = ROWS + (Scores::BYTES_PER_GAUSSIAN + select::BYTES_PER_GAUSSIAN) as u64;
 
+/// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
+const CLUSTERED: u64 = 125;
+
 /// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
 const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 
-/// Stages that look at pictures, at most `views` of a frame: states that lie ready, what is on its way to them, and
+/// Stages that look at pictures: states that lie ready, what is on its way to them, and
 /// pictures in the making with `sums` bytes per Gaussian.
-fn looking(work: &Workload, limits: &Limits, columns: Columns, views: u64, sums: u64) -> (Vec<Part>, Vec<Part>) {
+fn looking(work: &Workload, limits: &Limits, columns: Columns, sums: u64) -> (Vec<Part>, Vec<Part>) {
     let pictures = work.threads.min(limits.pictures_together as u64);
-    let ready = (PICTURES_PER_THREAD as u64 * work.threads).div_ceil(views.max(1));
+    let ready = PICTURES_PER_THREAD as u64 * work.threads;
     let per_gaussian = vec![
         ("states", ready.min(limits.frames_together as u64) * work.state(columns)),
         ("readers", work.reader),
@@ -397,7 +464,7 @@ pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: b
         fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving()],
     }];
     if looks(has_cameras, recipe.scan.coverage) {
-        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL.without(Columns::SH), work.views, 12);
+        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL.without(Columns::SH), 12);
         per_gaussian.insert(0, ("rows", ROWS + 16));
         let reads = 1.0 / f64::from(recipe.scan.frame_stride.get());
         needs.push(Need { stage: "visible", reads, per_gaussian, fixed });
@@ -416,13 +483,20 @@ pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: b
 }
 
 /// What compressing takes: [`scoring`], and the stages that `recipe` and `only` ask for.
-pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only, has_cameras: bool) -> Vec<Need> {
+pub fn compressing(
+    work: &Workload,
+    limits: &Limits,
+    recipe: &Recipe,
+    only: Only,
+    kind: OutputKind,
+    has_cameras: bool,
+) -> Vec<Need> {
     let mut needs = scoring(work, limits, recipe, has_cameras);
     let looks = looks(has_cameras, recipe.scan.coverage);
     let whole = work.state(Columns::ALL);
     let sampled = |pictures: usize| (pictures as u64).min(work.pictures) as f64 / work.frames.max(1) as f64;
     if looks && only != Only::Merge && recipe.select.round_fraction < 1.0 {
-        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL, work.views.min(VIEWS_AT_ONCE as u64), 8);
+        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL, 8);
         per_gaussian.insert(0, ("rows", SCORED));
         per_gaussian.insert(1, ("ranking", 32));
         // Each round reads what the round before left.
@@ -457,6 +531,7 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
             reads: 2.0 * sampled(choose::PICTURES),
             per_gaussian: vec![
                 ("rows", SCORED + 24),
+                ("clusters", CLUSTERED),
                 ("states", 2 * whole),
                 ("result", result),
                 ("pictures", PICTURE_ON_ALL_THREADS),
@@ -467,7 +542,11 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
             ],
         });
     }
-    let fitted = u64::from(recipe.refit.refit_pictures);
+    let fitted = match work.frames {
+        // Of a stream nobody knows how many pictures there will be.
+        0 => u64::from(recipe.refit.refit_pictures).min(1 << 16),
+        _ => u64::from(recipe.refit.refit_pictures).min(work.pictures),
+    };
     if looks && fitted > 0 {
         let tests = fitted.div_ceil(3);
         needs.push(Need {
@@ -484,34 +563,50 @@ pub fn compressing(work: &Workload, limits: &Limits, recipe: &Recipe, only: Only
             ],
             fixed: vec![
                 work.arriving(),
-                ("pictures", (tests + work.views) * 12 * work.pixels),
+                ("pictures", (tests + work.views + 1) * 12 * work.pixels),
                 ("pairs", (fitted.min(limits.sights_together as u64) + work.threads) * render::STRIP_BYTES as u64 / 3),
             ],
         });
     }
-    let mut emit = Need {
+    needs.push(emitting(work, limits, kind, only != Only::Prune && !recipe.merge.passes.is_empty()));
+    needs
+}
+
+/// What writing a result of `kind` takes, of explicit trajectories perhaps with proxies.
+fn emitting(work: &Workload, limits: &Limits, kind: OutputKind, merges: bool) -> Need {
+    let whole = work.state(Columns::ALL);
+    let is_model = work.resident > 0;
+    let mut need = Need {
         stage: "emit",
-        reads: if work.resident > 0 { 0.0 } else { 1.0 },
-        per_gaussian: vec![("rows", SCORED + 24), ("result", result)],
+        reads: if is_model { 0.0 } else { 1.0 },
+        per_gaussian: vec![("rows", SCORED + 24), ("result", if is_model { 2 * whole } else { 0 })],
         fixed: writing(work),
     };
-    if work.resident == 0 && only != Only::Prune && !recipe.merge.passes.is_empty() {
-        // Of each that is merged and of each that comes of it the frames of a block, and a state.
-        let mixed = Columns::ALL.without(Columns::SH) | work.varying;
-        let waiting = work.held(&Limits::NONE, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
-        let together = (limits.gaussians_together as u64).min(work.gaussians);
-        emit.per_gaussian.push(("members", 40));
-        emit.fixed.push(("merged", together * (waiting + 2 * whole + work.reader + 24)));
+    match kind {
+        OutputKind::Gseq if merges && !is_model => {
+            // Of each that is merged and of each that comes of it the frames of a block, and a state.
+            let mixed = Columns::ALL.without(Columns::SH) | work.varying;
+            let held = Limits::NONE;
+            let waiting = work.held(&held, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
+            let together = (limits.gaussians_together as u64).min(work.gaussians);
+            need.per_gaussian.push(("members", CLUSTERED));
+            need.fixed.push(("merged", together * (waiting + 2 * whole + work.reader + 24)));
+        }
+        OutputKind::Gseq => (),
+        // A file's rows and the proxies among them for each thread, or one state and what it is made of.
+        _ => {
+            need.per_gaussian.push(("files", work.threads * (work.file + 2 * whole)));
+            need.per_gaussian.push(("members", CLUSTERED));
+        }
     }
-    needs.push(emit);
-    needs
+    need
 }
 
 /// Buffers of a container, or of a frame's file, in the making.
 fn writing(work: &Workload) -> Vec<Part> {
     let block = GAUSSIAN_BLOCK as u64
         * (2 * work.state(Columns::ALL) + 3 * FRAME_BLOCK as u64 * work.state(work.varying) + work.reader);
-    vec![("blocks", 2 * work.threads * block), work.arriving()]
+    vec![("blocks", 2 * work.threads * block), work.arriving(), ("index", work.written_index())]
 }
 
 /// What it takes to pack a stream of which `held` frames are in memory together, and to scan it on the way unless
@@ -525,8 +620,8 @@ pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<
         per_gaussian.push(("accumulators", stats::BYTES_PER_GAUSSIAN as u64));
         fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
         if visible {
-            let nothing_held = Workload { decodes: false, ..*work };
-            let (more, pictures) = looking(&nothing_held, limits, Columns::ALL.without(Columns::SH), work.views, 12);
+            let nothing_held = Workload { frame_block: 0, ..*work };
+            let (more, pictures) = looking(&nothing_held, limits, Columns::ALL.without(Columns::SH), 12);
             per_gaussian.extend(more);
             fixed.extend(pictures);
         }
@@ -556,7 +651,7 @@ pub fn picturing_both(work: &Workload, limits: &Limits) -> Vec<Need> {
     // Both models' and the photograph, and what they are compared with.
     let mut need = of_pictures(work, limits, "evaluate", 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.resident));
-    need.fixed.push(("pictures before", 3 * 12 * work.views * work.pixels));
+    need.fixed.push(("pictures before", 3 * 12 * work.viewpoints * work.pixels));
     vec![need]
 }
 
@@ -586,9 +681,13 @@ mod tests {
             varying: Columns::ALL.without(Columns::SH),
             resident: 0,
             reader: 8,
-            decodes: true,
+            frame_block: FRAME_BLOCK as u64,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            field: 0,
+            file: 0,
             pixels: 320 * 240,
             views: 2,
+            viewpoints: 2,
             pictures: 1200,
             threads: 2,
         }
@@ -602,7 +701,7 @@ mod tests {
     fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<Need> {
         let mut recipe = Recipe::preset(preset).unwrap();
         recipe.refit.refit_pictures = 36;
-        move |work, limits| compressing(work, limits, &recipe, Only::Both, true)
+        move |work, limits| compressing(work, limits, &recipe, Only::Both, OutputKind::Gseq, true)
     }
 
     #[test]
@@ -634,7 +733,7 @@ mod tests {
     fn what_a_recipe_does_not_do_takes_nothing() {
         let mut recipe = Recipe::preset("paper").unwrap();
         recipe.merge.passes.clear();
-        let needs = compressing(&work(1000), &Limits::NONE, &recipe, Only::Both, true);
+        let needs = compressing(&work(1000), &Limits::NONE, &recipe, Only::Both, OutputKind::Gseq, true);
         assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
     }
 }

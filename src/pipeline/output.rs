@@ -49,7 +49,7 @@ impl OutputKind {
     /// input can give. A folder is of the input's own kind.
     pub fn of(path: &Path, asked: Option<OutputKind>, input: &Input) -> Result<OutputKind> {
         if matches!(input, Input::Model(_)) {
-            return Ok(asked.or(Self::by_name(path)).unwrap_or(OutputKind::Model));
+            return Ok(Self::planned(path, asked, true));
         }
         let kind = Self::of_sequence(path, asked)?;
         let frames = input.source().info().times.len();
@@ -68,8 +68,14 @@ impl OutputKind {
             Some(OutputKind::Model) => Err(Error::usage(
                 "only a 4DGaussians model can be written as a model folder\n  write a .gseq or --as ply-sequence",
             )),
-            kind => Ok(kind.unwrap_or(OutputKind::PlySequence)),
+            _ => Ok(Self::planned(path, asked, false)),
         }
+    }
+
+    /// The kind that a result will have, if the input can give it.
+    pub fn planned(path: &Path, asked: Option<OutputKind>, is_model: bool) -> OutputKind {
+        let own = if is_model { OutputKind::Model } else { OutputKind::PlySequence };
+        asked.or(Self::by_name(path)).unwrap_or(own)
     }
 
     fn by_name(path: &Path) -> Option<OutputKind> {
@@ -295,7 +301,7 @@ impl Emission<'_> {
         let places: Vec<u32> = self.sieved.clusters.iter().map(|cluster| cluster.output).collect();
         let rows = self.rows();
         let progress = Progress::new("emit", "frames", frames.paths().len() as u64);
-        (0..frames.paths().len()).into_par_iter().try_for_each(|frame| {
+        let write = |&frame: &usize| {
             let mut proxies = Gaussians::zeros(0, frames.info().sh_degree);
             result.open(Ids::List(&places))?.read(frame, Columns::ALL, &mut proxies)?;
             let template = frames.frame(frame)?;
@@ -305,8 +311,11 @@ impl Emission<'_> {
             };
             write_like(&template, &rows, &proxies, &target)?;
             progress.advance(1);
-            Ok(())
-        })
+            Ok::<_, Error>(())
+        };
+        // A batch at a time: a thread that waits for proxies would begin another frame.
+        let all: Vec<usize> = (0..frames.paths().len()).collect();
+        all.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
     }
 
     fn rows(&self) -> Vec<OutRow> {

@@ -121,8 +121,9 @@ fn look(
         pictures.iter().enumerate().map(|(k, &(frame, camera))| (k, frame, camera)).collect();
     for of_frame in numbered.chunk_by(|a, b| a.1 == b.1) {
         let frame = of_frame[0].1;
-        let [original, state] = [scene.input.source(), result].map(|source| gather_all(source, frame, Columns::ALL));
-        let (original, state) = (original?, state?);
+        // The result first: its members are in memory while it is made.
+        let state = gather_all(result, frame, Columns::ALL)?;
+        let original = gather_all(scene.input.source(), frame, Columns::ALL)?;
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         for &(k, _, index) in of_frame {
             let mut picture = render(&original, camera(index), background);

@@ -30,7 +30,7 @@ use crate::model::{Schedule, Split};
 use crate::pipeline::evaluate::{EvaluateOptions, SideBySide};
 use crate::pipeline::evaluation::{Evaluation, PictureScores};
 use crate::pipeline::input::Scene;
-use crate::pipeline::memory::{picturing_both, scoring};
+use crate::pipeline::memory::{SCORED, picturing_both, scoring};
 use crate::pipeline::scored::{Scored, UserOverrides, score_scene};
 use crate::pipeline::summary::Stages;
 use crate::pipeline::trade_off::TradeOff;
@@ -117,7 +117,10 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     side.keep_to(options.evaluate.original.memory, |work, limits| {
         let mut needs = scoring(work, limits, &recipe, has_cameras);
         needs.push(traits::need(work));
-        needs.extend(picturing_both(work, limits));
+        needs.extend(picturing_both(work, limits).into_iter().map(|mut need| {
+            need.per_gaussian.push(("rows", SCORED + 8));
+            need
+        }));
         needs
     })?;
     side.scene.schedule = scored_pictures(&side.scene, &run)?;

@@ -16,6 +16,9 @@ use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::recipe::{Merge, Placement};
 
+/// Columns that follow from one another: moments mix position, rotation and scale, and opacity follows from areas.
+const MIXED: Columns = Columns::ALL.without(Columns::SH);
+
 /// Proxies made at a time.
 const BATCH: usize = 4096;
 
@@ -43,11 +46,9 @@ impl<'a> MergedSequence<'a> {
         for (place, of_cluster) in clusters {
             members[place as usize] = of_cluster;
         }
-        // Moments mix position, rotation and scale, and opacity follows from areas; colours have weights of their own.
-        let mixed = Columns::ALL.without(Columns::SH);
         let mut varying = source.info().varying;
-        if !(varying & mixed).is_empty() && members.iter().any(|members| !members.is_empty()) {
-            varying = varying | mixed;
+        if !(varying & MIXED).is_empty() && members.iter().any(|members| !members.is_empty()) {
+            varying = varying | MIXED;
         }
         let info = SequenceInfo { count: kept.len(), varying, ..source.info().clone() };
         MergedSequence { source, info, kept, members, merge: Merge { placement: Placement::Mean, ..merge.clone() } }
@@ -126,7 +127,7 @@ impl Merging {
 
     /// Columns of the members that `want` takes.
     fn needed(&self, want: Columns) -> Columns {
-        if self.proxies.is_empty() { want } else { Columns::ALL }
+        if self.proxies.is_empty() || want.is_empty() { want } else { want | MIXED }
     }
 
     /// Writes the columns `want` of the Gaussians, made of `state`, to `out`.
@@ -138,6 +139,9 @@ impl Merging {
                 let plane = from.plane(c);
                 to.plane_mut(c).iter_mut().zip(&self.rows).for_each(|(to, &row)| *to = plane[row as usize]);
             }
+        }
+        if want.is_empty() {
+            return;
         }
         for batch in self.proxies.chunks(BATCH) {
             let made: Vec<ProxyState> = batch

@@ -35,8 +35,8 @@ pub(super) const NEEDED: Columns = Columns::POSITION.with(Columns::OPACITY);
 
 /// Gaussians between two that are wanted which are rather read than skipped.
 const GAP: u32 = 32;
-/// Gaussians read at a time.
-const RUN: usize = 2048;
+/// Gaussians read at a time, at most.
+const RUN: u32 = 2048;
 
 /// Trajectories in a file that lasts as long as this.
 pub(super) struct Trajectories {
@@ -121,7 +121,7 @@ impl Trajectories {
     /// Reads rows of `width` numbers at `places` of a table that begins with number `first` of the file.
     fn read(&mut self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
         let mut values: Vec<f32> = Vec::new();
-        for near in places.chunk_by(|a, b| b - a <= GAP).flat_map(|near| near.chunks(RUN)) {
+        for near in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
             let low = near[0] as usize;
             let rows = near[near.len() - 1] as usize + 1 - low;
             values.resize(rows * width, 0.0);

@@ -71,6 +71,11 @@ impl<R: Read> FrameStream<R> {
         &self.constant
     }
 
+    /// The columns that do not vary; [`FrameStream::constant`] has none afterwards.
+    pub fn take_constant(&mut self) -> Gaussians {
+        std::mem::take(&mut self.constant)
+    }
+
     /// Bytes that have come so far.
     pub fn received(&self) -> u64 {
         self.bytes.received
