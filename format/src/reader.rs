@@ -254,7 +254,7 @@ impl Reader {
     }
 
     /// Makes `frames` give the frames of a tile: decompresses it, or, if it is raw, verifies it unless it has been.
-    /// Nothing of it stays in `buffer`. By ordinary reads, like [`Reader::read_tile`].
+    /// No values of it stay in `buffer`. By ordinary reads, like [`Reader::read_tile`].
     pub fn load(&self, at: TileId, buffer: &mut TileBuffer, frames: &mut TileFrames) -> Result<()> {
         let index = self.index(at)?;
         let tile = &self.tiles[index];

@@ -45,7 +45,7 @@ pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 31 + 20;
 /// to be measured, what is known of it and of another of earlier passes ([`known::KnownPairs`]), and its likeness.
 pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * KNOWN_BYTES + size_of::<f64>();
 
-/// Memory per pair that passed all tests of a pass: the pair, and its place among its member's.
+/// Memory per pair that passed all tests of a pass: the pair, with some room for the list to grow.
 pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
 /// Nodes whose neighbours one task looks up.

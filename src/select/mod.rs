@@ -1,7 +1,8 @@
 //! Sampling and pruning (METHOD section 4): which Gaussians stay.
 //!
 //! In: scores. Out: a mask, and a ranking of all Gaussians of which the mask is a prefix, so that any
-//! other number can be kept by the same rule. Memory: 28 bytes per Gaussian. Source: "Temporally-Aware
+//! other number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and
+//! [`WORKING_BYTES_PER_GAUSSIAN`] meanwhile. Source: "Temporally-Aware
 //! Pruning for Compact 4D Gaussian Splatting Models", section 3.3.
 
 mod hash;
