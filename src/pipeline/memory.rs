@@ -280,7 +280,7 @@ impl Plan {
         if budget.explain {
             eprint!("{}", plan.text());
         }
-        if plan.excess() > 0 { Err(plan.refusal()) } else { Ok(plan) }
+        if plan.excess() > 0 { Err(plan.refusal(budget)) } else { Ok(plan) }
     }
 
     /// The fastest plan that fits into `budget`, else the one that takes least.
@@ -331,12 +331,13 @@ impl Plan {
         beyond.sum::<u64>() + self.base().saturating_sub(self.budget)
     }
 
-    fn refusal(&self) -> Error {
+    fn refusal(&self, budget: Budget) -> Error {
         let largest = self.needs.iter().max_by_key(|need| need.bytes(&self.work)).map_or("", |need| need.stage);
         // Rounded up to what a person would write.
         let least = self.peak().div_ceil(1 << 20);
+        let default = if budget.bytes.is_none() { " (a quarter of the machine's)" } else { "" };
         Error::usage(format!(
-            "--memory {}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
+            "--memory {}{default}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
              give it that, or fewer --threads; --explain shows what takes how much",
             size(self.budget),
             self.work.gaussians

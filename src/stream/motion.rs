@@ -11,14 +11,14 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 
 use super::trajectories::{NEEDED, Trajectories};
-use super::{BLOCK, Progress};
+use super::{Frames, Progress};
 use crate::emit::container::FRAME_BLOCK;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::merge::known::Likeness;
 use crate::merge::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merge::voxels::voxel_order;
-use crate::model::{Column, Gaussians, opacity};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::model::{Column, opacity};
+use crate::pass::{FrameSource, Ids};
 use crate::plan::Limits;
 use crate::recipe;
 
@@ -136,25 +136,13 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = Progress::new("motion", "Gaussian frames", (ids.len() * frames) as u64);
-        let mut readers: Vec<Box<dyn BlockReader + '_>> = ids
-            .par_chunks(BLOCK)
-            .map(|ids| {
-                let mut reader = self.source.open(Ids::List(ids))?;
-                reader.hold(self.limits.frames_held);
-                Ok(reader)
-            })
-            .collect::<Result<_>>()?;
-        let mut states: Vec<Gaussians> = readers.iter().map(|_| Gaussians::zeros(0, info.sh_degree)).collect();
+        let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, self.limits.frames_held)?;
+        let mut state = readers.state();
         for frame in 0..frames {
-            let want = if frame == 0 { NEEDED } else { varying };
-            readers.par_iter_mut().zip(&mut states).try_for_each(|(reader, state)| {
-                reader.read(frame, want, state)?;
-                progress.advance(state.position.len() as u64);
-                Ok::<_, Error>(())
-            })?;
+            readers.read(frame, if frame == 0 { NEEDED } else { varying }, &mut state)?;
+            progress.advance(ids.len() as u64);
             motion.frame(|node| {
-                let (state, row) = (&states[node / BLOCK], node % BLOCK);
-                (state.position.row(row), opacity(state.opacity_logit.plane(0)[row]) >= self.scan.alpha_min)
+                (state.position.row(node), opacity(state.opacity_logit.plane(0)[node]) >= self.scan.alpha_min)
             });
         }
         Ok(())
@@ -181,7 +169,9 @@ fn local<'a>(pairs: &'a [(u32, u32)], members: &'a [u32]) -> impl ExactSizeItera
 mod tests {
     use super::*;
     use crate::demo::Scene;
-    use crate::model::{Columns, SequenceInfo};
+    use crate::error::Error;
+    use crate::model::{Columns, Gaussians, SequenceInfo};
+    use crate::pass::BlockReader;
     use crate::recipe::Recipe;
     use crate::stream::gather;
 
