@@ -25,7 +25,6 @@ use splatsieve::merge::proxy::Importance;
 use splatsieve::merge::{self, Asked, Survivors};
 use splatsieve::model::{Column, Columns, Gaussians};
 use splatsieve::pass::FrameSource;
-use splatsieve::plan::Limits;
 use splatsieve::recipe::{Motion, Recipe};
 use splatsieve::select::hash_id;
 use splatsieve::stream::gather;
@@ -178,11 +177,14 @@ fn motion(criterion: &mut Criterion) {
                 source: &container,
                 scan: &recipe.scan,
                 gate: MotionGate::new(&recipe.merge, 4.0),
-                limits: Limits { pairs_together: pairs.len().div_ceil(partitions), ..Limits::NONE },
+                frames_held: usize::MAX,
                 scratch: folder.path().to_owned(),
                 gathered: None,
             };
-            meter.measure(&ids, &reference, pairs.clone(), 0.05, false).unwrap()
+            let parts = pairs.chunks(pairs.len().div_ceil(partitions));
+            parts
+                .map(|part| meter.measure(&ids, &reference, part.to_vec(), 0.05, partitions > 1).unwrap().len())
+                .sum::<usize>()
         };
         group.bench_function(BenchmarkId::new("partitions", partitions), |bencher| {
             bencher.iter(|| one_thread.install(measure));

@@ -13,7 +13,6 @@ use splatsieve::merge::known::KNOWN_BYTES;
 use splatsieve::merge::motion::MotionGate;
 use splatsieve::merge::neighbors::{PointIndex, Search};
 use splatsieve::model::Columns;
-use splatsieve::plan::Limits;
 use splatsieve::recipe::Recipe;
 use splatsieve::stream::gather;
 use splatsieve::stream::motion::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
@@ -68,13 +67,16 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
         source: &container,
         scan: &recipe.scan,
         gate: MotionGate::new(&recipe.merge, 4.0),
-        limits: Limits { pairs_together: pairs.len().div_ceil(partitions), frames_held: FRAMES_HELD, ..Limits::NONE },
+        frames_held: FRAMES_HELD,
         scratch: folder.to_owned(),
         gathered: None,
     };
     let (count, before) = (pairs.len(), NOW.load(Relaxed));
     PEAK.store(before, Relaxed);
-    let found = meter.measure(&ids, &reference, pairs, 0.1, false).unwrap();
+    let mut found = Vec::with_capacity(count);
+    for part in pairs.chunks(count.div_ceil(partitions)) {
+        found.extend(meter.measure(&ids, &reference, part.to_vec(), 0.1, partitions > 1).unwrap());
+    }
     assert_eq!(found.len(), count);
     (PEAK.load(Relaxed) - before, count)
 }

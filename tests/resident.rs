@@ -10,7 +10,7 @@ use splatsieve::demo::Scene;
 use splatsieve::emit::container::write_container;
 use splatsieve::ingest::container::Container;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::pass::{FrameSource, Ids};
+use splatsieve::pass::{BlockReader, FrameSource, Ids};
 use splatsieve::stream::Frames;
 
 const COUNT: usize = 20_000;

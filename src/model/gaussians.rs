@@ -146,6 +146,19 @@ impl Gaussians {
         }
     }
 
+    /// Writes the rows of `block`, which may have more harmonics, from row `first` on.
+    ///
+    /// # Panics
+    /// If there are not as many rows.
+    pub fn write_rows(&mut self, first: usize, block: &Gaussians) {
+        for column in Columns::ALL.iter() {
+            let (from, to) = (block.column(column), self.column_mut(column));
+            for c in 0..to.width() {
+                to.plane_mut(c)[first..][..from.len()].copy_from_slice(from.plane(c));
+            }
+        }
+    }
+
     /// The column of a single-column set.
     ///
     /// # Panics

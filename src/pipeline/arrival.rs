@@ -20,8 +20,8 @@ use crossbeam_channel::bounded;
 use glam::DVec3;
 use gseq::Compression;
 
-use super::input::{Input, InputOptions, Opened, Scene, Streamed, load_cameras, scene_of};
-use super::memory::{Budget, Need, Plan, Workload, receiving};
+use super::input::{Input, InputOptions, Opened, Scene, Streamed, load_cameras, open_scene, scene_of};
+use super::memory::{Budget, Need, Plan, Workload, keep_to, receiving};
 use super::scored::{Measured, looks};
 use crate::emit::atomic::ScratchFile;
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK};
@@ -74,12 +74,29 @@ pub fn open_arriving(options: &InputOptions) -> Result<Opened> {
     Ok(Opened { input: Input::Stream(streamed), rig, notes: Vec::new() })
 }
 
+/// Opens a scene to be measured, with the limits of its budget; `needs` says what is to be done, told whether there
+/// are cameras. A stream is measured as it arrives, see [`open_measured`].
+pub fn open_to_measure(
+    options: &InputOptions,
+    recipe: &Recipe,
+    check: impl FnOnce(usize) -> Result<()>,
+    needs: impl Fn(&Workload, &Limits, bool) -> Vec<Need>,
+) -> Result<(Scene, Option<Measured>)> {
+    if options.is_stream() {
+        return open_measured(options, recipe, check, needs);
+    }
+    let mut scene = open_scene(options)?;
+    let has_cameras = scene.has_cameras;
+    keep_to(options.memory, &mut scene, |work, limits| needs(work, limits, has_cameras))?;
+    Ok((scene, None))
+}
+
 /// Packs a stream into a scratch container and measures it meanwhile, if there is memory for that beside the frames
 /// held. `check` is told the number of Gaussians before any frame is read, and `needs` what is known, for the
 /// stages to come.
 ///
 /// Gives the scene, and the statistics if what was assumed held.
-pub fn open_measured(
+fn open_measured(
     options: &InputOptions,
     recipe: &Recipe,
     check: impl FnOnce(usize) -> Result<()>,

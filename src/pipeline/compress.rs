@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use super::arrival::open_measured;
+use super::arrival::open_to_measure;
 use super::choose::{Chosen, choose};
-use super::input::{InputOptions, Scene, open_scene};
-use super::memory::{Workload, compressing, keep_to};
+use super::input::{InputOptions, Scene};
+use super::memory::{Workload, compressing};
 use super::merging::sieve;
 use super::output::{OutputKind, check_output, write_result};
 use super::overrides::parse_ids;
@@ -98,14 +98,8 @@ pub fn compress(options: &CompressOptions) -> Result<Summary> {
     };
     let name = if is_stream { "receive" } else { "read" };
     let (scene, measured) = stages.run(name, 0, f64::from(u8::from(is_stream)), || {
-        let (mut scene, measured) = match is_stream {
-            true => open_measured(&options.input, &options.recipe, |count| options.check_stream(count), needs)?,
-            false => (open_scene(&options.input)?, None),
-        };
-        if !is_stream {
-            let has_cameras = scene.has_cameras;
-            keep_to(options.input.memory, &mut scene, |work, limits| needs(work, limits, has_cameras))?;
-        }
+        let check = |count| options.check_stream(count);
+        let (scene, measured) = open_to_measure(&options.input, &options.recipe, check, needs)?;
         let count = scene.input.source().info().count;
         Ok::<_, Error>(((scene, measured), count))
     })?;

@@ -20,7 +20,7 @@ use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::model::Columns;
-use crate::pass::{FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::stream::{Frames, Progress};
 
 /// What `pack` wrote.

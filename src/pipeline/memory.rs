@@ -37,7 +37,7 @@ pub struct Budget {
 
 /// Resident before any Gaussian is: the program, its libraries, its threads' stacks and heaps, messages.
 const PROGRAM: u64 = 14 << 20;
-/// Per thread beyond the first.
+/// Per thread.
 const PER_THREAD: u64 = 2 << 20;
 /// Resident per tile of an open container.
 const PER_TILE: u64 = 72;
@@ -94,25 +94,9 @@ impl Workload {
     pub fn of_input(input: &Input) -> Workload {
         let info = input.source().info();
         let whole = state_bytes(info.sh_degree, Columns::ALL);
-        // Normals and the like.
-        let row = whole + 24;
-        let unseen = Workload {
-            gaussians: info.count as u64,
-            frames: info.times.len() as u64,
-            sh_degree: info.sh_degree,
-            varying: info.varying,
-            resident: 0,
-            reader: 4,
-            frame_block: 0,
-            gaussian_block: GAUSSIAN_BLOCK as u64,
-            field: 0,
-            file: row,
-            pixels: 0,
-            views: 0,
-            viewpoints: 0,
-            pictures: 0,
-            threads: rayon::current_num_threads() as u64,
-        };
+        let unseen = Workload::new(info.count, info.sh_degree, info.varying);
+        // Normals and the like stand beside the values.
+        let unseen = Workload { frames: info.times.len() as u64, file: whole + 24, ..unseen };
         match input {
             Input::Model(model) => Workload {
                 resident: whole,
@@ -125,6 +109,27 @@ impl Workload {
             Input::Frames(_) => unseen,
             Input::Container(container) => of_container(container, unseen),
             Input::Stream(streamed) => of_container(&streamed.container, unseen),
+        }
+    }
+
+    /// Of Gaussians without frames, each of which is read by itself and which nobody looks at.
+    fn new(count: usize, sh_degree: usize, varying: Columns) -> Workload {
+        Workload {
+            gaussians: count as u64,
+            frames: 0,
+            sh_degree,
+            varying,
+            resident: 0,
+            reader: 4,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            field: 0,
+            file: 0,
+            viewpoints: 0,
+            pixels: 0,
+            views: 0,
+            pictures: 0,
+            threads: rayon::current_num_threads() as u64,
         }
     }
 
@@ -148,23 +153,8 @@ impl Workload {
         times.sort_by(f64::total_cmp);
         let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
         let views = (together + rig.shots.len() - times.len()) as u64;
-        let unseen = Workload {
-            gaussians: header.count as u64,
-            frames: 0,
-            sh_degree: header.sh_degree,
-            varying: header.varying,
-            resident: 0,
-            reader: 8,
-            frame_block: frame_block as u64,
-            gaussian_block: GAUSSIAN_BLOCK as u64,
-            field: 0,
-            file: 0,
-            pixels: 0,
-            views: 0,
-            viewpoints: 0,
-            pictures: 0,
-            threads: rayon::current_num_threads() as u64,
-        };
+        let unseen = Workload::new(header.count, header.sh_degree, header.varying);
+        let unseen = Workload { reader: 8, frame_block: frame_block as u64, ..unseen };
         unseen.seen_by(rig, views, 0)
     }
 
@@ -197,17 +187,19 @@ impl Workload {
 
     /// The whole input as it is known and seen, whatever its Gaussians hold.
     fn known(&self) -> u64 {
-        let tiles = |gaussian_block: u64, frame_block: u64| {
-            5 * self.gaussians.div_ceil(gaussian_block) * self.frames.div_ceil(frame_block)
-        };
-        let index = if self.frame_block == 0 { 0 } else { PER_TILE * tiles(self.gaussian_block, self.frame_block) };
+        let index =
+            if self.frame_block == 0 { 0 } else { PER_TILE * self.tiles(self.gaussian_block, self.frame_block) };
         index + self.field + 64 * self.frames + 160 * self.pictures
     }
 
     /// Index of a container that is written.
     fn written_index(&self) -> u64 {
-        let blocks = self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64) * self.frames.div_ceil(FRAME_BLOCK as u64);
-        5 * PER_WRITTEN_TILE * blocks
+        PER_WRITTEN_TILE * self.tiles(GAUSSIAN_BLOCK as u64, FRAME_BLOCK as u64)
+    }
+
+    /// Tiles of all columns, each of so many Gaussians and frames.
+    fn tiles(&self, gaussian_block: u64, frame_block: u64) -> u64 {
+        Columns::ALL.iter().count() as u64 * self.gaussians.div_ceil(gaussian_block) * self.frames.div_ceil(frame_block)
     }
 }
 
@@ -587,8 +579,7 @@ fn emitting(work: &Workload, limits: &Limits, kind: OutputKind, merges: bool) ->
         OutputKind::Gseq if merges && !is_model => {
             // Of each that is merged and of each that comes of it the frames of a block, and a state.
             let mixed = Columns::ALL.without(Columns::SH) | work.varying;
-            let held = Limits::NONE;
-            let waiting = work.held(&held, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
+            let waiting = work.held(&Limits::NONE, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
             let together = (limits.gaussians_together as u64).min(work.gaussians);
             need.per_gaussian.push(("members", CLUSTERED));
             need.fixed.push(("merged", together * (waiting + 2 * whole + work.reader + 24)));

@@ -166,6 +166,8 @@ struct Job<'a> {
     /// Whether each may merge.
     mergeable: Vec<bool>,
     meter: PairMeter<'a>,
+    /// Pairs measured together.
+    pairs_together: usize,
     /// How pairs of the pool move: it does not depend on who else survives.
     known: KnownPairs,
 }
@@ -186,11 +188,12 @@ impl<'a> Job<'a> {
             source,
             scan: &recipe.scan,
             gate: MotionGate::new(&merge, unit),
-            limits: scene.limits,
+            frames_held: scene.limits.frames_held,
             scratch: scene.scratch.clone().unwrap_or_else(std::env::temp_dir),
             gathered: None,
         };
-        Ok(Job { scored, merge, pool, states, mergeable, meter, known: KnownPairs::default() })
+        let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
+        Ok(Job { scored, merge, pool, states, mergeable, meter, pairs_together, known })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -207,7 +210,7 @@ impl<'a> Job<'a> {
 
     /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Sieved> {
-        let Job { scored, merge, pool, states, mergeable, meter, known, .. } = self;
+        let Job { scored, merge, pool, states, mergeable, meter, pairs_together, known } = self;
         let survivors = Survivors {
             states,
             rows: &places_of(survivors, pool),
@@ -215,7 +218,7 @@ impl<'a> Job<'a> {
             mergeable,
             extent: scored.reference.extent,
         };
-        let most = meter.limits.pairs_together;
+        let most = *pairs_together;
         let merged = merge::run(&survivors, merge, limit, most, |asked| {
             let missing = known.missing(asked.pairs());
             let found = match missing.is_empty() {
@@ -267,12 +270,7 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
     }
     for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
         let whole = gather(source, ids, frame, Columns::ALL)?;
-        for column in Columns::ALL.iter() {
-            let (from, to) = (whole.column(column), states.column_mut(column));
-            for c in 0..to.width() {
-                to.plane_mut(c)[start..][..ids.len()].copy_from_slice(from.plane(c));
-            }
-        }
+        states.write_rows(start, &whole);
         for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
             *finite = merge::is_finite(&whole, row);
         }

@@ -266,7 +266,7 @@ impl Emission<'_> {
             let of_block = start..times.len().min(start + FRAME_BLOCK);
             writer.begin(&times[of_block.clone()])?;
             for part in &parts {
-                let mut frames = merged.frames(part.clone(), FRAME_BLOCK)?;
+                let mut frames = merged.together(part.clone(), FRAME_BLOCK)?;
                 let mut constant = Gaussians::zeros(0, *sh_degree);
                 if start == 0 {
                     frames.read(start, Columns::ALL.without(*varying), &mut constant)?;

@@ -55,12 +55,7 @@ pub fn canonical_proxies(
         let states = merged_states(model, reference, clusters, merge)?;
         let mut of_block = of_leaders.clone();
         deltas.solve(&with_leader_lengths(&deltas, &of_leaders, states), solved, &mut of_block);
-        for column in Columns::ALL.iter() {
-            for c in 0..of_block.column(column).width() {
-                let block = of_block.column(column).plane(c);
-                raw.column_mut(column).plane_mut(c)[first..][..block.len()].copy_from_slice(block);
-            }
-        }
+        raw.write_rows(first, &of_block);
     }
     let unsolved = restore_unsolved(&mut raw, &of_leaders);
     if unsolved > 0 {

@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::arrival::open_measured;
-use super::input::{InputOptions, open_scene};
-use super::memory::{Workload, keep_to, scoring};
+use super::arrival::open_to_measure;
+use super::input::InputOptions;
+use super::memory::{Workload, scoring};
 use super::scored::{UserOverrides, measure, score_measured};
 use super::summary::Stages;
 use crate::emit::atomic::{Kind, StagedFile, check_target};
@@ -23,14 +23,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bo
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let stages = &mut Stages::default();
     let needs = |work: &Workload, limits: &Limits, has_cameras| scoring(work, limits, recipe, has_cameras);
-    let (mut scene, measured) = match input.is_stream() {
-        true => open_measured(input, recipe, |_| Ok(()), needs)?,
-        false => (open_scene(input)?, None),
-    };
-    if !input.is_stream() {
-        let has_cameras = scene.has_cameras;
-        keep_to(input.memory, &mut scene, |work, limits| needs(work, limits, has_cameras))?;
-    }
+    let (scene, measured) = open_to_measure(input, recipe, |_| Ok(()), needs)?;
     let measured = measured.map_or_else(|| measure(&scene, recipe, stages), Ok)?;
     let scored = score_measured(&scene, measured, recipe, &UserOverrides::default(), stages)?;
     let table = RowTable {

@@ -44,8 +44,15 @@ impl<'a> Frames<'a> {
         Gaussians::zeros(self.count, self.sh_degree())
     }
 
-    /// Reads the columns `want`, of those that were opened, at `frame` into `state`.
-    pub fn read(&mut self, frame: usize, want: Columns, state: &mut Gaussians) -> Result<()> {
+    /// No room for colours that nobody reads.
+    fn sh_degree(&self) -> usize {
+        if self.columns.contains(Columns::SH) { self.info.sh_degree } else { 0 }
+    }
+}
+
+impl BlockReader for Frames<'_> {
+    /// Of the columns `want` those that were opened.
+    fn read(&mut self, frame: usize, want: Columns, state: &mut Gaussians) -> Result<()> {
         let want = want & self.columns;
         if want.is_empty() {
             return Ok(());
@@ -61,8 +68,7 @@ impl<'a> Frames<'a> {
         )
     }
 
-    /// No room for colours that nobody reads.
-    fn sh_degree(&self) -> usize {
-        if self.columns.contains(Columns::SH) { self.info.sh_degree } else { 0 }
+    fn hold(&mut self, frames: usize) {
+        self.readers.iter_mut().for_each(|reader| reader.hold(frames));
     }
 }

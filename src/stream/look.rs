@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::{Frames, Progress};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Schedule};
-use crate::pass::{FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::plan::Limits;
 use crate::recipe;
 

@@ -2,7 +2,7 @@
 //!
 //! At every frame a proxy is the moment match of its members at that frame, with the weights of the
 //! reference frame: Σ w_i x_i(t) is its path. Nothing is stored; memory is that of the members read. Members lie
-//! anywhere in the source: whoever reads many Gaussians reads them together ([`MergedFrames`]), so that what is
+//! anywhere in the source: whoever reads many Gaussians reads them together ([`MergedSequence::together`]), so that what is
 //! decoded for one serves all.
 
 use std::ops::Range;
@@ -55,12 +55,15 @@ impl<'a> MergedSequence<'a> {
     }
 }
 
-impl<'a> MergedSequence<'a> {
-    /// The Gaussians `places`, frame by frame, best in order; readers of the source hold `held` frames.
-    pub fn frames(&self, places: Range<usize>, held: usize) -> Result<MergedFrames<'_>> {
+impl MergedSequence<'_> {
+    /// A reader of the Gaussians `places` that reads what they are made of together, on all threads; readers of the
+    /// source hold `held` frames.
+    ///
+    /// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
+    pub fn together(&self, places: Range<usize>, held: usize) -> Result<Box<dyn BlockReader + '_>> {
         let merging = Merging::new(self, places);
         let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::ALL, held)?;
-        Ok(MergedFrames { sequence: self, state: frames.state(), frames, known: Columns::NONE, merging })
+        Ok(Box::new(MergedReader::new(self, Box::new(frames), merging)))
     }
 
     /// How many Gaussians of the source that at `place` is made of.
@@ -77,14 +80,13 @@ impl FrameSource for MergedSequence<'_> {
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         let merging = Merging::new(self, ids.iter());
         let reader = self.source.open(Ids::List(&merging.ids))?;
-        let state = Gaussians::zeros(merging.ids.len(), self.info.sh_degree);
-        Ok(Box::new(MergedReader { sequence: self, reader, state, known: Columns::NONE, merging }))
+        Ok(Box::new(MergedReader::new(self, reader, merging)))
     }
 
     fn whole(&self, frame: usize, want: Columns) -> Option<Result<Gaussians>> {
-        Some(self.frames(0..self.kept.len(), 1).and_then(|mut frames| {
+        Some(self.together(0..self.kept.len(), 1).and_then(|mut reader| {
             let mut state = Gaussians::zeros(0, self.info.sh_degree);
-            frames.read(frame, want, &mut state)?;
+            reader.read(frame, want, &mut state)?;
             Ok(state)
         }))
     }
@@ -164,6 +166,13 @@ struct MergedReader<'a> {
     merging: Merging,
 }
 
+impl<'a> MergedReader<'a> {
+    fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, merging: Merging) -> Self {
+        let state = Gaussians::zeros(merging.ids.len(), sequence.info.sh_degree);
+        MergedReader { sequence, reader, state, known: Columns::NONE, merging }
+    }
+}
+
 impl BlockReader for MergedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let needed = self.merging.needed(want);
@@ -175,27 +184,5 @@ impl BlockReader for MergedReader<'_> {
 
     fn hold(&mut self, frames: usize) {
         self.reader.hold(frames);
-    }
-}
-
-/// Many Gaussians of a merged sequence, frame after frame.
-///
-/// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
-pub struct MergedFrames<'a> {
-    sequence: &'a MergedSequence<'a>,
-    frames: Frames<'a>,
-    state: Gaussians,
-    known: Columns,
-    merging: Merging,
-}
-
-impl MergedFrames<'_> {
-    /// Reads the columns `want` at `frame` into `out`, which is resized.
-    pub fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let needed = self.merging.needed(want);
-        self.frames.read(frame, needed.without(self.known), &mut self.state)?;
-        self.known = self.known | needed.without(self.sequence.source.info().varying);
-        self.merging.write(&self.state, want, &self.sequence.merge, out);
-        Ok(())
     }
 }

@@ -19,7 +19,7 @@ pub use frames::Frames;
 pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};
-pub use merged::{MergedFrames, MergedSequence};
+pub use merged::MergedSequence;
 pub use progress::Progress;
 pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;

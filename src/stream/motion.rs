@@ -1,8 +1,8 @@
 //! Measuring how alike pairs of Gaussians move, over all frames.
 //!
-//! As long as all pairs fit, they are measured in one read of the source. Else the trajectories of all survivors are
-//! gathered once in voxel order, and the pairs are cut into partitions of that order: a partition is so many
-//! consecutive pairs, and reads the Gaussians that lead them and their ghosts, the partners within ε that other
+//! As long as all pairs fit, they are measured in one read of the source. Else [`crate::merge::run`] cuts them into
+//! partitions, so many consecutive pairs in voxel order, and the trajectories of all survivors are gathered once in that
+//! order: a partition reads the Gaussians that lead its pairs and their ghosts, the partners within ε that other
 //! partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is split. Every pair is
 //! summed whole in one partition, so no cut changes a bit.
 
@@ -18,8 +18,7 @@ use crate::merge::known::Likeness;
 use crate::merge::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merge::voxels::voxel_order;
 use crate::model::{Column, opacity};
-use crate::pass::{FrameSource, Ids};
-use crate::plan::Limits;
+use crate::pass::{BlockReader, FrameSource, Ids};
 use crate::recipe;
 
 /// Memory of one pair while it is measured: its sums, its two Gaussians while they are counted, its result.
@@ -39,8 +38,8 @@ pub struct PairMeter<'a> {
     pub scan: &'a recipe::Scan,
     /// What makes a pair alike.
     pub gate: MotionGate,
-    /// How many pairs are measured together, and how many frames are held.
-    pub limits: Limits,
+    /// Frames that readers hold, and that are gathered together.
+    pub frames_held: usize,
     /// Folder for trajectories that have to wait.
     pub scratch: PathBuf,
     /// None at first.
@@ -61,8 +60,8 @@ impl PairMeter<'_> {
     /// positions of `ids` at the reference frame; partners lie within about `reach` of each other there. Both are the
     /// same at every call. `is_part`: other pairs were or will be asked for, so that gathering pays.
     ///
-    /// Memory: [`BYTES_PER_PAIR`] and [`bytes_per_gaussian`] for the pairs measured together; 16 bytes for every pair; and
-    /// where not all fit, 8 bytes for each of `ids` and, while they are gathered, 12 more and their moments at the
+    /// Memory: 16 bytes and [`BYTES_PER_PAIR`] for every pair, [`bytes_per_gaussian`] for everybody in one; and of a
+    /// part 8 bytes for each of `ids` and, while they are gathered, 12 more and their moments at the
     /// frames held. Nothing grows with the number of frames. A sequence in which neither positions nor opacities vary is
     /// measured by its first.
     ///
@@ -76,45 +75,37 @@ impl PairMeter<'_> {
         reach: f64,
         is_part: bool,
     ) -> Result<Vec<Likeness>> {
-        let mut found = Vec::with_capacity(pairs.len());
-        if self.gathered.is_none() && !is_part && pairs.len() <= self.limits.pairs_together {
+        if is_part && self.gathered.is_none() {
+            self.gathered = Some(self.gather(ids, reference, reach)?);
+        }
+        let Some(Gathered { trajectories, order, place }) = &mut self.gathered else {
             let rows = members(&pairs);
             let places = rows.iter().map(|&row| reference.row(row as usize));
             let mut motion = PairMotion::new(local(&pairs, &rows), places, self.scan.motion);
             self.play_source(&rows.iter().map(|&row| ids[row as usize]).collect::<Vec<u32>>(), &mut motion)?;
             let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
-            found.extend(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)));
-            return Ok(found);
-        }
-        let alpha_min = self.scan.alpha_min;
-        if self.gathered.is_none() {
-            self.gathered = Some(self.gather(ids, reference, reach)?);
-        }
-        let Some(Gathered { trajectories, order, place }) = &mut self.gathered else { return Ok(found) };
+            return Ok(pairs.iter().zip(measured).map(|(&(a, b), likeness)| (a, b, likeness)).collect());
+        };
         for (a, b) in &mut pairs {
             let (i, j) = (place[*a as usize], place[*b as usize]);
             (*a, *b) = (i.min(j), i.max(j));
         }
         pairs.par_sort_unstable();
-        // Partitions of equal size: as few as the limit allows.
-        let partitions = pairs.len().div_ceil(self.limits.pairs_together);
-        for of_partition in pairs.chunks(pairs.len().div_ceil(partitions.max(1)).max(1)) {
-            let places = members(of_partition);
-            let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
-            let mut motion = PairMotion::new(local(of_partition, &places), at, self.scan.motion);
-            trajectories.play(&places, |moments| {
-                motion.frame(|node| {
-                    let [x, y, z, logit] = moments[node];
-                    ([x, y, z], opacity(logit) >= alpha_min)
-                });
-            })?;
-            let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
-            found.extend(of_partition.iter().zip(measured).map(|(&(i, j), likeness)| {
-                let (a, b) = (order[i as usize], order[j as usize]);
-                (a.min(b), a.max(b), likeness)
-            }));
-        }
-        Ok(found)
+        let places = members(&pairs);
+        let at = places.iter().map(|&k| reference.row(order[k as usize] as usize));
+        let mut motion = PairMotion::new(local(&pairs, &places), at, self.scan.motion);
+        trajectories.play(&places, |moments| {
+            motion.frame(|node| {
+                let [x, y, z, logit] = moments[node];
+                ([x, y, z], opacity(logit) >= self.scan.alpha_min)
+            });
+        })?;
+        let measured = motion.finish().map(|pair| self.gate.likeness(&pair));
+        let of_rows = |(&(i, j), likeness): (&(u32, u32), f64)| {
+            let (a, b) = (order[i as usize], order[j as usize]);
+            (a.min(b), a.max(b), likeness)
+        };
+        Ok(pairs.iter().zip(measured).map(of_rows).collect())
     }
 
     /// The trajectories of all of `ids` in voxels of side `reach`.
@@ -122,7 +113,7 @@ impl PairMeter<'_> {
         let rows: Vec<u32> = (0..ids.len() as u32).collect();
         let order = voxel_order(&rows, |row| reference.row(row as usize), reach);
         let of_order: Vec<u32> = order.iter().map(|&row| ids[row as usize]).collect();
-        let trajectories = Trajectories::gather(self.source, &of_order, self.limits.frames_held, &self.scratch)?;
+        let trajectories = Trajectories::gather(self.source, &of_order, self.frames_held, &self.scratch)?;
         let mut place = rows;
         for (&row, k) in order.iter().zip(0u32..) {
             place[row as usize] = k;
@@ -136,7 +127,7 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = Progress::new("motion", "Gaussian frames", (ids.len() * frames) as u64);
-        let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, self.limits.frames_held)?;
+        let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, self.frames_held)?;
         let mut state = readers.state();
         for frame in 0..frames {
             readers.read(frame, if frame == 0 { NEEDED } else { varying }, &mut state)?;
@@ -205,15 +196,19 @@ mod tests {
                 source,
                 scan: &self.recipe.scan,
                 gate: MotionGate::new(&self.recipe.merge, 4.0),
-                limits: Limits { pairs_together, frames_held: 4, ..Limits::NONE },
+                frames_held: 4,
                 scratch: folder.path().to_owned(),
                 gathered: None,
             };
-            let found = meter.measure(&self.ids, &self.reference, self.pairs.clone(), reach, false);
+            let is_part = self.pairs.len() > pairs_together;
+            let of_parts = self.pairs.chunks(pairs_together);
+            let found: Result<Vec<Vec<Likeness>>> =
+                of_parts.map(|part| meter.measure(&self.ids, &self.reference, part.to_vec(), reach, is_part)).collect();
             drop(meter);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
             // NaN is a finding too, so bits are compared.
-            let mut found: Vec<(u32, u32, u64)> = found?.into_iter().map(|(a, b, x)| (a, b, x.to_bits())).collect();
+            let mut found: Vec<(u32, u32, u64)> =
+                found?.into_iter().flatten().map(|(a, b, x)| (a, b, x.to_bits())).collect();
             found.sort_unstable();
             Ok(found)
         }
