@@ -2,7 +2,7 @@
 //!
 //! Data in: tensors of a state dict, canonical positions, a time. Data out: deltas and masks per
 //! Gaussian. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared Gaussian, and about
-//! 4·ROWS·(features + trunk + heads) bytes of scratch per reader.
+//! 4·LANES·(features + trunk + heads) bytes of scratch per reader.
 //! Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
 //! behaviour of its public renderer.
 
@@ -12,13 +12,10 @@ use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians};
 
 use super::deltas::Deltas;
-use super::linear::{Hidden, Output, Rows};
+use super::linear::{LANES, Lanes, Linear};
 use super::planes::{Lines, Planes, PreparedPlanes};
 use super::tensors::{Lookup, Tensors};
 use super::voxel::VoxelMask;
-
-/// Rows evaluated at a time: whole tiles of both kinds of layer, their activations in the first-level cache.
-const ROWS: usize = 96;
 
 /// What of a model's hyper-parameters decides the evaluation and cannot be told from tensor shapes.
 #[derive(Debug, Clone, PartialEq)]
@@ -51,8 +48,8 @@ enum Mask {
 struct Head {
     /// The column it deforms; none for the mask of `static_mlp`.
     column: Option<Columns>,
-    hidden: Hidden,
-    output: Output,
+    hidden: Linear,
+    output: Linear,
 }
 
 /// A 4DGaussians deformation field. Evaluates any block of Gaussians at any time; the result of a
@@ -62,7 +59,7 @@ pub struct Field {
     config: FieldConfig,
     /// None when the trunk reads positions.
     planes: Option<Planes>,
-    trunk: Vec<Hidden>,
+    trunk: Vec<Linear>,
     heads: Vec<Head>,
     mask: Mask,
 }
@@ -85,9 +82,9 @@ enum PreparedInput {
 /// Reusable activations of one reader.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
-    features: Vec<f32>,
-    trunk: [Vec<f32>; 2],
-    hidden: Vec<f32>,
+    features: Vec<Lanes>,
+    trunk: [Vec<Lanes>; 2],
+    hidden: Vec<Lanes>,
 }
 
 /// Name of a column's head in the state dict and its flag in `cfg_args`.
@@ -118,10 +115,10 @@ impl Field {
             Some(planes) => planes.width(),
         };
         let layer = |i: usize| format!("deformation_net.feature_out.{}", 2 * i);
-        let mut trunk = vec![Hidden::load(lookup, &layer(0), inputs, None, "the features it reads")?];
+        let mut trunk = vec![Linear::load(lookup, &layer(0), inputs, None, "the features it reads")?];
         let width = trunk[0].outputs;
         while lookup.has(&format!("{}.weight", layer(trunk.len()))) {
-            trunk.push(Hidden::load(lookup, &layer(trunk.len()), width, Some(width), "the width of the network")?);
+            trunk.push(Linear::load(lookup, &layer(trunk.len()), width, Some(width), "the width of the network")?);
         }
 
         let shape = Gaussians::zeros(0, sh_degree);
@@ -141,8 +138,8 @@ impl Field {
         let mut heads = Vec::new();
         for (column, (name, why), outputs) in wanted {
             let name = format!("deformation_net.{name}");
-            let hidden = Hidden::load(lookup, &format!("{name}.1"), width, Some(width), why)?;
-            let output = Output::load(lookup, &format!("{name}.3"), width, Some(outputs), why)?;
+            let hidden = Linear::load(lookup, &format!("{name}.1"), width, Some(width), why)?;
+            let output = Linear::load(lookup, &format!("{name}.3"), width, Some(outputs), why)?;
             heads.push(Head { column, hidden, output });
         }
         Ok(Field { config, planes, trunk, heads, mask })
@@ -247,29 +244,25 @@ impl Field {
         out: &mut Deltas,
     ) {
         let Scratch { features, trunk, hidden } = scratch;
-        for start in (0..prepared.rows).step_by(ROWS) {
-            let rows = ROWS.min(prepared.rows - start);
-            let mut width = 4;
+        for start in (0..prepared.rows).step_by(LANES) {
+            let lanes = LANES.min(prepared.rows - start);
             match (&self.planes, &prepared.input) {
                 (Some(planes), PreparedInput::Planes(block)) => {
-                    width = planes.width();
-                    features.resize(rows * width, 0.0);
-                    planes.features(block, lines, start, features);
+                    planes.features(block, lines, start, lanes, features);
                     if self.config.grid_pe > 1 {
-                        *features = with_frequencies(features, width, self.config.grid_pe as f32);
-                        width *= 3;
+                        add_frequencies(features, self.config.grid_pe as f32);
                     }
                 }
                 (_, PreparedInput::Position(position)) => {
                     features.clear();
-                    for i in start..start + rows {
-                        let [x, y, z] = position.row(i);
-                        features.extend([x, y, z, time]);
+                    features.resize(4, Lanes([time; LANES]));
+                    for (axis, out) in features[..3].iter_mut().enumerate() {
+                        out.0[..lanes].copy_from_slice(&position.plane(axis)[start..start + lanes]);
                     }
                 }
                 (None, PreparedInput::Planes(_)) => {}
             }
-            let trunk = run_trunk::<FMA>(&self.trunk, Rows { values: features, stride: width }, trunk);
+            let trunk = run_trunk::<FMA>(&self.trunk, features, trunk);
             for head in &self.heads {
                 let (planes, len) = match (head.column, &mut out.mask) {
                     (Some(column), _) if out.active.contains(column) => {
@@ -280,33 +273,31 @@ impl Field {
                     (None, Some(mask)) => (mask.as_mut_slice(), prepared.rows),
                     _ => continue,
                 };
-                let hidden = head.hidden.activate::<FMA>(trunk, hidden);
-                head.output.write::<FMA>(hidden, planes, len, start);
+                head.hidden.activate::<FMA>(trunk, hidden);
+                head.output.write::<FMA>(hidden, lanes, planes, len, start);
             }
         }
     }
 }
 
-/// Runs the trunk on the rows of `input`; gives its ReLU-ed output, as every head wants it.
+/// Runs the trunk on `input`; gives its ReLU-ed output, as every head wants it.
 #[inline(always)]
-fn run_trunk<'a, const FMA: bool>(layers: &[Hidden], input: Rows<'_>, buffers: &'a mut [Vec<f32>; 2]) -> Rows<'a> {
-    let [even, odd] = buffers;
-    let mut stride = input.stride;
+fn run_trunk<'a, const FMA: bool>(
+    layers: &[Linear],
+    input: &[Lanes],
+    [last, spare]: &'a mut [Vec<Lanes>; 2],
+) -> &'a [Lanes] {
     for (i, layer) in layers.iter().enumerate() {
-        let (from, to) = if i % 2 == 0 { (&*odd, &mut *even) } else { (&*even, &mut *odd) };
-        let from = if i == 0 { input } else { Rows { values: from, stride } };
-        stride = layer.activate::<FMA>(from, to).stride;
+        std::mem::swap(last, spare);
+        layer.activate::<FMA>(if i == 0 { input } else { spare }, last);
     }
-    Rows { values: if layers.len() % 2 == 1 { even } else { odd }, stride }
+    last
 }
 
-/// `[f, sin(p·f), cos(p·f)]` for every row of `width` features.
-fn with_frequencies(features: &[f32], width: usize, p: f32) -> Vec<f32> {
-    let mut out = Vec::with_capacity(3 * features.len());
-    for row in features.chunks_exact(width) {
-        out.extend_from_slice(row);
-        out.extend(row.iter().map(|f| (p * f).sin()));
-        out.extend(row.iter().map(|f| (p * f).cos()));
+/// `[f, sin(p·f), cos(p·f)]` of features f.
+fn add_frequencies(features: &mut Vec<Lanes>, p: f32) {
+    let plain = features.clone();
+    for of in [f32::sin, f32::cos] {
+        features.extend(plain.iter().map(|f| Lanes(f.0.map(|f| of(p * f)))));
     }
-    out
 }

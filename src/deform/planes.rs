@@ -11,6 +11,7 @@
 use crate::error::Result;
 use crate::model::Column;
 
+use super::linear::{LANES, Lanes};
 use super::tensors::Lookup;
 
 const X: usize = 0;
@@ -194,14 +195,24 @@ impl Planes {
         self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
     }
 
-    /// Writes the features of rows `start..` of the prepared block into `out` `[rows, width]`.
+    /// The features of `lanes` Gaussians of the prepared block from `start` on into `out` `[width, LANES]`; lanes
+    /// beyond them are 0.
     #[inline(always)]
-    pub(super) fn features(&self, prepared: &PreparedPlanes, lines: &[Lines], start: usize, out: &mut [f32]) {
+    pub(super) fn features(
+        &self,
+        prepared: &PreparedPlanes,
+        lines: &[Lines],
+        start: usize,
+        lanes: usize,
+        out: &mut Vec<Lanes>,
+    ) {
         let width = self.width();
-        let product = &prepared.product[start * width..][..out.len()];
+        out.clear();
+        out.resize(width, Lanes([0.0; LANES]));
+        let product = &prepared.product[start * width..][..lanes * width];
         let taps = &prepared.taps[start * 3 * self.levels.len()..];
-        let rows = out.chunks_exact_mut(width).zip(product.chunks_exact(width));
-        for ((out, product), taps) in rows.zip(taps.chunks_exact(3 * self.levels.len())) {
+        let rows = product.chunks_exact(width).zip(taps.chunks_exact(3 * self.levels.len()));
+        for (lane, (product, taps)) in rows.enumerate() {
             let mut first = 0;
             for ((level, [x, y, z]), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
                 let n = level.channels;
@@ -214,7 +225,7 @@ impl Planes {
                     let along_x = x0[c] * (1.0 - x) + x1[c] * x;
                     let along_y = y0[c] * (1.0 - y) + y1[c] * y;
                     let along_z = z0[c] * (1.0 - z) + z1[c] * z;
-                    out[c] = product[c] * along_x * along_y * along_z;
+                    out[c].0[lane] = product[c] * along_x * along_y * along_z;
                 }
                 first += n;
             }
