@@ -14,6 +14,9 @@ use memmap2::Mmap;
 
 use crate::error::{Error, Fault, Result};
 
+/// Bytes read at a time where all of a long stretch is gone through: whole records.
+pub(crate) const PIECE: usize = 1 << 16;
+
 pub(crate) struct MappedFile {
     path: PathBuf,
     file: File,
@@ -57,6 +60,21 @@ impl MappedFile {
             io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),
             _ => Error::io("read", &self.path)(error),
         })
+    }
+
+    /// Calls `each` with the bytes of `range` in pieces of [`PIECE`] bytes, the last of what is left, and the place of each.
+    pub(crate) fn read_pieces(
+        &self,
+        range: std::ops::Range<u64>,
+        piece: &mut Vec<u8>,
+        mut each: impl FnMut(u64, &[u8]) -> Result<()>,
+    ) -> Result<()> {
+        for offset in range.clone().step_by(PIECE) {
+            piece.resize((range.end - offset).min(PIECE as u64) as usize, 0);
+            self.read_at(offset, piece)?;
+            each(offset, piece)?;
+        }
+        Ok(())
     }
 
     /// `len` bytes at `offset`, where they lie in the map.

@@ -38,6 +38,7 @@
 mod codec;
 mod error;
 mod file;
+mod index;
 mod layout;
 mod reader;
 mod record;

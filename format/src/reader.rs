@@ -9,25 +9,27 @@ use zstd::bulk::Decompressor;
 use crate::codec::{Encoding, Stats, Unfilter};
 use crate::error::{Error, Fault, Result};
 use crate::file::MappedFile;
+use crate::index::Index;
 use crate::layout::{FIXED_HEADER, Layout, TileId};
-use crate::record::{FooterRecord, RECORD, Record, TRAILER, TileRecord, align, digest, trailer_from_bytes};
+use crate::record::{Digest, FooterRecord, RECORD, Record, TRAILER, TileRecord, align, trailer_from_bytes};
 use crate::writer::check_times;
 
-/// Bytes of a raw tile that are verified at a time.
-const PIECE: u64 = 1 << 16;
 /// Tiles closer than this are expected together.
 const NEAR: u64 = 1 << 12;
 
-/// A finished container. Memory: 64 bytes per tile and 8 per frame, three times that while opening; the values
-/// stay on disk.
+/// A finished container. Memory: 8 bytes per frame, 1 per tile, some 80 per column and Gaussian block while opening;
+/// index and values stay on disk. A file whose tiles lie in another order than its index, which this crate's writer
+/// makes when told to, takes 80 bytes per tile while opening.
 ///
 /// What happens when the file changes underneath: see [`Reader::tile`].
 pub struct Reader {
     pub(crate) file: MappedFile,
     pub(crate) layout: Layout,
     pub(crate) times: Vec<f64>,
-    pub(crate) tiles: Vec<TileRecord>,
+    pub(crate) index: Index,
     pub(crate) footer_offset: u64,
+    /// Per column whether its values differ between frames.
+    varies: Vec<bool>,
     /// Per tile whether its bytes in the map have matched their checksum.
     verified: Vec<AtomicBool>,
     digest: u64,
@@ -48,8 +50,7 @@ pub struct TileBuffer {
 /// Memory: of a packed tile 4 bytes per value of all its frames and 8 per value of one; of a raw tile nothing.
 #[derive(Debug, Default)]
 pub struct TileFrames {
-    /// Place in the index.
-    tile: usize,
+    tile: Option<TileRecord>,
     unfilter: Unfilter,
 }
 
@@ -158,30 +159,36 @@ impl Reader {
         };
         let start = footer_offset + RECORD;
         check_footer(&footer, &layout, &header, footer_offset, trailer_offset - start).map_err(fault)?;
-        // As long as the file says, and the file is that long: no more memory than the file has bytes.
-        let mut payload = vec![0; (trailer_offset - start) as usize];
-        file.read_at(start, &mut payload)?;
-        let computed = xxh3_64(&payload);
+        let mut piece = Vec::new();
+        let mut hash = Xxh3::new();
+        file.read_pieces(start..trailer_offset, &mut piece, |_, bytes| {
+            hash.update(bytes);
+            Ok(())
+        })?;
+        let computed = hash.digest();
         if computed != footer.checksum {
             let expected = format!("footer checksum {computed:016x}");
             return Err(fault(Fault::new(footer_offset + 32, expected, format!("{:016x}", footer.checksum))));
         }
 
-        let (times, index) = payload.split_at(8 * footer.frames as usize);
-        let times: Vec<f64> = times.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)).collect();
+        // As many as the file says, and the file is that long: no more memory than the file has bytes.
+        let mut times = Vec::with_capacity(footer.frames as usize);
+        let index_offset = start + 8 * footer.frames;
+        file.read_pieces(start..index_offset, &mut piece, |_, bytes| {
+            times.extend(bytes.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes)));
+            Ok(())
+        })?;
         check_times(None, &times)
             .map_err(|(frame, found)| {
                 Fault::new(start + 8 * frame as u64, "finite, strictly increasing time stamps", found)
             })
             .map_err(fault)?;
-        let index_offset = start + 8 * footer.frames;
-        let tiles = parse_index(index, index_offset, &layout, footer.frames, first_record + RECORD..footer_offset)
-            .map_err(fault)?;
-        check_overlap(&tiles, index_offset).map_err(fault)?;
-
-        let digest = digest(&header, &times, &tiles);
-        let verified = tiles.iter().map(|_| AtomicBool::new(false)).collect();
-        Ok(Reader { file, layout, times, tiles, footer_offset, verified, digest })
+        let payloads = first_record + RECORD..footer_offset;
+        let index = Index { offset: index_offset, tiles: footer.tiles, frames: footer.frames, payloads };
+        let mut digest = Digest::new(&header, &times);
+        let varies = index.check(&file, &layout, &mut piece, &mut digest)?;
+        let verified = (0..footer.tiles).map(|_| AtomicBool::new(false)).collect();
+        Ok(Reader { file, layout, times, index, footer_offset, varies, verified, digest: digest.value() })
     }
 
     /// The shape of the container.
@@ -204,15 +211,24 @@ impl Reader {
         self.times.len().div_ceil(self.layout.frame_block as usize) as u32
     }
 
+    /// Whether a column's values differ between frames, by the index alone: if not, its tiles are constant each and
+    /// share their stored bytes.
+    ///
+    /// # Panics
+    /// If there is no such column.
+    pub fn varies(&self, column: u32) -> bool {
+        self.varies[column as usize]
+    }
+
     /// Identifies the content: a hash of header, time stamps and the checksums and statistics of every tile. The same
     /// for the same content, layout and compression, in whatever order the tiles were written.
     pub fn digest(&self) -> u64 {
         self.digest
     }
 
-    /// What the index says of a tile. Errors: there is no such tile.
+    /// What the index says of a tile, which is read from the file. Errors: there is no such tile.
     pub fn tile_info(&self, at: TileId) -> Result<TileInfo> {
-        let tile = &self.tiles[self.index(at)?];
+        let (_, tile) = self.record(at)?;
         Ok(TileInfo {
             encoding: tile.encoding,
             constant: tile.constant,
@@ -230,53 +246,55 @@ impl Reader {
     /// error; if it shrinks while the slice of a raw tile is in use, the system may end the process, and a file
     /// rewritten in place shows through. Use [`Reader::read_tile`] where others may do that to the file.
     pub fn tile<'a>(&'a self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
-        let index = self.index(at)?;
-        let tile = &self.tiles[index];
+        let (index, tile) = self.record(at)?;
         if tile.encoding == Encoding::Raw && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
             // Relaxed: the flag guards nothing but repeated work.
             if !self.verified[index].load(Ordering::Relaxed) {
-                check_payload(tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
+                check_payload(&tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
                 self.verified[index].store(true, Ordering::Relaxed);
             }
             // Offsets are multiples of 64 and maps start at a page: the bytes are aligned.
             if let Ok(values) = bytemuck::try_cast_slice(bytes) {
-                return Ok(self.shaped(tile, values));
+                return Ok(self.shaped(&tile, values));
             }
         }
-        self.read_record(tile, buffer)
+        self.read_record(&tile, buffer)
     }
 
     /// The values of a tile, always copied into `buffer` by ordinary reads and verified: the map is not touched,
     /// so that a file cut short at any moment ends in an error.
     pub fn read_tile<'a>(&self, at: TileId, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
-        self.read_record(&self.tiles[self.index(at)?], buffer)
+        self.read_record(&self.record(at)?.1, buffer)
     }
 
     /// Makes `frames` give the frames of a tile: decompresses it, or, if it is raw, verifies it unless it has been.
     /// No values of it stay in `buffer`. By ordinary reads, like [`Reader::read_tile`].
     pub fn load(&self, at: TileId, buffer: &mut TileBuffer, frames: &mut TileFrames) -> Result<()> {
-        let index = self.index(at)?;
-        let tile = &self.tiles[index];
-        frames.tile = index;
+        let (index, tile) = self.record(at)?;
+        // Set last: after an error no frames are given.
+        frames.tile = None;
         match tile.encoding {
-            Encoding::Raw => self.verify_raw(index, &mut buffer.stored),
+            Encoding::Raw => self.verify_raw(index, &tile, &mut buffer.stored)?,
             Encoding::Filtered { order } => {
-                read_stored(&self.file, tile, &mut buffer.stored)?;
+                read_stored(&self.file, &tile, &mut buffer.stored)?;
                 let TileBuffer { stored, zstd, .. } = buffer;
-                unfilter(&self.file, &self.layout, tile, order, stored, zstd, &mut frames.unfilter)
+                unfilter(&self.file, &self.layout, &tile, order, stored, zstd, &mut frames.unfilter)?;
             }
         }
+        frames.tile = Some(tile);
+        Ok(())
     }
 
     /// Writes the values of a frame, counted from the tile's first, into `out`: `[width, len]` of the tile that was
     /// loaded. Of a raw tile just these bytes are read from the file.
     ///
     /// # Panics
-    /// If `out` is of another size, or the tile that this reader loaded last into `frames` has no such frame.
+    /// If `out` is of another size, or the tile that this reader loaded last into `frames` has no such frame, or no
+    /// tile was.
     pub fn read_frame(&self, frames: &mut TileFrames, frame: usize, out: &mut [f32]) -> Result<()> {
-        let tile = &self.tiles[frames.tile];
-        let plane = plane_of(&self.layout, tile);
+        let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
+        let plane = plane_of(&self.layout, &tile);
         assert!(frame < tile.frames as usize && out.len() == plane, "frame {frame}, {} values of {tile:?}", out.len());
         let frame = if tile.constant { 0 } else { frame };
         match tile.encoding {
@@ -293,7 +311,7 @@ impl Reader {
     /// Costs no memory of this process; that the file cannot be read shows when it is.
     pub fn expect(&self, tiles: impl IntoIterator<Item = TileId>) {
         let mut ahead = 0..0;
-        for tile in tiles.into_iter().filter_map(|at| self.index(at).ok()).map(|index| &self.tiles[index]) {
+        for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
             let end = tile.offset + u64::from(tile.stored_bytes);
             // Columns of a block lie side by side, with a record between.
             if tile.offset < ahead.end || tile.offset - ahead.end > NEAR {
@@ -306,32 +324,28 @@ impl Reader {
     }
 
     /// Verifies a raw tile, through `piece`, unless it has been: its frames are read one by one afterwards.
-    fn verify_raw(&self, index: usize, piece: &mut Vec<u8>) -> Result<()> {
+    fn verify_raw(&self, index: usize, tile: &TileRecord, piece: &mut Vec<u8>) -> Result<()> {
         // Relaxed: the flag guards nothing but repeated work.
         if self.verified[index].load(Ordering::Relaxed) {
             return Ok(());
         }
-        let tile = &self.tiles[index];
         let mut hash = Xxh3::new();
-        let mut offset = tile.offset;
-        let end = offset + u64::from(tile.stored_bytes);
-        while offset < end {
-            piece.resize((end - offset).min(PIECE) as usize, 0);
-            self.file.read_at(offset, piece)?;
-            hash.update(piece);
-            offset += piece.len() as u64;
-        }
+        self.file.read_pieces(tile.offset..tile.offset + u64::from(tile.stored_bytes), piece, |_, bytes| {
+            hash.update(bytes);
+            Ok(())
+        })?;
         check_payload(tile, hash.digest()).map_err(|fault| fault.at(self.file.path()))?;
         self.verified[index].store(true, Ordering::Relaxed);
         Ok(())
     }
 
-    fn index(&self, at: TileId) -> Result<usize> {
-        let index = self.layout.index_of(at).filter(|&index| index < self.tiles.len() as u64);
-        index.map(|index| index as usize).ok_or_else(|| {
+    /// Place of a tile in the index and what stands there.
+    fn record(&self, at: TileId) -> Result<(usize, TileRecord)> {
+        let index = self.layout.index_of(at).filter(|&index| index < self.index.tiles).ok_or_else(|| {
             let frames = self.frames();
             Error::usage(format!("{}: there is no {at:?} in {frames} frames", self.file.path().display()))
-        })
+        })?;
+        Ok((index as usize, self.index.record(&self.file, &self.layout, index)?))
     }
 
     fn read_record<'a>(&self, tile: &TileRecord, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
@@ -463,52 +477,6 @@ fn check_footer(
     if footer.payload() != Some(room) {
         let expected = format!("{} time stamps and {} index entries", footer.frames, footer.tiles);
         return Err(Fault::new(offset + 8, expected, format!("{room} bytes before the trailer")));
-    }
-    Ok(())
-}
-
-fn parse_index(
-    index: &[u8],
-    offset: u64,
-    layout: &Layout,
-    frames: u64,
-    payloads: std::ops::Range<u64>,
-) -> std::result::Result<Vec<TileRecord>, Fault> {
-    let mut tiles = Vec::with_capacity(index.len() / RECORD as usize);
-    for (i, bytes) in index.as_chunks().0.iter().enumerate() {
-        let place = offset + RECORD * i as u64;
-        let id = layout.tile_at(i as u64);
-        let range = layout.frame_range(id.frame_block, frames);
-        match Record::from_bytes(bytes, place)? {
-            Record::Tile(tile) if tile.id == id && u64::from(tile.frames) == range.end - range.start => {
-                tile.check(layout, payloads.clone(), place)?;
-                tiles.push(tile);
-            }
-            other => {
-                let expected = format!("the index entry of {id:?}, frames {} to {}", range.start, range.end);
-                return Err(Fault::new(place, expected, format!("{other:?}")));
-            }
-        }
-    }
-    Ok(tiles)
-}
-
-/// No two tiles may use the same bytes of the file, but for constant ones that share all of them.
-fn check_overlap(tiles: &[TileRecord], index_offset: u64) -> std::result::Result<(), Fault> {
-    let mut order: Vec<usize> = (0..tiles.len()).collect();
-    order.sort_unstable_by_key(|&i| (tiles[i].offset, i));
-    for pair in order.windows(2) {
-        let (tile, next) = (&tiles[pair[0]], &tiles[pair[1]]);
-        let apart = next.offset - RECORD >= tile.offset + u64::from(tile.stored_bytes);
-        if !apart && !next.may_share(tile) {
-            let place = index_offset + RECORD * pair[1] as u64 + 24;
-            let expected = format!("{:?} stored apart from {:?}", next.id, tile.id);
-            return Err(Fault::new(
-                place,
-                expected,
-                format!("both at bytes {} to {}", next.offset, tile.offset + u64::from(tile.stored_bytes)),
-            ));
-        }
     }
     Ok(())
 }

@@ -237,14 +237,23 @@ pub(crate) fn trailer_from_bytes(bytes: &[u8; TRAILER as usize], offset: u64) ->
     Ok(footer)
 }
 
-/// What identifies a container's content: a hash of header, time stamps and every tile's record
-/// without the place it is stored at, so that the order of writing does not matter.
-pub(crate) fn digest(header: &[u8], times: &[f64], tiles: &[TileRecord]) -> u64 {
-    let mut hash = Xxh3::new();
-    hash.update(header);
-    times.iter().for_each(|time| hash.update(&time.to_le_bytes()));
-    for tile in tiles {
-        hash.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
+/// What identifies a container's content: a hash of header, time stamps and every tile's record in the order of the
+/// index, without the place it is stored at, so that the order of writing does not matter.
+pub(crate) struct Digest(Xxh3);
+
+impl Digest {
+    pub(crate) fn new(header: &[u8], times: &[f64]) -> Self {
+        let mut hash = Xxh3::new();
+        hash.update(header);
+        times.iter().for_each(|time| hash.update(&time.to_le_bytes()));
+        Digest(hash)
     }
-    hash.digest()
+
+    pub(crate) fn tile(&mut self, tile: &TileRecord) {
+        self.0.update(&Record::Tile(TileRecord { offset: 0, ..*tile }).to_bytes());
+    }
+
+    pub(crate) fn value(&self) -> u64 {
+        self.0.digest()
+    }
 }

@@ -5,12 +5,13 @@ use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use xxhash_rust::xxh3::xxh3_64;
+use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use crate::codec::EncodedTile;
 use crate::error::{Error, Result};
+use crate::file::PIECE;
 use crate::layout::{Layout, TileId};
-use crate::record::{FooterRecord, RECORD, Record, TileRecord, TimesRecord, align, digest, trailer_to_bytes};
+use crate::record::{Digest, FooterRecord, RECORD, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
 
 /// Writes a container: time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
 ///
@@ -21,8 +22,8 @@ use crate::record::{FooterRecord, RECORD, Record, TileRecord, TimesRecord, align
 /// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian
 /// block is not stored again: a column that never changes costs 64 bytes per further tile and its index entry.
 ///
-/// Memory: 64 bytes per tile and 8 per frame for the index, three times that in [`Writer::finish`]; 64 bytes per
-/// column and Gaussian block; the stored bytes of the largest constant tile.
+/// Memory: 8 bytes per frame, twice that in [`Writer::finish`]; 64 bytes per column and Gaussian block; the stored
+/// bytes of the largest constant tile. The index, 64 bytes per tile, waits in a nameless file in the same folder.
 ///
 /// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished
 /// writer removes it; a killed process leaves it behind, readable by [`crate::recover`].
@@ -35,7 +36,10 @@ pub struct Writer {
     /// Where the next record goes: a multiple of 64.
     position: u64,
     times: Vec<f64>,
-    tiles: Vec<Option<TileRecord>>,
+    /// Nameless: the record of tile i at byte 64·i, zeros where it is missing.
+    index: File,
+    /// Tiles that are to be written, and that are.
+    tiles: u64,
     written: u64,
     /// Per column and Gaussian block the last constant tile that was written.
     constants: Vec<Option<TileRecord>>,
@@ -50,6 +54,11 @@ impl Writer {
         let path = path.as_ref();
         let mut header = layout.to_header()?;
         let (temporary, file) = create_beside(path)?;
+        let index = tempfile::tempfile_in(folder_of(path)).map_err(|error| {
+            // Nothing was begun, and nobody is left to tell of a second failure.
+            let _ = fs::remove_file(&temporary);
+            Error::io("create the index of", path)(error)
+        })?;
         let mut writer = Writer {
             path: path.to_owned(),
             temporary,
@@ -59,7 +68,8 @@ impl Writer {
             header: Vec::new(),
             position: 0,
             times: Vec::new(),
-            tiles: Vec::new(),
+            index,
+            tiles: 0,
             written: 0,
             stored: Vec::new(),
             finished: false,
@@ -106,7 +116,7 @@ impl Writer {
         let record = TimesRecord { frame_block: block, frames: times.len() as u32, checksum: xxh3_64(&payload) };
         self.put(&[&Record::Times(record).to_bytes(), &payload])?;
         self.times.extend(times);
-        self.tiles.resize(self.tiles.len() + self.layout.tiles_per_frame_block() as usize, None);
+        self.tiles += self.layout.tiles_per_frame_block();
         Ok(block)
     }
 
@@ -134,7 +144,8 @@ impl Writer {
             checksum: tile.checksum,
             stats: tile.stats,
         };
-        let slot = index % self.constants.len();
+        let slot = index as usize % self.constants.len();
+        let start = self.position;
         match self.shared_payload(slot, &record, &tile.bytes)? {
             Some(offset) => {
                 record.offset = offset;
@@ -142,11 +153,10 @@ impl Writer {
             }
             None => self.put(&[&Record::Tile(record).to_bytes(), &tile.bytes])?,
         }
+        self.enter(index, record, start)?;
         if record.constant {
             self.constants[slot] = Some(record);
         }
-        self.tiles[index] = Some(record);
-        self.written += 1;
         Ok(())
     }
 
@@ -155,30 +165,61 @@ impl Writer {
     /// its time stamps have not been appended, it was written already, or no constant tile came before it.
     pub fn repeat_tile(&mut self, at: TileId) -> Result<()> {
         let (index, frames) = self.free_slot(at)?;
-        let slot = index % self.constants.len();
+        let slot = index as usize % self.constants.len();
         let Some(earlier) = self.constants[slot] else {
             return Err(Error::usage(format!("{at:?} has no constant tile before it to repeat")));
         };
         let record = TileRecord { id: at, frames, ..earlier };
+        let start = self.position;
         self.put(&[&Record::Tile(record).to_bytes()])?;
+        self.enter(index, record, start)?;
         self.constants[slot] = Some(record);
-        self.tiles[index] = Some(record);
-        self.written += 1;
         Ok(())
     }
 
     /// Place in the index of a tile that is still to be written, and the frames it covers.
-    fn free_slot(&self, at: TileId) -> Result<(usize, u32)> {
-        let Some(index) =
-            self.layout.index_of(at).map(|index| index as usize).filter(|&index| index < self.tiles.len())
-        else {
+    fn free_slot(&mut self, at: TileId) -> Result<(u64, u32)> {
+        let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
             return Err(Error::usage(format!("there is no {at:?} after {} frames", self.times.len())));
         };
-        if self.tiles[index].is_some() {
+        if self.is_entered(index)? {
             return Err(Error::usage(format!("{at:?} was written already")));
         }
         let frames = self.layout.frame_range(at.frame_block, self.times.len() as u64);
         Ok((index, (frames.end - frames.start) as u32))
+    }
+
+    fn is_entered(&mut self, index: u64) -> Result<bool> {
+        let mut bytes = Vec::new();
+        let read = self.index.seek(SeekFrom::Start(RECORD * index));
+        let read = read.and_then(|_| (&self.index).take(RECORD).read_to_end(&mut bytes));
+        read.map_err(Error::io("read back the index of", &self.temporary))?;
+        Ok(bytes.iter().any(|&byte| byte != 0))
+    }
+
+    /// Enters a tile whose record was put at `start`, to which an error goes back.
+    fn enter(&mut self, index: u64, record: TileRecord, start: u64) -> Result<()> {
+        let written = self.index.seek(SeekFrom::Start(RECORD * index));
+        let written = written.and_then(|_| self.index.write_all(&Record::Tile(record).to_bytes()));
+        written.map_err(|error| {
+            self.position = start;
+            Error::io("write the index of", &self.temporary)(error)
+        })?;
+        self.written += 1;
+        Ok(())
+    }
+
+    /// Calls `each` with the index, some whole entries at a time.
+    fn index_pieces(&mut self, mut each: impl FnMut(&mut Writer, &[u8]) -> Result<()>) -> Result<()> {
+        let end = RECORD * self.tiles;
+        let mut piece = Vec::new();
+        for offset in (0..end).step_by(PIECE) {
+            piece.resize((end - offset).min(PIECE as u64) as usize, 0);
+            let read = self.index.seek(SeekFrom::Start(offset)).and_then(|_| self.index.read_exact(&mut piece));
+            read.map_err(Error::io("read back the index of", &self.temporary))?;
+            each(self, &piece)?;
+        }
+        Ok(())
     }
 
     /// Writes the footer, syncs, renames the file to its final name (replacing what was there) and syncs the
@@ -186,33 +227,48 @@ impl Writer {
     ///
     /// Errors: a tile is missing. Nothing appears under the final name then.
     pub fn finish(mut self) -> Result<u64> {
-        if self.written != self.tiles.len() as u64 {
-            let missing = self.tiles.iter().position(Option::is_none).unwrap_or_default();
+        if self.written != self.tiles {
+            let mut first = 0;
+            while self.is_entered(first)? {
+                first += 1;
+            }
             return Err(Error::usage(format!(
                 "{} of {} tiles are missing, the first is {:?}",
-                self.tiles.len() as u64 - self.written,
-                self.tiles.len(),
-                self.layout.tile_at(missing as u64)
+                self.tiles - self.written,
+                self.tiles,
+                self.layout.tile_at(first)
             )));
         }
-        let tiles: Vec<TileRecord> = self.tiles.iter().flatten().copied().collect();
-        let mut payload = Vec::with_capacity(8 * self.times.len() + RECORD as usize * tiles.len());
-        payload.extend(self.times.iter().flat_map(|time| time.to_le_bytes()));
-        payload.extend(tiles.iter().flat_map(|&tile| Record::Tile(tile).to_bytes()));
+        let times: Vec<u8> = self.times.iter().flat_map(|time| time.to_le_bytes()).collect();
+        let mut checksum = Xxh3::new();
+        checksum.update(&times);
+        let mut digest = Digest::new(&self.header, &self.times);
+        self.index_pieces(|writer, piece| {
+            checksum.update(piece);
+            for (entry, offset) in piece.as_chunks().0.iter().zip((0..).step_by(RECORD as usize)) {
+                let record = Record::from_bytes(entry, offset).map_err(|fault| fault.at(&writer.temporary))?;
+                if let Record::Tile(tile) = record {
+                    digest.tile(&tile);
+                }
+            }
+            Ok(())
+        })?;
         let footer = FooterRecord {
             frames: self.times.len() as u64,
-            tiles: tiles.len() as u64,
-            checksum: xxh3_64(&payload),
+            tiles: self.tiles,
+            checksum: checksum.digest(),
             header_checksum: xxh3_64(&self.header),
         };
         let trailer = trailer_to_bytes(self.position);
-        // The payload is a multiple of 8 long; the trailer follows it without padding and ends the file.
-        self.put_exactly(&[&Record::Footer(footer).to_bytes(), &payload, &trailer])?;
+        // Times and index are multiples of 8 long; the trailer follows them without padding and ends the file.
+        self.put_exactly(&[&Record::Footer(footer).to_bytes(), &times])?;
+        self.index_pieces(|writer, piece| writer.put_exactly(&[piece]))?;
+        self.put_exactly(&[&trailer])?;
         self.file.sync_all().map_err(Error::io("sync", &self.temporary))?;
         fs::rename(&self.temporary, &self.path).map_err(Error::io("rename", &self.temporary))?;
         self.finished = true;
         sync_folder(&self.path)?;
-        Ok(digest(&self.header, &self.times, &tiles))
+        Ok(digest.value())
     }
 
     /// Where the bytes of a constant tile already lie in the file, if they do. Equal checksums only
@@ -228,23 +284,22 @@ impl Writer {
         Ok((self.stored == bytes).then_some(earlier.offset))
     }
 
-    /// Appends `parts` and the zeros that bring the next record to a multiple of 64. After an error the
-    /// position is as before, so that the call may be repeated.
+    /// Appends `parts` and the zeros that bring the next record to a multiple of 64.
     fn put(&mut self, parts: &[&[u8]]) -> Result<()> {
-        let len: u64 = parts.iter().map(|part| part.len() as u64).sum();
-        let end = self.position + len;
+        let end = self.position + parts.iter().map(|part| part.len() as u64).sum::<u64>();
         let zeros = [0; RECORD as usize];
-        self.put_exactly(&[parts, &[&zeros[..(align(end) - end) as usize]]].concat())?;
-        self.position = align(end);
-        Ok(())
+        self.put_exactly(&[parts, &[&zeros[..(align(end) - end) as usize]]].concat())
     }
 
+    /// Appends `parts`. After an error the position is as before, so that the call may be repeated.
     fn put_exactly(&mut self, parts: &[&[u8]]) -> Result<()> {
         let written = self
             .file
             .seek(SeekFrom::Start(self.position))
             .and_then(|_| parts.iter().try_for_each(|part| self.file.write_all(part)));
-        written.map_err(Error::io("write", &self.temporary))
+        written.map_err(Error::io("write", &self.temporary))?;
+        self.position += parts.iter().map(|part| part.len() as u64).sum::<u64>();
+        Ok(())
     }
 }
 
@@ -292,10 +347,15 @@ fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
     }
 }
 
+/// The folder a file lies in.
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Makes a rename last through a power failure. Elsewhere than on Unix folders cannot be synced.
 fn sync_folder(path: &Path) -> Result<()> {
     if cfg!(unix) {
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let folder = folder_of(path);
         File::open(folder).and_then(|folder| folder.sync_all()).map_err(Error::io("sync", folder))?;
     }
     Ok(())

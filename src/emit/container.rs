@@ -1,8 +1,8 @@
 //! Any sequence into a container, frame block by frame block, tile by tile.
 //!
 //! Memory: for every thread one tile of every column, [`GAUSSIAN_BLOCK`] × frames of a block values of
-//! each of its components, and as much again while it is encoded; nothing grows with N or T but the
-//! index, 64 bytes per tile.
+//! each of its components, and as much again while it is encoded; 80 bytes per column and block of Gaussians,
+//! 16 per frame.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

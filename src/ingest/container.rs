@@ -89,7 +89,7 @@ impl Container {
             .ok_or_else(|| Error::input(path, "header", "fewer than 2^32 Gaussians", layout.gaussians.to_string()))?;
         let mut varying = Columns::NONE;
         for &(column, place) in &places {
-            if varies(&reader, place)? {
+            if reader.varies(place) {
                 varying = varying | column;
             }
         }
@@ -135,21 +135,6 @@ impl Drop for Lent<'_> {
     fn drop(&mut self) {
         self.from.lock().unwrap_or_else(PoisonError::into_inner).push(std::mem::take(&mut self.scratch));
     }
-}
-
-/// Whether a column's values differ between frames: by the index alone. Tiles that are constant each and
-/// share their stored bytes are one value for all frames.
-fn varies(reader: &Reader, column: u32) -> Result<bool> {
-    for gaussian_block in 0..reader.layout().gaussian_blocks() {
-        let mut first = None;
-        for frame_block in 0..reader.frame_blocks() {
-            let tile = reader.tile_info(TileId { column, gaussian_block, frame_block })?;
-            if !tile.constant || *first.get_or_insert(tile.offset) != tile.offset {
-                return Ok(true);
-            }
-        }
-    }
-    Ok(false)
 }
 
 impl FrameSource for Container {
