@@ -15,6 +15,8 @@ pub struct Limits {
     pub gaussians_together: usize,
     /// Pairs of Gaussians whose motion is measured together; at least 1.
     pub pairs_together: usize,
+    /// Statistics wait in a scratch file once they have been scored.
+    pub rows_aside: bool,
 }
 
 impl Limits {
@@ -26,5 +28,6 @@ impl Limits {
         sights_together: usize::MAX,
         gaussians_together: usize::MAX,
         pairs_together: usize::MAX,
+        rows_aside: false,
     };
 }

@@ -143,7 +143,8 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
                 &mut nodes,
             );
         }
-        let size = |node: usize| groups[node].iter().map(|&id| scored.rows.c[id]).sum::<f64>();
+        let rows = scored.rows().unwrap();
+        let size = |node: usize| groups[node].iter().map(|&id| rows.c[id]).sum::<f64>();
         let hash = |node: usize| splatsieve::select::hash_id(groups[node][0] as u64);
         let mut order: Vec<usize> = (0..groups.len()).collect();
         order.sort_by(|&a, &b| size(b).partial_cmp(&size(a)).unwrap().then(hash(a).cmp(&hash(b))));
@@ -183,7 +184,8 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
 fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
     let mut ids = group.to_vec();
     ids.sort_unstable();
-    let seen: Vec<f64> = ids.iter().map(|&id| scored.rows.c[id] * scored.rows.vis[id]).collect();
+    let rows = scored.rows().unwrap();
+    let seen: Vec<f64> = ids.iter().map(|&id| rows.c[id] * rows.vis[id]).collect();
     let total: f64 = seen.iter().sum();
     assert!(total > 0.0, "a cluster that nobody saw");
     ids.iter().zip(seen).map(|(&id, weight)| (id as u32, weight / total)).collect()

@@ -82,7 +82,7 @@ fn rows(model: &Path, motion: Motion) -> (Rows, f64) {
     // Motion and opacity do not look at cameras; those of one frame tell that the scene is in view.
     scene.schedule.frames[1..].iter_mut().for_each(Vec::clear);
     let scored = score_scene(&scene, &recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
-    (scored.rows, scored.position_ulp)
+    (scored.rows().unwrap().into_owned(), scored.position_ulp)
 }
 
 /// All frames, both ways to count motion.

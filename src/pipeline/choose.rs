@@ -60,8 +60,8 @@ pub fn choose(
     let count = sieved.kept.len();
     let own = scored.ranked_by;
     let mut alternatives = Vec::new();
-    if !scored.rows.w.is_empty() && count > 0 {
-        alternatives = alternatives_to(scene, scored, recipe, count)?;
+    if scored.has_seen() && count > 0 {
+        alternatives = alternatives_to(scored, recipe, count)?;
     }
     if sieved.clusters.is_empty() {
         // It is the prefix of its ranking already.
@@ -102,26 +102,25 @@ pub fn choose(
     }
     if merged && chosen.sieved.clusters.is_empty() && target.is_none() {
         let survivors = scored.selection.counts.kept;
-        let ranking = rankings(scene, scored, recipe)?.into_iter().find(|(other, _)| *other == rule);
+        let ranking = rankings(scored, recipe)?.into_iter().find(|(other, _)| *other == rule);
         chosen.sieved = Sieved::pruned(ranking.map_or(scored.ranking.take(survivors), |found| found.1.take(survivors)));
     }
     Ok(chosen)
 }
 
 /// The rankings to compare, the recipe's own first, with what they go by.
-fn rankings(scene: &Scene, scored: &Scored, recipe: &Recipe) -> Result<Vec<(&'static str, Ranking)>> {
-    let frames = scene.input.source().info().times.len();
+fn rankings(scored: &Scored, recipe: &Recipe) -> Result<Vec<(&'static str, Ranking)>> {
     let mut found = vec![(scored.ranked_by, scored.ranking.clone())];
     for term in [StaticTerm::Mean, StaticTerm::Geometric] {
-        found.push((name(term), scored.ranking_by(term, frames, recipe)?));
+        found.push((name(term), scored.ranking_by(term, recipe)?));
     }
     Ok(found)
 }
 
 /// The first `count` of every ranking, none twice.
-fn alternatives_to(scene: &Scene, scored: &Scored, recipe: &Recipe, count: usize) -> Result<Vec<Alternative>> {
+fn alternatives_to(scored: &Scored, recipe: &Recipe, count: usize) -> Result<Vec<Alternative>> {
     let mut found: Vec<Alternative> = Vec::new();
-    for (rule, ranking) in rankings(scene, scored, recipe)? {
+    for (rule, ranking) in rankings(scored, recipe)? {
         let kept = ranking.take(count);
         if found.iter().all(|other| other.sieved.kept != kept) {
             found.push(Alternative { rule, sieved: Sieved::pruned(kept) });
@@ -214,7 +213,7 @@ pub(super) mod tests {
             let chosen = choose(&scene, &scored, &recipe, sieved.clone(), Some(target), stages).unwrap();
             assert_eq!(chosen.sieved.kept.len(), target);
             let got = quality(&scene, &scored, &recipe, &chosen.sieved);
-            let by_c = Sieved::pruned(scored.ranking_by(StaticTerm::Mean, 6, &recipe).unwrap().take(target));
+            let by_c = Sieved::pruned(scored.ranking_by(StaticTerm::Mean, &recipe).unwrap().take(target));
             let own = Sieved::pruned(scored.ranking.take(target));
             for other in [sieved.clone(), by_c, own] {
                 let expected = quality(&scene, &scored, &recipe, &other);

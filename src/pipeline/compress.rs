@@ -163,8 +163,8 @@ fn compress_measured(
         gaussians: sieved.kept.len(),
         output_bytes: None,
         selection: scored.selection.counts,
-        terms: scored.terms(),
-        flags: scored.flags(),
+        terms: scored.term_summaries(),
+        flags: scored.flags.clone(),
         merge: sieved.summary.clone(),
         left_out,
         notes,
@@ -237,7 +237,7 @@ fn stages_left_out(options: &CompressOptions, recipe: &Recipe) -> Vec<LeftOut> {
 }
 
 fn selection_notes(scored: &Scored) -> Vec<String> {
-    let flags = scored.flags();
+    let flags = &scored.flags;
     let mut notes = Vec::new();
     for (count, what) in [
         (flags.non_finite, "with NaN or infinity"),

@@ -90,6 +90,11 @@ pub struct Scene {
 }
 
 impl Scene {
+    /// Where scratch files go.
+    pub(super) fn scratch_folder(&self) -> PathBuf {
+        self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
+
     /// `input` as the cameras of `rig` in `split` see it, without limits.
     pub fn new(path: PathBuf, input: Input, rig: Rig, split: Option<Split>) -> Result<Scene> {
         let schedule = rig.schedule(&input.source().info().times, split)?;

@@ -287,6 +287,7 @@ impl Plan {
             sights_together: usize::MAX,
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1) as usize,
+            rows_aside: false,
         };
         // A model is read whole before anything else.
         let read = Need { stage: "read", reads: 0.0, per_gaussian: vec![("file", work.file)], fixed: Vec::new() };
@@ -294,6 +295,9 @@ impl Plan {
             let first = Some(read.clone()).filter(|_| work.resident > 0);
             first.into_iter().chain(needs(&work, limits)).collect::<Vec<Need>>()
         };
+        // Costs next to no time.
+        let without = Plan { work, budget, limits, needs: all(&limits) };
+        limits.rows_aside = without.excess() > 0;
         loop {
             let plan = Plan { work, budget, limits, needs: all(&limits) };
             let excess = plan.excess();
@@ -426,14 +430,21 @@ fn state_bytes(sh_degree: usize, columns: Columns) -> u64 {
 
 /// Statistics while they are gathered: no W yet.
 const ROWS: u64 = Rows::BYTES_PER_GAUSSIAN as u64;
-/// Statistics, scores and a selection, as they stay until the end.
-pub const SCORED: u64 = ROWS + (Scores::BYTES_PER_GAUSSIAN + select::BYTES_PER_GAUSSIAN) as u64;
+/// A selection, as it stays until the end.
+const SELECTED: u64 = select::BYTES_PER_GAUSSIAN as u64;
+/// Statistics, scores and a selection: while scores are looked at.
+pub const SCORED: u64 = ROWS + Scores::BYTES_PER_GAUSSIAN as u64 + SELECTED;
 
 /// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
 const CLUSTERED: u64 = 125;
 
 /// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
 const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
+
+/// What stays of scoring: the selection, and the statistics unless they are set aside.
+fn scored(limits: &Limits) -> Vec<Part> {
+    vec![("rows", if limits.rows_aside { 0 } else { ROWS }), ("selection", SELECTED)]
+}
 
 /// Stages that look at pictures: states that lie ready, what is on its way to them, and
 /// pictures in the making with `sums` bytes per Gaussian.
@@ -492,9 +503,8 @@ pub fn compressing(
     let whole = work.state(Columns::ALL);
     let sampled = |pictures: usize| (pictures as u64).min(work.pictures) as f64 / work.frames.max(1) as f64;
     if looks && only != Only::Merge && recipe.select.round_fraction < 1.0 {
-        let (mut per_gaussian, fixed) = looking(work, limits, Columns::ALL, 8);
-        per_gaussian.insert(0, ("rows", SCORED));
-        per_gaussian.insert(1, ("ranking", 32));
+        let (looking, fixed) = looking(work, limits, Columns::ALL, 8);
+        let per_gaussian = [scored(limits), vec![("ranking", 32)], looking].concat();
         // Each round reads what the round before left.
         let rounds = 1.0 / (1.0 - recipe.select.round_fraction);
         needs.push(Need { stage: "rounds", reads: rounds * sampled(rounds::PICTURES), per_gaussian, fixed });
@@ -503,19 +513,25 @@ pub fn compressing(
         let pairs = merge::BYTES_PER_PAIR + stream::motion::BYTES_PER_PAIR;
         // Of the colours the first band.
         let states = state_bytes(0, Columns::ALL);
+        let mut per_gaussian = scored(limits);
+        // C and Vis are read back.
+        per_gaussian.push(("importance", if limits.rows_aside { 16 } else { 0 }));
         needs.push(Need {
             stage: "merge",
             reads: 1.0,
-            per_gaussian: vec![
-                ("rows", SCORED),
-                ("pool", merging::BYTES_PER_SURVIVOR as u64),
-                // At most one for every two, before a pass and after it; then with all colours.
-                ("proxies", states.max(whole.div_ceil(2))),
-                ("survivors", merge::BYTES_PER_SURVIVOR as u64),
-                ("passing", (recipe.merge.max_neighbors * merge::BYTES_PER_PASSING) as u64),
-                ("readers", work.reader),
-                ("followed", stream::motion::bytes_per_gaussian(limits.frames_held) as u64),
-            ],
+            per_gaussian: [
+                per_gaussian,
+                vec![
+                    ("pool", merging::BYTES_PER_SURVIVOR as u64),
+                    // At most one for every two, before a pass and after it; then with all colours.
+                    ("proxies", states.max(whole.div_ceil(2))),
+                    ("survivors", merge::BYTES_PER_SURVIVOR as u64),
+                    ("passing", (recipe.merge.max_neighbors * merge::BYTES_PER_PASSING) as u64),
+                    ("readers", work.reader),
+                    ("followed", stream::motion::bytes_per_gaussian(limits.frames_held) as u64),
+                ],
+            ]
+            .concat(),
             fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs as u64)), work.arriving()],
         });
     }
@@ -525,13 +541,17 @@ pub fn compressing(
         needs.push(Need {
             stage: "choose",
             reads: 2.0 * sampled(choose::PICTURES),
-            per_gaussian: vec![
-                ("rows", SCORED + 24),
-                ("clusters", CLUSTERED),
-                ("states", 2 * whole),
-                ("result", result),
-                ("pictures", PICTURE_ON_ALL_THREADS),
-            ],
+            per_gaussian: [
+                scored(limits),
+                vec![
+                    ("alternatives", 24),
+                    ("clusters", CLUSTERED),
+                    ("states", 2 * whole),
+                    ("result", result),
+                    ("pictures", PICTURE_ON_ALL_THREADS),
+                ],
+            ]
+            .concat(),
             fixed: vec![
                 work.arriving(),
                 ("pictures", render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + choose::AT_ONCE as u64)),
@@ -548,15 +568,19 @@ pub fn compressing(
         needs.push(Need {
             stage: "refit",
             reads: sampled((fitted + 2 * tests) as usize),
-            per_gaussian: vec![
-                ("rows", SCORED + 24),
-                ("states", 2 * whole),
-                ("result", result),
-                ("equations", refit::BYTES_PER_GAUSSIAN as u64),
-                ("sights", fitted.min(limits.sights_together as u64) * render::BYTES_PER_VISIBLE as u64),
-                // Made at a time, with what they pull at: twice three f64.
-                ("pictures", work.threads * (render::BYTES_PER_VISIBLE as u64 + 48)),
-            ],
+            per_gaussian: [
+                scored(limits),
+                vec![
+                    ("kept", 24),
+                    ("states", 2 * whole),
+                    ("result", result),
+                    ("equations", refit::BYTES_PER_GAUSSIAN as u64),
+                    ("sights", fitted.min(limits.sights_together as u64) * render::BYTES_PER_VISIBLE as u64),
+                    // Made at a time, with what they pull at: twice three f64.
+                    ("pictures", work.threads * (render::BYTES_PER_VISIBLE as u64 + 48)),
+                ],
+            ]
+            .concat(),
             fixed: vec![
                 work.arriving(),
                 ("pictures", (tests + work.views + 1) * 12 * work.pixels),
@@ -575,7 +599,7 @@ fn emitting(work: &Workload, limits: &Limits, kind: OutputKind, merges: bool) ->
     let mut need = Need {
         stage: "emit",
         reads: if is_model { 0.0 } else { 1.0 },
-        per_gaussian: vec![("rows", SCORED + 24), ("result", if is_model { 2 * whole } else { 0 })],
+        per_gaussian: [scored(limits), vec![("kept", 24), ("result", if is_model { 2 * whole } else { 0 })]].concat(),
         fixed: writing(work),
     };
     match kind {

@@ -3,6 +3,8 @@
 //! Memory while merging, of every Gaussian that may survive [`BYTES_PER_SURVIVOR`], what [`crate::merge`] says of
 //! survivors and candidate pairs, and what [`crate::stream::motion`] says of the pairs it measures together.
 
+use std::borrow::Cow;
+
 use super::compress::Only;
 use super::input::Scene;
 use super::scored::Scored;
@@ -165,6 +167,8 @@ struct Job<'a> {
     states: Gaussians,
     /// Whether each may merge.
     mergeable: Vec<bool>,
+    /// C and Vis by id.
+    importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
     /// Pairs measured together.
     pairs_together: usize,
@@ -189,11 +193,12 @@ impl<'a> Job<'a> {
             scan: &recipe.scan,
             gate: MotionGate::new(&merge, unit),
             frames_held: scene.limits.frames_held,
-            scratch: scene.scratch.clone().unwrap_or_else(std::env::temp_dir),
+            scratch: scene.scratch_folder(),
             gathered: None,
         };
         let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
-        Ok(Job { scored, merge, pool, states, mergeable, meter, pairs_together, known })
+        let importance = scored.importance()?;
+        Ok(Job { scored, merge, pool, states, mergeable, importance, meter, pairs_together, known })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -210,11 +215,12 @@ impl<'a> Job<'a> {
 
     /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Sieved> {
-        let Job { scored, merge, pool, states, mergeable, meter, pairs_together, known } = self;
+        let Job { scored, merge, pool, states, mergeable, importance, meter, pairs_together, known } = self;
+        let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
             rows: &places_of(survivors, pool),
-            importance: Importance { ids: pool, coverage: &scored.rows.c, visibility: &scored.rows.vis },
+            importance: Importance { ids: pool, coverage, visibility },
             mergeable,
             extent: scored.reference.extent,
         };

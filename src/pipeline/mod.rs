@@ -22,6 +22,7 @@ pub mod result;
 pub mod rounds;
 pub mod score;
 pub mod scored;
+mod shelf;
 pub mod summary;
 pub mod sweep;
 pub mod trade_off;

@@ -54,7 +54,7 @@ pub fn refit(
     let count = sieved.kept.len();
     let pictures = spread(&scene.schedule, wanted + wanted.div_ceil(TEST_EVERY - 1));
     // A single picture cannot be fitted to and tested on.
-    if scored.rows.w.is_empty() || pictures.len() < 2 || count == 0 {
+    if !scored.has_seen() || pictures.len() < 2 || count == 0 {
         return Ok(Refitted::default());
     }
     let reads = pictures.len() as f64 / scene.schedule.frames.len().max(1) as f64;

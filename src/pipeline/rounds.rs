@@ -31,7 +31,7 @@ pub fn rank_in_rounds(
     stages: &mut Stages,
 ) -> Result<()> {
     let fraction = recipe.select.round_fraction;
-    if scored.rows.w.is_empty() || fraction >= 1.0 {
+    if !scored.has_seen() || fraction >= 1.0 {
         return Ok(());
     }
     let sample = Sample::at_most(&scene.schedule, PICTURES);

@@ -26,11 +26,13 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bo
     let (scene, measured) = open_to_measure(input, recipe, |_| Ok(()), needs)?;
     let measured = measured.map_or_else(|| measure(&scene, recipe, stages), Ok)?;
     let scored = score_measured(&scene, measured, recipe, &UserOverrides::default(), stages)?;
+    let scores = scored.scores(&recipe.score)?;
+    let rows = scored.rows()?;
     let table = RowTable {
-        rows: &scored.rows,
-        static_score: &scored.scores.static_score,
-        dynamic_score: &scored.scores.dynamic_score,
-        score: &scored.scores.score,
+        rows: &rows,
+        static_score: &scores.static_score,
+        dynamic_score: &scores.dynamic_score,
+        score: &scores.score,
         keep: &scored.selection.keep,
     };
     let staged = StagedFile::new(output, overwrite)?;
@@ -41,7 +43,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bo
     staged.commit()?;
     Ok(ScoreReport {
         output: output.to_owned(),
-        gaussians: scored.rows.len(),
+        gaussians: scored.count(),
         kept: scored.selection.counts.kept,
         notes: scene.notes,
     })

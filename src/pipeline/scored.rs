@@ -1,21 +1,28 @@
 //! From frames to a selection: scan, score, select.
 
+use std::borrow::Cow;
+
 use super::input::Scene;
+use super::shelf::Shelf;
 use super::summary::{FlagSummary, LeftOut, Stages, TermSummary};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Flags, Gaussians, Rows};
 use crate::recipe::{self, Coverage, NonFinite, Recipe, StaticTerm};
-use crate::score::{Scores, score};
+use crate::score::{Scores, Term, score};
 use crate::select::{Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, ScanPlan, fill_anisotropy, snap};
 use crate::stream::{Sample, Scanned, Seen, gather, scan, visible_contribution};
 
-/// A scene with statistics, scores and a selection for every Gaussian.
+/// A scene with statistics and a selection of every Gaussian.
 pub struct Scored {
     /// Statistics, noise snapped as the recipe says.
-    pub rows: Rows,
-    /// Scores.
-    pub scores: Scores,
+    shelf: Shelf,
+    /// T.
+    frames: usize,
+    /// How the terms of the scores were normalised.
+    pub terms: Vec<Term>,
+    /// Counts of odd Gaussians.
+    pub flags: FlagSummary,
     /// Stages 1 and 2, with the user's overrides.
     pub selection: Selection,
     /// The order in which Gaussians stay: the selection's, until there is a better one.
@@ -141,8 +148,13 @@ pub fn score_measured(
         let scored = Scored {
             ranking: selection.ranking.clone(),
             ranked_by: name(recipe.score.static_term),
-            rows,
-            scores,
+            frames: info.times.len(),
+            terms: scores.terms,
+            flags: flags(&rows),
+            shelf: match scene.limits.rows_aside {
+                true => Shelf::aside(rows, &scene.scratch_folder())?,
+                false => Shelf::Memory(rows),
+            },
             selection,
             protected,
             dropped: drop,
@@ -197,6 +209,19 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
         .hint("--non-finite drop removes them, --non-finite keep leaves them as they are"))
 }
 
+/// Counts of odd Gaussians.
+fn flags(rows: &Rows) -> FlagSummary {
+    let count = |bits| rows.flags.iter().filter(|flags| flags.has(bits)).count();
+    FlagSummary {
+        non_finite: count(Flags::NON_FINITE),
+        zero_rotation: count(Flags::ZERO_ROTATION),
+        snapped_d: count(Flags::SNAPPED_D),
+        snapped_kappa: count(Flags::SNAPPED_KAPPA),
+        never_alive: rows.life.iter().filter(|&&life| life == 0).count(),
+        never_in_view: rows.vis.iter().filter(|&&vis| vis == 0.0).count(),
+    }
+}
+
 /// Cameras of another scene see nothing of this one.
 fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
     let alive = rows.life.iter().filter(|&&life| life > 0).count();
@@ -214,35 +239,60 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
-    /// The ranking of the same rows, of `frames` frames, by another static term.
-    pub fn ranking_by(&self, term: StaticTerm, frames: usize, recipe: &Recipe) -> Result<Ranking> {
-        let scores = score(&self.rows, frames, &recipe::Score { static_term: term, ..recipe.score.clone() });
+    /// Statistics of every Gaussian.
+    ///
+    /// # Errors
+    /// They were set aside and cannot be read back.
+    pub fn rows(&self) -> Result<Cow<'_, Rows>> {
+        self.shelf.rows()
+    }
+
+    /// C and Vis of every Gaussian.
+    ///
+    /// # Errors
+    /// They were set aside and cannot be read back.
+    pub fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
+        self.shelf.importance()
+    }
+
+    /// Whether C is visible contribution.
+    pub fn has_seen(&self) -> bool {
+        self.shelf.has_peak()
+    }
+
+    /// N.
+    pub fn count(&self) -> usize {
+        self.shelf.len()
+    }
+
+    /// The scores that were selected by, computed anew.
+    ///
+    /// # Errors
+    /// Those of [`Scored::rows`].
+    pub fn scores(&self, recipe: &recipe::Score) -> Result<Scores> {
+        let rows = self.rows()?;
+        Ok(score(&rows, self.frames, recipe))
+    }
+
+    /// The ranking by another static term.
+    ///
+    /// # Errors
+    /// Those of [`Scored::rows`].
+    pub fn ranking_by(&self, term: StaticTerm, recipe: &Recipe) -> Result<Ranking> {
+        let scores = self.scores(&recipe::Score { static_term: term, ..recipe.score.clone() })?;
         let overrides = Overrides { keep_ids: self.protected.clone(), drop_ids: self.dropped.clone() };
         Ok(select(&scores, &recipe.select, &overrides)?.ranking)
     }
 
     /// Percentiles of every term.
-    pub fn terms(&self) -> Vec<TermSummary> {
-        let summarise = |term: &crate::score::Term| TermSummary {
+    pub fn term_summaries(&self) -> Vec<TermSummary> {
+        let summarise = |term: &Term| TermSummary {
             name: term.name,
             p1: term.norm.p1,
             p99: term.norm.p99,
             active: term.norm.is_active(),
         };
-        self.scores.terms.iter().map(summarise).collect()
-    }
-
-    /// Counts of odd Gaussians.
-    pub fn flags(&self) -> FlagSummary {
-        let count = |bits| self.rows.flags.iter().filter(|flags| flags.has(bits)).count();
-        FlagSummary {
-            non_finite: count(Flags::NON_FINITE),
-            zero_rotation: count(Flags::ZERO_ROTATION),
-            snapped_d: count(Flags::SNAPPED_D),
-            snapped_kappa: count(Flags::SNAPPED_KAPPA),
-            never_alive: self.rows.life.iter().filter(|&&life| life == 0).count(),
-            never_in_view: self.rows.vis.iter().filter(|&&vis| vis == 0.0).count(),
-        }
+        self.terms.iter().map(summarise).collect()
     }
 
     /// What the scene did not need in scan and score.
@@ -263,7 +313,7 @@ impl Scored {
         if info.sh_degree == 0 {
             out.push(LeftOut { what: "higher bands of colour", why: "SH degree 0".to_owned() });
         }
-        for term in self.scores.terms.iter().filter(|term| !term.norm.is_active()) {
+        for term in self.terms.iter().filter(|term| !term.norm.is_active()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
             out.push(LeftOut { what: inactive(term.name), why });
         }

@@ -26,6 +26,7 @@ use serde::Serialize;
 
 use crate::emit::atomic::{Kind as TargetKind, MARKER, StagedFolder, check_target};
 use crate::error::{Error, Result};
+use crate::model::Rows;
 use crate::model::{Schedule, Split};
 use crate::pipeline::evaluate::{EvaluateOptions, SideBySide};
 use crate::pipeline::evaluation::{Evaluation, PictureScores};
@@ -127,7 +128,8 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let scored = score_scene(&side.scene, &recipe, &UserOverrides::default(), &mut Stages::default())?;
     notes.extend(differing_terms(&run, &scored));
     let traits = traits(side.scene.input.source(), &scored, recipe.scan.alpha_min)?;
-    let members = members(&scored, &traits, run.fates.as_deref());
+    let rows = scored.rows()?;
+    let members = members(&rows, &traits, run.fates.as_deref());
     let (evaluation, seen) = side.evaluate(|state, camera, taken| observe(state, &traits, camera, taken))?;
     let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
@@ -136,6 +138,10 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let (shown, close) = look_again(&side, &choices, &failure_modes, &traits)?;
 
     notes.extend(evaluation.notes.iter().cloned());
+    let histograms = match &run.fates {
+        Some(fates) => Some(histograms(&rows, &scored.scores(&recipe.score)?, frames, fates)),
+        None => None,
+    };
     let report = Report {
         tool: evaluation.tool.clone(),
         verdict: verdict::verdict(&evaluation, &failure_modes),
@@ -143,7 +149,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         evaluation,
         shown: choices,
         failure_modes,
-        histograms: run.fates.as_deref().map(|fates| histograms(&scored.rows, &scored.scores, frames, fates)),
+        histograms,
         missing: run.missing.clone(),
         run: run.summary.as_ref().map(|(_, whole)| whole.clone()),
         trade_off,
@@ -209,7 +215,7 @@ fn differing_terms(run: &Run, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
     let (summary, _) = run.summary.as_ref()?;
-    let found = scored.terms();
+    let found = scored.term_summaries();
     let differs = |then: &&run::Term| {
         !found.iter().any(|now| now.name == then.name && same(now.p1, then.p1) && same(now.p99, then.p99))
     };
@@ -222,9 +228,9 @@ fn differing_terms(run: &Run, scored: &Scored) -> Option<String> {
 }
 
 /// How many Gaussians of each kind there are, and what became of them.
-fn members(scored: &Scored, traits: &[Traits], fates: Option<&[Fate]>) -> [Members; 3] {
+fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [Members; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
-    let shares = shares(&scored.rows, traits, |i| fate(i) != Fate::Kept);
+    let shares = shares(rows, traits, |i| fate(i) != Fate::Kept);
     std::array::from_fn(|kind| {
         let with = |wanted: Fate| (0..traits.len()).filter(|&i| traits[i][kind] && fate(i) == wanted).count();
         Members {

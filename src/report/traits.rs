@@ -72,7 +72,7 @@ pub type Traits = [bool; 3];
 /// # Errors
 /// Frames that cannot be read.
 pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Result<Vec<Traits>> {
-    let (rows, extent) = (&scored.rows, scored.reference.extent);
+    let (rows, extent) = (scored.rows()?, scored.reference.extent);
     let mut found = vec![[false; 3]; rows.len()];
     let frames = samples(source.info().times.len());
     if rows.is_empty() || frames.is_empty() {

@@ -41,7 +41,8 @@ fn looked() -> Looked {
 impl Looked {
     /// Part of the visible members of a family that have a trait.
     fn part(&self, family: Family, kind: Kind) -> f64 {
-        let members: Vec<usize> = self.made.members(family).filter(|&i| self.scored.rows.c[i] > 0.0).collect();
+        let rows = self.scored.rows().unwrap();
+        let members: Vec<usize> = self.made.members(family).filter(|&i| rows.c[i] > 0.0).collect();
         let with = members.iter().filter(|&&i| self.traits[i][kind as usize]).count();
         with as f64 / members.len().max(1) as f64
     }
@@ -65,7 +66,7 @@ impl Looked {
                 names.push((frame, view as u32));
             }
         }
-        let shares = shares(&self.scored.rows, &self.traits, &lost);
+        let shares = shares(&self.scored.rows().unwrap(), &self.traits, &lost);
         Kind::ALL.map(|kind| {
             let of = |wanted: bool| {
                 (0..self.traits.len()).filter(|&i| self.traits[i][kind as usize] && (!wanted || lost(i))).count()
