@@ -141,6 +141,12 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
         for part in ["memory: at most", "N x", "full reads of the frames"] {
             assert!(run.stderr.contains(part), "{arguments}: {part:?} is not in {:?}", run.stderr);
         }
+        // Where the system says so.
+        if let Some(taken) = run.stderr.lines().last().and_then(|line| line.strip_suffix(" MiB taken")) {
+            let taken: f64 = taken.rsplit(' ').next().unwrap().parse().unwrap();
+            println!("{arguments}: {taken} of {least} MiB");
+            assert!(taken <= least as f64, "{arguments}: {taken} MiB resident, {least} promised");
+        }
     }
 }
 

@@ -67,6 +67,23 @@ pub(super) enum Verb {
     Completions(Completions),
 }
 
+impl Verb {
+    /// Whether it is to say what memory it takes. A sweep's table does, run by run.
+    pub(super) fn explains(&self) -> bool {
+        match self {
+            Verb::Compress(Compress { input, .. })
+            | Verb::Score(Score { input, .. })
+            | Verb::Render(Render { input, .. })
+            | Verb::Pack(Pack { input, .. })
+            | Verb::Info(Info { input, .. })
+            | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
+            Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(Report { models, .. }) => models.memory.explain,
+            Verb::Demo(Demo { memory, .. }) => memory.explain,
+            Verb::Sweep(_) | Verb::Verify(_) | Verb::Recover(_) | Verb::Recipe(_) | Verb::Completions(_) => false,
+        }
+    }
+}
+
 /// What to read.
 #[derive(Debug, Args)]
 pub(super) struct Input {
@@ -91,7 +108,8 @@ pub(super) struct Memory {
     /// machine's]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
     pub(super) memory: Option<u64>,
-    /// Print, before any work, what takes how much memory and how often the frames are read
+    /// Print, before any work, what takes how much memory and how often the frames are read; at the end, what was
+    /// taken
     #[arg(long)]
     pub(super) explain: bool,
 }

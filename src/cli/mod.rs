@@ -17,7 +17,7 @@ use crate::pipeline::arrival::scratch_beside;
 use crate::pipeline::compress::{CompressOptions, Only, Target, compress};
 use crate::pipeline::evaluate::EvaluateOptions;
 use crate::pipeline::input::InputOptions;
-use crate::pipeline::memory::Budget;
+use crate::pipeline::memory::{self, Budget};
 use crate::pipeline::output::OutputKind;
 use crate::pipeline::pictures::Part;
 use crate::pipeline::render::{RenderOptions, Wanted};
@@ -38,8 +38,14 @@ pub fn main() -> ExitCode {
             return ExitCode::from(error.exit_code() as u8);
         }
     };
+    let explains = cli.verb.explains();
     match run(cli) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => {
+            if let Some(taken) = memory::taken().filter(|_| explains) {
+                tell(&taken);
+            }
+            ExitCode::SUCCESS
+        }
         // Whoever read our output has seen enough.
         Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(error) => {

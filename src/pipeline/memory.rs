@@ -14,6 +14,7 @@ use super::compress::Only;
 use super::input::{Input, Scene};
 use super::output::OutputKind;
 use super::scored::looks;
+use super::summary::peak_memory_bytes;
 use super::{choose, merging, rounds};
 use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::error::{Error, Result};
@@ -402,6 +403,11 @@ impl Budget {
     fn limit(self) -> u64 {
         self.bytes.or_else(|| Some(machine_memory()? / 4)).unwrap_or(u64::MAX)
     }
+}
+
+/// What this process has taken so far, for a person; none where the system does not say.
+pub fn taken() -> Option<String> {
+    peak_memory_bytes().map(|bytes| format!("memory: at most {} taken", size(bytes)))
 }
 
 /// Plans what is to be done with `scene` and gives it its limits.
