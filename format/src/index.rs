@@ -60,9 +60,27 @@ impl Index {
         piece: &mut Vec<u8>,
         digest: &mut Digest,
     ) -> Result<Vec<bool>> {
+        let (varies, in_order) = self.go_through(file, layout, piece, digest)?;
+        if !in_order {
+            let tiles = (0..self.tiles).map(|index| self.record(file, layout, index)).collect::<Result<Vec<_>>>()?;
+            self.check_overlap(&tiles).map_err(|fault| fault.at(file.path()))?;
+        }
+        Ok(varies)
+    }
+
+    /// The part of [`Index::check`] that needs no more than the last constant tiles. Also gives whether it saw that no
+    /// two tiles overlap, as it does where they lie in the order of the index.
+    fn go_through(
+        &self,
+        file: &MappedFile,
+        layout: &Layout,
+        piece: &mut Vec<u8>,
+        digest: &mut Digest,
+    ) -> Result<(Vec<bool>, bool)> {
         let mut varies = vec![false; layout.columns.len()];
-        // By column and Gaussian block the tile of the frame block before, if it is constant.
-        let mut constants: Vec<Option<TileRecord>> = vec![None; layout.tiles_per_frame_block() as usize];
+        // By column and Gaussian block. A file without frames has no tile, whatever its header says.
+        let mut constants: Vec<Option<TileRecord>> =
+            vec![None; layout.tiles_per_frame_block().min(self.tiles) as usize];
         let mut end = 0;
         let mut in_order = true;
         let entries = self.offset..self.place(self.tiles);
@@ -79,15 +97,13 @@ impl Index {
                 } else {
                     in_order &= before.is_some_and(|before| tile.may_share(&before));
                 }
-                *before = tile.constant.then_some(tile);
+                if tile.constant {
+                    *before = Some(tile);
+                }
             }
             Ok(())
         })?;
-        if !in_order {
-            let tiles = (0..self.tiles).map(|index| self.record(file, layout, index)).collect::<Result<Vec<_>>>()?;
-            self.check_overlap(&tiles).map_err(|fault| fault.at(file.path()))?;
-        }
-        Ok(varies)
+        Ok((varies, in_order))
     }
 
     /// No two tiles may use the same bytes of the file, but for constant ones that share all of them.
@@ -107,5 +123,48 @@ impl Index {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ColumnSpec, Compression, Reader, TileId, Writer, encode_tile};
+
+    /// Writes 2 blocks of 2 Gaussians over 3 frame blocks, the frame blocks of `order` one after the other; column 0
+    /// always moves, column 1 stands still, moves and stands where it stood.
+    fn open(path: &std::path::Path, order: [u32; 3]) -> Reader {
+        let columns = ["moving", "pausing"].map(|name| ColumnSpec { name: name.into(), width: 1 }).into();
+        let layout =
+            Layout { gaussians: 4, gaussian_block: 2, frame_block: 2, columns, attributes: Default::default() };
+        let mut writer = Writer::create(path, layout).unwrap();
+        for times in [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]] {
+            writer.append_times(&times).unwrap();
+        }
+        for frame_block in order {
+            for (gaussian_block, column) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                let moves = column == 0 || frame_block == 1;
+                let values = [1.0, 2.0, if moves { 3.0 } else { 1.0 }, 2.0];
+                let tile = encode_tile(&values, 2, 1, 2, Compression::Raw).unwrap();
+                writer.write_tile(TileId { column, gaussian_block, frame_block }, &tile).unwrap();
+            }
+        }
+        writer.finish().unwrap();
+        Reader::open(path).unwrap()
+    }
+
+    #[test]
+    fn tiles_in_the_order_of_the_index_are_checked_in_one_go_also_where_constant_ones_return() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        for (order, expected) in [([0, 1, 2], true), ([2, 0, 1], false)] {
+            let reader = open(&path, order);
+            let mut digest = Digest::new(&[], &[]);
+            let found = reader.index.go_through(&reader.file, &reader.layout, &mut Vec::new(), &mut digest).unwrap();
+            assert_eq!(found, (vec![true, true], expected), "{order:?}");
+            let tile = |frame_block| reader.tile_info(TileId { column: 1, gaussian_block: 0, frame_block }).unwrap();
+            assert_eq!(tile(0).offset, tile(2).offset, "{order:?}: stored twice");
+            reader.verify().unwrap();
+        }
     }
 }

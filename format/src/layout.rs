@@ -27,7 +27,7 @@ const MAX_NAME_BYTES: usize = 64;
 const MAX_ATTRIBUTES: usize = 1024;
 const MAX_KEY_BYTES: usize = 256;
 const MAX_VALUE_BYTES: usize = 1 << 20;
-/// Most tiles of one frame block: bounds the index a writer holds at 1 GiB per frame block.
+/// Most tiles of one frame block: bounds what a reader that opens and a writer know of the last constant ones.
 const MAX_TILES_PER_FRAME_BLOCK: u64 = 1 << 24;
 
 /// One attribute of every Gaussian.

@@ -18,8 +18,8 @@ use crate::writer::check_times;
 const NEAR: u64 = 1 << 12;
 
 /// A finished container. Memory: 8 bytes per frame, 1 per tile, some 80 per column and Gaussian block while opening;
-/// index and values stay on disk. A file whose tiles lie in another order than its index, which this crate's writer
-/// makes when told to, takes 80 bytes per tile while opening.
+/// index and values stay on disk. A file whose tiles lie in another order than its index, as a writer makes that is
+/// given them so, takes 80 bytes per tile while opening.
 ///
 /// What happens when the file changes underneath: see [`Reader::tile`].
 pub struct Reader {

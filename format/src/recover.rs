@@ -32,7 +32,7 @@ pub struct RecoverReport {
 
 /// Writes a valid container `dst` with the frame blocks of `src` up to the first that lacks its time stamps or
 /// a tile; every value has the bits it had. Tiles whose place in the file is damaged are searched for
-/// record by record. Memory: 64 bytes per tile, the time stamps, one tile buffer.
+/// record by record. Memory: some 150 bytes per tile, the time stamps, one tile buffer.
 ///
 /// Errors: the header of `src` is damaged, or `dst` cannot be written. No frames left is not an error:
 /// `dst` has none then, and the report says so.

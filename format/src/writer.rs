@@ -22,7 +22,7 @@ use crate::record::{Digest, FooterRecord, RECORD, Record, TileRecord, TimesRecor
 /// A constant tile whose stored bytes equal those of the last constant tile written for its column and Gaussian
 /// block is not stored again: a column that never changes costs 64 bytes per further tile and its index entry.
 ///
-/// Memory: 8 bytes per frame, twice that in [`Writer::finish`]; 64 bytes per column and Gaussian block; the stored
+/// Memory: 8 bytes per frame, twice that in [`Writer::finish`]; 80 bytes per column and Gaussian block; the stored
 /// bytes of the largest constant tile. The index, 64 bytes per tile, waits in a nameless file in the same folder.
 ///
 /// The file grows under a hidden name ending in `.tmp` in the folder of its final name. Dropping an unfinished
@@ -41,7 +41,7 @@ pub struct Writer {
     /// Tiles that are to be written, and that are.
     tiles: u64,
     written: u64,
-    /// Per column and Gaussian block the last constant tile that was written.
+    /// Per column and Gaussian block the last constant tile that was written; none before there are frames.
     constants: Vec<Option<TileRecord>>,
     stored: Vec<u8>,
     finished: bool,
@@ -63,7 +63,7 @@ impl Writer {
             path: path.to_owned(),
             temporary,
             file,
-            constants: vec![None; layout.tiles_per_frame_block() as usize],
+            constants: Vec::new(),
             layout,
             header: Vec::new(),
             position: 0,
@@ -117,6 +117,7 @@ impl Writer {
         self.put(&[&Record::Times(record).to_bytes(), &payload])?;
         self.times.extend(times);
         self.tiles += self.layout.tiles_per_frame_block();
+        self.constants.resize(self.layout.tiles_per_frame_block() as usize, None);
         Ok(block)
     }
 
@@ -245,10 +246,14 @@ impl Writer {
         let mut digest = Digest::new(&self.header, &self.times);
         self.index_pieces(|writer, piece| {
             checksum.update(piece);
-            for (entry, offset) in piece.as_chunks().0.iter().zip((0..).step_by(RECORD as usize)) {
-                let record = Record::from_bytes(entry, offset).map_err(|fault| fault.at(&writer.temporary))?;
-                if let Record::Tile(tile) = record {
-                    digest.tile(&tile);
+            for entry in piece.as_chunks().0 {
+                match Record::from_bytes(entry, 0) {
+                    Ok(Record::Tile(tile)) => digest.tile(&tile),
+                    _ => {
+                        return Err(Error::io("read back the index of", &writer.temporary)(
+                            io::ErrorKind::InvalidData.into(),
+                        ));
+                    }
                 }
             }
             Ok(())
@@ -264,6 +269,8 @@ impl Writer {
         self.put_exactly(&[&Record::Footer(footer).to_bytes(), &times])?;
         self.index_pieces(|writer, piece| writer.put_exactly(&[piece]))?;
         self.put_exactly(&[&trailer])?;
+        // Nothing that a failed write left may lie behind the end.
+        self.file.set_len(self.position).map_err(Error::io("cut", &self.temporary))?;
         self.file.sync_all().map_err(Error::io("sync", &self.temporary))?;
         fs::rename(&self.temporary, &self.path).map_err(Error::io("rename", &self.temporary))?;
         self.finished = true;

@@ -93,8 +93,8 @@ pub(super) struct Input {
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
-    /// Folder for the packed frames of a stream while the run lasts [default: that of the output, else the
-    /// system's]
+    /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
+    /// --memory [default: that of the output, else the system's]
     #[arg(long, value_name = "FOLDER")]
     pub(super) scratch_dir: Option<PathBuf>,
     #[command(flatten)]

@@ -1,6 +1,6 @@
 //! HexPlane features: six bilinear samples per level, multiplied elementwise.
 //!
-//! Data in: canonical positions `[N, 3]`, a time. Data out: features `[N, Σ channels]`.
+//! Data in: canonical positions `[N, 3]`, a time. Data out: features `[Σ channels, LANES]`.
 //! Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian.
 //! Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting", 2024, section 4.2.
 //!

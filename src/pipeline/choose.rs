@@ -2,7 +2,8 @@
 //!
 //! No rule wins everywhere, and merging pays on some scenes only (METHOD section 6: "let scoring views choose
 //! among rules").
-//! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
+//! Memory: statistics and scores while the alternatives are made, then two states of one frame, the original's and an
+//! alternative's, and [`AT_ONCE`] pictures.
 
 use super::input::Scene;
 use super::merging::Sieved;

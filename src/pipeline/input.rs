@@ -34,7 +34,8 @@ pub struct InputOptions {
     pub size: Option<(u32, u32)>,
     /// Which pictures to score with; none: all.
     pub split: Option<Split>,
-    /// Folder for the packed frames of a stream while the run lasts; none: the system's for such files.
+    /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
+    /// `memory`; none: the system's for such files.
     pub scratch: Option<PathBuf>,
     /// Memory that the run may take.
     pub memory: Budget,

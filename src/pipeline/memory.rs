@@ -2,8 +2,8 @@
 //!
 //! Every stage states its bytes per Gaussian and its fixed bytes as sums of named parts; the largest stage counts.
 //! [`Plan::fit`] begins with limits that cost no time and halves the one that frees most, until all stages fit.
-//! A result never depends on the limits. Nothing grows with frames but time stamps, the cameras' pictures and
-//! the index of tiles, which are parts like any other.
+//! A result never depends on the limits. Nothing grows with frames but time stamps, the cameras' pictures and a
+//! byte per tile of a container, which are parts like any other.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -78,6 +78,10 @@ pub struct Workload {
     pub views: u64,
     /// Pictures of all frames.
     pub pictures: u64,
+    /// Pictures the cameras name one by one.
+    pub shots: u64,
+    /// Columns of a container.
+    pub columns: u64,
     /// Threads to work on.
     pub threads: u64,
 }
@@ -131,6 +135,8 @@ impl Workload {
             pixels: 0,
             views: 0,
             pictures: 0,
+            shots: 0,
+            columns: 0,
             threads: rayon::current_num_threads() as u64,
         }
     }
@@ -144,7 +150,8 @@ impl Workload {
             pixels: rig.cameras.iter().map(pixels).max().unwrap_or(0),
             views,
             viewpoints: numbers.len() as u64,
-            pictures: pairs.max(rig.shots.len() as u64),
+            pictures: pairs,
+            shots: rig.shots.len() as u64,
             ..self
         }
     }
@@ -156,7 +163,8 @@ impl Workload {
         let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
         let views = (together + rig.shots.len() - times.len()) as u64;
         let unseen = Workload::new(header.count, header.sh_degree, header.varying);
-        let unseen = Workload { reader: 8, frame_block: frame_block as u64, ..unseen };
+        let columns = Columns::ALL.iter().count() as u64;
+        let unseen = Workload { reader: 8, frame_block: frame_block as u64, columns, ..unseen };
         unseen.seen_by(rig, views, 0)
     }
 
@@ -191,19 +199,19 @@ impl Workload {
     fn known(&self) -> u64 {
         let index = match self.frame_block {
             0 => 0,
-            frames => self.slots(self.gaussian_block) * (PER_SLOT + PER_TILE * self.frames.div_ceil(frames)),
+            frames => {
+                let slots = self.columns * self.gaussians.div_ceil(self.gaussian_block);
+                slots * (PER_SLOT + PER_TILE * self.frames.div_ceil(frames))
+            }
         };
-        index + self.field + 64 * self.frames + 160 * self.pictures
+        // Pictures are listed by frame, and while they are gone through once more.
+        index + self.field + 112 * self.frames + 24 * self.pictures + 160 * self.shots
     }
 
     /// What a container knows while it is written.
     fn written_index(&self) -> u64 {
-        PER_SLOT * self.slots(GAUSSIAN_BLOCK as u64) + PER_WRITTEN_FRAME * self.frames
-    }
-
-    /// Tiles of all columns in one block of frames.
-    fn slots(&self, gaussian_block: u64) -> u64 {
-        Columns::ALL.iter().count() as u64 * self.gaussians.div_ceil(gaussian_block)
+        let slots = Columns::ALL.iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
+        PER_SLOT * slots + PER_WRITTEN_FRAME * self.frames
     }
 }
 
@@ -214,6 +222,7 @@ fn of_container(container: &Container, unseen: Workload) -> Workload {
         reader: 8,
         frame_block: layout.frame_block.into(),
         gaussian_block: layout.gaussian_block.into(),
+        columns: layout.columns.len() as u64,
         file: 0,
         ..unseen
     }
@@ -297,8 +306,11 @@ impl Plan {
             first.into_iter().chain(needs(&work, limits)).collect::<Vec<Need>>()
         };
         // Costs next to no time.
-        let without = Plan { work, budget, limits, needs: all(&limits) };
-        limits.rows_aside = without.excess() > 0;
+        let [excess, less] = [false, true].map(|rows_aside| {
+            let limits = Limits { rows_aside, ..limits };
+            Plan { work, budget, limits, needs: all(&limits) }.excess()
+        });
+        limits.rows_aside = less < excess;
         loop {
             let plan = Plan { work, budget, limits, needs: all(&limits) };
             let excess = plan.excess();
@@ -434,7 +446,7 @@ fn state_bytes(sh_degree: usize, columns: Columns) -> u64 {
     columns.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
 }
 
-/// Statistics while they are gathered: no W yet.
+/// Statistics.
 const ROWS: u64 = Rows::BYTES_PER_GAUSSIAN as u64;
 /// A selection, as it stays until the end.
 const SELECTED: u64 = select::BYTES_PER_GAUSSIAN as u64;
@@ -473,7 +485,8 @@ pub fn scoring(work: &Workload, limits: &Limits, recipe: &Recipe, has_cameras: b
     let mut needs = vec![Need {
         stage: "scan",
         reads: 1.0,
-        per_gaussian: vec![("rows", ROWS)],
+        // Block by block, then joined.
+        per_gaussian: vec![("rows", 2 * ROWS)],
         fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving()],
     }];
     if looks(has_cameras, recipe.scan.coverage) {
@@ -605,7 +618,7 @@ fn emitting(work: &Workload, limits: &Limits, kind: OutputKind, merges: bool) ->
     let mut need = Need {
         stage: "emit",
         reads: if is_model { 0.0 } else { 1.0 },
-        per_gaussian: [scored(limits), vec![("kept", 24), ("result", if is_model { 2 * whole } else { 0 })]].concat(),
+        per_gaussian: [scored(limits), vec![("kept", 40), ("result", if is_model { 2 * whole } else { 0 })]].concat(),
         fixed: writing(work),
     };
     match kind {
@@ -714,6 +727,8 @@ mod tests {
             views: 2,
             viewpoints: 2,
             pictures: 1200,
+            shots: 2,
+            columns: 5,
             threads: 2,
         }
     }

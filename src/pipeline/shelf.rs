@@ -7,6 +7,7 @@ use std::borrow::Cow;
 use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
 use bytemuck::{AnyBitPattern, NoUninit};
 
@@ -22,7 +23,8 @@ pub(super) enum Shelf {
 
 /// Rows in a file that lasts as long as this.
 pub(super) struct Aside {
-    file: File,
+    /// Locked from finding a place to having read it.
+    file: Mutex<File>,
     scratch: ScratchFile,
     count: usize,
     has_peak: bool,
@@ -47,7 +49,7 @@ impl Shelf {
         let written = written.and_then(|()| flags.iter().try_for_each(|flags| out.write_all(&[flags.0])));
         written.map_err(io("write"))?;
         let file = out.into_inner().map_err(|error| io("write")(error.into_error()))?;
-        Ok(Shelf::Aside(Aside { file, scratch, count: rows.len(), has_peak: !w.is_empty() }))
+        Ok(Shelf::Aside(Aside { file: Mutex::new(file), scratch, count: rows.len(), has_peak: !w.is_empty() }))
     }
 
     /// All rows.
@@ -108,8 +110,9 @@ impl Aside {
     /// A value for every Gaussian from byte `start` on.
     fn values<T: AnyBitPattern + NoUninit>(&self, start: u64) -> Result<Vec<T>> {
         let mut values = vec![T::zeroed(); self.count];
-        let read = (&self.file).seek(SeekFrom::Start(start));
-        let read = read.and_then(|_| (&self.file).read_exact(bytemuck::cast_slice_mut(&mut values)));
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let read = file.seek(SeekFrom::Start(start));
+        let read = read.and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)));
         read.map_err(Error::io("read back", self.scratch.path()))?;
         Ok(values)
     }

@@ -251,13 +251,6 @@ mod tests {
     }
 
     #[test]
-    fn no_pair_reads_nothing() {
-        let case = Case { pairs: Vec::new(), ..Case::new(0.0) };
-        let unreadable = Failing { scene: &case.scene, from: 0 };
-        assert!(case.measure(&unreadable, 1, 0.3).unwrap().is_empty());
-    }
-
-    #[test]
     fn a_source_that_fails_midway_leaves_no_scratch_file() {
         let case = Case::new(0.3);
         let failing = Failing { scene: &case.scene, from: 6 };
