@@ -62,7 +62,8 @@ impl MappedFile {
         })
     }
 
-    /// Calls `each` with the bytes of `range` in pieces of [`PIECE`] bytes, the last of what is left, and the place of each.
+    /// Calls `each` with the bytes of `range` in pieces of [`PIECE`] bytes, the last of what is left, and the place of
+    /// each.
     pub(crate) fn read_pieces(
         &self,
         range: std::ops::Range<u64>,

@@ -93,7 +93,8 @@ impl Linear {
 }
 
 /// One panel's outputs. Each sum starts from its bias and adds the inputs in their order, so the result of a Gaussian
-/// does not depend on those beside it. Fused multiply-adds only where the processor has them: elsewhere each would be a call.
+/// does not depend on those beside it. Fused multiply-adds only where the processor has them: elsewhere each would be a
+/// call.
 #[inline(always)]
 fn sums<const FMA: bool>(input: &[Lanes], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [Lanes; PANEL] {
     let mut sums = bias.map(|b| Lanes([b; LANES]));

@@ -6,7 +6,7 @@
 //! say which processes run: Linux), and a folder that such a run had moved aside is put back.
 
 use std::ffi::{OsStr, OsString};
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -192,6 +192,15 @@ impl ScratchFile {
     /// Where to write it.
     pub fn path(&self) -> &Path {
         &self.0
+    }
+
+    /// Creates it, to be written and read back.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub fn create(&self) -> Result<File> {
+        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&self.0);
+        file.map_err(Error::io("create", &self.0))
     }
 }
 

@@ -4,7 +4,7 @@
 //! its life (u32), then its flags; all as this machine has them. Memory: nothing, until something is asked for.
 
 use std::borrow::Cow;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -40,8 +40,7 @@ impl Shelf {
     pub(super) fn aside(rows: Rows, folder: &Path) -> Result<Shelf> {
         let scratch = ScratchFile::new(folder)?;
         let io = |what| Error::io(what, scratch.path());
-        let file = OpenOptions::new().read(true).write(true).create_new(true).open(scratch.path());
-        let mut out = BufWriter::new(file.map_err(io("create"))?);
+        let mut out = BufWriter::new(scratch.create()?);
         let Rows { d, kappa, v, life, c, w, e, vis, flags } = &rows;
         let columns = [d, kappa, v, c, e, vis, w].map(|column| bytemuck::cast_slice::<f64, u8>(column));
         let written = columns.iter().try_for_each(|column| out.write_all(column));

@@ -2,8 +2,8 @@
 //!
 //! At every frame a proxy is the moment match of its members at that frame, with the weights of the
 //! reference frame: Σ w_i x_i(t) is its path. Nothing is stored; memory is that of the members read. Members lie
-//! anywhere in the source: whoever reads many Gaussians reads them together ([`MergedSequence::together`]), so that what is
-//! decoded for one serves all.
+//! anywhere in the source: whoever reads many Gaussians reads them together ([`MergedSequence::together`]), so that
+//! what is decoded for one serves all.
 
 use std::ops::Range;
 

@@ -1,8 +1,8 @@
 //! Measuring how alike pairs of Gaussians move, over all frames.
 //!
 //! As long as all pairs fit, they are measured in one read of the source. Else [`crate::merge::run`] cuts them into
-//! partitions, so many consecutive pairs in voxel order, and the trajectories of all survivors are gathered once in that
-//! order: a partition reads the Gaussians that lead its pairs and their ghosts, the partners within ε that other
+//! partitions, so many consecutive pairs in voxel order, and the trajectories of all survivors are gathered once in
+//! that order: a partition reads the Gaussians that lead its pairs and their ghosts, the partners within ε that other
 //! partitions share. As partitions are cut by counting pairs, a voxel that holds more than fit is split. Every pair is
 //! summed whole in one partition, so no cut changes a bit.
 
@@ -201,7 +201,10 @@ mod tests {
                 gathered: None,
             };
             let is_part = self.pairs.len() > pairs_together;
-            let of_parts = self.pairs.chunks(pairs_together);
+            // No pairs are one part.
+            let starts = (0..self.pairs.len().max(1)).step_by(pairs_together);
+            let of_parts =
+                starts.map(|start| &self.pairs[start..self.pairs.len().min(start.saturating_add(pairs_together))]);
             let found: Result<Vec<Vec<Likeness>>> =
                 of_parts.map(|part| meter.measure(&self.ids, &self.reference, part.to_vec(), reach, is_part)).collect();
             drop(meter);
@@ -248,6 +251,13 @@ mod tests {
         // Voxels wider than the scene: all pairs are led from one.
         let got = case.measure(&case.scene, case.pairs.len() / 5, 1e6).unwrap();
         assert!(got == case.plainly());
+    }
+
+    #[test]
+    fn no_pair_reads_nothing() {
+        let case = Case { pairs: Vec::new(), ..Case::new(0.0) };
+        let unreadable = Failing { scene: &case.scene, from: 0 };
+        assert!(case.measure(&unreadable, 1, 0.3).unwrap().is_empty());
     }
 
     #[test]

@@ -23,8 +23,8 @@ pub struct Scanned {
 
 /// Scans `source` as seen by the cameras of `schedule`.
 ///
-/// Memory: a row per Gaussian, twice while blocks are joined, 4 bytes per frame, and per thread one block of Gaussians with its
-/// accumulators ([`crate::stats::BYTES_PER_GAUSSIAN`] each) and its state at one frame.
+/// Memory: a row per Gaussian, twice while blocks are joined, 4 bytes per frame, and per thread one block of Gaussians
+/// with its accumulators ([`crate::stats::BYTES_PER_GAUSSIAN`] each) and its state at one frame.
 pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
     let info = source.info();
     let frames = info.times.len();

@@ -13,7 +13,7 @@
 //! Memory while gathering, per Gaussian: 8 bytes, and what varies of 16 for each of F frames; for every thread two
 //! blocks of as many frames.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::Path;
@@ -67,8 +67,7 @@ impl Trajectories {
         places.par_sort_unstable();
         let scratch = ScratchFile::new(folder)?;
         let io = |what| Error::io(what, scratch.path());
-        let mut file =
-            OpenOptions::new().read(true).write(true).create_new(true).open(scratch.path()).map_err(io("create"))?;
+        let mut file = scratch.create()?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
         let progress = Progress::new("gather", "frames", frames as u64);
         let mut values = Vec::new();
