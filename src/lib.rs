@@ -5,29 +5,34 @@
 //! | layer | modules | what lives there |
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
-//! | L1 | [`error`], [`model`], [`pass`], [`plan`], [`recipe`] | the vocabulary |
+//! | L1 | [`error`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`refit`], [`metrics`] | pure mathematics: slices in, values out |
-//! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
-//! | L4 | [`pipeline`], [`report`] | the order of the passes; the page about their result |
+//! | L3 | [`ingest`], [`stream`], [`emit`], [`families`], [`demo`] | files, threads, terminals |
+//! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
 
+pub mod budget;
 pub mod cli;
+pub mod compress;
 pub mod deform;
 pub mod demo;
 pub mod emit;
 pub mod error;
+pub mod families;
 pub mod ingest;
 pub mod merge;
 pub mod metrics;
 pub mod model;
 pub mod pass;
-pub mod pipeline;
 pub mod plan;
 pub mod recipe;
+pub mod reduction;
 pub mod refit;
 pub mod render;
 pub mod report;
+pub mod scene;
 pub mod score;
 pub mod select;
 pub mod stats;
 pub mod stream;
+pub mod verbs;

@@ -1,6 +1,8 @@
 //! How frames reach a pass: a source hands out readers over blocks of Gaussians.
 
-use std::ops::Range;
+use std::ops::{Range, Sub};
+
+use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
@@ -38,11 +40,39 @@ impl Ids<'_> {
     }
 }
 
+/// What was read of a source.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Reads {
+    /// Stored bytes.
+    pub bytes: u64,
+    /// Tiles of a container decoded.
+    pub tiles: u64,
+    /// States handed out, each of one Gaussian at one frame.
+    pub states: u64,
+}
+
+impl Sub for Reads {
+    type Output = Reads;
+
+    fn sub(self, before: Reads) -> Reads {
+        Reads {
+            bytes: self.bytes - before.bytes,
+            tiles: self.tiles - before.tiles,
+            states: self.states - before.states,
+        }
+    }
+}
+
 /// A sequence of Gaussians that can be read block by block, frame by frame, in any order, from
 /// several threads. The same (Gaussian, frame) always gives the same bits, whatever the block.
 pub trait FrameSource: Send + Sync {
     /// Size, time stamps and varying columns.
     fn info(&self) -> &SequenceInfo;
+
+    /// What readers of it have read so far.
+    fn reads(&self) -> Reads {
+        Reads::default()
+    }
 
     /// A reader over the Gaussians `ids`, in that order. What does not change with time is prepared
     /// here once.

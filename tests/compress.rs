@@ -50,7 +50,7 @@ fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &st
         };
         assert!(find(model) == find(&output), "{kind} changed");
     }
-    let times = scene::scene(model).input.source().info().times.clone();
+    let times = scene::scene(model).source().info().times.clone();
     let open = |root: &Path| ModelFolder::open(root, None).unwrap().with_times(times.clone()).unwrap();
     let (original, result) = (open(model), open(&output));
     let alone = || members.iter().enumerate().filter(|(_, ids)| ids.len() == 1).map(|(place, ids)| (place, ids[0]));
@@ -163,7 +163,7 @@ fn box_keeps_who_is_inside_at_the_reference_frame() {
         .summary("{tiny} -o out --preset paper --keep-box -0.4,-0.4,-0.4,0.4,0.4,0.4 --keep-fraction 0.1 --drop-ids 0");
     let frame = summary["merge"]["reference_frame"].as_u64().unwrap() as usize;
     let scene = scene::scene(&tiny());
-    let state = state(scene.input.source(), frame);
+    let state = state(scene.source(), frame);
     let map = index_map(&workplace.path("out/index_map.npy"));
     let inside: Vec<usize> =
         (1..N).filter(|&i| state.position.row::<3>(i).iter().all(|x| (-0.4..=0.4).contains(&f64::from(*x)))).collect();
@@ -198,7 +198,7 @@ fn all_kinds_of_output_hold_the_same_gaussians() {
         for other in ["one.gseq.index_map.npy", "one.ply.index_map.npy", "frames/index_map.npy"] {
             assert!(fs::read(workplace.path(other)).unwrap() == map, "{other}");
         }
-        let times = scene::scene(&tiny()).input.source().info().times.clone();
+        let times = scene::scene(&tiny()).source().info().times.clone();
         let model = ModelFolder::open(&folder, None).unwrap().with_times(times.clone()).unwrap();
         let container = Container::open(&workplace.path("one.gseq")).unwrap();
         let frames = PlySequence::open(&workplace.path("frames")).unwrap();

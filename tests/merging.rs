@@ -7,14 +7,13 @@ use std::path::Path;
 
 use glam::{DMat3, DQuat, DVec3};
 use scene::{PlyRows, by_formula, lasting_files, state, tiny};
+use splatsieve::compress::score::{Scored, UserOverrides};
+use splatsieve::compress::{Only, Request, Target, compress_scene, score_scene};
 use splatsieve::merge::proxy::merge_state;
 use splatsieve::model::{Columns, Gaussians, SH_C0};
-use splatsieve::pipeline::compress::{CompressOptions, Only, Target, compress_scene};
-use splatsieve::pipeline::input::{InputOptions, Scene};
-use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
-use splatsieve::pipeline::summary::Stages;
 use splatsieve::plan::Limits;
 use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
+use splatsieve::scene::{InputOptions, Scene};
 
 /// Tightens a gate.
 type Edit = fn(&mut Merge);
@@ -29,7 +28,7 @@ struct Whole {
 
 impl Whole {
     fn read(scene: &Scene) -> Whole {
-        let source = scene.input.source();
+        let source = scene.source();
         let frames: Vec<Gaussians> = (0..source.info().times.len()).map(|frame| state(source, frame)).collect();
         let alive: Vec<Vec<bool>> = frames
             .iter()
@@ -191,9 +190,9 @@ fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
     ids.iter().zip(seen).map(|(&id, weight)| (id as u32, weight / total)).collect()
 }
 
-fn options(output: &Path, recipe: &Recipe, only: Only) -> CompressOptions {
+fn options(output: &Path, recipe: &Recipe, only: Only) -> Request {
     let input = InputOptions { path: tiny(), ..InputOptions::default() };
-    CompressOptions { only, ..CompressOptions::new(input, output.to_owned(), recipe.clone()) }
+    Request { only, ..Request::new(input, output.to_owned(), recipe.clone()) }
 }
 
 /// Compresses the tiny model and compares clusters and proxies; gives how many Gaussians joined others.
@@ -201,8 +200,8 @@ fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let output = folder.path().join("out");
     let scene = scene::scene(&tiny());
-    let (summary, map) = compress_scene(&scene, &options(&output, recipe, only), Stages::default()).unwrap();
-    let scored = score_scene(&scene, recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
+    let (summary, map) = compress_scene(&scene, &options(&output, recipe, only)).unwrap();
+    let scored = score_scene(&scene, recipe, &UserOverrides::default()).unwrap();
     let whole = Whole::read(&scene);
     assert_eq!(summary.merge.unwrap().reference_frame, whole.reference);
     let kept: Vec<usize> = (0..map.len()).filter(|&id| only == Only::Merge || scored.selection.keep[id]).collect();
@@ -232,7 +231,7 @@ fn proxies_are_solved_at_their_leaders(
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
     let result = splatsieve::ingest::ModelFolder::open(output, None).unwrap();
-    let result = result.with_times(scene.input.source().info().times.clone()).unwrap();
+    let result = result.with_times(scene.source().info().times.clone()).unwrap();
     let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
     let at_reference = &whole.frames[whole.reference];
     for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
@@ -348,9 +347,9 @@ fn partitions_of_the_pairs_change_no_byte() {
             let (output, scratch) = (folder.path().join(format!("out{pairs_together}")), tempfile::tempdir().unwrap());
             let mut scene = scene::scene(&tiny());
             scene.limits = Limits { pairs_together, frames_held: 3, ..Limits::NONE };
-            scene.scratch = Some(scratch.path().to_owned());
-            let options = CompressOptions { target, ..options(&output, &recipe, Only::Both) };
-            let (summary, map) = compress_scene(&scene, &options, Stages::default()).unwrap();
+            scene.scratch = scratch.path().to_owned();
+            let options = Request { target, ..options(&output, &recipe, Only::Both) };
+            let (summary, map) = compress_scene(&scene, &options).unwrap();
             assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "scratch files are left");
             (lasting_files(&output), map, summary.merge.unwrap().passes)
         };

@@ -10,7 +10,8 @@ use std::process::Output;
 use assert_cmd::Command;
 use serde_json::{Value, json};
 use splatsieve::demo::Scene;
-use splatsieve::pipeline::output::{OutputKind, write_sequence};
+use splatsieve::emit::kind::OutputKind;
+use splatsieve::families::trajectories::write_sequence;
 use tempfile::TempDir;
 
 const FRAMES: usize = 4;

@@ -4,16 +4,16 @@
 mod scene;
 
 use scene::{by_formula, scene, tiny};
+use splatsieve::compress::score::{Scored, UserOverrides};
+use splatsieve::compress::score_scene;
 use splatsieve::model::Rows;
-use splatsieve::pipeline::scored::{Scored, UserOverrides, score_scene};
-use splatsieve::pipeline::summary::Stages;
 use splatsieve::recipe::{Anisotropy, LowPriority, Recipe};
 
 const N: usize = 300;
 const FRAMES: f64 = 10.0;
 
 fn scored(recipe: &Recipe) -> Scored {
-    score_scene(&scene(&tiny()), recipe, &UserOverrides::default(), &mut Stages::default()).unwrap()
+    score_scene(&scene(&tiny()), recipe, &UserOverrides::default()).unwrap()
 }
 
 /// Nearest rank: the smallest value that at least `percent` of all do not exceed.

@@ -6,9 +6,9 @@ use std::fmt::{self, Display, Formatter};
 use std::path::Path;
 
 use scene::{arrays, shared, state, tiny};
+use splatsieve::compress::score::UserOverrides;
+use splatsieve::compress::score_scene;
 use splatsieve::model::{Gaussians, Rows};
-use splatsieve::pipeline::scored::{UserOverrides, score_scene};
-use splatsieve::pipeline::summary::Stages;
 use splatsieve::recipe::{Motion, Recipe};
 
 fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
@@ -42,7 +42,7 @@ fn extent(state: &Gaussians) -> f64 {
 fn frames_agree(model: &Path) {
     let expected = arrays(&model.join("states.npz"));
     let scene = scene::scene(model);
-    let source = scene.input.source();
+    let source = scene.source();
     for (row, &frame) in expected["frames"].iter().enumerate() {
         let frame = frame as usize;
         close("time", source.info().times[frame], expected["times"][row], 1e-12);
@@ -81,7 +81,7 @@ fn rows(model: &Path, motion: Motion) -> (Rows, f64) {
     let mut scene = scene::scene(model);
     // Motion and opacity do not look at cameras; those of one frame tell that the scene is in view.
     scene.schedule.frames[1..].iter_mut().for_each(Vec::clear);
-    let scored = score_scene(&scene, &recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
     (scored.rows().unwrap().into_owned(), scored.position_ulp)
 }
 

@@ -10,7 +10,7 @@ use crate::error::{Error, Fault, Result};
 
 /// First bytes of every container. A high bit, a line ending and a control byte, so that transfers
 /// which rewrite text are noticed at once.
-pub(crate) const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
+pub const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
 /// The one version of the format this crate reads and writes.
 pub(crate) const VERSION: u32 = 1;
 /// Bytes before the first column: magic, version, header length, the four sizes and two counts.

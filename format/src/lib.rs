@@ -48,7 +48,7 @@ mod writer;
 
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
 pub use error::{Error, Result};
-pub use layout::{ColumnSpec, Layout, MAX_TILE_BYTES, TileId};
+pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
 pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo};
 pub use recover::{RecoverReport, recover};
 pub use verify::VerifyReport;

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-use super::RecipeFlags;
-use crate::pipeline::sweep::Method;
+use super::recipe_flags::RecipeFlags;
+use crate::verbs::sweep::Method;
 
 const EXAMPLES: &str = "\
 Examples:

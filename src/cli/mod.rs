@@ -10,23 +10,21 @@ use std::process::ExitCode;
 use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
+use crate::budget::{self, Budget};
+use crate::compress::{Only, Request, Target, compress};
 use crate::emit::image::ImageFormat;
+use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::model::Split;
-use crate::pipeline::arrival::scratch_beside;
-use crate::pipeline::compress::{CompressOptions, Only, Target, compress};
-use crate::pipeline::evaluate::EvaluateOptions;
-use crate::pipeline::input::InputOptions;
-use crate::pipeline::memory::{self, Budget};
-use crate::pipeline::output::OutputKind;
-use crate::pipeline::pictures::Part;
-use crate::pipeline::render::{RenderOptions, Wanted};
-use crate::pipeline::sweep::{Method, SweepOptions};
-use crate::pipeline::{container, demo, evaluate, render, score, sweep};
 use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions};
+use crate::scene::pictures::Part;
+use crate::scene::{InputOptions, scratch_beside};
+use crate::verbs::evaluate::EvaluateOptions;
+use crate::verbs::render::{RenderOptions, Wanted};
+use crate::verbs::sweep::{Method, SweepOptions};
+use crate::verbs::{container, demo, evaluate, render, score, sweep};
 use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, Render, SideBySide, SplitArg, Sweep, Verb};
-use recipe_flags::RecipeFlags;
 
 /// Runs the program on the arguments of this process.
 pub fn main() -> ExitCode {
@@ -41,7 +39,7 @@ pub fn main() -> ExitCode {
     let explains = cli.verb.explains();
     match run(cli) {
         Ok(()) => {
-            if let Some(taken) = memory::taken().filter(|_| explains) {
+            if let Some(taken) = budget::taken().filter(|_| explains) {
                 tell(&taken);
             }
             ExitCode::SUCCESS
@@ -167,7 +165,7 @@ fn run(cli: Cli) -> Result<()> {
             let recipe = args.recipe.recipe()?;
             let output = args.output.as_deref();
             let (gaussians, frames) = (args.gaussians as usize, args.frames as usize);
-            let report = demo::run(gaussians, frames, recipe, output, args.overwrite, budget(args.memory))?;
+            let report = demo::run(gaussians, frames, recipe, output, args.overwrite, budget_of(args.memory))?;
             print(&report.text())?;
             if let Some(folder) = output {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
@@ -183,7 +181,7 @@ fn run(cli: Cli) -> Result<()> {
     }
 }
 
-fn compress_options(args: Compress) -> Result<CompressOptions> {
+fn compress_options(args: Compress) -> Result<Request> {
     let recipe = args.recipe.recipe()?;
     let kind = args.kind.map(|kind| match kind {
         args::OutputKind::Model => OutputKind::Model,
@@ -191,7 +189,7 @@ fn compress_options(args: Compress) -> Result<CompressOptions> {
         args::OutputKind::PlySequence => OutputKind::PlySequence,
         args::OutputKind::Ply => OutputKind::Ply,
     });
-    Ok(CompressOptions {
+    Ok(Request {
         input: input_options(args.input, Some(args.cameras), Some(&args.output)),
         output: args.output,
         kind,
@@ -234,7 +232,7 @@ fn render_options(args: Render) -> RenderOptions {
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.look_from(args.cameras);
-    original.memory = budget(args.memory);
+    original.memory = budget_of(args.memory);
     EvaluateOptions {
         original,
         compressed: args.compressed,
@@ -271,13 +269,13 @@ fn part_of(split: SplitArg) -> Part {
     }
 }
 
-fn budget(memory: Memory) -> Budget {
+fn budget_of(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, explain: memory.explain }
 }
 
 fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {
     let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
-    options.memory = budget(input.memory);
+    options.memory = budget_of(input.memory);
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         options.look_from(cameras.file);

@@ -8,5 +8,6 @@ pub mod container;
 pub mod frame_stream;
 pub mod image;
 pub mod index_map;
+pub mod kind;
 pub mod ply;
 pub mod rows;

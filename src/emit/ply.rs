@@ -10,6 +10,7 @@ use std::path::Path;
 use crate::error::{Error, Result};
 use crate::ingest::ply::{Encoding, Plane, Ply, Property, Scalar, read_plane};
 use crate::model::{Columns, Gaussians, sh_coefficients};
+use crate::reduction::Reduction;
 
 /// One row of a smaller PLY.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,6 +21,17 @@ pub struct OutRow {
     pub proxy: Option<u32>,
     /// What is added to its `f_dc_0..2`; zeros leave them their bytes.
     pub recolor: [f32; 3],
+}
+
+/// The rows of what `reduction` leaves.
+pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
+    let row = |&source: &u32| OutRow { source, proxy: None, recolor: [0.0; 3] };
+    let mut rows: Vec<OutRow> = reduction.kept.iter().map(row).collect();
+    rows.iter_mut().zip(&reduction.recolor).for_each(|(row, &recolor)| row.recolor = recolor);
+    for (proxy, cluster) in reduction.clusters.iter().enumerate() {
+        rows[cluster.output as usize].proxy = Some(proxy as u32);
+    }
+    rows
 }
 
 /// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):

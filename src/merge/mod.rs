@@ -25,7 +25,7 @@ pub mod proxy;
 pub mod voxels;
 
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::model::{Columns, Gaussians};
 use crate::recipe;
@@ -96,7 +96,7 @@ pub struct Merged {
 }
 
 /// What one pass did.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
     /// Nodes with more neighbours within ε than were looked at.
     pub truncated: usize,

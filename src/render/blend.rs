@@ -3,10 +3,9 @@
 //! Data in: the tile's splats, nearest first. Data out: each pixel's transmittance, and whatever an
 //! [`Ink`] makes of the weights alpha · transmittance. Memory: a tile's pixels, in the first-level cache.
 
-use super::TILE;
+use super::convention::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 use super::lanes::{LANES, Lanes, Portable};
 use super::project::Splat;
-use super::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE};
 
 const SIDE: usize = TILE as usize;
 /// Groups of eight pixels in a tile: group `row + 16 · column` covers eight neighbours of one row.

@@ -5,7 +5,7 @@
 
 use std::ops::Range;
 
-use super::project::BLOCK;
+use super::convention::BLOCK;
 use crate::model::{Gaussians, SH_C0, sh_coefficients};
 
 /// Red, green and blue of one block.

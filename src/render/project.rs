@@ -10,11 +10,8 @@ use std::f64::consts::{LN_2, LOG2_E};
 use std::ops::Range;
 
 use super::colour::{self, Colours};
-use super::{MIN_ALPHA, TILE};
+use super::convention::{BLOCK, MIN_ALPHA, TILE};
 use crate::model::{Camera, Gaussians};
-
-/// Gaussians projected together: the arrays of one block stay in the first-level cache.
-pub(super) const BLOCK: usize = 128;
 
 /// View depths up to this are not drawn, scene units; an f32 in the reference kernel.
 const NEAR: f64 = 0.2f32 as f64;

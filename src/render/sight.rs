@@ -9,9 +9,10 @@
 
 use super::bin::Bins;
 use super::blend::{Blend, GROUPS, Ink, Lattice, Plane, lane_sum};
+use super::convention::TILE;
 use super::lanes::{LANES, Lanes};
 use super::project::{Splat, Splats, View};
-use super::{Image, Renderer, TILE};
+use super::renderer::{Image, Renderer};
 use crate::model::{Camera, Gaussians};
 
 /// What one camera sees of Gaussians whose colours may change.

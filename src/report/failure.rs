@@ -13,8 +13,8 @@ use serde::Serialize;
 use super::traits::{Kind, Traits};
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{Camera, Column, Gaussians, SH_C0};
-use crate::pipeline::evaluate::Taken;
 use crate::render::{Image, render};
+use crate::verbs::evaluate::Taken;
 
 /// PSNR below which an error can be seen: one part in a hundred, root mean square.
 pub const VISIBLE_DB: f64 = 40.0;

@@ -9,6 +9,7 @@
 
 pub mod chart;
 pub mod failure;
+mod findings;
 pub mod histogram;
 mod html;
 mod page;
@@ -22,22 +23,23 @@ mod verdict;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
-
+use crate::compress::journal::Journal;
+use crate::compress::measure::{Measure, Stages};
+use crate::compress::score::{SCORED, Scored, UserOverrides};
+use crate::compress::summary::TermSummary;
 use crate::emit::atomic::{Kind as TargetKind, MARKER, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::model::{Schedule, Split};
-use crate::pipeline::evaluate::{EvaluateOptions, SideBySide};
-use crate::pipeline::evaluation::{Evaluation, PictureScores};
-use crate::pipeline::input::Scene;
-use crate::pipeline::memory::{SCORED, picturing_both, scoring};
-use crate::pipeline::scored::{Scored, UserOverrides, score_scene};
-use crate::pipeline::summary::Stages;
-use crate::pipeline::trade_off::TradeOff;
 use crate::recipe::{NonFinite, Recipe};
+use crate::scene::Scene;
+use crate::verbs::evaluate::{self, EvaluateOptions, SideBySide};
+use crate::verbs::trade_off::TradeOff;
+pub use findings::Report;
+
 use failure::{FailureMode, Members, judge, observe};
-use histogram::{Histogram, histograms};
+use findings::Close;
+use histogram::histograms;
 use run::{Fate, Run};
 use shown::{Choice, Shown, choices, show};
 use traits::{Kind, Traits, shares, traits};
@@ -58,46 +60,6 @@ pub struct ReportOptions {
     pub overwrite: bool,
 }
 
-/// Everything the page shows, as data.
-#[derive(Debug, Serialize)]
-pub struct Report {
-    /// Program and version.
-    pub tool: String,
-    /// The result in a sentence or two.
-    pub verdict: String,
-    /// Means overall, by view and by frame.
-    pub evaluation: Evaluation,
-    /// The scores of every picture.
-    pub pictures: Vec<PictureScores>,
-    /// Pictures that the page shows.
-    pub shown: Vec<Choice>,
-    /// The failure modes, by [`Kind::ALL`].
-    pub failure_modes: Vec<FailureMode>,
-    /// The scores of what was kept, merged and dropped; none where that is not known.
-    pub histograms: Option<Vec<Histogram>>,
-    /// The run's `summary.json` as it stands.
-    pub run: Option<serde_json::Value>,
-    /// What was not found beside the result, and why.
-    pub missing: Vec<String>,
-    /// A sweep over the original.
-    pub trade_off: Option<TradeOff>,
-    /// Things a person should know.
-    pub notes: Vec<String>,
-}
-
-/// Part of both models' pictures where a failure mode is worst.
-#[derive(Debug, Clone, PartialEq)]
-struct Close {
-    /// Index into the failure modes.
-    mode: usize,
-    /// Its upper left pixel.
-    corner: (u32, u32),
-    /// PSNR inside, dB.
-    psnr: f64,
-    /// Data URIs: original, compressed.
-    images: [String; 2],
-}
-
 /// Compares two models and writes the report.
 ///
 /// # Errors
@@ -108,26 +70,26 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
     let trade_off = options.sweep.as_deref().map(read_sweep).transpose()?;
     let mut side = SideBySide::open(&options.evaluate)?;
-    let info = side.scene.input.source().info();
+    let info = side.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
     let run = Run::beside(&options.evaluate.compressed, count, side.compressed_count());
     let mut notes = notes_on(&run, &side.scene)?;
 
     let recipe = recipe_to_look_with(&run)?;
-    let has_cameras = side.scene.has_cameras;
+    let measure = Measure::new(&recipe, side.scene.has_cameras, UserOverrides::default());
     side.keep_to(options.evaluate.original.memory, |work, limits| {
-        let mut needs = scoring(work, limits, &recipe, has_cameras);
+        let mut needs = measure.needs(work, limits);
         needs.push(traits::need(work));
-        needs.extend(picturing_both(work, limits).into_iter().map(|mut need| {
+        needs.extend(evaluate::needs(work, limits).into_iter().map(|mut need| {
             need.per_gaussian.push(("rows", SCORED + 8));
             need
         }));
         needs
     })?;
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
-    let scored = score_scene(&side.scene, &recipe, &UserOverrides::default(), &mut Stages::default())?;
+    let scored = measure.run(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
-    let traits = traits(side.scene.input.source(), &scored, recipe.scan.alpha_min)?;
+    let traits = traits(side.scene.source(), &scored, recipe.scan.alpha_min)?;
     let rows = scored.rows()?;
     let members = members(&rows, &traits, run.fates.as_deref());
     let (evaluation, seen) = side.evaluate(|state, camera, taken| observe(state, &traits, camera, taken))?;
@@ -194,7 +156,7 @@ fn recipe_to_look_with(run: &Run) -> Result<Recipe> {
 /// The pictures that the run scored with: the split that has as many as its summary says, else those of
 /// training, else all.
 fn scored_pictures(scene: &Scene, run: &Run) -> Result<Schedule> {
-    let times = &scene.input.source().info().times;
+    let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
     let mut first = None;
     for split in [Some(Split::Train), None, Some(Split::Test)] {
@@ -216,7 +178,7 @@ fn differing_terms(run: &Run, scored: &Scored) -> Option<String> {
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
     let (summary, _) = run.summary.as_ref()?;
     let found = scored.term_summaries();
-    let differs = |then: &&run::Term| {
+    let differs = |then: &&TermSummary| {
         !found.iter().any(|now| now.name == then.name && same(now.p1, then.p1) && same(now.p99, then.p99))
     };
     let then = summary.terms.iter().find(differs)?;

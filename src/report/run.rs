@@ -10,8 +10,9 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
+use crate::compress::emit::{INDEX_MAP, RECIPE, beside};
+use crate::compress::summary::Summary;
 use crate::emit::atomic::MARKER;
-use crate::pipeline::output::{INDEX_MAP, RECIPE, beside};
 use crate::recipe::Recipe;
 
 /// What became of a Gaussian of the original.
@@ -23,74 +24,6 @@ pub enum Fate {
     Merged,
     /// It is gone.
     Dropped,
-}
-
-/// A stage of the run, as its summary tells it.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct Stage {
-    /// Its name.
-    pub name: String,
-    /// Gaussians that entered it.
-    pub gaussians_in: usize,
-    /// Gaussians that left it.
-    pub gaussians_out: usize,
-    /// Wall-clock time.
-    pub seconds: f64,
-    /// Largest resident memory up to its end, where the system told.
-    pub peak_memory_bytes: Option<u64>,
-}
-
-/// Something the scene did not need.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct LeftOut {
-    /// What was not done.
-    pub what: String,
-    /// Why not.
-    pub why: String,
-}
-
-/// Percentiles of a term of the scores.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct Term {
-    /// Its name.
-    pub name: String,
-    /// 1st percentile.
-    pub p1: f64,
-    /// 99th percentile.
-    pub p99: f64,
-    /// Whether they differ.
-    pub active: bool,
-}
-
-/// The original, as the summary names it.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct OfInput {
-    /// Hash over its bytes.
-    pub digest: String,
-}
-
-/// The pictures that were scored.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct OfCameras {
-    /// (frame, view) pairs.
-    pub pairs: usize,
-}
-
-/// What this report reads of a `summary.json`.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct Summary {
-    /// The original.
-    pub input: OfInput,
-    /// Where it was looked at from.
-    pub cameras: OfCameras,
-    /// Everything in order.
-    pub stages: Vec<Stage>,
-    /// Percentiles.
-    pub terms: Vec<Term>,
-    /// What the scene did not need.
-    pub left_out: Vec<LeftOut>,
-    /// Things a person should know.
-    pub notes: Vec<String>,
 }
 
 /// What was found beside a result.

@@ -11,9 +11,9 @@ use serde::Serialize;
 
 use crate::emit::image::png_bytes;
 use crate::error::{Error, Result};
-use crate::pipeline::evaluate::Taken;
-use crate::pipeline::evaluation::{Evaluation, Score};
 use crate::render::Image;
+use crate::verbs::evaluate::Taken;
+use crate::verbs::evaluation::{Evaluation, Score};
 
 /// Pictures to look at: the worst, that of the worst view, of the worst frame, and the median.
 pub const CHOSEN: usize = 4;

@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use super::failure::FailureMode;
-use super::run::Summary;
-use crate::pipeline::csv::{known, quoted};
+use crate::compress::summary::Summary;
+use crate::verbs::csv::{known, quoted};
 
 /// One line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {

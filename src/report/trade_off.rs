@@ -3,7 +3,7 @@
 //! Data in: a [`TradeOff`]. Data out: charts as SVG, which need [`super::chart::STYLE`] around them.
 
 use super::chart::{Axis, Plot, Series};
-use crate::pipeline::trade_off::{Point, TradeOff};
+use crate::verbs::trade_off::{Point, TradeOff};
 
 /// What a chart is about, and its SVG.
 pub type Chart = (&'static str, String);

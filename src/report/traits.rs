@@ -7,12 +7,12 @@
 
 use rayon::prelude::*;
 
+use crate::budget::{Need, Workload};
+use crate::compress::score::{SCORED, Scored};
 use crate::error::Result;
 use crate::merge::neighbors::{PointIndex, Search};
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
 use crate::pass::FrameSource;
-use crate::pipeline::memory::{Need, SCORED, Workload};
-use crate::pipeline::scored::Scored;
 use crate::stream::gather;
 
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the

@@ -11,7 +11,7 @@ mod ranking;
 pub use hash::hash_id;
 pub use ranking::Ranking;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 use crate::recipe::{LowPriority, Select};
@@ -39,7 +39,7 @@ pub struct Selection {
 
 /// Gaussians at each stage. Before overrides: total = candidates + outside, and
 /// kept = candidates − pruned by stage 2 + rescued.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Counts {
     /// N.
     pub total: usize,

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use assert_cmd::Command;
 use splatsieve::model::{Columns, Gaussians};
 use splatsieve::pass::FrameSource;
-use splatsieve::pipeline::input::{InputOptions, Scene, open_scene};
+use splatsieve::scene::{InputOptions, Scene, open_scene};
 use splatsieve::stream::gather;
 use tempfile::TempDir;
 

@@ -3,18 +3,17 @@
 use glam::DVec3;
 
 use super::*;
+use crate::compress::score::{Scored, UserOverrides};
+use crate::compress::score_scene;
 use crate::demo::{Family, Scene};
 use crate::emit::container::write_container;
 use crate::ingest::container::Container;
 use crate::model::Split;
 use crate::pass::FrameSource;
-use crate::pipeline::evaluate::Taken;
-use crate::pipeline::input::Input;
-use crate::pipeline::scored::{Scored, UserOverrides, score_scene};
-use crate::pipeline::summary::Stages;
 use crate::recipe::Recipe;
 use crate::report::traits::{shares, traits};
 use crate::stream::gather;
+use crate::verbs::evaluate::Taken;
 
 /// The demo scene with its scores and traits.
 struct Looked {
@@ -29,12 +28,12 @@ fn looked() -> Looked {
     let made = Scene::new(3000, 12);
     let path = folder.path().join("scene.gseq");
     write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
-    let input = Input::Container(Container::open(&path).unwrap());
+    let input = Box::new(Container::open(&path).unwrap());
     let rig = made.rig();
-    let scene = crate::pipeline::input::Scene::new(path, input, rig, Some(Split::Train)).unwrap();
+    let scene = crate::scene::Scene::new(path, input, rig, Some(Split::Train)).unwrap();
     let recipe = Recipe::preset("default").unwrap();
-    let scored = score_scene(&scene, &recipe, &UserOverrides::default(), &mut Stages::default()).unwrap();
-    let traits = traits(scene.input.source(), &scored, recipe.scan.alpha_min).unwrap();
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
+    let traits = traits(scene.source(), &scored, recipe.scan.alpha_min).unwrap();
     Looked { made, scored, traits, _folder: folder }
 }
 

@@ -1,0 +1,420 @@
+//! What a run needs of memory, and how it keeps to a budget. Names no stage: each states its own [`Need`].
+//!
+//! A need is a number of bytes per Gaussian and a fixed one, both as sums of named parts; the largest stage counts.
+//! [`Plan::fit`] begins with limits that cost no time and halves the one that frees most, until all stages fit.
+//! A result never depends on the limits. Nothing grows with frames but time stamps, the cameras' pictures and a
+//! byte per tile of a container, which are parts like any other.
+
+use std::fmt::Write as _;
+use std::fs;
+
+use bytesize::ByteSize;
+
+use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
+use crate::error::{Error, Result};
+use crate::families::Residence;
+use crate::families::trajectories::state_bytes;
+use crate::ingest::frame_stream::StreamHeader;
+use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
+use crate::plan::Limits;
+use crate::render;
+use crate::stream::{BLOCK, PICTURES_PER_THREAD};
+
+/// Memory that a run may take, and whether it is to say beforehand what it will take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Budget {
+    /// Bytes; none: a quarter of the machine's memory.
+    pub bytes: Option<u64>,
+    /// Print the plan on standard error before any work.
+    pub explain: bool,
+}
+
+/// Resident before any Gaussian is: the program, its libraries, its threads' stacks and heaps, messages.
+const PROGRAM: u64 = 14 << 20;
+/// Per thread.
+const PER_THREAD: u64 = 2 << 20;
+/// Resident per tile of an open container: whether it has been verified.
+const PER_TILE: u64 = 1;
+/// Resident per column and block of Gaussians while a container is opened or written: its last constant tile.
+const PER_SLOT: u64 = 80;
+/// Resident per frame of a container that is written: its time stamp, when it finishes once more as bytes.
+const PER_WRITTEN_FRAME: u64 = 16;
+
+/// What the need for memory depends on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Workload {
+    /// N.
+    pub gaussians: u64,
+    /// T; of a stream 0, for nobody knows.
+    pub frames: u64,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: usize,
+    /// Columns that differ between frames.
+    pub varying: Columns,
+    /// What the input keeps in memory.
+    pub input: Residence,
+    /// Different views of the cameras.
+    pub viewpoints: u64,
+    /// Pixels of the largest picture.
+    pub pixels: u64,
+    /// Most pictures of one frame.
+    pub views: u64,
+    /// Pictures of all frames.
+    pub pictures: u64,
+    /// Pictures the cameras name one by one.
+    pub shots: u64,
+    /// Threads to work on.
+    pub threads: u64,
+}
+
+impl Workload {
+    /// Of an open input that nobody looks at.
+    pub fn new(info: &SequenceInfo, input: Residence) -> Workload {
+        Workload {
+            gaussians: info.count as u64,
+            frames: info.times.len() as u64,
+            sh_degree: info.sh_degree,
+            varying: info.varying,
+            input,
+            viewpoints: 0,
+            pixels: 0,
+            views: 0,
+            pictures: 0,
+            shots: 0,
+            threads: rayon::current_num_threads() as u64,
+        }
+    }
+
+    /// The same as the cameras of `schedule`, of `rig`, see it.
+    pub fn seen(self, rig: &Rig, schedule: &Schedule) -> Workload {
+        let views = schedule.frames.iter().map(Vec::len).max().unwrap_or(0);
+        self.seen_by(rig, views as u64, schedule.pairs() as u64)
+    }
+
+    fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
+        let mut numbers: Vec<u32> = rig.shots.iter().map(|shot| shot.view).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        let pixels = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
+        Workload {
+            pixels: rig.cameras.iter().map(pixels).max().unwrap_or(0),
+            views,
+            viewpoints: numbers.len() as u64,
+            pictures: pairs,
+            shots: rig.shots.len() as u64,
+            ..self
+        }
+    }
+
+    /// Of a stream of which only the header has arrived, as `rig` will see it once it is packed into tiles of
+    /// `frame_block` frames.
+    pub fn of_stream(header: &StreamHeader, frame_block: usize, rig: &Rig) -> Workload {
+        let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
+        times.sort_by(f64::total_cmp);
+        let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
+        let views = (together + rig.shots.len() - times.len()) as u64;
+        let StreamHeader { count, sh_degree, varying } = *header;
+        let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
+        Workload::new(&info, Residence::of_tiles(frame_block as u64)).seen_by(rig, views, 0)
+    }
+
+    /// Bytes of one Gaussian's columns `of`.
+    pub fn state(&self, of: Columns) -> u64 {
+        state_bytes(self.sh_degree, of)
+    }
+
+    /// Bytes per Gaussian of the frames that a reader of the columns `of` holds: one frame is not worth holding, and
+    /// a whole block takes two frames more.
+    pub fn held(&self, limits: &Limits, of: Columns) -> u64 {
+        let frames = match (limits.frames_held as u64).min(self.input.frame_block) {
+            0..=1 => 0,
+            some => some + 2,
+        };
+        frames * self.state(of & self.varying)
+    }
+
+    /// One block of each thread on its way from a reader, and what decoding it takes.
+    pub fn arriving(&self) -> Part {
+        let block = BLOCK as u64 * (self.state(Columns::ALL) + self.input.reader);
+        ("arriving", self.decoding() + self.threads * block)
+    }
+
+    /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
+    fn decoding(&self) -> u64 {
+        let Residence { frame_block, gaussian_block, .. } = self.input;
+        let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
+        let largest = Columns::ALL.iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
+        if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
+    }
+
+    /// Looking at pictures: states of the columns `of` that lie ready, what is on its way to them, and pictures in
+    /// the making with `sums` bytes per Gaussian. Per Gaussian, and however many there are.
+    pub fn looking(&self, limits: &Limits, of: Columns, sums: u64) -> (Vec<Part>, Vec<Part>) {
+        let pictures = self.threads.min(limits.pictures_together as u64);
+        let ready = PICTURES_PER_THREAD as u64 * self.threads;
+        let per_gaussian = vec![
+            ("states", ready.min(limits.frames_together as u64) * self.state(of)),
+            ("readers", self.input.reader),
+            ("held", self.held(limits, of)),
+            ("pictures", pictures * (render::BYTES_PER_VISIBLE as u64 + sums) + sums),
+        ];
+        let of_pictures = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
+        (per_gaussian, vec![self.arriving(), ("pictures", of_pictures)])
+    }
+
+    /// Buffers of a container, or of a frame's file, in the making.
+    pub fn writing(&self) -> Vec<Part> {
+        let varying = FRAME_BLOCK as u64 * self.state(self.varying);
+        let block = GAUSSIAN_BLOCK as u64 * (2 * self.state(Columns::ALL) + 3 * varying + self.input.reader);
+        vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
+    }
+
+    /// Full reads of the frames that looking at `pictures` pictures, one after the other in time, takes at most.
+    pub fn sampled(&self, pictures: usize) -> f64 {
+        (pictures as u64).min(self.pictures) as f64 / self.frames.max(1) as f64
+    }
+
+    /// The whole input as it is known and seen, whatever its Gaussians hold.
+    fn known(&self) -> u64 {
+        let index = match self.input.frame_block {
+            0 => 0,
+            frames => {
+                let slots = self.input.columns * self.gaussians.div_ceil(self.input.gaussian_block);
+                slots * (PER_SLOT + PER_TILE * self.frames.div_ceil(frames))
+            }
+        };
+        // Pictures are listed by frame, and while they are gone through once more.
+        index + self.input.fixed + 112 * self.frames + 24 * self.pictures + 160 * self.shots
+    }
+
+    /// What a container knows while it is written.
+    fn written_index(&self) -> u64 {
+        let slots = Columns::ALL.iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
+        PER_SLOT * slots + PER_WRITTEN_FRAME * self.frames
+    }
+}
+
+/// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
+pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
+
+/// A named part of a stage's memory.
+pub type Part = (&'static str, u64);
+
+/// What a stage needs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Need {
+    /// The stage's name.
+    pub stage: &'static str,
+    /// Full reads of the frames, at most.
+    pub reads: f64,
+    /// Bytes per Gaussian.
+    pub per_gaussian: Vec<Part>,
+    /// Bytes, however many Gaussians there are.
+    pub fixed: Vec<Part>,
+}
+
+impl Need {
+    fn of_gaussian(&self) -> u64 {
+        self.per_gaussian.iter().map(|&(_, bytes)| bytes).sum()
+    }
+
+    fn bytes(&self, work: &Workload) -> u64 {
+        let fixed: u64 = self.fixed.iter().map(|&(_, bytes)| bytes).sum();
+        work.gaussians.saturating_mul(work.input.per_gaussian + self.of_gaussian()).saturating_add(fixed)
+    }
+}
+
+/// Every limit halved, first those that cost most time.
+const HALVINGS: [fn(&Limits) -> Limits; 6] = [
+    |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
+    |limits| Limits { sights_together: limits.sights_together / 2, ..*limits },
+    |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
+    |limits| Limits { gaussians_together: (limits.gaussians_together / 2).max(GAUSSIAN_BLOCK), ..*limits },
+    |limits| Limits { frames_together: limits.frames_together.div_ceil(2), ..*limits },
+    |limits| Limits { frames_held: limits.frames_held.div_ceil(2), ..*limits },
+];
+
+/// How a run keeps to its budget.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    work: Workload,
+    budget: u64,
+    /// What stages keep at a time.
+    pub limits: Limits,
+    needs: Vec<Need>,
+}
+
+impl Plan {
+    /// The fastest limits by which every stage that `needs` names fits into `budget`; says so if that is asked for.
+    ///
+    /// # Errors
+    /// A budget that no limits fit; the error names the least that works.
+    pub fn fit(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<Plan> {
+        let plan = Self::closest(work, budget.limit(), needs);
+        if budget.explain {
+            eprint!("{}", plan.text());
+        }
+        if plan.excess() > 0 { Err(plan.refusal(budget)) } else { Ok(plan) }
+    }
+
+    /// The fastest plan that fits into `budget`, else the one that takes least.
+    pub(crate) fn closest(work: Workload, budget: u64, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Plan {
+        let mut limits = Limits {
+            frames_held: FRAME_BLOCK,
+            frames_together: PICTURES_PER_THREAD * work.threads as usize,
+            pictures_together: work.threads as usize,
+            sights_together: usize::MAX,
+            gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
+            pairs_together: 8 * work.gaussians.max(1) as usize,
+            rows_aside: false,
+        };
+        // A model is read whole before anything else.
+        let opening = vec![("file", work.input.opening)];
+        let read = Need { stage: "read", reads: 0.0, per_gaussian: opening, fixed: Vec::new() };
+        let all = |limits: &Limits| {
+            let first = Some(read.clone()).filter(|_| work.input.opening > 0);
+            first.into_iter().chain(needs(&work, limits)).collect::<Vec<Need>>()
+        };
+        // Costs next to no time.
+        let [excess, less] = [false, true].map(|rows_aside| {
+            let limits = Limits { rows_aside, ..limits };
+            Plan { work, budget, limits, needs: all(&limits) }.excess()
+        });
+        limits.rows_aside = less < excess;
+        loop {
+            let plan = Plan { work, budget, limits, needs: all(&limits) };
+            let excess = plan.excess();
+            let saved = |other: &Limits| excess - Plan { limits: *other, needs: all(other), ..plan.clone() }.excess();
+            let halved = HALVINGS.iter().filter_map(|halve| {
+                let smaller = std::iter::successors(Some(limits), |limits| Some(halve(limits)));
+                smaller.take(usize::BITS as usize).find(|other| saved(other) > 0)
+            });
+            // Of equals the last one: what is cheapest to do without.
+            match halved.max_by_key(saved) {
+                Some(other) => limits = other,
+                None => return plan,
+            }
+        }
+    }
+
+    /// Bytes resident at most.
+    pub fn peak(&self) -> u64 {
+        self.base() + self.needs.iter().map(|need| need.bytes(&self.work)).max().unwrap_or(0)
+    }
+
+    fn base(&self) -> u64 {
+        PROGRAM + PER_THREAD * self.work.threads + self.work.known()
+    }
+
+    /// Bytes by which stages pass the budget, all together.
+    fn excess(&self) -> u64 {
+        let room = self.budget.saturating_sub(self.base());
+        let beyond = self.needs.iter().map(|need| need.bytes(&self.work).saturating_sub(room));
+        beyond.sum::<u64>() + self.base().saturating_sub(self.budget)
+    }
+
+    fn refusal(&self, budget: Budget) -> Error {
+        let largest = self.needs.iter().max_by_key(|need| need.bytes(&self.work)).map_or("", |need| need.stage);
+        // Rounded up to what a person would write.
+        let least = self.peak().div_ceil(1 << 20);
+        let default = if budget.bytes.is_none() { " (a quarter of the machine's)" } else { "" };
+        Error::usage(format!(
+            "--memory {}{default}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
+             give it that, or fewer --threads; --explain shows what takes how much",
+            size(self.budget),
+            self.work.gaussians
+        ))
+    }
+
+    /// The plan for a person: stages with their parts, limits, reads.
+    pub fn text(&self) -> String {
+        let Plan { work, limits, .. } = self;
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            out,
+            "memory: at most {} of {} for {} Gaussians x {} frames of {} pictures, {} threads",
+            size(self.peak()),
+            size(self.budget),
+            work.gaussians,
+            work.frames,
+            work.pictures,
+            work.threads
+        );
+        let _ = writeln!(
+            out,
+            "  = {} program and threads + {} frames, cameras, index + the largest stage:",
+            size(self.base() - work.known()),
+            size(work.known())
+        );
+        for need in &self.needs {
+            let parts = |parts: &[Part], unit: fn(u64) -> String| -> String {
+                let some = parts.iter().filter(|&&(_, bytes)| bytes > 0);
+                some.map(|&(name, bytes)| format!("{} {name}", unit(bytes))).collect::<Vec<_>>().join(" + ")
+            };
+            let input = [("input", work.input.per_gaussian)];
+            let per_gaussian = [&input[..], &need.per_gaussian].concat();
+            let _ = writeln!(
+                out,
+                "  {:<8} {:>11} = N x {} ({}) + {}",
+                need.stage,
+                size(need.bytes(work)),
+                work.input.per_gaussian + need.of_gaussian(),
+                parts(&per_gaussian, |bytes| bytes.to_string()),
+                parts(&need.fixed, size)
+            );
+        }
+        let _ = writeln!(
+            out,
+            "  at a time: {} frames held by readers, {} frames ready, {} pictures, {} pairs measured",
+            limits.frames_held.min(work.input.frame_block as usize),
+            limits.frames_together,
+            limits.pictures_together,
+            limits.pairs_together
+        );
+        let reads = self.needs.iter().filter(|need| need.reads > 0.0);
+        let named: Vec<String> = reads.map(|need| format!("{:.2} {}", need.reads, need.stage)).collect();
+        let sum: f64 = self.needs.iter().map(|need| need.reads).sum();
+        let _ = writeln!(out, "full reads of the frames: at most {sum:.2} ({})", named.join(" + "));
+        out
+    }
+}
+
+impl Budget {
+    /// Bytes that the run may take on this machine.
+    fn limit(self) -> u64 {
+        self.bytes.or_else(|| Some(machine_memory()? / 4)).unwrap_or(u64::MAX)
+    }
+}
+
+/// What this process has taken so far, for a person; none where the system does not say.
+pub fn taken() -> Option<String> {
+    peak_memory_bytes().map(|bytes| format!("memory: at most {} taken", size(bytes)))
+}
+
+/// Memory of the machine or of the group of processes this one is confined to, bytes; none where the system does
+/// not say.
+fn machine_memory() -> Option<u64> {
+    let info = fs::read_to_string("/proc/meminfo").ok()?;
+    let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let machine = line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024;
+    let group = fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|max| max.trim().parse().ok());
+    Some(group.map_or(machine, |group: u64| group.min(machine)))
+}
+
+/// Largest resident memory of this process so far, mapped pages included (`VmHWM`); none where the
+/// system does not say.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+/// Lets [`peak_memory_bytes`] begin anew from what is resident now; false where the system has no such thing.
+pub fn reset_peak_memory() -> bool {
+    fs::write("/proc/self/clear_refs", "5").is_ok()
+}
+
+fn size(bytes: u64) -> String {
+    ByteSize(bytes).display().iec().to_string()
+}

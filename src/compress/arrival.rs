@@ -1,0 +1,215 @@
+//! Opening a scene that is to be measured; a stream is measured as it arrives, so that it is read once.
+//!
+//! Memory of a stream: what packing it takes ([`crate::families::stream`]) and, when measuring, the accumulators of all
+//! Gaussians ([`crate::stats::BYTES_PER_GAUSSIAN`] each) and what [`Looking`] needs.
+//!
+//! What only the end of the stream tells (time span, number of frames) is assumed meanwhile: even frames, and
+//! pictures taken at exactly the times that arrive. Where that proves wrong the packed frames are
+//! measured instead: the result is the same either way.
+
+use std::cell::OnceCell;
+use std::time::Instant;
+
+use glam::DVec3;
+
+use super::journal::Journal;
+use super::measure::{Measure, Measured, Outlook, Stages};
+use crate::budget::{Budget, Plan, Workload};
+use crate::emit::kind::OutputKind;
+use crate::error::Result;
+use crate::families::stream::{AHEAD, Streamed, frame_block};
+use crate::ingest::cameras;
+use crate::model::{Camera, Rig, Split};
+use crate::pass::{FrameSource, Reads};
+use crate::recipe;
+use crate::scene::{InputOptions, Opened, Scene, load_cameras, open_scene, open_stream, receiving, scene_of};
+use crate::stats::{RobustBox, ScanPlan};
+use crate::stream::{HeldFrames, Looking, RunningScan, Sampler};
+
+/// Opens a scene to be measured, with the limits of its budget; `plan` says what is to be done with such a scene. A
+/// stream is measured as it arrives, see [`receive_measured`]; the statistics come back then.
+///
+/// # Errors
+/// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
+pub fn open_to_measure<S: Stages>(
+    options: &InputOptions,
+    plan: impl FnOnce(Outlook) -> Result<S>,
+    journal: &mut Journal,
+) -> Result<(Scene, S, Option<Measured>)> {
+    let start = Instant::now();
+    if options.is_stream() {
+        let found = receive_measured(options, plan)?;
+        journal.opened("receive", start, found.0.source().info().count, Reads::default());
+        return Ok(found);
+    }
+    let mut scene = open_scene(options)?;
+    let stages = plan(Outlook::of(&scene))?;
+    scene.keep_to(options.memory, |work, limits| stages.needs(work, limits))?;
+    journal.opened("read", start, scene.source().info().count, scene.source().reads());
+    Ok((scene, stages, None))
+}
+
+/// Packs a stream into a scratch container and measures it meanwhile, if there is memory for that beside the frames
+/// held. Gives the statistics if what was assumed held.
+fn receive_measured<S: Stages>(
+    options: &InputOptions,
+    plan: impl FnOnce(Outlook) -> Result<S>,
+) -> Result<(Scene, S, Option<Measured>)> {
+    let loaded = load_cameras(options, options.cameras.as_deref())?;
+    let has_cameras = loaded.is_some();
+    let stream = open_stream(options)?;
+    let count = stream.header().count;
+    let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OutputKind::PlySequence })?;
+    let Measure { scan, visible, .. } = stages.measure();
+    let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
+    let block = frame_block(stream.header());
+    let work = Workload::of_stream(stream.header(), block, &of_rig);
+    let held = (block + AHEAD) as u64;
+    let fit = |explain: bool, measuring: Option<bool>| {
+        Plan::fit(work, Budget { explain, ..options.memory }, |work, limits| {
+            let mut all = vec![receiving(work, limits, held, measuring)];
+            all.extend(stages.needs(work, limits));
+            all
+        })
+    };
+    let measures = fit(false, Some(visible.is_some())).is_ok();
+    let memory = fit(options.memory.explain, measures.then_some(visible.is_some()))?;
+    // Without cameras the rig stands around the first frame, and everything else around the rig.
+    let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
+    if let Some(loaded) = loaded {
+        let _ = rig.set(loaded);
+    }
+    let mut measuring: Option<Measuring<'_>> = None;
+    let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| {
+        let measuring = match &mut measuring {
+            Some(measuring) => measuring,
+            none if measures => {
+                let rig: &Rig = rig.get_or_init(|| rig_around(held));
+                let plan = plan_of_scan.get_or_init(|| ScanPlan::arriving(&scan.recipe, &rig.cameras));
+                let looking = visible.as_ref().map(|_| Looking::new(count, scan.recipe.pixel_stride, memory.limits));
+                none.insert(Measuring::new(count, rig, options.split, plan, &scan.recipe, looking))
+            }
+            _ => return Ok(()),
+        };
+        measuring.add(held)
+    })?;
+    let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
+    let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
+    let mut scene = Scene { limits: memory.limits, ..scene_of(opened, options)? };
+    // Now that the frames are counted; what they add is small, and no reason to throw away what has arrived.
+    let counted = Budget { explain: false, ..options.memory };
+    if let Ok(plan) = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits)) {
+        scene.limits = plan.limits;
+    }
+    let mut arrived = None;
+    if let Some(measuring) = measuring {
+        let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
+        match measuring.wrong(&complete, &scene) {
+            None => arrived = Some(measuring.finish(&complete)),
+            Some(why) => {
+                let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
+                scene.notes.push(note);
+            }
+        }
+    }
+    Ok((scene, stages, arrived))
+}
+
+/// A virtual rig around the first of the frames.
+fn rig_around(held: &HeldFrames) -> Rig {
+    let bounds = RobustBox::of(held.position(0));
+    cameras::virtual_rig(bounds.middle, bounds.extent())
+}
+
+/// Statistics of the frames so far.
+struct Measuring<'a> {
+    plan: &'a ScanPlan,
+    cameras: &'a [Camera],
+    assumed: AssumedTimes<'a>,
+    /// For every frame its (view number, camera index) pairs, as assumed.
+    frames: Vec<Vec<(u32, u32)>>,
+    scan: RunningScan<'a>,
+    looking: Option<(Sampler, Looking)>,
+}
+
+impl<'a> Measuring<'a> {
+    fn new(
+        count: usize,
+        rig: &'a Rig,
+        split: Option<Split>,
+        plan: &'a ScanPlan,
+        scan: &recipe::Scan,
+        looking: Option<Looking>,
+    ) -> Self {
+        Measuring {
+            plan,
+            cameras: &rig.cameras,
+            assumed: AssumedTimes::new(rig, split),
+            frames: Vec::new(),
+            scan: RunningScan::new(count, plan),
+            looking: looking.map(|looking| (Sampler::new(scan), looking)),
+        }
+    }
+
+    fn add(&mut self, held: &HeldFrames) -> Result<()> {
+        let first = self.frames.len();
+        self.frames.extend(held.info().times.iter().map(|&time| self.assumed.at(time)));
+        let new = &self.frames[first..];
+        let cameras: Vec<Vec<&Camera>> =
+            new.iter().map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect()).collect();
+        self.scan.add(held, &cameras)?;
+        if let Some((sampler, looking)) = &mut self.looking {
+            let taken = new.iter().map(|views| sampler.next(views, self.cameras)).enumerate();
+            let pictures: Vec<(usize, Vec<&Camera>)> = taken.filter(|(_, cameras)| !cameras.is_empty()).collect();
+            looking.add(held, &pictures, |_| ())?;
+        }
+        Ok(())
+    }
+
+    /// What was assumed wrongly, if anything was.
+    fn wrong(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
+        if !complete.finishes(self.plan) {
+            return Some("the frames are not evenly spaced in time");
+        }
+        (self.frames != scene.schedule.frames).then_some("the cameras' times are not exactly those of the frames")
+    }
+
+    fn finish(self, complete: &ScanPlan) -> Measured {
+        Measured { scanned: self.scan.finish(complete), seen: self.looking.map(|(_, looking)| looking.finish()) }
+    }
+}
+
+/// Which cameras see a frame, while the other frames are unknown: those whose pictures were taken at its very
+/// time, and those without a time.
+struct AssumedTimes<'a> {
+    rig: &'a Rig,
+    /// Places in the rig of the pictures of the split, by time, then place.
+    timed: Vec<(f64, usize)>,
+    timeless: Vec<usize>,
+    tolerance: f64,
+}
+
+impl<'a> AssumedTimes<'a> {
+    fn new(rig: &'a Rig, split: Option<Split>) -> Self {
+        let (mut timed, mut timeless) = (Vec::new(), Vec::new());
+        for (place, shot) in rig.shots.iter().enumerate() {
+            if split.is_none_or(|split| split == shot.split) {
+                match shot.time {
+                    Some(time) => timed.push((time, place)),
+                    None => timeless.push(place),
+                }
+            }
+        }
+        timed.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
+    }
+
+    /// (View number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
+    fn at(&self, time: f64) -> Vec<(u32, u32)> {
+        let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
+        let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);
+        let mut places: Vec<usize> = near.map(|&(_, place)| place).chain(self.timeless.iter().copied()).collect();
+        places.sort_unstable();
+        places.iter().map(|&place| (self.rig.shots[place].view, self.rig.shots[place].camera)).collect()
+    }
+}

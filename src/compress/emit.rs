@@ -1,0 +1,194 @@
+//! Stage `emit`: the smaller model and, beside it, the recipe, the index map and the summary.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::choose::CLUSTERED;
+use super::journal::Journal;
+use super::request::Request;
+use super::score::scored;
+use super::summary::Summary;
+use crate::budget::{Need, Workload};
+use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::container::FRAME_BLOCK;
+use crate::emit::index_map::write_index_map;
+use crate::emit::kind::OutputKind;
+use crate::error::{Error, Result};
+use crate::families::Family;
+use crate::model::Columns;
+use crate::plan::Limits;
+use crate::reduction::Reduction;
+use crate::scene::Scene;
+
+/// What the stage is called.
+const NAME: &str = "emit";
+
+/// File beside every result: all parameters it was made with.
+pub const RECIPE: &str = "recipe.toml";
+/// File beside every result: where each Gaussian of the input went.
+pub const INDEX_MAP: &str = "index_map.npy";
+
+/// Path of a file beside the result: inside a folder, next to a file and named after it.
+pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
+    if is_folder {
+        return result.join(name);
+    }
+    let mut file = result.file_name().unwrap_or_default().to_owned();
+    file.push(".");
+    file.push(name);
+    result.with_file_name(file)
+}
+
+/// The writing of a run.
+#[derive(Debug, Clone)]
+pub struct Emit {
+    /// What is written.
+    pub kind: OutputKind,
+    /// Whether there may be proxies.
+    pub merges: bool,
+    output: PathBuf,
+    overwrite: bool,
+}
+
+impl Emit {
+    /// As `request` asks, of an input whose own kind of result is `own`.
+    pub fn new(request: &Request, own: OutputKind, merges: bool) -> Emit {
+        let kind = OutputKind::of(&request.output, request.kind, own);
+        Emit { kind, merges, output: request.output.clone(), overwrite: request.overwrite }
+    }
+
+    /// Confirms, before any work, that the result and what goes beside it can be written by a run that reads `inputs`.
+    ///
+    /// # Errors
+    /// Outputs that are there already, or cannot be; see [`check_target`].
+    pub fn check(&self, inputs: &[&Path]) -> Result<()> {
+        if self.kind.is_folder() {
+            return check_target(&self.output, Kind::Folder, inputs, self.overwrite);
+        }
+        check_target(&self.output, Kind::File, inputs, self.overwrite)?;
+        for name in [RECIPE, INDEX_MAP, MARKER] {
+            check_target(&beside(&self.output, false, name), Kind::File, inputs, self.overwrite)?;
+        }
+        Ok(())
+    }
+
+    /// What is left, and buffers of what is written.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let whole = work.state(Columns::ALL);
+        let is_solved = work.input.reduced > 0;
+        let mut per_gaussian = [scored(limits), vec![("kept", 40), ("result", work.input.reduced)]].concat();
+        let mut fixed = work.writing();
+        match self.kind {
+            OutputKind::Gseq if self.merges && !is_solved => {
+                // Of each that is merged and of each that comes of it the frames of a block, and a state.
+                let mixed = Columns::ALL.without(Columns::SH) | work.varying;
+                let waiting = work.held(&Limits::NONE, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
+                let together = (limits.gaussians_together as u64).min(work.gaussians);
+                per_gaussian.push(("members", CLUSTERED));
+                fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
+            }
+            OutputKind::Gseq => (),
+            // A file's rows and the proxies among them for each thread, or one state and what it is made of.
+            _ => {
+                per_gaussian.push(("files", work.threads * (work.input.file + 2 * whole)));
+                per_gaussian.push(("members", CLUSTERED));
+            }
+        }
+        Need { stage: NAME, reads: if is_solved { 0.0 } else { 1.0 }, per_gaussian, fixed }
+    }
+
+    /// Writes the result and what goes beside it; everything appears under its name at the end, a file
+    /// before its companions and the summary, which says that all is there, last. `summarise` is told the bytes of the
+    /// result.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, a failed write; nothing is left behind then.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        reduction: &Reduction,
+        recipe: &str,
+        mut journal: Journal,
+        summarise: impl FnOnce(Journal, u64) -> Summary,
+    ) -> Result<Summary> {
+        let map = reduction.index_map(scene.source().info().count);
+        let mut write = |path: &Path| -> Result<u64> {
+            journal.stage(NAME, reduction.len(), scene.source(), |journal| {
+                let notes = scene.input.write(reduction, self.kind, path, scene.limits.gaussians_together)?;
+                journal.notes.extend(notes);
+                Ok((bytes_below(path)?, reduction.len()))
+            })
+        };
+        let target = self.output.as_path();
+        if self.kind.is_folder() {
+            let staged = StagedFolder::new(target, self.overwrite)?;
+            let bytes = write(staged.path())?;
+            write_text(&staged.path().join(RECIPE), recipe)?;
+            write_index_map(&map, &staged.path().join(INDEX_MAP))?;
+            let summary = summarise(journal, bytes);
+            write_text(&staged.path().join(MARKER), &summary.json())?;
+            staged.commit()?;
+            return Ok(summary);
+        }
+        let staged = StagedFile::new(target, self.overwrite)?;
+        let companion = |name| StagedFile::new(&beside(target, false, name), self.overwrite);
+        let (recipe_file, index_map, marker) = (companion(RECIPE)?, companion(INDEX_MAP)?, companion(MARKER)?);
+        let bytes = write(staged.path())?;
+        write_text(recipe_file.path(), recipe)?;
+        write_index_map(&map, index_map.path())?;
+        let summary = summarise(journal, bytes);
+        write_text(marker.path(), &summary.json())?;
+        for file in [staged, recipe_file, index_map, marker] {
+            file.commit()?;
+        }
+        Ok(summary)
+    }
+}
+
+/// Writes `reduction` as a result of `kind`, without anything beside it; gives its bytes.
+///
+/// # Errors
+/// Frames that cannot be read, a failed write.
+pub fn write_alone(input: &dyn Family, reduction: &Reduction, kind: OutputKind, path: &Path) -> Result<u64> {
+    if kind.is_folder() {
+        fs::create_dir(path).map_err(Error::io("create", path))?;
+    }
+    input.write(reduction, kind, path, usize::MAX)?;
+    bytes_below(path)
+}
+
+fn write_text(path: &Path, text: &str) -> Result<()> {
+    fs::write(path, text).map_err(Error::io("write", path))
+}
+
+/// Bytes of a file, or of all files below a folder.
+fn bytes_below(path: &Path) -> Result<u64> {
+    let found = fs::metadata(path).map_err(Error::io("read", path))?;
+    if !found.is_dir() {
+        return Ok(found.len());
+    }
+    let entries = fs::read_dir(path).map_err(Error::io("list", path))?;
+    entries.map(|entry| bytes_below(&entry.map_err(Error::io("list", path))?.path())).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_beside_results_of_other_kinds_do_not_collide() {
+        assert_eq!(beside(Path::new("a/small"), true, "summary.json"), Path::new("a/small/summary.json"));
+        assert_eq!(beside(Path::new("a/small.ply"), false, "summary.json"), Path::new("a/small.ply.summary.json"));
+        assert_eq!(beside(Path::new("small.gseq"), false, "summary.json"), Path::new("small.gseq.summary.json"));
+    }
+
+    #[test]
+    fn the_bytes_of_a_folder_are_those_of_all_its_files() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir(folder.path().join("a")).unwrap();
+        fs::write(folder.path().join("a/b"), [0; 7]).unwrap();
+        fs::write(folder.path().join("c"), [0; 5]).unwrap();
+        assert_eq!(bytes_below(folder.path()).unwrap(), 12);
+        assert_eq!(bytes_below(&folder.path().join("c")).unwrap(), 5);
+    }
+}

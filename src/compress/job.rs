@@ -1,0 +1,171 @@
+//! What a run does: which stages, with which parameters, and what is left out and why. Made once, before any work.
+
+use super::choose::Choose;
+use super::emit::Emit;
+use super::ids::parse_ids;
+use super::journal::Journal;
+use super::measure::{Measure, Outlook, Stages};
+use super::merge::Merge;
+use super::prune::Prune;
+use super::refit::Refit;
+use super::request::{Only, Request};
+use super::rounds::Rounds;
+use super::score::UserOverrides;
+use crate::budget::{Need, Workload};
+use crate::error::{Error, Result};
+use crate::plan::Limits;
+use crate::recipe::Coverage;
+
+/// The stages of a run, in their order.
+#[derive(Debug, Clone)]
+pub struct Job {
+    /// From frames to scores.
+    pub measure: Measure,
+    /// Ranks anew as the model shrinks.
+    pub rounds: Option<Rounds>,
+    /// Says how many survive.
+    pub prune: Prune,
+    /// Merges survivors.
+    pub merge: Option<Merge>,
+    /// Lets pictures choose.
+    pub choose: Option<Choose>,
+    /// Recolours what is left.
+    pub refit: Option<Refit>,
+    /// Writes.
+    pub emit: Emit,
+    /// Exact size of the output, if asked for.
+    pub target: Option<usize>,
+    has_cameras: bool,
+}
+
+impl Job {
+    /// The stages that `request` takes.
+    ///
+    /// # Errors
+    /// A recipe out of range; a target or ids that such an input does not have.
+    pub fn new(request: &Request, outlook: Outlook) -> Result<Job> {
+        let Request { recipe, only, .. } = request;
+        recipe.validate().map_err(Error::usage)?;
+        let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
+        let ids =
+            |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, outlook.gaussians));
+        let user =
+            UserOverrides { keep: ids(&request.keep_ids)?, drop: ids(&request.drop_ids)?, keep_box: request.keep_box };
+        let measure = Measure::new(recipe, outlook.has_cameras, user);
+        let looks = measure.visible.is_some();
+        let prunes = *only != Only::Merge;
+        let merges = *only != Only::Prune && !recipe.merge.passes.is_empty();
+        let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
+        let choose =
+            || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
+        Ok(Job {
+            rounds: Rounds::of(&recipe.select).filter(|_| looks && prunes),
+            prune: Prune { prunes, merges, target },
+            merge: merges.then(merge),
+            choose: (looks && prunes && recipe.select.choose_by_views).then(choose),
+            refit: Refit::of(&recipe.refit).filter(|_| looks),
+            emit: Emit::new(request, outlook.own_output, merges),
+            measure,
+            target,
+            has_cameras: outlook.has_cameras,
+        })
+    }
+
+    /// Writes down the stages that the request leaves out.
+    pub fn write_down(&self, request: &Request, journal: &mut Journal) {
+        if !self.prune.prunes {
+            journal.leave_out("pruning", "--merge-only");
+        }
+        if self.merge.is_none() {
+            let why = if request.only == Only::Prune { "--prune-only" } else { "the recipe has no merge pass" };
+            journal.leave_out("merging, and its pass over the frames", why);
+        }
+        if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
+            let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
+            journal.leave_out("visible coverage", why);
+        }
+    }
+}
+
+impl Stages for Job {
+    fn measure(&self) -> &Measure {
+        &self.measure
+    }
+
+    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need> {
+        let mut needs = self.measure.needs(work, limits);
+        needs.extend(self.rounds.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.refit.as_ref().map(|stage| stage.need(work, limits)));
+        needs.push(self.emit.need(work, limits));
+        needs
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::budget::{Budget, Plan};
+    use crate::compress::tests::work;
+    use crate::emit::kind::OutputKind;
+    use crate::recipe::Recipe;
+    use crate::scene::InputOptions;
+
+    const OUTLOOK: Outlook = Outlook { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
+
+    fn request(recipe: Recipe) -> Request {
+        Request::new(InputOptions::default(), "out.gseq".into(), recipe)
+    }
+
+    fn budget(bytes: u64) -> Budget {
+        Budget { bytes: Some(bytes), explain: false }
+    }
+
+    /// Everything compressing does under `preset`, colours fitted too.
+    fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<Need> {
+        let mut recipe = Recipe::preset(preset).unwrap();
+        recipe.refit.refit_pictures = 36;
+        let job = Job::new(&request(recipe), OUTLOOK).unwrap();
+        move |work, limits| job.needs(work, limits)
+    }
+
+    #[test]
+    fn every_plan_keeps_to_its_budget_down_to_the_least_and_no_further() {
+        for preset in ["default", "strong"] {
+            let least = Plan::closest(work(200_000), 1, everything(preset)).peak();
+            let mut before = 0;
+            for bytes in [least, least + (8 << 20), 2 * least, 4 * least, 64 * least] {
+                let plan = Plan::fit(work(200_000), budget(bytes), everything(preset)).unwrap();
+                assert!((before..=bytes).contains(&plan.peak()), "{bytes}: {}", plan.text());
+                before = plan.peak();
+            }
+            let message = Plan::fit(work(200_000), budget(least - 1), everything(preset)).unwrap_err().to_string();
+            assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
+        }
+    }
+
+    #[test]
+    fn ten_times_the_gaussians_take_ten_times_the_stated_bytes_and_ten_times_the_frames_next_to_nothing() {
+        let least = |work: Workload| Plan::closest(work, 1, everything("default"));
+        let peaks = [100_000, 1_000_000, 1_900_000].map(|count| least(work(count)).peak());
+        let (first, second) = (peaks[1] - peaks[0], peaks[2] - peaks[1]);
+        assert!(first.abs_diff(second) <= first / 1000, "not linear: {peaks:?}");
+        let (few, longer) = (least(work(100_000)), least(Workload { frames: 6000, ..work(100_000) }));
+        assert!(longer.peak() as f64 / few.peak() as f64 <= 1.05, "{} {}", longer.text(), few.text());
+    }
+
+    #[test]
+    fn what_a_recipe_does_not_do_takes_nothing_and_is_named() {
+        let mut recipe = Recipe::preset("paper").unwrap();
+        recipe.merge.passes.clear();
+        let request = request(recipe);
+        let job = Job::new(&request, OUTLOOK).unwrap();
+        let needs = job.needs(&work(1000), &Limits::NONE);
+        assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
+        let mut journal = Journal::default();
+        job.write_down(&request, &mut journal);
+        assert_eq!(journal.left_out.len(), 1);
+        assert_eq!(journal.left_out[0].why, "the recipe has no merge pass");
+    }
+}

@@ -1,0 +1,61 @@
+//! What happens in a run, written down where it happens: stages with their time, memory and reads, what was left out
+//! and why, and notes.
+
+use std::time::Instant;
+
+use super::summary::{LeftOut, Stage};
+use crate::budget::peak_memory_bytes;
+use crate::error::Result;
+use crate::pass::{FrameSource, Reads};
+
+/// The record of a run so far.
+#[derive(Debug, Default)]
+pub struct Journal {
+    /// Everything done, in order.
+    pub stages: Vec<Stage>,
+    /// What the scene did not need.
+    pub left_out: Vec<LeftOut>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+impl Journal {
+    /// Runs `work` as a stage that reads `source`; it gives its result and the number of Gaussians that left it.
+    ///
+    /// # Errors
+    /// Those of `work`; nothing is written down then.
+    pub fn stage<T>(
+        &mut self,
+        name: &'static str,
+        gaussians_in: usize,
+        source: &dyn FrameSource,
+        work: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
+    ) -> Result<T> {
+        let (start, before) = (Instant::now(), source.reads());
+        let (value, gaussians_out) = work(self)?;
+        let reads = source.reads() - before;
+        self.add(name, gaussians_in, gaussians_out, start, reads);
+        Ok(value)
+    }
+
+    /// Writes down that opening the input, begun at `start`, gave `gaussians` Gaussians and read so much.
+    pub fn opened(&mut self, name: &'static str, start: Instant, gaussians: usize, reads: Reads) {
+        self.add(name, 0, gaussians, start, reads);
+    }
+
+    /// Writes down what was not done, and why not.
+    pub fn leave_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
+        self.left_out.push(LeftOut { what: what.into(), why: why.into() });
+    }
+
+    fn add(&mut self, name: &str, gaussians_in: usize, gaussians_out: usize, start: Instant, reads: Reads) {
+        self.stages.push(Stage {
+            name: name.to_owned(),
+            gaussians_in,
+            gaussians_out,
+            reads,
+            seconds: start.elapsed().as_secs_f64(),
+            peak_memory_bytes: peak_memory_bytes(),
+        });
+    }
+}

@@ -1,0 +1,107 @@
+//! From frames to a selection: the stages `scan`, `visible` and `score`, which `score` and `report` run too.
+
+use super::journal::Journal;
+use super::scan::Scan;
+use super::score::{Score, Scored, UserOverrides};
+use super::visible::Visible;
+use crate::budget::{Need, Workload};
+use crate::emit::kind::OutputKind;
+use crate::error::Result;
+use crate::plan::Limits;
+use crate::recipe::Recipe;
+use crate::scene::Scene;
+use crate::stream::{Scanned, Seen};
+
+/// What is known of a scene before its frames are read.
+#[derive(Debug, Clone, Copy)]
+pub struct Outlook {
+    /// N.
+    pub gaussians: usize,
+    /// Whether the cameras are the scene's own, not a virtual rig.
+    pub has_cameras: bool,
+    /// The kind of result to which neither the user nor its name gives one.
+    pub own_output: OutputKind,
+}
+
+impl Outlook {
+    /// Of an open scene.
+    pub fn of(scene: &Scene) -> Outlook {
+        Outlook {
+            gaussians: scene.source().info().count,
+            has_cameras: scene.has_cameras,
+            own_output: scene.input.own_output(),
+        }
+    }
+}
+
+/// What is done with a scene that begins with measuring it.
+pub trait Stages {
+    /// The stages that measure.
+    fn measure(&self) -> &Measure;
+
+    /// What all its stages need.
+    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need>;
+}
+
+/// The stages that measure and score.
+#[derive(Debug, Clone)]
+pub struct Measure {
+    /// Looks at every frame.
+    pub scan: Scan,
+    /// Looks at pictures, where C is measured by them.
+    pub visible: Option<Visible>,
+    /// Scores and selects.
+    pub score: Score,
+}
+
+/// What the frames say before anything is scored.
+pub struct Measured {
+    /// Statistics of every Gaussian.
+    pub scanned: Scanned,
+    /// What the pictures show of each, where that is asked for.
+    pub seen: Option<Seen>,
+}
+
+impl Measure {
+    /// As `recipe` has it; `has_cameras`: the scene has cameras of its own.
+    pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
+        Measure {
+            scan: Scan { recipe: recipe.scan.clone() },
+            visible: Visible::of(&recipe.scan, has_cameras),
+            score: Score {
+                snap_noise: recipe.scan.snap_noise,
+                non_finite: recipe.scan.non_finite,
+                score: recipe.score.clone(),
+                select: recipe.select.clone(),
+                user,
+            },
+        }
+    }
+
+    /// Measures, unless the scene was measured as it arrived, and scores.
+    ///
+    /// # Errors
+    /// Those of the stages.
+    pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
+        let Measured { scanned, seen } = match arrived {
+            Some(measured) => measured,
+            None => Measured {
+                scanned: self.scan.run(scene, journal)?,
+                seen: self.visible.as_ref().map(|visible| visible.run(scene, journal)).transpose()?,
+            },
+        };
+        self.score.run(scene, scanned, seen, journal)
+    }
+}
+
+impl Stages for Measure {
+    fn measure(&self) -> &Measure {
+        self
+    }
+
+    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need> {
+        let visible = self.visible.as_ref().map(|visible| visible.need(work, limits));
+        let scan = self.scan.need(work, limits);
+        [Some(scan), visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()
+    }
+}

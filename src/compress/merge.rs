@@ -1,0 +1,306 @@
+//! Stage `merge`: which survivors become one, and what becomes of them.
+//!
+//! Memory, of every Gaussian that may survive [`BYTES_PER_SURVIVOR`], what [`crate::merge`] says of
+//! survivors and candidate pairs, and what [`crate::stream::motion`] says of the pairs it measures together.
+
+use std::borrow::Cow;
+
+use super::journal::Journal;
+use super::score::{Ranked, Scored, scored};
+use super::summary::MergeSummary;
+use crate::budget::{Need, Workload};
+use crate::error::{Error, Result};
+use crate::families::trajectories::state_bytes;
+use crate::merge::known::KnownPairs;
+use crate::merge::motion::MotionGate;
+use crate::merge::proxy::{Importance, weights};
+use crate::merge::{self, Merged, Survivors};
+use crate::model::{Columns, Gaussians};
+use crate::pass::FrameSource;
+use crate::plan::Limits;
+use crate::recipe;
+use crate::reduction::{Cluster, Reduction};
+use crate::scene::Scene;
+use crate::stream::motion::{self, PairMeter};
+use crate::stream::{BLOCK, gather};
+
+/// What the stage is called.
+const NAME: &str = "merge";
+
+/// Memory of a Gaussian that may survive: its id, its state with base colours only, and whether it may merge. Twice
+/// the ids while merging is tried on some of them.
+const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<bool>();
+
+/// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
+const GATHERED: usize = 16 * BLOCK;
+
+/// The merging of a run.
+#[derive(Debug, Clone)]
+pub struct Merge {
+    /// Tests, passes and how members make up a proxy.
+    pub recipe: recipe::Merge,
+    /// What is life, and what is a step.
+    pub scan: recipe::Scan,
+    /// Whether survivors may be pruned to reach the target.
+    pub prunes: bool,
+    /// Exact size of the output.
+    pub target: Option<usize>,
+}
+
+/// A reduction, and what merging did to get there.
+pub struct Outcome {
+    /// What is left.
+    pub reduction: Reduction,
+    /// Counts of every pass.
+    pub summary: Option<MergeSummary>,
+}
+
+impl Merge {
+    /// What is known of pairs that are measured together and of all that may survive, and the proxies.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let pairs = (merge::BYTES_PER_PAIR + motion::BYTES_PER_PAIR) as u64;
+        // Of the colours the first band; of proxies at most one for every two, before a pass and after it, then with
+        // all colours.
+        let proxies = state_bytes(0, Columns::ALL).max(work.state(Columns::ALL).div_ceil(2));
+        let per_gaussian = vec![
+            // C and Vis are read back.
+            ("importance", if limits.rows_aside { 16 } else { 0 }),
+            ("pool", BYTES_PER_SURVIVOR as u64),
+            ("proxies", proxies),
+            ("survivors", merge::BYTES_PER_SURVIVOR as u64),
+            ("passing", (self.recipe.max_neighbors * merge::BYTES_PER_PASSING) as u64),
+            ("readers", work.input.reader),
+            ("followed", motion::bytes_per_gaussian(limits.frames_held) as u64),
+        ];
+        Need {
+            stage: NAME,
+            reads: 1.0,
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
+        }
+    }
+
+    /// Merges the first `survivors` of a ranking, or, to exactly the target, as many as it takes; solves the proxies.
+    ///
+    /// # Errors
+    /// Frames that cannot be read; a target that merging alone cannot reach.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        ranked: &Ranked,
+        survivors: usize,
+        journal: &mut Journal,
+    ) -> Result<Outcome> {
+        let ranking = &ranked.ranking;
+        journal.stage(NAME, survivors, scene.source(), |_| {
+            let mut trial = Trial::new(scene, scored, self, ranking.take(survivors))?;
+            let mut merged = match self.target {
+                None => trial.merge(&ranking.take(survivors), None)?,
+                Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
+                Some(target) => {
+                    let count = |m| Ok(trial.merge(&ranking.take(m), None)?.reduction.len());
+                    let m = bracket(target, survivors, count)?;
+                    trial.merge_to(&ranking.take(m), target)?
+                }
+            };
+            drop(trial);
+            let Outcome { reduction, summary } = &mut merged;
+            reduction.proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
+            if let Some(summary) = summary {
+                summary.deviation = reduction.proxies.deviation;
+            }
+            let left = reduction.len();
+            Ok((merged, left))
+        })
+    }
+}
+
+/// The largest number m of survivors, up to `all`, that the search finds to merge into at most
+/// `target`; m = `target` always does. Counts grow with m but for small dips, so the bracket closes
+/// by the secant, and stops when what is missing is under a thousandth of the target: merging then
+/// ends early by that much.
+fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
+    let (mut low, mut high) = (target, all);
+    let mut high_count = merged(high)?;
+    if high_count <= target {
+        return Ok(high);
+    }
+    let mut low_count = merged(low)?;
+    while high - low > 1 && target - low_count > target / 1000 {
+        let slope = (target - low_count) as f64 / (high_count - low_count) as f64;
+        // Away from the ends, so that a curved count cannot stall the search.
+        let m = low + ((high - low) as f64 * slope.clamp(0.1, 0.9)) as usize;
+        let m = m.clamp(low + 1, high - 1);
+        let count = merged(m)?;
+        if count <= target {
+            (low, low_count) = (m, count);
+        } else {
+            (high, high_count) = (m, count);
+        }
+    }
+    Ok(low)
+}
+
+/// Everything merging reads, so that it can be tried on many sets of survivors.
+struct Trial<'a> {
+    scored: &'a Scored,
+    /// The recipe's, with a noise floor no lower than that of the positions.
+    merge: recipe::Merge,
+    /// Ids whose states are known, increasing.
+    pool: Vec<u32>,
+    /// Their states at the reference frame, of the harmonics the first band.
+    states: Gaussians,
+    /// Whether each may merge.
+    mergeable: Vec<bool>,
+    /// C and Vis by id.
+    importance: [Cow<'a, [f64]>; 2],
+    meter: PairMeter<'a>,
+    /// Pairs measured together.
+    pairs_together: usize,
+    /// How pairs of the pool move: it does not depend on who else survives.
+    known: KnownPairs,
+}
+
+impl<'a> Trial<'a> {
+    fn new(scene: &'a Scene, scored: &'a Scored, stage: &'a Merge, pool: Vec<u32>) -> Result<Self> {
+        let source = scene.source();
+        let (states, mut mergeable) = states_of(source, &pool, scored.reference.frame)?;
+        for id in &scored.protected {
+            if let Ok(row) = pool.binary_search(id) {
+                mergeable[row] = false;
+            }
+        }
+        let mut merge = stage.recipe.clone();
+        let unit = merge.length_unit.in_scene_units(scored.reference.extent);
+        merge.motion_noise = merge.motion_noise.max(2.0 * scored.position_ulp / unit);
+        let meter = PairMeter {
+            source,
+            scan: &stage.scan,
+            gate: MotionGate::new(&merge, unit),
+            frames_held: scene.limits.frames_held,
+            scratch: scene.scratch.clone(),
+            gathered: None,
+        };
+        let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
+        let importance = scored.importance()?;
+        Ok(Trial { scored, merge, pool, states, mergeable, importance, meter, pairs_together, known })
+    }
+
+    /// Merges `survivors` to exactly `target`.
+    fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<Outcome> {
+        let merged = self.merge(survivors, Some(survivors.len() - target))?;
+        let left = merged.reduction.len();
+        if left > target {
+            return Err(Error::usage(format!(
+                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  allow pruning, or looser merge passes"
+            )));
+        }
+        Ok(merged)
+    }
+
+    /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
+    fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
+        let Trial { scored, merge, pool, states, mergeable, importance, meter, pairs_together, known } = self;
+        let [coverage, visibility] = &*importance;
+        let survivors = Survivors {
+            states,
+            rows: &places_of(survivors, pool),
+            importance: Importance { ids: pool, coverage, visibility },
+            mergeable,
+            extent: scored.reference.extent,
+        };
+        let most = *pairs_together;
+        let merged = merge::run(&survivors, merge, limit, most, |asked| {
+            let missing = known.missing(asked.pairs());
+            let found = match missing.is_empty() {
+                true => Vec::new(),
+                false => meter.measure(pool, &states.position, missing, asked.reach, asked.is_part)?,
+            };
+            let found = KnownPairs::new(found);
+            let likeness = |pair| known.likeness(pair).or_else(|| found.likeness(pair)).unwrap_or(f64::NAN);
+            let answer = asked.pairs().map(likeness).collect();
+            known.add(found, most);
+            Ok::<_, Error>(answer)
+        })?;
+        Ok(outcome(&survivors, &merged, scored.reference.frame, merge))
+    }
+}
+
+/// What `merged` leaves of `survivors`.
+fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::Merge) -> Outcome {
+    let (groups, importance) = (&merged.groups, &survivors.importance);
+    let id = |row: u32| importance.ids[row as usize];
+    let clusters: Vec<Cluster> = groups
+        .clusters()
+        .map(|group| {
+            let rows = groups.members(group as usize);
+            let ids = rows.iter().map(|&row| id(row));
+            let members = ids.zip(weights(rows, importance, survivors.states)).collect();
+            Cluster { output: group, leader: id(groups.leaders()[group as usize]), members }
+        })
+        .collect();
+    let summary = MergeSummary {
+        reference_frame,
+        proxies: clusters.len(),
+        members: clusters.iter().map(|cluster| cluster.members.len()).sum(),
+        opacity: merge.opacity,
+        passes: merged.passes.clone(),
+        deviation: None,
+    };
+    let kept = groups.leaders().iter().map(|&row| id(row)).collect();
+    Outcome { reduction: Reduction { clusters, ..Reduction::pruned(kept, merge) }, summary: Some(summary) }
+}
+
+/// States of the Gaussians `ids` (increasing) at `frame`, of the harmonics the first band; and whether the whole state
+/// is finite. Without frames all is zero.
+fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gaussians, Vec<bool>)> {
+    let mut states = Gaussians::zeros(ids.len(), 0);
+    let mut finite = vec![true; ids.len()];
+    if source.info().times.is_empty() {
+        return Ok((states, finite));
+    }
+    for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
+        let whole = gather(source, ids, frame, Columns::ALL)?;
+        states.write_rows(start, &whole);
+        for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
+            *finite = merge::is_finite(&whole, row);
+        }
+    }
+    Ok((states, finite))
+}
+
+/// Place of each of `ids` in `pool`, both increasing, the first part of the second.
+fn places_of(ids: &[u32], pool: &[u32]) -> Vec<u32> {
+    let mut place = 0;
+    ids.iter()
+        .map(|&id| {
+            while pool[place] < id {
+                place += 1;
+            }
+            place as u32
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bracket_finds_the_most_survivors_that_merge_into_the_target() {
+        // Merging halves what lies beyond the first hundred.
+        for target in [1, 50, 100, 101, 400, 549, 550, 1000] {
+            let count = |m: usize| m.min(100) + m.saturating_sub(100) / 2;
+            let m = bracket(target, 1000, |m| Ok(count(m))).unwrap();
+            assert!(count(m) <= target && m >= target, "target {target}, got {m}");
+            assert!(m == 1000 || count(m + 2) > target - target / 1000, "target {target}: {m} could be larger");
+        }
+    }
+
+    #[test]
+    fn places_follow_the_ids() {
+        assert_eq!(places_of(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
+        assert!(places_of(&[], &[4]).is_empty());
+    }
+}

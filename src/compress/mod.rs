@@ -1,0 +1,182 @@
+//! The main job: scan, score, rank, prune, merge, refit, emit. Types flow scene → statistics → ranking → reduction →
+//! files; the order of the passes stands in [`reduce`].
+
+mod arrival;
+mod choose;
+pub mod emit;
+mod ids;
+mod job;
+pub mod journal;
+pub mod measure;
+mod merge;
+mod prune;
+mod refit;
+mod request;
+mod rounds;
+mod scan;
+pub mod score;
+mod statistics;
+pub mod summary;
+mod visible;
+
+pub use arrival::open_to_measure;
+pub use job::Job;
+pub use request::{Only, Request, Target};
+
+use crate::error::Result;
+use crate::recipe::Recipe;
+use crate::reduction::Reduction;
+use crate::scene::Scene;
+use journal::Journal;
+use measure::{Measure, Measured, Outlook, Stages};
+use merge::Outcome;
+use score::{Scored, UserOverrides};
+use summary::{CameraSummary, InputSummary, Summary};
+
+/// Writes a smaller model and says what was done.
+///
+/// # Errors
+/// Whatever is wrong with input, cameras, recipe or output. Nothing is left behind then.
+pub fn compress(request: &Request) -> Result<Summary> {
+    let mut journal = Journal::default();
+    let plan = |outlook| {
+        let job = Job::new(request, outlook)?;
+        job.emit.check(&[])?;
+        Ok(job)
+    };
+    let (scene, job, arrived) = open_to_measure(&request.input, plan, &mut journal)?;
+    Ok(reduce(&scene, &job, arrived, request, journal)?.0)
+}
+
+/// [`compress`] of a scene that is open already; also gives every Gaussian's place in the output.
+///
+/// # Errors
+/// Those of [`compress`].
+pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
+    let job = Job::new(request, Outlook::of(scene))?;
+    reduce(scene, &job, None, request, Journal::default())
+}
+
+/// Gives a scene that is open already the limits by which the request's budget holds.
+///
+/// # Errors
+/// A budget that cannot work, and those of [`Job::new`].
+pub fn keep_to_budget(scene: &mut Scene, request: &Request) -> Result<()> {
+    let job = Job::new(request, Outlook::of(scene))?;
+    scene.keep_to(request.input.memory, |work, limits| job.needs(work, limits))
+}
+
+/// Measures a scene, scores and selects, as `recipe` has it.
+///
+/// # Errors
+/// Whatever is wrong with the frames.
+pub fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Result<Scored> {
+    Measure::new(recipe, scene.has_cameras, user.clone()).run(scene, None, &mut Journal::default())
+}
+
+/// The passes of a run, one after the other.
+fn reduce(
+    scene: &Scene,
+    job: &Job,
+    arrived: Option<Measured>,
+    request: &Request,
+    mut journal: Journal,
+) -> Result<(Summary, Vec<Option<u32>>)> {
+    scene.input.check_output(job.emit.kind, &request.output)?;
+    job.emit.check(&[&scene.path])?;
+    journal.notes.extend(scene.notes.iter().cloned());
+    let input = InputSummary::of(&*scene.input, &scene.path)?;
+    let recipe = request.recipe_text(&input.digest);
+
+    let scored = job.measure.run(scene, arrived, &mut journal)?;
+    let mut ranked = scored.ranked();
+    if let Some(rounds) = &job.rounds {
+        let fewest = job.target.unwrap_or(scored.selection.counts.kept);
+        ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
+    }
+    let survivors = job.prune.run(scene, &scored, &ranked, &mut journal)?;
+    let mut outcome = match &job.merge {
+        Some(merge) => merge.run(scene, &scored, &ranked, survivors, &mut journal)?,
+        None => Outcome {
+            reduction: Reduction::pruned(ranked.ranking.take(survivors), &request.recipe.merge),
+            summary: None,
+        },
+    };
+    if let Some(choose) = &job.choose {
+        outcome = choose.run(scene, &scored, &ranked, outcome, &mut journal)?;
+    }
+    let Outcome { mut reduction, summary: merge } = outcome;
+    journal.notes.extend(reduction.proxies.notes.iter().cloned());
+    if let Some(refit) = &job.refit {
+        reduction = refit.run(scene, &scored, reduction, &mut journal)?;
+    }
+    job.write_down(request, &mut journal);
+
+    let map = reduction.index_map(scene.source().info().count);
+    let summarise = |journal: Journal, output_bytes: Option<u64>| Summary {
+        schema: summary::SCHEMA,
+        tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        cameras: CameraSummary::of(scene),
+        gaussians: reduction.len(),
+        output_bytes,
+        selection: scored.selection.counts,
+        terms: scored.term_summaries(),
+        flags: scored.flags.clone(),
+        merge,
+        left_out: journal.left_out,
+        notes: journal.notes,
+        stages: journal.stages,
+        input,
+    };
+    if request.dry_run {
+        journal.notes.push("dry run: nothing was written".to_owned());
+        return Ok((summarise(journal, None), map));
+    }
+    let written = |journal, bytes| summarise(journal, Some(bytes));
+    Ok((job.emit.run(scene, &reduction, &recipe, journal, written)?, map))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::budget::Workload;
+    use crate::demo;
+    use crate::emit::container::{FRAME_BLOCK, write_container};
+    use crate::families::Residence;
+    use crate::ingest::container::Container;
+    use crate::model::{Columns, SequenceInfo, Split};
+
+    /// A small dynamic scene with its cameras.
+    pub(crate) fn scene(folder: &std::path::Path) -> Scene {
+        let made = demo::Scene::new(1500, 6);
+        let path = folder.join("scene.gseq");
+        write_container(&made, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        let input = Box::new(Container::open(&path).unwrap());
+        let rig = made.rig();
+        Scene::new(path, input, rig, Some(Split::Train)).unwrap()
+    }
+
+    pub(crate) fn score_scene(scene: &Scene, recipe: &Recipe, user: &UserOverrides) -> Scored {
+        super::score_scene(scene, recipe, user).unwrap()
+    }
+
+    /// A container of `gaussians` Gaussians in 600 frames of two views.
+    pub(crate) fn work(gaussians: u64) -> Workload {
+        let info = SequenceInfo {
+            count: gaussians as usize,
+            times: Vec::new(),
+            sh_degree: 3,
+            varying: Columns::ALL.without(Columns::SH),
+        };
+        Workload {
+            frames: 600,
+            pixels: 320 * 240,
+            views: 2,
+            viewpoints: 2,
+            pictures: 1200,
+            shots: 2,
+            threads: 2,
+            ..Workload::new(&info, Residence::of_tiles(FRAME_BLOCK as u64))
+        }
+    }
+}

@@ -1,0 +1,110 @@
+//! What a user asks for.
+
+use std::path::PathBuf;
+
+use crate::emit::kind::OutputKind;
+use crate::error::{Error, Result};
+use crate::recipe::Recipe;
+use crate::scene::InputOptions;
+
+/// Which of pruning and merging to do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Only {
+    /// Prune, then merge.
+    #[default]
+    Both,
+    /// The paper's "pruned".
+    Prune,
+    /// The paper's "merged".
+    Merge,
+}
+
+/// How many Gaussians the output is to have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Target {
+    /// This many.
+    Count(u64),
+    /// This fraction of the input, in (0, 1], rounded to the nearest and at least one.
+    Ratio(f64),
+}
+
+/// Everything a compression is asked for.
+#[derive(Debug, Clone)]
+pub struct Request {
+    /// What to read.
+    pub input: InputOptions,
+    /// Where to write.
+    pub output: PathBuf,
+    /// What to write; none: by the output's name.
+    pub kind: Option<OutputKind>,
+    /// All hyper-parameters.
+    pub recipe: Recipe,
+    /// Which stages to run.
+    pub only: Only,
+    /// Exact size of the output, if asked for.
+    pub target: Option<Target>,
+    /// Ids to keep: a list or a file.
+    pub keep_ids: Option<String>,
+    /// Ids to drop: a list or a file.
+    pub drop_ids: Option<String>,
+    /// Box whose Gaussians are kept.
+    pub keep_box: Option<[f64; 6]>,
+    /// Write nothing.
+    pub dry_run: bool,
+    /// Replace an earlier output.
+    pub overwrite: bool,
+}
+
+impl Request {
+    /// Prunes and merges `input` to the recipe's own size, keeps and drops nobody in particular, replaces nothing.
+    pub fn new(input: InputOptions, output: PathBuf, recipe: Recipe) -> Self {
+        Request {
+            input,
+            output,
+            kind: None,
+            recipe,
+            only: Only::Both,
+            target: None,
+            keep_ids: None,
+            drop_ids: None,
+            keep_box: None,
+            dry_run: false,
+            overwrite: false,
+        }
+    }
+}
+
+impl Target {
+    /// The number of Gaussians it means for an input of `count`.
+    pub fn count(self, count: usize) -> Result<usize> {
+        let wanted = match self {
+            Target::Count(wanted) => wanted,
+            Target::Ratio(ratio) if ratio > 0.0 && ratio <= 1.0 => ((ratio * count as f64).round() as u64).max(1),
+            Target::Ratio(ratio) => {
+                return Err(Error::usage(format!(
+                    "--target-ratio: expected a number above 0 and at most 1, found {ratio}"
+                )));
+            }
+        };
+        match usize::try_from(wanted) {
+            Ok(wanted @ 1..) if wanted <= count => Ok(wanted),
+            // The empty scene has one size only.
+            _ if count == 0 => Ok(0),
+            _ => Err(Error::usage(format!(
+                "--target-count: expected 1 to {count}, the Gaussians of the input, found {wanted}"
+            ))),
+        }
+    }
+}
+
+impl Request {
+    /// Text of `recipe.toml`: where it comes from, then every parameter.
+    pub fn recipe_text(&self, input_digest: &str) -> String {
+        format!(
+            "# What this result was made with; give it to --recipe to repeat the run.\n\
+             [provenance]\ntool = \"splatsieve {}\"\ninput_digest = \"{input_digest}\"\n\n{}",
+            env!("CARGO_PKG_VERSION"),
+            self.recipe.to_toml()
+        )
+    }
+}

@@ -1,0 +1,174 @@
+//! Ranking by what the pictures would lose, scored anew as the model shrinks.
+//!
+//! One look at the whole model cannot rank for strong reductions: when a Gaussian goes, those behind it show
+//! and those that it made superfluous are needed. So each round looks at what is left, ranks it by
+//! [`RemovalError`](crate::render::RemovalError) and lets the worst go. Which Gaussians the next round sees
+//! does not depend on how many are wanted in the end: a smaller target keeps a subset of a larger one.
+//! Memory: see [`removal_error`].
+
+use super::journal::Journal;
+use super::score::{Order, Ranked, Scored, scored};
+use crate::budget::{Need, Workload};
+use crate::error::Result;
+use crate::model::Columns;
+use crate::plan::Limits;
+use crate::recipe;
+use crate::scene::Scene;
+use crate::select::Ranking;
+use crate::stream::{Sample, removal_error};
+
+/// What the stage is called.
+const NAME: &str = "rounds";
+
+/// Pictures per round, the same for a longer sequence: of a scene of 780, 65 rank about as well as 130.
+const PICTURES: usize = 96;
+
+/// The rounds of a run.
+#[derive(Debug, Clone)]
+pub struct Rounds {
+    /// Part of the Gaussians that a round leaves.
+    pub fraction: f64,
+    /// Contrast that every Gaussian is taken to have at least with what it hides.
+    pub contrast_floor: f64,
+}
+
+impl Rounds {
+    /// The stage, unless `recipe` ranks once. Takes visible contributions.
+    pub fn of(recipe: &recipe::Select) -> Option<Rounds> {
+        let recipe::Select { round_fraction: fraction, contrast_floor, .. } = *recipe;
+        (fraction < 1.0).then_some(Rounds { fraction, contrast_floor })
+    }
+
+    /// The ranking, and pictures of all that is left.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let (looking, fixed) = work.looking(limits, Columns::ALL, 8);
+        let per_gaussian = [scored(limits), vec![("ranking", 32)], looking].concat();
+        // Each round reads what the round before left.
+        let rounds = 1.0 / (1.0 - self.fraction);
+        Need { stage: NAME, reads: rounds * work.sampled(PICTURES), per_gaussian, fixed }
+    }
+
+    /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
+    /// round, and those that stay after the last, by error, ties by the order there was. Protected Gaussians come
+    /// first.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        before: Ranked,
+        fewest: usize,
+        journal: &mut Journal,
+    ) -> Result<Ranked> {
+        let sample = Sample::at_most(&scene.schedule, PICTURES);
+        let floor = self.contrast_floor as f32;
+        let source = scene.source();
+        let protected = &scored.protected;
+        let is_free = |id: &u32| protected.binary_search(id).is_err();
+        let mut free: Vec<u32> = before.ranking.order().iter().copied().filter(is_free).collect();
+        // Worst last.
+        let mut gone: Vec<u32> = Vec::new();
+        let mut rounds = 0;
+        while free.len() + protected.len() > fewest && !free.is_empty() {
+            let seen = free.len() + protected.len();
+            let left = ((seen as f64 * self.fraction) as usize).max(protected.len());
+            journal.stage(NAME, seen, source, |_| {
+                let mut ids: Vec<u32> = free.iter().chain(protected).copied().collect();
+                ids.sort_unstable();
+                let errors = removal_error(source, &ids, &sample, scene.background, floor, scene.limits)?.sum;
+                let error = |id: &u32| ids.binary_search(id).map_or(0, |row| errors[row]);
+                // Stable: ties keep the order there was.
+                free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
+                let mut worst = free.split_off(left - protected.len());
+                worst.append(&mut gone);
+                gone = worst;
+                Ok(((), left))
+            })?;
+            rounds += 1;
+        }
+        if rounds == 0 {
+            return Ok(before);
+        }
+        let order = protected.iter().copied().chain(free).chain(gone).collect();
+        Ok(Ranked { ranking: Ranking::new(order), by: Order::Rounds })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compress::score::UserOverrides;
+    use crate::compress::tests::{scene, score_scene};
+    use crate::metrics::psnr;
+    use crate::recipe::Recipe;
+    use crate::render::render;
+    use crate::scene::pictures::spread;
+    use crate::stream::gather;
+
+    /// The order of scoring, and that of the rounds.
+    fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranked, Ranked) {
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(scene, &recipe, user);
+        let rounds = Rounds::of(&recipe.select).unwrap();
+        let found = rounds.run(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
+        (scored.ranked(), found)
+    }
+
+    #[test]
+    fn a_smaller_target_keeps_a_subset_of_a_larger_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let [(once, few), (_, many)] = [200, 800].map(|fewest| ranked(&scene, &UserOverrides::default(), fewest));
+        assert_eq!(few.ranking.take(800), many.ranking.take(800));
+        assert_ne!(few.ranking.take(800), once.ranking.take(800), "rounds changed nothing");
+        let mut every = few.ranking.order().to_vec();
+        every.sort_unstable();
+        assert!(every.iter().copied().eq(0..1500), "a Gaussian is missing or stands twice");
+    }
+
+    #[test]
+    fn rounds_keep_more_of_the_pictures_than_one_ranking_by_coverage() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let (once, rounds) = ranked(&scene, &UserOverrides::default(), 150);
+        let all: Vec<u32> = (0..1500).collect();
+        for target in [150, 500] {
+            let quality = |kept: &[u32]| -> f64 {
+                let of_picture = |&(frame, camera): &(usize, u32)| {
+                    let original = gather(scene.source(), &all, frame, Columns::ALL).unwrap();
+                    let camera = &scene.schedule.cameras[camera as usize];
+                    psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
+                };
+                spread(&scene.schedule, 12).iter().map(of_picture).sum::<f64>() / 12.0
+            };
+            let got = quality(&rounds.ranking.take(target));
+            let at_once = quality(&once.ranking.take(target));
+            assert!(got > at_once + 1.0, "{target}: got {got} dB in rounds, {at_once} at once");
+        }
+    }
+
+    #[test]
+    fn what_the_user_keeps_comes_first_and_what_he_drops_does_not_come() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let worst = ranked(&scene, &UserOverrides::default(), 100).1.ranking.order()[1490..].to_vec();
+        let user = UserOverrides { keep: worst[..5].to_vec(), drop: worst[5..].to_vec(), keep_box: None };
+        let (_, rounds) = ranked(&scene, &user, 100);
+        let (mut first, mut kept) = (rounds.ranking.order()[..5].to_vec(), worst[..5].to_vec());
+        first.sort_unstable();
+        kept.sort_unstable();
+        assert_eq!(first, kept);
+        assert!(worst[5..].iter().all(|id| !rounds.ranking.order().contains(id)));
+    }
+
+    #[test]
+    fn a_model_that_is_small_enough_keeps_its_order() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let (once, rounds) = ranked(&scene, &UserOverrides::default(), 1500);
+        assert_eq!(rounds, once);
+        assert_eq!(rounds.by.name(), "sqrt(C*W)");
+    }
+}

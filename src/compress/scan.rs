@@ -1,0 +1,71 @@
+//! Stage `scan`: every Gaussian at every frame once, through one fixed-size accumulator each.
+
+use super::journal::Journal;
+use crate::budget::{Need, Workload};
+use crate::error::Result;
+use crate::model::{Columns, Rows};
+use crate::plan::Limits;
+use crate::recipe;
+use crate::scene::Scene;
+use crate::stats::{self, ScanPlan};
+use crate::stream::{self, BLOCK, Scanned};
+
+/// What the stage is called.
+const NAME: &str = "scan";
+
+/// The scan of a run.
+#[derive(Debug, Clone)]
+pub struct Scan {
+    /// Its parameters.
+    pub recipe: recipe::Scan,
+}
+
+impl Scan {
+    /// A block of Gaussians at a time, then the rows of all, joined.
+    pub fn need(&self, work: &Workload, _: &Limits) -> Need {
+        let block = stats::BYTES_PER_GAUSSIAN as u64 + work.held(&Limits::NONE, Columns::ALL);
+        Need {
+            stage: NAME,
+            reads: 1.0,
+            per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
+            fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving()],
+        }
+    }
+
+    /// Statistics of every Gaussian of `scene`.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, or whose times cannot be scanned.
+    pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
+        let source = scene.source();
+        let info = source.info();
+        let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
+        journal.stage(NAME, info.count, source, |_| Ok((stream::scan(source, &scene.schedule, &plan)?, info.count)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compress::tests::{scene, work};
+    use crate::recipe::Recipe;
+
+    #[test]
+    fn every_gaussian_gets_a_row_and_the_stage_is_written_down() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
+        let mut journal = Journal::default();
+        let found = scan.run(&scene, &mut journal).unwrap();
+        assert_eq!((found.rows.len(), found.alive_per_frame.len()), (1500, 6));
+        let stage = &journal.stages[0];
+        assert_eq!((stage.name.as_str(), stage.gaussians_in, stage.gaussians_out), ("scan", 1500, 1500));
+    }
+
+    #[test]
+    fn memory_beside_the_rows_does_not_grow_with_gaussians() {
+        let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
+        let [few, many] = [1_000, 1_000_000].map(|count| scan.need(&work(count), &Limits::NONE));
+        assert_eq!(few, many);
+    }
+}

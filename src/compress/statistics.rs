@@ -1,0 +1,142 @@
+//! Statistics that nothing needs until later: in memory, or set aside in a scratch file.
+//!
+//! The file: of every Gaussian D, κ, V, C, E, Vis and, where there is one, W, one column of f64 after the other, then
+//! its life (u32), then its flags; all as this machine has them. Memory: nothing, until something is asked for.
+
+use std::borrow::Cow;
+use std::fs::File;
+use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+
+use bytemuck::{AnyBitPattern, NoUninit};
+
+use crate::emit::atomic::ScratchFile;
+use crate::error::{Error, Result};
+use crate::model::{Flags, Rows};
+
+/// The rows of N Gaussians.
+pub(super) enum Statistics {
+    Memory(Rows),
+    Aside(Aside),
+}
+
+/// Rows in a file that lasts as long as this.
+pub(super) struct Aside {
+    /// Locked from finding a place to having read it.
+    file: Mutex<File>,
+    scratch: ScratchFile,
+    count: usize,
+    has_peak: bool,
+}
+
+/// Places of the columns in the file.
+const COVERAGE: usize = 3;
+const VISIBILITY: usize = 5;
+const PEAK: usize = 6;
+
+impl Statistics {
+    /// Writes `rows` to a file in `folder`.
+    pub(super) fn aside(rows: Rows, folder: &Path) -> Result<Statistics> {
+        let scratch = ScratchFile::new(folder)?;
+        let io = |what| Error::io(what, scratch.path());
+        let mut out = BufWriter::new(scratch.create()?);
+        let Rows { d, kappa, v, life, c, w, e, vis, flags } = &rows;
+        let columns = [d, kappa, v, c, e, vis, w].map(|column| bytemuck::cast_slice::<f64, u8>(column));
+        let written = columns.iter().try_for_each(|column| out.write_all(column));
+        let written = written.and_then(|()| out.write_all(bytemuck::cast_slice(life)));
+        let written = written.and_then(|()| flags.iter().try_for_each(|flags| out.write_all(&[flags.0])));
+        written.map_err(io("write"))?;
+        let file = out.into_inner().map_err(|error| io("write")(error.into_error()))?;
+        Ok(Statistics::Aside(Aside { file: Mutex::new(file), scratch, count: rows.len(), has_peak: !w.is_empty() }))
+    }
+
+    /// All rows.
+    pub(super) fn rows(&self) -> Result<Cow<'_, Rows>> {
+        match self {
+            Statistics::Memory(rows) => Ok(Cow::Borrowed(rows)),
+            Statistics::Aside(aside) => aside.rows().map(Cow::Owned),
+        }
+    }
+
+    /// C and Vis of every Gaussian.
+    pub(super) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
+        Ok(match self {
+            Statistics::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
+            Statistics::Aside(aside) => [Cow::Owned(aside.column(COVERAGE)?), Cow::Owned(aside.column(VISIBILITY)?)],
+        })
+    }
+
+    /// N.
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Statistics::Memory(rows) => rows.len(),
+            Statistics::Aside(aside) => aside.count,
+        }
+    }
+}
+
+impl Aside {
+    fn rows(&self) -> Result<Rows> {
+        let lives = if self.has_peak { PEAK + 1 } else { PEAK };
+        let first = 8 * self.count as u64 * lives as u64;
+        let flags: Vec<u8> = self.values(first + 4 * self.count as u64)?;
+        Ok(Rows {
+            d: self.column(0)?,
+            kappa: self.column(1)?,
+            v: self.column(2)?,
+            life: self.values(first)?,
+            c: self.column(COVERAGE)?,
+            w: if self.has_peak { self.column(PEAK)? } else { Vec::new() },
+            e: self.column(4)?,
+            vis: self.column(VISIBILITY)?,
+            flags: flags.into_iter().map(Flags).collect(),
+        })
+    }
+
+    fn column(&self, place: usize) -> Result<Vec<f64>> {
+        self.values(8 * self.count as u64 * place as u64)
+    }
+
+    /// A value for every Gaussian from byte `start` on.
+    fn values<T: AnyBitPattern + NoUninit>(&self, start: u64) -> Result<Vec<T>> {
+        let mut values = vec![T::zeroed(); self.count];
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let read = file.seek(SeekFrom::Start(start));
+        let read = read.and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)));
+        read.map_err(Error::io("read back", self.scratch.path()))?;
+        Ok(values)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_set_aside_comes_back_bit_for_bit_and_the_file_goes() {
+        let folder = tempfile::tempdir().unwrap();
+        for (count, peak) in [(0, false), (1, true), (1000, true), (1000, false)] {
+            let column = |by: f64| (0..count).map(|i| (i as f64 - 7.3) * by).collect::<Vec<_>>();
+            let rows = Rows {
+                d: column(0.1),
+                kappa: column(-0.0),
+                v: column(1e-300),
+                life: (0..count as u32).collect(),
+                c: column(4.0),
+                w: if peak { column(0.01) } else { Vec::new() },
+                e: column(1e12),
+                vis: column(0.3),
+                flags: (0..count).map(|i| Flags(i as u8)).collect(),
+            };
+            let statistics = Statistics::aside(rows.clone(), folder.path()).unwrap();
+            assert_eq!(statistics.len(), count);
+            assert_eq!(format!("{:?}", statistics.rows().unwrap()), format!("{rows:?}"));
+            assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);
+            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        }
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        let message = Statistics::aside(Rows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
+        assert!(message.contains("nowhere"), "{message}");
+    }
+}

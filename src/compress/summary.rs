@@ -1,0 +1,244 @@
+//! What a run did, for people and for programs: counts in and out of every stage, what was left out
+//! and why, memory and time. The only output whose bytes differ between runs.
+//!
+//! These types are the one schema of `summary.json`: `compress` writes it by them and `report` reads it by them.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::Result;
+use crate::families::Family;
+use crate::merge::PassCounts;
+use crate::pass::Reads;
+use crate::recipe::ProxyOpacity;
+use crate::scene::Scene;
+use crate::select::Counts;
+
+/// One stage of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Stage {
+    /// Its name.
+    pub name: String,
+    /// Gaussians that entered it.
+    pub gaussians_in: usize,
+    /// Gaussians that left it.
+    pub gaussians_out: usize,
+    /// What it read of the input, counted where it happened.
+    pub reads: Reads,
+    /// Wall-clock time.
+    pub seconds: f64,
+    /// Largest resident memory of the process up to the end of this stage, where the system tells.
+    pub peak_memory_bytes: Option<u64>,
+}
+
+/// Something the scene did not need.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LeftOut {
+    /// What was not done.
+    pub what: String,
+    /// Why not.
+    pub why: String,
+}
+
+/// The input, as the summary names it.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct InputSummary {
+    /// Path as given.
+    pub path: String,
+    /// "4DGaussians model", "PLY sequence", ...
+    pub kind: String,
+    /// Hash over the bytes read.
+    pub digest: String,
+    /// N.
+    pub gaussians: usize,
+    /// T; none for a model whose frames nobody has chosen yet.
+    pub frames: Option<usize>,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: usize,
+    /// Columns that differ between frames.
+    pub varying: Vec<String>,
+    /// Bytes of everything the model consists of, or that arrived of a stream.
+    pub bytes: u64,
+}
+
+impl InputSummary {
+    /// Of an open input, whose path is given.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn of(input: &dyn Family, path: &Path) -> Result<InputSummary> {
+        let info = input.source().info();
+        Ok(InputSummary {
+            path: path.display().to_string(),
+            kind: input.kind().to_owned(),
+            digest: input.digest()?,
+            gaussians: info.count,
+            frames: Some(info.times.len()),
+            sh_degree: info.sh_degree,
+            varying: info.varying.iter().map(|column| column.name().to_owned()).collect(),
+            bytes: input.bytes()?,
+        })
+    }
+}
+
+/// The cameras, as the summary names them.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct CameraSummary {
+    /// File, or the recipe of a virtual rig.
+    pub origin: String,
+    /// Distinct cameras.
+    pub cameras: usize,
+    /// M, (time, view) pairs that were scored.
+    pub pairs: usize,
+}
+
+impl CameraSummary {
+    /// Of the pictures that are scored.
+    pub fn of(scene: &Scene) -> CameraSummary {
+        CameraSummary {
+            origin: scene.rig.origin.clone(),
+            cameras: scene.schedule.cameras.len(),
+            pairs: scene.schedule.pairs(),
+        }
+    }
+}
+
+/// A term of the scores.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct TermSummary {
+    /// C, W, sqrt(C*W), E, D, kappa, V, Life, S_static or S_dynamic.
+    pub name: String,
+    /// 1st percentile.
+    pub p1: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// Whether the percentiles differ, so that the term grades rather than splits.
+    pub active: bool,
+}
+
+/// Counts of odd Gaussians.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct FlagSummary {
+    /// NaN or infinity in some frame.
+    pub non_finite: usize,
+    /// Zero quaternion in some frame.
+    pub zero_rotation: usize,
+    /// D set to 0 as rounding noise.
+    pub snapped_d: usize,
+    /// κ set to 0 as rounding noise.
+    pub snapped_kappa: usize,
+    /// Never alive.
+    pub never_alive: usize,
+    /// In no picture of the scored cameras.
+    pub never_in_view: usize,
+}
+
+/// What merging did.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct MergeSummary {
+    /// Frame at which Gaussians were compared and merged.
+    pub reference_frame: usize,
+    /// Proxies in the output.
+    pub proxies: usize,
+    /// Gaussians that went into them.
+    pub members: usize,
+    /// Rule by which a proxy's opacity was made.
+    pub opacity: ProxyOpacity,
+    /// One entry per pass.
+    pub passes: Vec<PassCounts>,
+    /// Furthest that a proxy strays from its place among its members over sampled frames, scene units;
+    /// none without a deformation field.
+    pub deviation: Option<f64>,
+}
+
+/// Version of the schema: grows when a field changes its meaning or goes.
+pub const SCHEMA: u32 = 2;
+
+/// A run from input to output.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Summary {
+    /// [`SCHEMA`].
+    pub schema: u32,
+    /// Program and version.
+    pub tool: String,
+    /// What was read.
+    pub input: InputSummary,
+    /// From where it was looked at.
+    pub cameras: CameraSummary,
+    /// Gaussians in the output.
+    pub gaussians: usize,
+    /// Bytes of everything the output's model consists of; none for a dry run.
+    pub output_bytes: Option<u64>,
+    /// Stages 1 and 2.
+    pub selection: Counts,
+    /// Everything in order.
+    pub stages: Vec<Stage>,
+    /// Percentiles of every term.
+    pub terms: Vec<TermSummary>,
+    /// Odd Gaussians.
+    pub flags: FlagSummary,
+    /// Stage 3, unless it was left out.
+    pub merge: Option<MergeSummary>,
+    /// What the scene did not need.
+    pub left_out: Vec<LeftOut>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+impl Summary {
+    /// As JSON, for programs.
+    pub fn json(&self) -> String {
+        let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
+        text.push('\n');
+        text
+    }
+
+    /// A few lines for a person.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let input = &self.input;
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            out,
+            "{}: {}, {} Gaussians x {} frames, SH degree {}",
+            input.path,
+            input.kind,
+            input.gaussians,
+            input.frames.unwrap_or(0),
+            input.sh_degree
+        );
+        let _ = writeln!(
+            out,
+            "cameras: {} ({} cameras, {} pictures)",
+            self.cameras.origin, self.cameras.cameras, self.cameras.pairs
+        );
+        for stage in &self.stages {
+            let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
+            let _ = writeln!(
+                out,
+                "  {:<7} {:>9} -> {:>9}  {:8.2} s{memory}",
+                stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds
+            );
+        }
+        for left in &self.left_out {
+            let _ = writeln!(out, "  left out: {} ({})", left.what, left.why);
+        }
+        for note in &self.notes {
+            let _ = writeln!(out, "  note: {note}");
+        }
+        let percent = 100.0 * self.gaussians as f64 / input.gaussians.max(1) as f64;
+        let _ = write!(out, "{} of {} Gaussians ({percent:.1}%)", self.gaussians, input.gaussians);
+        if let Some(bytes) = self.output_bytes {
+            let _ = write!(
+                out,
+                ", {bytes} of {} bytes ({:.1}%)",
+                input.bytes,
+                100.0 * bytes as f64 / input.bytes.max(1) as f64
+            );
+        }
+        out.push('\n');
+        out
+    }
+}

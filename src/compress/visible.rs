@@ -1,0 +1,69 @@
+//! Stage `visible`: what every Gaussian adds to the pictures, occlusion included.
+
+use super::journal::Journal;
+use crate::budget::{Need, Workload};
+use crate::error::Result;
+use crate::model::{Columns, Rows};
+use crate::plan::Limits;
+use crate::recipe::{self, Coverage};
+use crate::scene::Scene;
+use crate::stream::{Sample, Seen, visible_contribution};
+
+/// What the stage is called.
+const NAME: &str = "visible";
+
+/// The look at the pictures of a run that measures C by them.
+#[derive(Debug, Clone)]
+pub struct Visible {
+    /// Its parameters.
+    pub recipe: recipe::Scan,
+}
+
+impl Visible {
+    /// The stage, if `recipe` measures C by pictures; `has_cameras`: these are the scene's own, not a virtual rig.
+    pub fn of(recipe: &recipe::Scan, has_cameras: bool) -> Option<Visible> {
+        let looks = match recipe.coverage {
+            Coverage::Auto => has_cameras,
+            Coverage::Visible => true,
+            Coverage::Projected => false,
+        };
+        looks.then(|| Visible { recipe: recipe.clone() })
+    }
+
+    /// The rows scanned so far, C and W, and pictures in the making.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let (mut per_gaussian, fixed) = work.looking(limits, Columns::ALL.without(Columns::SH), 12);
+        per_gaussian.insert(0, ("rows", Rows::BYTES_PER_GAUSSIAN as u64 + 16));
+        Need { stage: NAME, reads: 1.0 / f64::from(self.recipe.frame_stride.get()), per_gaussian, fixed }
+    }
+
+    /// C and W of every Gaussian of `scene`.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Seen> {
+        let source = scene.source();
+        let count = source.info().count;
+        let sample = Sample::new(&scene.schedule, &self.recipe);
+        journal.stage(NAME, count, source, |_| {
+            Ok((visible_contribution(source, &sample, self.recipe.pixel_stride, scene.limits)?, count))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::Recipe;
+
+    #[test]
+    fn pictures_of_a_virtual_rig_are_looked_at_only_when_asked_for() {
+        let mut recipe = Recipe::preset("default").unwrap().scan;
+        let looks = |recipe: &recipe::Scan| [true, false].map(|cameras| Visible::of(recipe, cameras).is_some());
+        assert_eq!(looks(&recipe), [true, false]);
+        recipe.coverage = Coverage::Visible;
+        assert_eq!(looks(&recipe), [true, true]);
+        recipe.coverage = Coverage::Projected;
+        assert_eq!(looks(&recipe), [false, false]);
+    }
+}

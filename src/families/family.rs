@@ -1,0 +1,230 @@
+//! What a kind of input can do.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::emit::container::GAUSSIAN_BLOCK;
+use crate::emit::kind::OutputKind;
+use crate::error::{Error, Result};
+use crate::model::{Columns, Gaussians};
+use crate::pass::FrameSource;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+
+/// An open input of some kind.
+pub trait Family: Send + Sync {
+    /// What it is, for people.
+    fn kind(&self) -> &'static str;
+
+    /// Its frames.
+    fn source(&self) -> &dyn FrameSource;
+
+    /// Hash over the bytes read.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    fn digest(&self) -> Result<String>;
+
+    /// Bytes of everything the model consists of; of a stream, those that arrived.
+    ///
+    /// # Errors
+    /// A file that is not there any more.
+    fn bytes(&self) -> Result<u64>;
+
+    /// What it keeps in memory, and how it is read.
+    fn residence(&self) -> Residence;
+
+    /// Where its frames get their times.
+    fn timing(&self) -> Timing;
+
+    /// The same input with frames at `times`; refused where [`Timing::Stamped`].
+    ///
+    /// # Errors
+    /// Times that are not finite or do not increase; another number of them than there are frames.
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>>;
+
+    /// Folder of the data it was trained on, as the input names it, where it does: there cameras may be.
+    fn data_folder(&self) -> Option<&str> {
+        None
+    }
+
+    /// Colour behind the scene that it was trained with, where it names one.
+    fn background(&self) -> Option<[f32; 3]> {
+        None
+    }
+
+    /// The raw parameters that all frames follow from, of a family that has such.
+    fn canonical(&self) -> Option<&Gaussians> {
+        None
+    }
+
+    /// What its container holds, column by column; empty where it is no container.
+    ///
+    /// # Errors
+    /// An index that cannot be read.
+    fn columns(&self) -> Result<Vec<ColumnInfo>> {
+        Ok(Vec::new())
+    }
+
+    /// The kind of a result to which neither the user nor its name gives one.
+    fn own_output(&self) -> OutputKind;
+
+    /// Confirms that a result can be of `kind`, written to `path`.
+    ///
+    /// # Errors
+    /// A kind that this input cannot be written as, naming those that it can.
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()>;
+
+    /// Raw parameters of the proxies that `clusters` become, compared at `reference`. A family without raw
+    /// parameters has nothing to solve: its proxies follow from their members frame by frame.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        let _ = (clusters, reference, rule);
+        Ok(Proxies::default())
+    }
+
+    /// The frames of what `reduction` leaves, as they will be once it is written.
+    ///
+    /// # Errors
+    /// A field that cannot be evaluated.
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>>;
+
+    /// Writes what `reduction` leaves to `path`, a new file or an empty folder; gives things a person should know.
+    /// Frames of at most about `gaussians_together` Gaussians wait together to be written.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, a failed write.
+    fn write(
+        &self,
+        reduction: &Reduction,
+        kind: OutputKind,
+        path: &Path,
+        gaussians_together: usize,
+    ) -> Result<Vec<String>>;
+}
+
+/// Where frames get their times.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Timing {
+    /// Any instant can be a frame.
+    Continuous,
+    /// There are so many frames; cameras may say when.
+    Numbered,
+    /// The input says when its frames are.
+    Stamped,
+}
+
+/// What an open input keeps in memory, and how it is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Residence {
+    /// Bytes per Gaussian that are resident while it is open.
+    pub per_gaussian: u64,
+    /// Bytes per Gaussian while it is opened, beside these.
+    pub opening: u64,
+    /// Bytes per Gaussian of an open reader, beside the frames it holds.
+    pub reader: u64,
+    /// Bytes per Gaussian of a reduced copy of it, of which frames are read.
+    pub reduced: u64,
+    /// Bytes per Gaussian of a file that is mapped while it is read whole.
+    pub file: u64,
+    /// Bytes however many Gaussians there are.
+    pub fixed: u64,
+    /// Frames that are decoded together, so that a reader may hold some; 0 where each is read by itself.
+    pub frame_block: u64,
+    /// Gaussians that are decoded together.
+    pub gaussian_block: u64,
+    /// Columns of a container.
+    pub columns: u64,
+}
+
+impl Residence {
+    /// Of a container in tiles of `frame_block` frames.
+    pub fn of_tiles(frame_block: u64) -> Residence {
+        Residence {
+            per_gaussian: 0,
+            opening: 0,
+            reader: 8,
+            reduced: 0,
+            file: 0,
+            fixed: 0,
+            frame_block,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: Columns::ALL.iter().count() as u64,
+        }
+    }
+}
+
+/// One column of a container.
+#[derive(Debug, Serialize)]
+pub struct ColumnInfo {
+    /// Its name.
+    pub name: String,
+    /// f32 components per Gaussian.
+    pub width: u32,
+    /// Number of tiles.
+    pub tiles: usize,
+    /// Of those, tiles that hold one frame for all.
+    pub constant_tiles: usize,
+    /// Of those, tiles stored as they are.
+    pub raw_tiles: usize,
+    /// Bytes stored, of shared tiles once.
+    pub stored_bytes: u64,
+    /// Bytes of the same values as one f32 per frame, component and Gaussian.
+    pub raw_bytes: u64,
+    /// Smallest finite value; none if there is no finite value.
+    pub min: Option<f32>,
+    /// Largest finite value; none if there is no finite value.
+    pub max: Option<f32>,
+}
+
+/// How a family takes part.
+pub(super) struct Entry {
+    /// What to give, for the message that nothing fits.
+    pub(super) expected: &'static str,
+    /// Whether a path is of this family, told by what is there.
+    pub(super) recognises: fn(&Found) -> bool,
+    /// Opens it; without frames where [`Timing::Continuous`].
+    pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn Family>>,
+}
+
+/// What lies at a path.
+pub(super) struct Found<'a> {
+    pub(super) path: &'a Path,
+    pub(super) is_folder: bool,
+    /// The first bytes of a file.
+    pub(super) head: Vec<u8>,
+}
+
+impl Found<'_> {
+    /// Whether a file begins with `magic`, or, where it is so damaged that it does not, has that extension.
+    pub(super) fn is_file_of(&self, magic: &[u8], extension: &str) -> bool {
+        let named = || self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension));
+        !self.is_folder && (self.head.starts_with(magic) || named())
+    }
+}
+
+/// What a user may say about an input beside its path.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct OpenOptions {
+    /// Training iteration of a model folder; none: the largest.
+    pub iteration: Option<u32>,
+}
+
+impl OpenOptions {
+    /// Refuses what only model folders take.
+    pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
+        match self.iteration {
+            Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.display()))),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Sum of the sizes of files, bytes.
+pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<u64> {
+    paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
+}

@@ -1,0 +1,166 @@
+//! 4DGaussians model folders as a family: a canonical cloud, and a field that deforms it.
+//!
+//! The result is a folder of the same layout with a smaller point cloud; the field and the configuration stay byte
+//! for byte as they were.
+
+mod proxies;
+
+use std::fs::{self, File};
+use std::io;
+use std::path::Path;
+
+use super::family::{Entry, Family, Residence, Timing, bytes_of};
+use super::trajectories::{state_bytes, write_sequence};
+use crate::emit::container::GAUSSIAN_BLOCK;
+use crate::emit::kind::OutputKind;
+use crate::emit::ply::{out_rows, write_like};
+use crate::error::{Error, Result};
+use crate::ingest::ModelFolder;
+use crate::ingest::ply::Ply;
+use crate::model::{Columns, Gaussians};
+use crate::pass::FrameSource;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::stream::recolor;
+
+/// A model folder.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a 4DGaussians model folder",
+    recognises: |found| {
+        found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
+    },
+    open: |path, options| Ok(Box::new(ModelFolder::open(path, options.iteration)?)),
+};
+
+impl Family for ModelFolder {
+    fn kind(&self) -> &'static str {
+        "4DGaussians model"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        self.paths().digest()
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        let paths = self.paths();
+        let training = [&paths.deformation_table, &paths.deformation_accum];
+        bytes_of(
+            [&paths.point_cloud, &paths.deformation, &paths.cfg_args].into_iter().chain(training.into_iter().flatten()),
+        )
+    }
+
+    fn residence(&self) -> Residence {
+        let whole = state_bytes(self.info().sh_degree, Columns::ALL);
+        Residence {
+            per_gaussian: whole,
+            // Normals and the like stand beside the values.
+            opening: whole + 24,
+            // A copy of the canonical values, what is prepared of them, and their changes.
+            reader: 2 * whole + self.field().bytes_per_gaussian() as u64 + 128,
+            // The canonical values of what is left, and while they are made once more.
+            reduced: 2 * whole,
+            file: whole + 24,
+            // Tensors as they are read and as they are used.
+            fixed: 2 * fs::metadata(&self.paths().deformation).map_or(0, |file| file.len()),
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+        }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Continuous
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        Ok(Box::new(ModelFolder::with_times(*self, times)?))
+    }
+
+    fn data_folder(&self) -> Option<&str> {
+        self.config().source_path.as_deref()
+    }
+
+    fn background(&self) -> Option<[f32; 3]> {
+        self.config().white_background.then_some([1.0; 3])
+    }
+
+    fn canonical(&self) -> Option<&Gaussians> {
+        Some(ModelFolder::canonical(self))
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::Model
+    }
+
+    fn check_output(&self, _: OutputKind, _: &Path) -> Result<()> {
+        Ok(())
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        proxies::solve(self, clusters, reference, rule)
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.with_canonical(canonical_cloud(self, reduction))))
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, _: usize) -> Result<Vec<String>> {
+        let mut notes = Vec::new();
+        let paths = self.paths();
+        match kind {
+            OutputKind::Model => {
+                let folder = path.join("point_cloud").join(format!("iteration_{}", paths.iteration));
+                fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
+                copy(&paths.cfg_args, &path.join("cfg_args"))?;
+                copy(&paths.deformation, &folder.join("deformation.pth"))?;
+                self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
+                if paths.deformation_table.is_some() || paths.deformation_accum.is_some() {
+                    notes.push(
+                        "deformation_table.pth and deformation_accum.pth, which only training reads, were left out"
+                            .to_owned(),
+                    );
+                }
+            }
+            OutputKind::Ply => self.write_cloud(reduction, path)?,
+            OutputKind::Gseq | OutputKind::PlySequence => write_sequence(&*self.reduced(reduction)?, kind, path)?,
+        }
+        Ok(notes)
+    }
+}
+
+impl ModelFolder {
+    /// Writes the canonical cloud of what is left with the properties and comments that the model's has.
+    fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+        let none = Gaussians::zeros(0, self.info().sh_degree);
+        let proxies = reduction.proxies.raw.as_ref().unwrap_or(&none);
+        write_like(&Ply::open(&self.paths().point_cloud)?, &out_rows(reduction), proxies, path)
+    }
+}
+
+/// The canonical cloud of what is left, recoloured: the field's changes of colour add to the base.
+fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
+    let mut cloud = ModelFolder::canonical(model).pick(&reduction.kept);
+    if let Some(raw) = &reduction.proxies.raw {
+        for (proxy, cluster) in reduction.clusters.iter().enumerate() {
+            for column in Columns::ALL.iter() {
+                for c in 0..raw.column(column).width() {
+                    cloud.column_mut(column).plane_mut(c)[cluster.output as usize] = raw.column(column).plane(c)[proxy];
+                }
+            }
+        }
+    }
+    recolor(&mut cloud, &reduction.recolor);
+    cloud
+}
+
+/// Copies the bytes, not the permissions: a result of a read-only model can be replaced.
+fn copy(from: &Path, to: &Path) -> Result<()> {
+    let mut source = File::open(from).map_err(Error::io("open", from))?;
+    let mut target = File::create(to).map_err(Error::io("create", to))?;
+    io::copy(&mut source, &mut target).map_err(Error::io("copy", from))?;
+    Ok(())
+}

@@ -1,0 +1,43 @@
+//! Families: kinds of input, each of which can be recognised, read as frames, reduced and written back.
+//!
+//! A family is one module here and one line of `FAMILIES`; outside its module nobody asks which one it is.
+
+mod container;
+mod family;
+mod four_d_gaussians;
+mod ply_sequence;
+pub mod stream;
+pub mod trajectories;
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::Path;
+
+pub use family::{ColumnInfo, Family, OpenOptions, Residence, Timing};
+
+use crate::error::{Error, Result};
+use family::{Entry, Found};
+
+/// Every family that lies in files; the first that recognises a path opens it.
+const FAMILIES: [Entry; 4] = [four_d_gaussians::ENTRY, ply_sequence::FOLDER, ply_sequence::FILE, container::ENTRY];
+
+/// Opens a path by what is there. Frames of a family that is continuous in time are still to be chosen.
+///
+/// # Errors
+/// Nothing there, or of no family; whatever is wrong with it.
+pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
+    let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
+    let mut head = Vec::new();
+    if !is_folder {
+        let file = File::open(path).map_err(Error::io("open", path))?;
+        file.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
+    }
+    let found = Found { path, is_folder, head };
+    match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
+        Some(entry) => (entry.open)(path, options),
+        None => {
+            let expected: Vec<&str> = FAMILIES.iter().map(|entry| entry.expected).collect();
+            Err(Error::input(path, "", expected.join(", "), "another kind of file"))
+        }
+    }
+}

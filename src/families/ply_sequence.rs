@@ -1,0 +1,129 @@
+//! Frames in PLY files: a folder with one for each, or a single one.
+//!
+//! What is written back has the properties, comments and names that the files had.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::family::{Entry, Family, OpenOptions, Residence, Timing, bytes_of};
+use super::trajectories::{merged, reduced_trajectories, state_bytes, write_trajectories};
+use crate::emit::container::GAUSSIAN_BLOCK;
+use crate::emit::kind::OutputKind;
+use crate::emit::ply::{out_rows, write_like};
+use crate::error::Result;
+use crate::ingest::ply_sequence::PlySequence;
+use crate::model::{Columns, Gaussians};
+use crate::pass::{FrameSource, Ids};
+use crate::reduction::Reduction;
+use crate::stream::Progress;
+
+/// A folder with one PLY per frame.
+pub(super) const FOLDER: Entry = Entry {
+    expected: "a folder of PLY files",
+    recognises: |found| found.is_folder,
+    open: |path, options| open(path, options, PlySequence::open),
+};
+
+/// One PLY.
+pub(super) const FILE: Entry = Entry {
+    expected: "a .ply",
+    recognises: |found| found.is_file_of(b"ply", "ply"),
+    open: |path, options| open(path, options, PlySequence::single),
+};
+
+fn open(path: &Path, options: &OpenOptions, by: impl FnOnce(&Path) -> Result<PlySequence>) -> Result<Box<dyn Family>> {
+    let sequence = by(path)?;
+    options.refuse_for(path)?;
+    Ok(Box::new(sequence))
+}
+
+impl Family for PlySequence {
+    fn kind(&self) -> &'static str {
+        "PLY frames"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        PlySequence::digest(self)
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_of(self.paths())
+    }
+
+    fn residence(&self) -> Residence {
+        Residence {
+            per_gaussian: 0,
+            opening: 0,
+            reader: 4,
+            reduced: 0,
+            // Normals and the like stand beside the values.
+            file: state_bytes(self.info().sh_degree, Columns::ALL) + 24,
+            fixed: 0,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+        }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Numbered
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        Ok(Box::new(PlySequence::with_times(*self, times)?))
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::PlySequence
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        super::trajectories::check_output(self.info().times.len(), kind, path)
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(reduced_trajectories(self, reduction))
+    }
+
+    fn write(
+        &self,
+        reduction: &Reduction,
+        kind: OutputKind,
+        path: &Path,
+        gaussians_together: usize,
+    ) -> Result<Vec<String>> {
+        match kind {
+            OutputKind::Gseq => write_trajectories(self, reduction, kind, path, gaussians_together)?,
+            _ => write_files(self, reduction, kind, path)?,
+        }
+        Ok(Vec::new())
+    }
+}
+
+/// Writes every frame's file again with the properties, comments and names it had.
+fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, path: &Path) -> Result<()> {
+    let result = merged(sequence, reduction);
+    let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
+    let rows = out_rows(reduction);
+    let progress = Progress::new("emit", "frames", sequence.paths().len() as u64);
+    let write = |&frame: &usize| {
+        let mut proxies = Gaussians::zeros(0, sequence.info().sh_degree);
+        result.open(Ids::List(&places))?.read(frame, Columns::ALL, &mut proxies)?;
+        let template = sequence.frame(frame)?;
+        let target = match (kind, template.path().file_name()) {
+            (OutputKind::PlySequence, Some(name)) => path.join(name),
+            _ => path.to_owned(),
+        };
+        write_like(&template, &rows, &proxies, &target)?;
+        progress.advance(1);
+        Ok(())
+    };
+    // A batch at a time: a thread that waits for proxies would begin another frame.
+    let all: Vec<usize> = (0..sequence.paths().len()).collect();
+    all.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
+}

@@ -1,0 +1,140 @@
+//! What families of explicit trajectories share: each Gaussian's state stands in every frame, so that a proxy is the
+//! moment match of its members frame by frame, and nothing has to be solved.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use gseq::Compression;
+
+use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
+use crate::emit::kind::OutputKind;
+use crate::emit::ply::write_inria;
+use crate::error::{Error, Result};
+use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::pass::FrameSource;
+use crate::reduction::Reduction;
+use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored};
+
+/// zstd level of containers that are a result: higher ones gain about 1% on trained models.
+const LEVEL: i32 = 1;
+
+/// Bytes of the columns `of` of one Gaussian at one frame.
+pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {
+    of.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()
+}
+
+/// What is left of `source`, merged.
+pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a Reduction) -> MergedSequence<'a> {
+    let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
+    MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
+}
+
+/// What is left of `source`, merged and recoloured.
+pub(super) fn reduced_trajectories<'a>(
+    source: &'a dyn FrameSource,
+    reduction: &'a Reduction,
+) -> Box<dyn FrameSource + 'a> {
+    Box::new(Recolored::new(Box::new(merged(source, reduction)), &reduction.recolor))
+}
+
+/// Confirms that a sequence of so many frames can be written as `kind`.
+pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Result<()> {
+    match kind {
+        OutputKind::Model => Err(Error::usage(
+            "only a trained model can be written as a model folder\n  write a .gseq or --as ply-sequence",
+        )),
+        OutputKind::Ply if frames != 1 => Err(Error::usage(format!(
+            "{}: {frames} frames do not fit one .ply\n  write a .gseq or --as ply-sequence",
+            path.display()
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// Writes what is left of `source` as `kind`, to `path`.
+pub(super) fn write_trajectories(
+    source: &dyn FrameSource,
+    reduction: &Reduction,
+    kind: OutputKind,
+    path: &Path,
+    gaussians_together: usize,
+) -> Result<()> {
+    if kind == OutputKind::Gseq && !reduction.clusters.is_empty() {
+        return write_merged(source, reduction, path, gaussians_together);
+    }
+    write_sequence(&*reduced_trajectories(source, reduction), kind, path)
+}
+
+/// A container with proxies, whose members lie anywhere: a frame block at a time, of as many Gaussians together as
+/// `most` allows.
+fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, most: usize) -> Result<()> {
+    let merged = merged(source, reduction);
+    let SequenceInfo { count, times, sh_degree, varying } = merged.info();
+    let compression = Compression::Zstd(LEVEL);
+    let mut writer = ContainerWriter::create(path, *count, *sh_degree, FRAME_BLOCK, compression, BTreeMap::new())?;
+    let progress = Progress::new("emit", "Gaussian frames", (count * times.len()) as u64);
+    let parts = parts(&merged, most);
+    for start in (0..times.len()).step_by(FRAME_BLOCK) {
+        let of_block = start..times.len().min(start + FRAME_BLOCK);
+        writer.begin(&times[of_block.clone()])?;
+        for part in &parts {
+            let mut frames = merged.together(part.clone(), FRAME_BLOCK)?;
+            let mut constant = Gaussians::zeros(0, *sh_degree);
+            if start == 0 {
+                frames.read(start, Columns::ALL.without(*varying), &mut constant)?;
+            }
+            let mut held = HeldFrames::new(part.len(), *sh_degree, *varying, constant);
+            for frame in of_block.clone() {
+                let mut state = Gaussians::zeros(0, *sh_degree);
+                frames.read(frame, *varying, &mut state)?;
+                held.push(times[frame], state);
+            }
+            drop(frames);
+            let change = reduction.recolor.get(part.clone()).unwrap_or(&[]);
+            let held = Recolored::new(Box::new(held), change);
+            writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
+        }
+    }
+    writer.finish()
+}
+
+/// The Gaussians of `merged` in whole blocks, each part made of about `most` Gaussians of the source at most.
+fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
+    let count = merged.info().count;
+    let (mut parts, mut start, mut made_of) = (Vec::new(), 0, 0);
+    for block in (0..count).step_by(GAUSSIAN_BLOCK) {
+        let of_block = block..count.min(block + GAUSSIAN_BLOCK);
+        let members: usize = of_block.map(|place| merged.members(place)).sum();
+        if made_of > 0 && made_of + members > most {
+            parts.push(start..block);
+            (start, made_of) = (block, 0);
+        }
+        made_of += members;
+    }
+    parts.push(start..count);
+    parts
+}
+
+/// Writes every frame of `source`: as a container, as a folder of PLY files, or its only frame as one.
+///
+/// # Errors
+/// Frames that cannot be read, a failed write.
+pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path) -> Result<()> {
+    let info = source.info();
+    if kind == OutputKind::Gseq {
+        let progress = Progress::new("emit", "Gaussian frames", info.count as u64 * info.times.len() as u64);
+        return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
+    }
+    let progress = Progress::new("emit", "frames", info.times.len() as u64);
+    for frame in 0..info.times.len() {
+        let state = crate::stream::gather_all(source, frame, Columns::ALL)?;
+        let file = match kind {
+            OutputKind::Ply => path.to_owned(),
+            _ => path.join(format!("frame_{frame:05}.ply")),
+        };
+        write_inria(&state, &[], &file)?;
+        progress.advance(1);
+    }
+    Ok(())
+}

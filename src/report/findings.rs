@@ -1,0 +1,49 @@
+//! Everything a report shows, as data.
+
+use serde::Serialize;
+
+use super::failure::FailureMode;
+use super::histogram::Histogram;
+use super::shown::Choice;
+use crate::verbs::evaluation::{Evaluation, PictureScores};
+use crate::verbs::trade_off::TradeOff;
+
+/// Everything the page shows, as data.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// Program and version.
+    pub tool: String,
+    /// The result in a sentence or two.
+    pub verdict: String,
+    /// Means overall, by view and by frame.
+    pub evaluation: Evaluation,
+    /// The scores of every picture.
+    pub pictures: Vec<PictureScores>,
+    /// Pictures that the page shows.
+    pub shown: Vec<Choice>,
+    /// The failure modes, by [`super::traits::Kind::ALL`].
+    pub failure_modes: Vec<FailureMode>,
+    /// The scores of what was kept, merged and dropped; none where that is not known.
+    pub histograms: Option<Vec<Histogram>>,
+    /// The run's `summary.json` as it stands.
+    pub run: Option<serde_json::Value>,
+    /// What was not found beside the result, and why.
+    pub missing: Vec<String>,
+    /// A sweep over the original.
+    pub trade_off: Option<TradeOff>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Part of both models' pictures where a failure mode is worst.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Close {
+    /// Index into the failure modes.
+    pub(super) mode: usize,
+    /// Its upper left pixel.
+    pub(super) corner: (u32, u32),
+    /// PSNR inside, dB.
+    pub(super) psnr: f64,
+    /// Data URIs: original, compressed.
+    pub(super) images: [String; 2],
+}

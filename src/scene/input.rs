@@ -1,0 +1,62 @@
+//! What to read and from where to look, before anything is opened.
+
+use std::path::{Path, PathBuf};
+
+use crate::budget::Budget;
+use crate::error::Result;
+use crate::families::Family;
+use crate::ingest::cameras::{self, CameraOptions};
+use crate::model::{Rig, Split};
+
+/// What to read and from where to look.
+#[derive(Debug, Clone, Default)]
+pub struct InputOptions {
+    /// Model folder, folder of PLY files, .ply or .gseq; `-`: a frame stream on standard input.
+    pub path: PathBuf,
+    /// Training iteration of a model folder; none: the largest.
+    pub iteration: Option<u32>,
+    /// Frames of a model that is continuous in time; none: the cameras' times.
+    pub frames: Option<usize>,
+    /// Camera file or folder; none: searched for.
+    pub cameras: Option<PathBuf>,
+    /// Picture size where the cameras name none.
+    pub size: Option<(u32, u32)>,
+    /// Which pictures to score with; none: all.
+    pub split: Option<Split>,
+    /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
+    /// `memory`; none: the system's for such files.
+    pub scratch: Option<PathBuf>,
+    /// Memory that the run may take.
+    pub memory: Budget,
+}
+
+impl InputOptions {
+    /// Whether the input is the stream on standard input.
+    pub fn is_stream(&self) -> bool {
+        self.path == Path::new("-")
+    }
+
+    /// Where scratch files go.
+    pub fn scratch_folder(&self) -> PathBuf {
+        self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
+}
+
+/// An input with its frames, and the cameras if there are any.
+pub struct Opened {
+    /// The input.
+    pub input: Box<dyn Family>,
+    /// Cameras given or found.
+    pub rig: Option<Rig>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// The cameras of a file, if there is one.
+///
+/// # Errors
+/// A file that is not there, or holds no cameras.
+pub fn load_cameras(options: &InputOptions, path: Option<&Path>) -> Result<Option<Rig>> {
+    let camera_options = CameraOptions { size: options.size, frames: options.frames };
+    path.map(|path| cameras::load(path, &camera_options)).transpose()
+}

@@ -1,0 +1,249 @@
+//! Which pictures of a rig to make: at which frame, by which camera, over what background.
+
+use super::Scene;
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
+use crate::error::{Error, Result};
+use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
+use crate::pass::FrameSource;
+use crate::plan::Limits;
+use crate::render;
+use crate::stream::gather_all;
+
+/// The part of a rig's pictures that is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Part {
+    /// The held-out pictures; of cameras that hold none out, every one.
+    #[default]
+    HeldOut,
+    /// One split, which must not be empty.
+    Split(Split),
+    /// Every picture.
+    All,
+}
+
+/// A picture to make.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Picture {
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// View number.
+    pub view: u32,
+    /// Index into [`Rig::cameras`].
+    pub camera: usize,
+    /// Index into [`Rig::shots`].
+    pub shot: usize,
+}
+
+impl Picture {
+    /// `tNNN_vNN`: frame and view, with more digits where they need them.
+    pub fn name(&self) -> String {
+        format!("t{:03}_v{:02}", self.frame, self.view)
+    }
+}
+
+/// The pictures of `part`, by frame, then view.
+///
+/// # Errors
+/// A picture at no frame's time; a split without pictures; two cameras that share frame and view, which
+/// only splits of one numbering can.
+pub fn pictures(rig: &Rig, frame_times: &[f64], part: Part) -> Result<Vec<Picture>> {
+    let split = part.split(rig);
+    let mut found = Vec::new();
+    for (index, shot) in rig.shots.iter().enumerate() {
+        if split.is_some_and(|split| split != shot.split) {
+            continue;
+        }
+        let frames = match rig.frame_of(shot, frame_times)? {
+            Some(frame) => frame..frame + 1,
+            None => 0..frame_times.len(),
+        };
+        let camera = shot.camera as usize;
+        found.extend(frames.map(|frame| Picture { frame, view: shot.view, camera, shot: index }));
+    }
+    found.sort_unstable_by_key(|picture| (picture.frame, picture.view, picture.shot));
+    // Train and test files may both list a picture.
+    found.dedup_by_key(|picture| (picture.frame, picture.view, picture.camera));
+    if let Some(pair) = found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
+        return Err(Error::usage(format!(
+            "{}: two cameras are view {} at frame {}\n  choose one part with --split train or --split test",
+            rig.origin, pair[0].view, pair[0].frame
+        )));
+    }
+    if found.is_empty() {
+        return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
+    }
+    Ok(found)
+}
+
+/// The picture of `view` at `frame`.
+///
+/// # Errors
+/// As [`pictures`]; a frame that the sequence does not have, a view that does not see it.
+pub fn picture(rig: &Rig, frame_times: &[f64], part: Part, frame: usize, view: u32) -> Result<Picture> {
+    if frame >= frame_times.len() {
+        let last = frame_times.len().saturating_sub(1);
+        return Err(Error::usage(format!("--frame {frame}: expected 0 to {last}, the frames of this sequence")));
+    }
+    let here: Vec<Picture> =
+        pictures(rig, frame_times, part)?.into_iter().filter(|picture| picture.frame == frame).collect();
+    here.iter().find(|picture| picture.view == view).copied().ok_or_else(|| {
+        let views: Vec<String> = here.iter().map(|picture| picture.view.to_string()).collect();
+        let views = if views.is_empty() { "none".to_owned() } else { views.join(", ") };
+        Error::usage(format!("--view {view}: expected a view of frame {frame}, which are {views} ({})", rig.origin))
+    })
+}
+
+/// At most `count` (at least one) of the frames that `pictures` show, evenly from first to last: of K frames those
+/// numbered round(i·(K − 1)/(count − 1)), halves to even, as numpy's `round(linspace(0, K - 1, count))`.
+pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
+    let count = count.max(1);
+    let mut frames: Vec<usize> = pictures.iter().map(|picture| picture.frame).collect();
+    frames.dedup();
+    if count >= frames.len() {
+        return pictures;
+    }
+    let step = (frames.len() - 1) as f64 / (count - 1).max(1) as f64;
+    // Fewer than there are frames: steps above 1 never take one twice.
+    let kept: Vec<usize> = (0..count).map(|i| frames[(i as f64 * step).round_ties_even() as usize]).collect();
+    pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
+}
+
+/// At most `count` (frame, camera) pairs, spread evenly over all of `schedule`; its cameras by index.
+pub fn spread(schedule: &Schedule, count: usize) -> Vec<(usize, u32)> {
+    let frames = schedule.frames.iter().enumerate();
+    let all: Vec<(usize, u32)> =
+        frames.flat_map(|(frame, views)| views.iter().map(move |&(_, camera)| (frame, camera))).collect();
+    let count = all.len().min(count);
+    (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect()
+}
+
+/// Hands every frame's state and its pictures to `visit`, in order, no more pictures at once than there
+/// are threads and `limits` allow; each state is read once.
+///
+/// Memory: of each source the state of one frame.
+pub fn for_each_batch<const S: usize>(
+    sources: [&dyn FrameSource; S],
+    pictures: &[Picture],
+    limits: Limits,
+    mut visit: impl FnMut(&[Gaussians; S], &[Picture]) -> Result<()>,
+) -> Result<()> {
+    for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
+        let mut states: [Gaussians; S] = std::array::from_fn(|_| Gaussians::default());
+        for (state, source) in states.iter_mut().zip(sources) {
+            *state = gather_all(source, frame[0].frame, Columns::ALL)?;
+        }
+        for batch in frame.chunks(rayon::current_num_threads().min(limits.pictures_together)) {
+            visit(&states, batch)?;
+        }
+    }
+    Ok(())
+}
+
+/// Colour behind a scene: the one asked for, else the scene's own.
+///
+/// # Errors
+/// A colour that is not from 0 to 1.
+pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
+    match asked {
+        Some(rgb) if rgb.iter().any(|c| !(0.0..=1.0).contains(c)) => {
+            Err(Error::usage(format!("--background: expected red, green, blue from 0 to 1, found {rgb:?}")))
+        }
+        asked => Ok(asked.unwrap_or(scene.background)),
+    }
+}
+
+/// Pictures of `models` models, each picture with `pixel` bytes per pixel.
+pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> Need {
+    let pictures = work.threads.min(limits.pictures_together as u64);
+    Need {
+        stage,
+        reads: models as f64,
+        per_gaussian: vec![
+            ("states", models * work.state(Columns::ALL)),
+            ("pictures", pictures * PICTURE_ON_ALL_THREADS),
+        ],
+        fixed: vec![work.arriving(), ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels))],
+    }
+}
+
+impl Part {
+    /// The split it comes to with these cameras; none: every picture.
+    fn split(self, rig: &Rig) -> Option<Split> {
+        match self {
+            Part::HeldOut => Some(Split::Test).filter(|_| rig.shots.iter().any(|shot| shot.split == Split::Test)),
+            Part::Split(split) => Some(split),
+            Part::All => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::model::{Camera, Shot};
+
+    /// Shots of (view, camera, time, split).
+    fn rig(shots: &[(u32, u32, Option<f64>, Split)]) -> Rig {
+        let camera = |k: u32| Camera::look_at(DVec3::new(f64::from(k), -5.0, 1.0), DVec3::ZERO, 1.0, (8, 8));
+        let shot = |&(view, camera, time, split)| Shot { view, camera, time, split, image: None };
+        Rig {
+            cameras: (0..4).map(camera).collect(),
+            shots: shots.iter().map(shot).collect(),
+            background: None,
+            origin: "test.json".into(),
+        }
+    }
+
+    fn pairs(pictures: &[Picture]) -> Vec<(usize, u32)> {
+        pictures.iter().map(|picture| (picture.frame, picture.view)).collect()
+    }
+
+    #[test]
+    fn pictures_come_by_frame_then_view_whatever_the_file_says() {
+        let rig = rig(&[
+            (2, 0, Some(1.0), Split::Test),
+            (7, 1, None, Split::Test),
+            (1, 2, Some(0.0), Split::Test),
+            (5, 3, Some(0.5), Split::Train),
+        ]);
+        let times = [0.0, 0.5, 1.0];
+        assert_eq!(pairs(&pictures(&rig, &times, Part::HeldOut).unwrap()), [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]);
+        assert_eq!(pairs(&pictures(&rig, &times, Part::Split(Split::Train)).unwrap()), [(1, 5)]);
+        assert_eq!(pictures(&rig, &times, Part::All).unwrap().len(), 6);
+        assert_eq!(pairs(&[picture(&rig, &times, Part::All, 1, 5).unwrap()]), [(1, 5)]);
+    }
+
+    #[test]
+    fn cameras_that_hold_nothing_out_are_all_looked_at_unless_asked_not_to() {
+        let rig = rig(&[(0, 0, None, Split::Train)]);
+        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], Part::HeldOut).unwrap()), [(0, 0), (1, 0)]);
+        let message = pictures(&rig, &[0.0], Part::Split(Split::Test)).unwrap_err().to_string();
+        assert!(message.contains("--split"), "{message}");
+    }
+
+    #[test]
+    fn one_picture_in_two_files_is_one_and_two_of_one_name_are_refused() {
+        let same = rig(&[(3, 1, Some(0.0), Split::Train), (3, 1, Some(0.0), Split::Test)]);
+        assert_eq!(pairs(&pictures(&same, &[0.0], Part::All).unwrap()), [(0, 3)]);
+        let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
+        let message = pictures(&two, &[0.0], Part::All).unwrap_err().to_string();
+        assert!(message.contains("view 3 at frame 0") && message.contains("--split"), "{message}");
+    }
+
+    #[test]
+    fn thinned_frames_are_those_of_numpys_linspace() {
+        let every = |frames: usize| -> Vec<Picture> {
+            (0..frames).map(|frame| Picture { frame: 3 * frame, view: 0, camera: 0, shot: 0 }).collect()
+        };
+        let kept = |frames, count| pairs(&thin(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
+        // np.round(np.linspace(0, 59, 15)), np.round(np.linspace(0, 9, 3)) with 4.5 going to 4.
+        assert_eq!(kept(60, 15), [0, 4, 8, 13, 17, 21, 25, 30, 34, 38, 42, 46, 51, 55, 59]);
+        assert_eq!(kept(10, 3), [0, 4, 9]);
+        assert_eq!(kept(10, 1), [0]);
+        assert_eq!(kept(10, 0), [0]);
+        assert_eq!(kept(3, 3), [0, 1, 2]);
+        assert_eq!(kept(3, 99), [0, 1, 2]);
+    }
+}

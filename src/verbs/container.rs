@@ -1,0 +1,214 @@
+//! The verbs around containers: pack, info, verify, unpack, recover.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+
+use gseq::{Compression, Reader, RecoverReport, VerifyReport};
+use serde::Serialize;
+
+use crate::budget::{Need, Plan, Workload};
+use crate::compress::summary::InputSummary;
+use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::container::write_container;
+use crate::emit::frame_stream::StreamWriter;
+use crate::emit::kind::OutputKind;
+use crate::error::{Error, Result};
+use crate::families::stream::pack_stream;
+use crate::families::trajectories::write_sequence;
+use crate::families::{self, ColumnInfo, Family, OpenOptions, Timing};
+use crate::ingest::container::Container;
+use crate::ingest::frame_stream::StreamHeader;
+use crate::model::Columns;
+use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::plan::Limits;
+use crate::scene::{InputOptions, Opened, check_memory, open_input, open_stream};
+use crate::stream::{Frames, Progress};
+
+/// What `pack` wrote.
+#[derive(Debug)]
+pub struct Packed {
+    /// N.
+    pub gaussians: usize,
+    /// T.
+    pub frames: usize,
+    /// Size of the container.
+    pub bytes: u64,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Packs any input into a container. That of a stream names no digest of its source, which is known only
+/// when the container's header has long been written.
+pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: bool) -> Result<Packed> {
+    check_target(output, Kind::File, &[&input.path], overwrite)?;
+    if input.is_stream() {
+        let staged = StagedFile::new(output, overwrite)?;
+        let stream = open_stream(input)?;
+        check_memory(input, stream.header())?;
+        pack_stream(stream, staged.path(), compression, |_| Ok(()))?;
+        let container = Container::open(staged.path())?;
+        let (gaussians, frames) = (container.info().count, container.info().times.len());
+        let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+        staged.commit()?;
+        return Ok(Packed { gaussians, frames, bytes, notes: Vec::new() });
+    }
+    let opened = open_input(input)?;
+    let source = opened.input.source();
+    Plan::fit(workload(&*opened.input), input.memory, packing)?;
+    let staged = StagedFile::new(output, overwrite)?;
+    let work = source.info().count as u64 * source.info().times.len() as u64;
+    let progress = Progress::new("pack", "Gaussian frames", work);
+    let attributes = BTreeMap::from([("source_digest".to_owned(), opened.input.digest()?)]);
+    write_container(source, staged.path(), compression, attributes, |done| progress.advance(done))?;
+    drop(progress);
+    let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+    staged.commit()?;
+    let info = opened.input.source().info();
+    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, notes: opened.notes })
+}
+
+/// Writes any input as a frame stream; gives the input.
+///
+/// Memory: see [`unpacking`].
+pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
+    let opened = open_input(input)?;
+    let source = opened.input.source();
+    let info = source.info();
+    let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
+    let held = Plan::fit(workload(&*opened.input), input.memory, unpacking)?.limits.frames_held;
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, held)?;
+    let mut state = frames.state();
+    if !info.times.is_empty() {
+        frames.read(0, Columns::ALL, &mut state)?;
+    }
+    let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+    let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
+    for (frame, &time) in info.times.iter().enumerate() {
+        frames.read(frame, info.varying, &mut state)?;
+        stream.frame(time, &state)?;
+        progress.advance(1);
+    }
+    stream.finish()?;
+    drop((progress, frames));
+    Ok(opened)
+}
+
+/// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
+pub fn unpack(input: &InputOptions, output: &Path, overwrite: bool) -> Result<Opened> {
+    check_target(output, Kind::Folder, &[&input.path], overwrite)?;
+    let opened = open_input(input)?;
+    let source = opened.input.source();
+    Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
+    let staged = StagedFolder::new(output, overwrite)?;
+    write_sequence(source, OutputKind::PlySequence, staged.path())?;
+    let marker = serde_json::json!({
+        "tool": format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        "input": InputSummary::of(&*opened.input, &input.path)?,
+    });
+    let path = staged.path().join(MARKER);
+    fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
+    staged.commit()?;
+    Ok(opened)
+}
+
+/// Reads every byte of a container and checks it.
+pub fn verify(path: &Path) -> Result<VerifyReport> {
+    Ok(Reader::open(path)?.verify()?)
+}
+
+/// Saves the complete frames of a container that was cut short.
+pub fn recover(input: &Path, output: &Path, overwrite: bool) -> Result<RecoverReport> {
+    check_target(output, Kind::File, &[input], overwrite)?;
+    let staged = StagedFile::new(output, overwrite)?;
+    let report = gseq::recover(input, staged.path())?;
+    staged.commit()?;
+    Ok(report)
+}
+
+/// What an input holds.
+#[derive(Debug, Serialize)]
+pub struct Info {
+    /// The input.
+    #[serde(flatten)]
+    pub input: InputSummary,
+    /// Time stamps of first and last frame; none without frames, or where cameras choose them.
+    pub times: Option<(f64, f64)>,
+    /// Columns of a container.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub columns: Vec<ColumnInfo>,
+}
+
+/// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
+pub fn info(options: &InputOptions) -> Result<Info> {
+    let input: Box<dyn Family> = match options.is_stream() {
+        true => open_input(options)?.input,
+        false => families::open(&options.path, &OpenOptions { iteration: options.iteration })?,
+    };
+    let times = &input.source().info().times;
+    let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
+    let mut summary = InputSummary::of(&*input, &options.path)?;
+    if input.timing() == Timing::Continuous {
+        summary.frames = None;
+    }
+    Ok(Info { input: summary, times, columns: input.columns()? })
+}
+
+/// Of an input that nobody looks at.
+fn workload(input: &dyn Family) -> Workload {
+    Workload::new(input.source().info(), input.residence())
+}
+
+/// What it takes to write every frame as a container.
+fn packing(work: &Workload, _: &Limits) -> Vec<Need> {
+    vec![Need { stage: "pack", reads: 1.0, per_gaussian: Vec::new(), fixed: work.writing() }]
+}
+
+/// What it takes to write every frame by itself.
+fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
+    let states = ("states", work.state(Columns::ALL));
+    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::ALL))];
+    vec![Need { stage: "unpack", reads: 1.0, per_gaussian, fixed: vec![work.arriving()] }]
+}
+
+impl Info {
+    /// A few lines for a person.
+    pub fn text(&self) -> String {
+        let input = &self.input;
+        let mut out = format!(
+            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes, digest {}\n",
+            input.path,
+            input.kind,
+            input.gaussians,
+            input.sh_degree,
+            match self.times {
+                Some((first, last)) => format!("{} frames from t = {first} to {last}", input.frames.unwrap_or(0)),
+                None => match input.frames {
+                    Some(_) => "no frames".to_owned(),
+                    None => "continuous in time".to_owned(),
+                },
+            },
+            if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
+            input.bytes,
+            input.digest,
+        );
+        for column in &self.columns {
+            let range = match (column.min, column.max) {
+                (Some(min), Some(max)) => format!("{min} to {max}"),
+                _ => "no finite value".to_owned(),
+            };
+            out += &format!(
+                "  {:<14} x{:<3} {:>6} tiles ({} constant, {} raw)  {:>12} bytes of {:>12}  {range}\n",
+                column.name,
+                column.width,
+                column.tiles,
+                column.constant_tiles,
+                column.raw_tiles,
+                column.stored_bytes,
+                column.raw_bytes
+            );
+        }
+        out
+    }
+}

@@ -1,0 +1,115 @@
+//! The built-in demo: a generated scene, compressed, and what happened to each kind of Gaussian in it.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::budget::Budget;
+use crate::compress::summary::Summary;
+use crate::compress::{Request, compress_scene, keep_to_budget};
+use crate::demo::{self, Family};
+use crate::emit::atomic::{Kind, MARKER, StagedFolder, check_target};
+use crate::emit::kind::OutputKind;
+use crate::error::{Error, Result};
+use crate::families::trajectories::write_sequence;
+use crate::ingest::container::Container;
+use crate::model::{Camera, Rig, Split};
+use crate::recipe::Recipe;
+use crate::scene::{InputOptions, Scene};
+
+/// What the demo did.
+#[derive(Debug)]
+pub struct DemoReport {
+    /// The compression.
+    pub summary: Summary,
+    /// For every family its Gaussians: all, kept as they were or as leaders, merged away.
+    pub families: Vec<(Family, usize, usize, usize)>,
+}
+
+/// Generates the scene, packs it, compresses it. With `output` the folder keeps `scene.gseq`,
+/// `cameras.json` and `compressed.gseq`; without, everything is gone afterwards.
+pub fn run(
+    gaussians: usize,
+    frames: usize,
+    recipe: Recipe,
+    output: Option<&Path>,
+    overwrite: bool,
+    memory: Budget,
+) -> Result<DemoReport> {
+    if let Some(output) = output {
+        check_target(output, Kind::Folder, &[], overwrite)?;
+        let staged = StagedFolder::new(output, overwrite)?;
+        let report = run_in(staged.path(), gaussians, frames, recipe, memory)?;
+        staged.commit()?;
+        return Ok(report);
+    }
+    let folder = tempfile::tempdir().map_err(Error::io("create a folder in", &std::env::temp_dir()))?;
+    run_in(folder.path(), gaussians, frames, recipe, memory)
+}
+
+fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory: Budget) -> Result<DemoReport> {
+    let made = demo::Scene::new(gaussians, frames);
+    let packed = folder.join("scene.gseq");
+    write_sequence(&made, OutputKind::Gseq, &packed)?;
+    let rig = made.rig();
+    let cameras = folder.join("cameras.json");
+    fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;
+
+    let input = Box::new(Container::open(&packed)?);
+    let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
+    let request =
+        Request::new(InputOptions { memory, ..InputOptions::default() }, folder.join("compressed.gseq"), recipe);
+    keep_to_budget(&mut scene, &request)?;
+    let (summary, map) = compress_scene(&scene, &request)?;
+    let marker = folder.join(MARKER);
+    fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
+
+    let mut leaders = vec![false; summary.gaussians];
+    let families = Family::ALL
+        .iter()
+        .map(|&family| {
+            let members = made.members(family);
+            // The first Gaussian to reach a place of the output stands for it here.
+            let kept = members
+                .clone()
+                .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
+            let kept = kept.count();
+            let merged = members.clone().filter(|&id| map[id].is_some()).count() - kept;
+            (family, members.len(), kept, merged)
+        })
+        .collect();
+    Ok(DemoReport { summary, families })
+}
+
+/// The cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
+fn cameras_json(rig: &Rig) -> String {
+    let camera = |(id, camera): (usize, &Camera)| {
+        let to_world = camera.rotation.transpose();
+        let rows = [0, 1, 2].map(|row| to_world.row(row).to_array());
+        serde_json::json!({
+            "id": id,
+            "img_name": format!("view_{id:02}"),
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.center().to_array(),
+            "rotation": rows,
+            "fx": camera.fx,
+            "fy": camera.fy,
+        })
+    };
+    let all: Vec<serde_json::Value> = rig.cameras.iter().enumerate().map(camera).collect();
+    format!("{:#}\n", serde_json::Value::from(all))
+}
+
+impl DemoReport {
+    /// A table for a person.
+    pub fn text(&self) -> String {
+        let mut out = self.summary.text();
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "family", "Gaussians", "kept", "merged", "pruned");
+        for &(family, all, kept, merged) in &self.families {
+            let _ = writeln!(out, "  {:<12} {all:>9} {kept:>9} {merged:>9} {:>9}", family.name(), all - kept - merged);
+        }
+        out
+    }
+}

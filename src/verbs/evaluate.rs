@@ -1,0 +1,378 @@
+//! What compression cost: the renders of two models side by side, and beside photographs.
+//!
+//! Frames stream: at a time one state of either model, and per thread one picture of each. For the error
+//! of what moves, the last pictures of every view that is seen again stay: 12 bytes per pixel, two or,
+//! with ground truth, three pictures per view.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use hashbrown::{HashMap, HashSet};
+use rayon::prelude::*;
+
+use super::evaluation::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
+use crate::budget::{Budget, Need, Plan, Workload};
+use crate::compress::summary::CameraSummary;
+use crate::emit::atomic::{Kind, StagedFile, check_target};
+use crate::error::{Error, Result};
+use crate::families::{self, Family, OpenOptions, Timing};
+use crate::ingest::image::read_png;
+use crate::metrics::{self, flip, psnr, ssim, temporal_error};
+use crate::model::{Camera, Gaussians, Rig};
+use crate::pass::FrameSource;
+use crate::plan::Limits;
+use crate::render::{Image, render};
+use crate::scene::pictures::{self, Part, Picture, background, for_each_batch, pictures, thin};
+use crate::scene::{InputOptions, Scene, open_scene};
+use crate::stream::Progress;
+
+/// What to compare.
+#[derive(Debug, Clone)]
+pub struct EvaluateOptions {
+    /// The model before compression and its cameras; of its split nothing is used.
+    pub original: InputOptions,
+    /// The model after it, of any kind.
+    pub compressed: PathBuf,
+    /// Folder of photographs.
+    pub ground_truth: Option<PathBuf>,
+    /// Part of the cameras' pictures to compare.
+    pub part: Part,
+    /// Compare at most this many frames, evenly; none: all.
+    pub max_frames: Option<usize>,
+    /// Red, green, blue in [0, 1]; none: see [`background`].
+    pub background: Option<[f32; 3]>,
+    /// Whether to compute FLIP too, which takes longer than all else.
+    pub flip: bool,
+    /// File for the scores of every picture.
+    pub csv: Option<PathBuf>,
+    /// Replace an earlier file.
+    pub overwrite: bool,
+}
+
+/// Renders both models at the cameras' pictures and compares them.
+///
+/// # Errors
+/// Whatever is wrong with inputs, cameras, pictures or output; models whose frames are not the same.
+pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
+    if let Some(csv) = &options.csv {
+        check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
+    }
+    let mut side = SideBySide::open(options)?;
+    side.keep_to(options.original.memory, needs)?;
+    let (evaluation, _) = side.evaluate(|_, _, _| ())?;
+    if let Some(csv) = &options.csv {
+        let staged = StagedFile::new(csv, options.overwrite)?;
+        fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
+        staged.commit()?;
+    }
+    Ok(evaluation)
+}
+
+/// What it takes to make pictures of two models, each of as many Gaussians at most, and to compare them.
+pub fn needs(work: &Workload, limits: &Limits) -> Vec<Need> {
+    // Both models' and the photograph, and what they are compared with.
+    let mut need = pictures::need(work, limits, "evaluate", 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
+    need.per_gaussian.push(("other model", work.input.per_gaussian));
+    need.fixed.push(("pictures before", 3 * 12 * work.viewpoints * work.pixels));
+    vec![need]
+}
+
+impl EvaluateOptions {
+    /// Every path that is read.
+    pub fn inputs(&self) -> Vec<&Path> {
+        let mut inputs = vec![self.original.path.as_path(), &self.compressed];
+        inputs.extend(self.original.cameras.as_deref());
+        inputs.extend(self.ground_truth.as_deref());
+        inputs
+    }
+}
+
+/// Two open models, and the pictures to compare them on.
+pub struct SideBySide {
+    /// The original and its cameras, those of every split.
+    pub scene: Scene,
+    compressed: Box<dyn Family>,
+    compressed_path: PathBuf,
+    background: [f32; 3],
+    flip: bool,
+    pictures: Vec<Picture>,
+    truth_folder: Option<PathBuf>,
+    truth: Option<GroundTruth>,
+}
+
+impl SideBySide {
+    /// Opens both models and finds every picture; of `options` the files to write are not looked at.
+    ///
+    /// # Errors
+    /// Whatever is wrong with inputs, cameras or the folder of photographs; models whose frames are not
+    /// the same.
+    pub fn open(options: &EvaluateOptions) -> Result<SideBySide> {
+        let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
+        let compressed = open_compressed(&options.compressed, &scene)?;
+        let background = background(options.background, &scene)?;
+        let times = &scene.source().info().times;
+        let mut chosen = pictures(&scene.rig, times, options.part)?;
+        if let Some(frames) = options.max_frames {
+            chosen = thin(chosen, frames);
+        }
+        let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, &chosen));
+        Ok(SideBySide {
+            truth: truth.transpose()?,
+            truth_folder: options.ground_truth.clone(),
+            compressed_path: options.compressed.clone(),
+            pictures: chosen,
+            scene,
+            compressed,
+            background,
+            flip: options.flip,
+        })
+    }
+
+    /// Limits what comparing keeps in memory; `needs` names what is to be done.
+    ///
+    /// # Errors
+    /// A budget that cannot work.
+    pub fn keep_to(&mut self, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
+        let of_scene = self.scene.workload();
+        let gaussians = of_scene.gaussians.max(self.compressed_count() as u64);
+        let pictures = of_scene.pictures.max(self.pictures.len() as u64);
+        self.scene.limits = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, needs)?.limits;
+        Ok(())
+    }
+
+    /// Compares all pictures; `observe` sees each of them too, with the original's state, from any thread.
+    /// Gives what it made of them in the order of [`Evaluation::pictures`].
+    ///
+    /// # Errors
+    /// A source or a photograph that cannot be read.
+    pub fn evaluate<O: Send>(
+        &self,
+        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+    ) -> Result<(Evaluation, Vec<O>)> {
+        let (scores, observed) = self.scores(observe)?;
+        let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
+            Some(TruthComparison {
+                folder: folder.display().to_string(),
+                compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
+                original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
+            })
+        });
+        let scene = &self.scene;
+        let count = |input: &dyn Family| input.source().info().count;
+        let path =
+            Both { original: scene.path.display().to_string(), compressed: self.compressed_path.display().to_string() };
+        let evaluation = Evaluation {
+            tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+            path,
+            count: Both { original: count(&*scene.input), compressed: count(&*self.compressed) },
+            bytes: Both { original: scene.input.bytes()?, compressed: self.compressed.bytes()? },
+            cameras: CameraSummary {
+                origin: scene.rig.origin.clone(),
+                cameras: self.pictures.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
+                pairs: self.pictures.len(),
+            },
+            background: self.background,
+            loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
+            ground_truth,
+            notes: scene.notes.clone(),
+            pictures: scores,
+        };
+        Ok((evaluation, observed))
+    }
+
+    /// Makes the pictures numbered `places` among [`Evaluation::pictures`] again (to keep all of them would
+    /// take memory that grows with frames and views), each with the original's state.
+    ///
+    /// # Errors
+    /// A source or a photograph that cannot be read.
+    pub fn again<O>(
+        &self,
+        places: &[usize],
+        mut see: impl FnMut(usize, &Gaussians, &Camera, Taken) -> O,
+    ) -> Result<Vec<O>> {
+        let mut places = places.to_vec();
+        places.sort_unstable();
+        places.dedup();
+        let chosen: Vec<Picture> = places.iter().map(|&place| self.pictures[place]).collect();
+        let mut found = Vec::with_capacity(chosen.len());
+        for_each_batch(self.sources(), &chosen, self.scene.limits, |states, batch| {
+            for picture in batch {
+                let taken = self.take(picture, states)?;
+                found.push(see(places[found.len()], &states[0], &self.scene.rig.cameras[picture.camera], taken));
+            }
+            Ok(())
+        })?;
+        Ok(found)
+    }
+
+    /// Gaussians of the compressed model.
+    pub fn compressed_count(&self) -> usize {
+        self.compressed.source().info().count
+    }
+
+    fn sources(&self) -> [&dyn FrameSource; 2] {
+        [self.scene.source(), self.compressed.source()]
+    }
+
+    fn scores<O: Send>(
+        &self,
+        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+    ) -> Result<(Vec<PictureScores>, Vec<O>)> {
+        let pictures = &self.pictures;
+        let times = &self.scene.source().info().times;
+        let mut last_frame: HashMap<u32, usize> = HashMap::new();
+        for picture in pictures {
+            last_frame.insert(picture.view, picture.frame);
+        }
+        let mut before: HashMap<u32, Taken> = HashMap::new();
+        let mut all = Vec::with_capacity(pictures.len());
+        let mut observed = Vec::with_capacity(pictures.len());
+        let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
+        for_each_batch(self.sources(), pictures, self.scene.limits, |states, batch| {
+            let taken: Vec<_> = batch
+                .par_iter()
+                .map(|picture| {
+                    let taken = self.take(picture, states)?;
+                    let scores = taken.scores(before.get(&picture.view), self.flip);
+                    let seen = observe(&states[0], &self.scene.rig.cameras[picture.camera], &taken);
+                    progress.advance(1);
+                    Ok((taken, scores, seen))
+                })
+                .collect::<Result<_>>()?;
+            for (&Picture { frame, view, .. }, (taken, (loss, truth), seen)) in batch.iter().zip(taken) {
+                all.push(PictureScores { frame, time: times[frame], view, loss, truth });
+                observed.push(seen);
+                if last_frame.get(&view).is_some_and(|&last| last > frame) {
+                    before.insert(view, taken);
+                } else {
+                    before.remove(&view);
+                }
+            }
+            Ok(())
+        })?;
+        Ok((all, observed))
+    }
+
+    fn take(&self, picture: &Picture, [original, compressed]: &[Gaussians; 2]) -> Result<Taken> {
+        let camera = &self.scene.rig.cameras[picture.camera];
+        let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
+        let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
+        Ok(Taken {
+            original: render(original, camera, self.background),
+            compressed: render(compressed, camera, self.background),
+            truth: file.map(read).transpose()?,
+        })
+    }
+}
+
+/// Most that time stamps of the same frame may differ, in parts of the time span: files round them.
+const TIME_TOLERANCE: f64 = 1e-6;
+
+/// Opens the compressed model at the frames of the original.
+fn open_compressed(path: &Path, original: &Scene) -> Result<Box<dyn Family>> {
+    let times = &original.source().info().times;
+    let input = families::open(path, &OpenOptions::default())?;
+    let input = match input.timing() {
+        Timing::Continuous => input.with_times(times.clone())?,
+        Timing::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,
+        Timing::Numbered | Timing::Stamped => input,
+    };
+    let found = &input.source().info().times;
+    let expected = |what: String| format!("{what}, as in {}", original.path.display());
+    if found.len() != times.len() {
+        let expected = expected(format!("{} frames", times.len()));
+        return Err(Error::input(path, "", expected, format!("{} frames", found.len()))
+            .hint("compare models of the same scene, with the cameras both were made for"));
+    }
+    let span = times.first().zip(times.last()).map_or(0.0, |(first, last)| last - first);
+    let tolerance = TIME_TOLERANCE * if times.len() > 1 { span } else { 1.0 };
+    match (0..times.len()).find(|&frame| (found[frame] - times[frame]).abs() > tolerance) {
+        Some(frame) => {
+            let expected = expected(format!("time {}", times[frame]));
+            Err(Error::input(path, format!("frame {frame}"), expected, found[frame].to_string())
+                .hint("compare models of the same scene, with the cameras both were made for"))
+        }
+        None => Ok(input),
+    }
+}
+
+/// Where the photographs are.
+struct GroundTruth {
+    /// By frame and view.
+    files: HashMap<(usize, u32), PathBuf>,
+}
+
+impl GroundTruth {
+    /// Finds the photograph of every picture: `tNNN_vNN.png`, else the file its camera names, by as
+    /// much of its path as leads to one inside `folder`.
+    fn find(folder: &Path, rig: &Rig, pictures: &[Picture]) -> Result<GroundTruth> {
+        if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
+            return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.display())));
+        }
+        let mut files = HashMap::new();
+        let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
+        for &picture in pictures {
+            let place = || format!("frame {}, view {}", picture.frame, picture.view);
+            let named = rig.shots[picture.shot].image.as_deref();
+            let numbered = folder.join(format!("{}.png", picture.name()));
+            let file = if numbered.is_file() {
+                numbered
+            } else {
+                named.and_then(|image| inside(folder, image)).ok_or_else(|| {
+                    let named = named.and_then(Path::file_name).map(|name| format!(" or {}", name.display()));
+                    let expected = format!("{}.png{}", picture.name(), named.unwrap_or_default());
+                    Error::input(folder, place(), expected, "no such file")
+                        .hint("--max-frames compares fewer frames, --split other pictures")
+                })?
+            };
+            // The names that a time-stamped rig gives its files are shared by all of its cameras.
+            if let Some(other) = takers.insert(file.clone(), picture) {
+                let found = format!("{}, as for frame {}, view {}", file.display(), other.frame, other.view);
+                return Err(Error::input(folder, place(), "a picture of its own", found)
+                    .hint("give the folder that the cameras' file paths start from"));
+            }
+            files.insert((picture.frame, picture.view), file);
+        }
+        Ok(GroundTruth { files })
+    }
+}
+
+/// The file inside `folder` that ends as `image` does, by the longest such end.
+fn inside(folder: &Path, image: &Path) -> Option<PathBuf> {
+    let parts: Vec<_> = image.components().collect();
+    let ends = (0..parts.len()).map(|start| parts[start..].iter().collect::<PathBuf>());
+    ends.filter(|end| end.is_relative()).map(|end| folder.join(end)).find(|file| file.is_file())
+}
+
+/// The pictures of one (frame, view), all of one size.
+pub struct Taken {
+    /// Render of the original.
+    pub original: Image,
+    /// Render of the compressed model.
+    pub compressed: Image,
+    /// The photograph, where there are any.
+    pub truth: Option<Image>,
+}
+
+impl Taken {
+    /// Scores, with those of motion from the pictures `before` of the same view.
+    fn scores(&self, before: Option<&Taken>, with_flip: bool) -> (Score, Option<Both<Score>>) {
+        let size = |taken: &Taken| (taken.original.width, taken.original.height);
+        // A view whose camera changed may have another size, and nothing to be compared with.
+        let before = before.filter(|before| size(before) == size(self));
+        let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]), with_flip);
+        let truth = self.truth.as_ref().map(|truth| {
+            let against = |image: fn(&Taken) -> &Image| {
+                score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
+            };
+            Both { original: against(|taken| &taken.original), compressed: against(|taken| &taken.compressed) }
+        });
+        (loss, truth)
+    }
+}
+
+/// How close `a` is to `b`, given the same two at the view's frame before.
+fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> Score {
+    let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
+    Score { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
+}

@@ -1,0 +1,276 @@
+//! What an evaluation found, for people and for programs: scores of every picture and their means.
+//!
+//! Data in: scores per picture, by frame, then view. Data out: means overall, per view and per frame, as
+//! JSON, as text, and the pictures themselves as CSV. Means are arithmetic, in the order of the pictures.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::csv::known;
+use crate::compress::summary::CameraSummary;
+
+/// One value for the model before compression and one for the model after it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Both<T> {
+    /// Before.
+    pub original: T,
+    /// After.
+    pub compressed: T,
+}
+
+/// How close two pictures are.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Score {
+    /// [`crate::metrics::psnr`], dB.
+    pub psnr: f64,
+    /// [`crate::metrics::ssim`].
+    pub ssim: f64,
+    /// [`crate::metrics::temporal_error`] from the view's picture before; none of its first.
+    pub temporal: Option<f64>,
+    /// [`crate::metrics::flip`], where it is asked for.
+    pub flip: Option<f64>,
+}
+
+/// The scores of one (frame, view).
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PictureScores {
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// Its time stamp.
+    pub time: f64,
+    /// View number.
+    pub view: u32,
+    /// Compressed against original.
+    pub loss: Score,
+    /// Each against the ground truth, where that is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub truth: Option<Both<Score>>,
+}
+
+/// Means over pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Means {
+    /// Number of pictures.
+    pub pairs: usize,
+    /// Mean PSNR, dB.
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+    /// Mean temporal error of those pictures that have one; none if no view is seen twice.
+    pub temporal: Option<f64>,
+    /// Mean FLIP, where it is asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flip: Option<f64>,
+}
+
+/// Means over the pictures of one view.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ViewMeans {
+    /// View number.
+    pub view: u32,
+    /// Its means.
+    #[serde(flatten)]
+    pub means: Means,
+}
+
+/// Means over the pictures of one frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct FrameMeans {
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// Its time stamp.
+    pub time: f64,
+    /// Its means; the temporal error is that since the frame evaluated before.
+    #[serde(flatten)]
+    pub means: Means,
+}
+
+/// Pictures of one origin against pictures of another.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Comparison {
+    /// Over all pictures.
+    #[serde(flatten)]
+    pub overall: Means,
+    /// View by view, by number.
+    pub per_view: Vec<ViewMeans>,
+    /// Frame by frame.
+    pub per_frame: Vec<FrameMeans>,
+}
+
+/// Both models against the ground truth.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TruthComparison {
+    /// Folder of the pictures.
+    pub folder: String,
+    /// The compressed model.
+    #[serde(flatten)]
+    pub compressed: Comparison,
+    /// The original, for what was lost to be seen.
+    pub original: Comparison,
+}
+
+/// Everything an evaluation found.
+#[derive(Debug, Clone, Serialize)]
+pub struct Evaluation {
+    /// Program and version.
+    pub tool: String,
+    /// Paths as given.
+    pub path: Both<String>,
+    /// Gaussians.
+    pub count: Both<usize>,
+    /// Bytes of the files that grow with the Gaussians.
+    pub bytes: Both<u64>,
+    /// From where they were looked at.
+    pub cameras: CameraSummary,
+    /// Red, green, blue behind the scene.
+    pub background: [f32; 3],
+    /// Compressed against original.
+    #[serde(flatten)]
+    pub loss: Comparison,
+    /// Both against the ground truth, where that is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ground_truth: Option<TruthComparison>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+    /// Every picture; for the CSV.
+    #[serde(skip)]
+    pub pictures: Vec<PictureScores>,
+}
+
+impl Means {
+    /// Of nothing: no pairs, and NaN, which JSON shows as null.
+    fn of(scores: &[Score]) -> Means {
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        let all = |value: fn(&Score) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
+        let given = |value: fn(&Score) -> Option<f64>| {
+            let values: Vec<f64> = scores.iter().filter_map(value).collect();
+            (!values.is_empty()).then(|| mean(&values))
+        };
+        Means {
+            pairs: scores.len(),
+            psnr: all(|score| score.psnr),
+            ssim: all(|score| score.ssim),
+            temporal: given(|score| score.temporal),
+            flip: given(|score| score.flip),
+        }
+    }
+}
+
+impl Comparison {
+    /// Averages what `score` picks of each picture; none if a picture lacks it.
+    pub fn of(pictures: &[PictureScores], score: impl Fn(&PictureScores) -> Option<Score>) -> Option<Comparison> {
+        let scores: Vec<Score> = pictures.iter().map(score).collect::<Option<_>>()?;
+        let mut views: BTreeMap<u32, Vec<Score>> = BTreeMap::new();
+        for (picture, &score) in pictures.iter().zip(&scores) {
+            views.entry(picture.view).or_default().push(score);
+        }
+        let mut per_frame = Vec::new();
+        let mut rest = &scores[..];
+        for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
+            let (these, after) = rest.split_at(frame.len());
+            per_frame.push(FrameMeans { frame: frame[0].frame, time: frame[0].time, means: Means::of(these) });
+            rest = after;
+        }
+        Some(Comparison {
+            overall: Means::of(&scores),
+            per_view: views.iter().map(|(&view, scores)| ViewMeans { view, means: Means::of(scores) }).collect(),
+            per_frame,
+        })
+    }
+}
+
+impl Evaluation {
+    /// A few lines for a person.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let Both { original, compressed } = self.count;
+        let percent = 100.0 * compressed as f64 / original.max(1) as f64;
+        // Writing to a String cannot fail.
+        let _ = writeln!(out, "{}: {original} Gaussians in {} bytes", self.path.original, self.bytes.original);
+        let _ = writeln!(
+            out,
+            "{}: {compressed} Gaussians ({percent:.1}%) in {} bytes",
+            self.path.compressed, self.bytes.compressed
+        );
+        let frames = self.loss.per_frame.len();
+        let _ = writeln!(out, "{} pictures of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
+        let with_flip = self.loss.overall.flip.is_some();
+        let flip = if with_flip { "     FLIP" } else { "" };
+        let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");
+        let mut line = |what: &str, means: &Means| {
+            let temporal = means.temporal.map_or("-".to_owned(), |error| format!("{error:.6}"));
+            let flip = means.flip.map_or(String::new(), |error| format!(" {error:>8.5}"));
+            let _ = writeln!(out, "  {what:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
+        };
+        line("compressed against original", &self.loss.overall);
+        if let Some(truth) = &self.ground_truth {
+            line("compressed against ground truth", &truth.compressed.overall);
+            line("original against ground truth", &truth.original.overall);
+        }
+        let worst_view = self.loss.per_view.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr));
+        let worst_frame = self.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr));
+        if let (Some(view), Some(frame)) = (worst_view, worst_frame) {
+            line(&format!("worst view: {}", view.view), &view.means);
+            line(&format!("worst frame: {}", frame.frame), &frame.means);
+        }
+        for note in &self.notes {
+            let _ = writeln!(out, "  note: {note}");
+        }
+        out
+    }
+
+    /// One line per picture under a line of names; a value that does not exist is empty.
+    pub fn csv(&self) -> String {
+        let mut out = String::from("frame,view,time");
+        let with_flip = self.loss.overall.flip.is_some();
+        let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };
+        for with in compared {
+            let _ = write!(out, ",psnr{with},ssim{with},temporal{with}");
+            if with_flip {
+                let _ = write!(out, ",flip{with}");
+            }
+        }
+        for picture in &self.pictures {
+            let _ = write!(out, "\n{},{},{}", picture.frame, picture.view, picture.time);
+            let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
+            for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
+                let _ = write!(out, ",{},{},{}", score.psnr, score.ssim, known(score.temporal));
+                if with_flip {
+                    let _ = write!(out, ",{}", known(score.flip));
+                }
+            }
+        }
+        out.push('\n');
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> PictureScores {
+        let loss = Score { psnr, ssim: psnr / 100.0, temporal, flip: None };
+        PictureScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
+    }
+
+    #[test]
+    fn means_weigh_every_picture_alike_and_skip_a_missing_temporal_error() {
+        let pictures = [
+            picture(0, 1, 30.0, None),
+            picture(0, 2, 40.0, None),
+            picture(2, 1, 50.0, Some(0.25)),
+            picture(2, 7, 20.0, None),
+            picture(3, 1, 10.0, Some(0.75)),
+        ];
+        let found = Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap();
+        assert_eq!(found.overall, Means { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
+        let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
+        assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
+        let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
+        assert_eq!(frames, [(0, 35.0, None), (2, 35.0, Some(0.25)), (3, 10.0, Some(0.75))]);
+        assert!(Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
+    }
+}

@@ -1,0 +1,12 @@
+//! What each verb beside `compress` does from input to output.
+
+pub mod baseline;
+pub mod container;
+pub(crate) mod csv;
+pub mod demo;
+pub mod evaluate;
+pub mod evaluation;
+pub mod render;
+pub mod score;
+pub mod sweep;
+pub mod trade_off;

@@ -1,0 +1,147 @@
+//! Pictures of an input, as files.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+
+use crate::budget::{Need, Workload};
+use crate::compress::summary::{CameraSummary, InputSummary};
+use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::image::{ImageFormat, write_image};
+use crate::error::{Error, Result};
+use crate::model::Camera;
+use crate::pass::FrameSource;
+use crate::plan::Limits;
+use crate::render;
+use crate::scene::pictures::{self, Part, Picture, background, for_each_batch, picture, pictures};
+use crate::scene::{InputOptions, open_scene};
+use crate::stream::Progress;
+
+/// Which pictures to render.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wanted {
+    /// One, into a file whose name says its format.
+    One {
+        /// Frame of the sequence.
+        frame: usize,
+        /// View number.
+        view: u32,
+    },
+    /// All of the part, into a folder, named `tNNN_vNN`.
+    All(ImageFormat),
+}
+
+/// What to render.
+#[derive(Debug, Clone)]
+pub struct RenderOptions {
+    /// What to read; of its split nothing is used.
+    pub input: InputOptions,
+    /// Which pictures.
+    pub wanted: Wanted,
+    /// Part of the cameras' pictures they are among.
+    pub part: Part,
+    /// Red, green, blue in [0, 1]; none: see [`background`].
+    pub background: Option<[f32; 3]>,
+    /// File or folder to write.
+    pub output: PathBuf,
+    /// Replace an earlier output.
+    pub overwrite: bool,
+}
+
+/// What was rendered.
+#[derive(Debug)]
+pub struct Rendered {
+    /// Number of pictures.
+    pub pictures: usize,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Renders pictures of an input.
+///
+/// Memory: one frame's state, and per thread one picture with its footprints ([`crate::scene::pictures::need`]).
+///
+/// # Errors
+/// Whatever is wrong with input, cameras, choice or output. Nothing is left behind then.
+pub fn render(options: &RenderOptions) -> Result<Rendered> {
+    let output = options.output.as_path();
+    let (kind, format) = match options.wanted {
+        Wanted::All(format) => (Kind::Folder, format),
+        Wanted::One { .. } => (Kind::File, format_of(output)?),
+    };
+    let mut inputs = vec![options.input.path.as_path()];
+    inputs.extend(options.input.cameras.as_deref());
+    check_target(output, kind, &inputs, options.overwrite)?;
+    let mut scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
+    scene.keep_to(options.input.memory, needs)?;
+    let source = scene.source();
+    let times = &source.info().times;
+    let background = background(options.background, &scene)?;
+    let chosen = match options.wanted {
+        Wanted::One { frame, view } => vec![picture(&scene.rig, times, options.part, frame, view)?],
+        Wanted::All(_) => pictures(&scene.rig, times, options.part)?,
+    };
+    let job = Job { source, cameras: &scene.rig.cameras, limits: scene.limits, background, format };
+    if kind == Kind::File {
+        let staged = StagedFile::new(output, options.overwrite)?;
+        job.write(&chosen, |_| staged.path().to_owned())?;
+        staged.commit()?;
+    } else {
+        let staged = StagedFolder::new(output, options.overwrite)?;
+        let name = |picture: &Picture| format!("{}.{}", picture.name(), format.extension());
+        job.write(&chosen, |picture| staged.path().join(name(picture)))?;
+        let marker = serde_json::json!({
+            "tool": format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+            "input": InputSummary::of(&*scene.input, &scene.path)?,
+            "cameras": CameraSummary {
+                origin: scene.rig.origin.clone(),
+                cameras: scene.rig.cameras.len(),
+                pairs: chosen.len(),
+            },
+            "background": background,
+        });
+        let path = staged.path().join(MARKER);
+        fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
+        staged.commit()?;
+    }
+    Ok(Rendered { pictures: chosen.len(), notes: scene.notes })
+}
+
+/// What it takes to make pictures of a model.
+fn needs(work: &Workload, limits: &Limits) -> Vec<Need> {
+    vec![pictures::need(work, limits, "render", 1, 12)]
+}
+
+fn format_of(output: &Path) -> Result<ImageFormat> {
+    ImageFormat::of(output).ok_or_else(|| {
+        Error::usage(format!(
+            "{}: expected a name that ends in .png or .npy\n  for every picture into a folder, say --all",
+            output.display()
+        ))
+    })
+}
+
+/// Rendering into files.
+struct Job<'a> {
+    source: &'a dyn FrameSource,
+    cameras: &'a [Camera],
+    limits: Limits,
+    background: [f32; 3],
+    format: ImageFormat,
+}
+
+impl Job<'_> {
+    fn write(&self, pictures: &[Picture], path: impl Fn(&Picture) -> PathBuf + Sync) -> Result<()> {
+        let progress = Progress::new("render", "pictures", pictures.len() as u64);
+        for_each_batch([self.source], pictures, self.limits, |[state], batch| {
+            // Tasks within a picture too: a frame may have fewer pictures than there are threads.
+            batch.par_iter().try_for_each(|picture| {
+                let image = render::render(state, &self.cameras[picture.camera], self.background);
+                write_image(&image, self.format, &path(picture))?;
+                progress.advance(1);
+                Ok(())
+            })
+        })
+    }
+}
