@@ -5,7 +5,7 @@
 //! | layer | modules | what lives there |
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
-//! | L1 | [`error`], [`model`], [`pass`], [`plan`], [`recipe`] | the vocabulary |
+//! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`refit`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`demo`] | files, threads, terminals |
 //! | L4 | [`pipeline`], [`report`] | the order of the passes; the page about their result |
@@ -17,6 +17,7 @@ pub mod demo;
 pub mod emit;
 pub mod error;
 pub mod ingest;
+pub mod machine;
 pub mod merge;
 pub mod metrics;
 pub mod model;

@@ -20,6 +20,7 @@ use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
+use crate::machine::memory_limit;
 use crate::model::{Camera, Columns, Rig, Rows};
 use crate::plan::Limits;
 use crate::recipe::Recipe;
@@ -30,7 +31,7 @@ use crate::{merge, metrics, refit, render, select, stats};
 /// Memory that a run may take, and whether it is to say beforehand what it will take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Budget {
-    /// Bytes; none: a quarter of the machine's memory.
+    /// Bytes; none: a quarter of what this process may take, see [`memory_limit`].
     pub bytes: Option<u64>,
     /// Print the plan on standard error before any work.
     pub explain: bool,
@@ -283,7 +284,7 @@ impl Plan {
     pub fn fit(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<Plan> {
         let plan = Self::closest(work, budget.limit(), needs);
         if budget.explain {
-            eprint!("{}", plan.text());
+            eprint!("{}{}", budget.text(), plan.text());
         }
         if plan.excess() > 0 { Err(plan.refusal(budget)) } else { Ok(plan) }
     }
@@ -347,9 +348,9 @@ impl Plan {
         let largest = self.needs.iter().max_by_key(|need| need.bytes(&self.work)).map_or("", |need| need.stage);
         // Rounded up to what a person would write.
         let least = self.peak().div_ceil(1 << 20);
-        let default = if budget.bytes.is_none() { " (a quarter of the machine's)" } else { "" };
+        let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
         Error::usage(format!(
-            "--memory {}{default}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
+            "--memory {}{origin}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
              give it that, or fewer --threads; --explain shows what takes how much",
             size(self.budget),
             self.work.gaussians
@@ -411,9 +412,26 @@ impl Plan {
 }
 
 impl Budget {
-    /// Bytes that the run may take on this machine.
+    /// Bytes that the run may take.
     fn limit(self) -> u64 {
-        self.bytes.or_else(|| Some(machine_memory()? / 4)).unwrap_or(u64::MAX)
+        self.bytes.unwrap_or_else(|| Budget::by_default().0)
+    }
+
+    /// Bytes that a run takes unless told otherwise, and where that number comes from.
+    fn by_default() -> (u64, String) {
+        let (bytes, origin) = memory_limit();
+        (bytes / 4, format!("a quarter of {}, {origin}", size(bytes)))
+    }
+
+    /// The budget for a person.
+    fn text(self) -> String {
+        match self.bytes {
+            Some(bytes) => format!("budget: {}, as asked for\n", size(bytes)),
+            None => {
+                let (bytes, origin) = Budget::by_default();
+                format!("budget: {}, {origin}\n", size(bytes))
+            }
+        }
     }
 }
 
@@ -426,16 +444,6 @@ pub fn taken() -> Option<String> {
 pub fn keep_to(budget: Budget, scene: &mut Scene, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
     scene.limits = Plan::fit(Workload::of(scene), budget, needs)?.limits;
     Ok(())
-}
-
-/// Memory of the machine or of the group of processes this one is confined to, bytes; none where the system does
-/// not say.
-fn machine_memory() -> Option<u64> {
-    let info = fs::read_to_string("/proc/meminfo").ok()?;
-    let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
-    let machine = line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024;
-    let group = fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|max| max.trim().parse().ok());
-    Some(group.map_or(machine, |group: u64| group.min(machine)))
 }
 
 fn size(bytes: u64) -> String {
