@@ -32,6 +32,9 @@ pub(super) struct Cli {
     /// Threads to work on; the result does not depend on it. Default: all.
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(super) threads: Option<u16>,
+    /// Show no progress: no bars on a terminal, no lines in a log
+    #[arg(long, global = true)]
+    pub(super) quiet: bool,
 }
 
 /// The verbs.

@@ -25,6 +25,7 @@ use crate::pipeline::sweep::{Method, SweepOptions};
 use crate::pipeline::{container, demo, evaluate, render, score, sweep};
 use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions};
+use crate::stream::{Mode, Progress};
 use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, Render, SideBySide, SplitArg, Sweep, Verb};
 use recipe_flags::RecipeFlags;
 
@@ -38,6 +39,7 @@ pub fn main() -> ExitCode {
             return ExitCode::from(error.exit_code() as u8);
         }
     };
+    Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
     match run(cli) {
         Ok(()) => {
