@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
+use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
 use crate::error::{Error, Result};
 use crate::model::Split;
@@ -72,7 +73,7 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Score(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
-            let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.overwrite)?;
+            let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
             notes(&report.notes);
             print(&format!(
                 "{}: {} Gaussians, of which the recipe keeps {} before merging\n",
@@ -90,7 +91,8 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
-            let options = EvaluateOptions { csv: args.csv, overwrite: args.overwrite, ..evaluate_options(args.models) };
+            let options =
+                EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models) };
             let found = evaluate::evaluate(&options)?;
             print(&if as_json { json(&found) } else { found.text() })
         }
@@ -105,7 +107,7 @@ fn run(cli: Cli) -> Result<()> {
                 evaluate: evaluate_options(args.models),
                 sweep: args.sweep,
                 output: args.output,
-                overwrite: args.overwrite,
+                overwrite: args.earlier.replace(),
             })?;
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.display()))
@@ -113,7 +115,7 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
-            let packed = container::pack(&input, &args.output, compression, args.overwrite)?;
+            let packed = container::pack(&input, &args.output, compression, args.earlier.replace())?;
             notes(&packed.notes);
             print(&format!(
                 "{}: {} Gaussians x {} frames in {} bytes\n",
@@ -150,13 +152,13 @@ fn run(cli: Cli) -> Result<()> {
                 notes(&container::unpack_stream(&input, stdout)?.notes);
                 return Ok(());
             };
-            let opened = container::unpack(&input, &output, args.overwrite)?;
+            let opened = container::unpack(&input, &output, args.earlier.replace())?;
             notes(&opened.notes);
             let frames = opened.input.source().info().times.len();
             print(&format!("{}: {frames} PLY files\n", output.display()))
         }
         Verb::Recover(args) => {
-            let report = container::recover(&args.input, &args.output, args.overwrite)?;
+            let report = container::recover(&args.input, &args.output, args.earlier.replace())?;
             print(&format!(
                 "{}: {} complete frames of {} seen, {} tiles\n",
                 args.output.display(),
@@ -169,7 +171,7 @@ fn run(cli: Cli) -> Result<()> {
             let recipe = args.recipe.recipe()?;
             let output = args.output.as_deref();
             let (gaussians, frames) = (args.gaussians as usize, args.frames as usize);
-            let report = demo::run(gaussians, frames, recipe, output, args.overwrite, budget(args.memory))?;
+            let report = demo::run(gaussians, frames, recipe, output, args.earlier.replace(), budget(args.memory))?;
             print(&report.text())?;
             if let Some(folder) = output {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
@@ -208,7 +210,7 @@ fn compress_options(args: Compress) -> Result<CompressOptions> {
         drop_ids: args.overrides.drop_ids,
         keep_box: args.overrides.keep_box,
         dry_run: args.dry_run,
-        overwrite: args.overwrite,
+        overwrite: args.earlier.replace(),
     })
 }
 
@@ -229,7 +231,7 @@ fn render_options(args: Render) -> RenderOptions {
         part: args.split.map_or(part, part_of),
         background: args.background.background,
         output: args.output,
-        overwrite: args.overwrite,
+        overwrite: args.earlier.replace(),
     }
 }
 
@@ -246,7 +248,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
         background: args.background.background,
         flip: args.flip,
         csv: None,
-        overwrite: false,
+        overwrite: Replace::Never,
     }
 }
 
@@ -261,7 +263,7 @@ fn sweep_options(args: Sweep) -> SweepOptions {
         max_frames: Some(args.max_frames as usize),
         background: args.background.background,
         output: args.output,
-        overwrite: args.overwrite,
+        overwrite: args.earlier.replace(),
     }
 }
 

@@ -13,6 +13,7 @@ use super::refit::refit;
 use super::rounds::rank_in_rounds;
 use super::scored::{Measured, Scored, UserOverrides, measure, score_measured};
 use super::summary::{CameraSummary, LeftOut, Stages, Summary};
+use crate::emit::atomic::Replace;
 use crate::error::{Error, Result};
 use crate::plan::Limits;
 use crate::recipe::{Coverage, Recipe};
@@ -62,7 +63,7 @@ pub struct CompressOptions {
     /// Write nothing.
     pub dry_run: bool,
     /// Replace an earlier output.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 impl CompressOptions {
@@ -79,7 +80,7 @@ impl CompressOptions {
             drop_ids: None,
             keep_box: None,
             dry_run: false,
-            overwrite: false,
+            overwrite: Replace::Never,
         }
     }
 }

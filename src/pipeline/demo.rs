@@ -10,7 +10,7 @@ use super::memory::{Budget, compressing, keep_to};
 use super::output::{OutputKind, write_sequence};
 use super::summary::{Stages, Summary};
 use crate::demo::{self, Family};
-use crate::emit::atomic::{Kind, MARKER, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::model::{Camera, Rig, Split};
@@ -32,7 +32,7 @@ pub fn run(
     frames: usize,
     recipe: Recipe,
     output: Option<&Path>,
-    overwrite: bool,
+    overwrite: Replace,
     memory: Budget,
 ) -> Result<DemoReport> {
     if let Some(output) = output {
@@ -42,7 +42,7 @@ pub fn run(
         staged.commit()?;
         return Ok(report);
     }
-    let folder = tempfile::tempdir().map_err(Error::io("create a folder in", &std::env::temp_dir()))?;
+    let folder = ScratchFolder::new(&std::env::temp_dir())?;
     run_in(folder.path(), gaussians, frames, recipe, memory)
 }
 

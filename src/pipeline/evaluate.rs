@@ -15,7 +15,7 @@ use super::input::{Input, InputOptions, Scene, open_scene};
 use super::memory::{Budget, Need, Plan, Workload, picturing_both};
 use super::pictures::{Part, Picture, background, for_each_batch, pictures, thin};
 use super::summary::CameraSummary;
-use crate::emit::atomic::{Kind, StagedFile, check_target};
+use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::error::{Error, Result};
 use crate::ingest::image::read_png;
 use crate::metrics::{flip, psnr, ssim, temporal_error};
@@ -45,7 +45,7 @@ pub struct EvaluateOptions {
     /// File for the scores of every picture.
     pub csv: Option<PathBuf>,
     /// Replace an earlier file.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 /// Renders both models at the cameras' pictures and compares them.

@@ -16,7 +16,7 @@ use super::proxies::{canonical_cloud, canonical_proxies};
 use super::result::{merged, result_frames};
 use super::scored::{Reference, Scored};
 use super::summary::{Stages, Summary};
-use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target, commit_files};
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::emit::index_map::write_index_map;
 use crate::emit::ply::{OutRow, write_inria, write_like};
@@ -109,7 +109,7 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
 }
 
 /// Confirms, before any work, that the result and what goes beside it can be written.
-pub fn check_output(path: &Path, kind: OutputKind, inputs: &[&Path], overwrite: bool) -> Result<()> {
+pub fn check_output(path: &Path, kind: OutputKind, inputs: &[&Path], overwrite: Replace) -> Result<()> {
     if kind.is_folder() {
         return check_target(path, Kind::Folder, inputs, overwrite);
     }
@@ -163,9 +163,7 @@ pub fn write_result(
         write_text(recipe.path(), &text)?;
         write_index_map(&map, index_map.path())?;
         write_text(marker.path(), &summary.json())?;
-        for file in [staged, recipe, index_map, marker] {
-            file.commit()?;
-        }
+        commit_files(&[staged, recipe, index_map, marker])?;
     }
     Ok(summary)
 }

@@ -24,7 +24,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::emit::atomic::{Kind as TargetKind, MARKER, StagedFolder, check_target};
+use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::model::{Schedule, Split};
@@ -55,7 +55,7 @@ pub struct ReportOptions {
     /// Folder to write.
     pub output: PathBuf,
     /// Replace an earlier report.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 /// Everything the page shows, as data.
