@@ -30,8 +30,29 @@ fn started(workplace: &Workplace, mut command: Command) -> Child {
     piped.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
+/// Starts the program; it waits for what comes on standard input.
+fn waiting(workplace: &Workplace, arguments: &str) -> Child {
+    let mut command = Command::new(program());
+    command.args(arguments.split_whitespace());
+    started(workplace, command)
+}
+
 fn told(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Waits until `folder` holds anything, for a run that goes on.
+fn wait_for_temporaries(folder: &Path, child: &mut Child) {
+    let start = Instant::now();
+    while files(folder).is_empty() {
+        assert!(start.elapsed() < Duration::from_secs(60), "nothing appeared in {}", folder.display());
+        assert!(child.try_wait().unwrap().is_none(), "the run ended");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn send(signal: &str, child: &Child) {
+    assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
 }
 
 /// The program in a namespace of process ids of its own, as in a container, with a number above `before`; none with a
@@ -96,6 +117,57 @@ fn runs_in_different_containers_share_their_folders_and_both_succeed() {
 }
 
 #[test]
+fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() {
+    let workplace = Workplace::new();
+    let half = stream(&workplace);
+    let half = &half[..half.len() / 2];
+    for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
+        for (arguments, input) in [
+            ("compress - -o out --scratch-dir scratch", half),
+            ("pack - -o out.gseq", half),
+            ("demo --gaussians 100000 --frames 400 -o demo", &[]),
+        ] {
+            fs::create_dir(workplace.path("scratch")).unwrap();
+            let mut child = waiting(&workplace, arguments);
+            let mut pipe = child.stdin.take().unwrap();
+            pipe.write_all(input).unwrap();
+            let place = if arguments.contains("scratch") { "scratch" } else { "" };
+            if place.is_empty() {
+                fs::remove_dir(workplace.path("scratch")).unwrap();
+            }
+            wait_for_temporaries(&workplace.path(place), &mut child);
+            std::thread::sleep(Duration::from_millis(100));
+            send(signal, &child);
+            let output = child.wait_with_output().unwrap();
+            assert_eq!(output.status.code(), Some(code), "{signal} {arguments}: {}", told(&output));
+            _ = fs::remove_dir(workplace.path("scratch"));
+            let left = files(&workplace.path(""));
+            assert!(left.is_empty(), "{signal} {arguments}: left {:?}", left.keys());
+        }
+    }
+}
+
+#[test]
+fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
+    let workplace = Workplace::new();
+    let stream = stream(&workplace);
+    let mut command = Command::new("sh");
+    command.args(["-c", &format!("trap '' HUP INT; exec {} pack - -o out.gseq", program().display())]);
+    let mut child = started(&workplace, command);
+    let mut pipe = child.stdin.take().unwrap();
+    pipe.write_all(&stream[..stream.len() / 2]).unwrap();
+    wait_for_temporaries(&workplace.path(""), &mut child);
+    send("-HUP", &child);
+    send("-INT", &child);
+    std::thread::sleep(Duration::from_millis(200));
+    pipe.write_all(&stream[stream.len() / 2..]).unwrap();
+    drop(pipe);
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", told(&output));
+    assert_eq!(files(&workplace.path("")).len(), 1);
+}
+
+#[test]
 fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} -o out");
@@ -126,6 +198,45 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
     assert!(!workplace.path("frames/notes.txt").exists(), "--force replaces the folder with all in it");
     let hidden = fs::read_dir(workplace.path("")).unwrap().map(|entry| entry.unwrap().file_name());
     assert_eq!(hidden.filter(|name| name.to_str().unwrap().starts_with('.')).count(), 0);
+}
+
+#[test]
+fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_foreign_file_is_lost() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("unpack shorter/scene.gseq -o old");
+    let start = Instant::now();
+    workplace.done("unpack {tiny} -o new");
+    let whole = start.elapsed();
+    let [old, new] = ["old", "new"].map(|name| lasting_files(&workplace.path(name)));
+    let reset = || workplace.done("unpack shorter/scene.gseq -o frames --overwrite");
+    reset();
+    fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
+    const ENDS: u32 = 24;
+    for end in 0..ENDS {
+        let mut child = waiting(&workplace, &format!("unpack {} -o frames --overwrite", tiny().display()));
+        std::thread::sleep(whole * end / ENDS);
+        let is_told = end % 2 == 0;
+        if is_told {
+            // It may have ended already.
+            _ = Command::new("kill").arg(child.id().to_string()).stderr(Stdio::null()).status();
+        } else {
+            child.kill().unwrap();
+        }
+        child.wait().unwrap();
+        let output = workplace.path("frames");
+        let mut found = if output.exists() { lasting_files(&output) } else { Default::default() };
+        let notes = found.remove(Path::new("notes.txt"));
+        assert!(found == old || found == new || (found.is_empty() && !is_told), "{end}: {:?}", found.keys());
+        if is_told {
+            assert_eq!(notes.as_deref(), Some(&b"precious"[..]), "{end}");
+            let mut left = files(&workplace.path(""));
+            left.retain(|name, _| name.to_str().unwrap().starts_with('.'));
+            assert!(left.is_empty(), "{end}: {:?}", left.keys());
+        }
+        reset();
+        assert_eq!(fs::read(workplace.path("frames/notes.txt")).unwrap(), b"precious", "{end}");
+    }
 }
 
 #[test]

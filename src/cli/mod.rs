@@ -1,7 +1,9 @@
-//! Arguments and exit codes: 0 done, 1 failed, 2 misused. Data on stdout, everything else on stderr.
+//! Arguments and exit codes: 0 done, 1 failed, 2 misused, 128 + signal ended by one. Data on stdout, everything
+//! else on stderr.
 
 mod args;
 mod recipe_flags;
+mod signals;
 
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -40,6 +42,8 @@ pub fn main() -> ExitCode {
             return ExitCode::from(error.exit_code() as u8);
         }
     };
+    // Before anything is begun.
+    signals::install();
     Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
     match run(cli) {
