@@ -15,6 +15,7 @@ use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::trajectories::state_bytes;
 use crate::ingest::frame_stream::StreamHeader;
+use crate::machine::memory_limit;
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
 use crate::plan::Limits;
 use crate::render;
@@ -23,7 +24,7 @@ use crate::stream::{BLOCK, PICTURES_PER_THREAD};
 /// Memory that a run may take, and whether it is to say beforehand what it will take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Budget {
-    /// Bytes; none: a quarter of the machine's memory.
+    /// Bytes; none: a quarter of what this process may take, see [`memory_limit`].
     pub bytes: Option<u64>,
     /// Print the plan on standard error before any work.
     pub explain: bool,
@@ -252,7 +253,7 @@ impl Plan {
     pub fn fit(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<Plan> {
         let plan = Self::closest(work, budget.limit(), needs);
         if budget.explain {
-            eprint!("{}", plan.text());
+            eprint!("{}{}", budget.text(), plan.text());
         }
         if plan.excess() > 0 { Err(plan.refusal(budget)) } else { Ok(plan) }
     }
@@ -317,9 +318,9 @@ impl Plan {
         let largest = self.needs.iter().max_by_key(|need| need.bytes(&self.work)).map_or("", |need| need.stage);
         // Rounded up to what a person would write.
         let least = self.peak().div_ceil(1 << 20);
-        let default = if budget.bytes.is_none() { " (a quarter of the machine's)" } else { "" };
+        let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
         Error::usage(format!(
-            "--memory {}{default}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
+            "--memory {}{origin}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
              give it that, or fewer --threads; --explain shows what takes how much",
             size(self.budget),
             self.work.gaussians
@@ -381,25 +382,32 @@ impl Plan {
 }
 
 impl Budget {
-    /// Bytes that the run may take on this machine.
+    /// Bytes that the run may take.
     fn limit(self) -> u64 {
-        self.bytes.or_else(|| Some(machine_memory()? / 4)).unwrap_or(u64::MAX)
+        self.bytes.unwrap_or_else(|| Budget::by_default().0)
+    }
+
+    /// Bytes that a run takes unless told otherwise, and where that number comes from.
+    fn by_default() -> (u64, String) {
+        let (bytes, origin) = memory_limit();
+        (bytes / 4, format!("a quarter of {}, {origin}", size(bytes)))
+    }
+
+    /// The budget for a person.
+    fn text(self) -> String {
+        match self.bytes {
+            Some(bytes) => format!("budget: {}, as asked for\n", size(bytes)),
+            None => {
+                let (bytes, origin) = Budget::by_default();
+                format!("budget: {}, {origin}\n", size(bytes))
+            }
+        }
     }
 }
 
 /// What this process has taken so far, for a person; none where the system does not say.
 pub fn taken() -> Option<String> {
     peak_memory_bytes().map(|bytes| format!("memory: at most {} taken", size(bytes)))
-}
-
-/// Memory of the machine or of the group of processes this one is confined to, bytes; none where the system does
-/// not say.
-fn machine_memory() -> Option<u64> {
-    let info = fs::read_to_string("/proc/meminfo").ok()?;
-    let line = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
-    let machine = line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024;
-    let group = fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|max| max.trim().parse().ok());
-    Some(group.map_or(machine, |group: u64| group.min(machine)))
 }
 
 /// Largest resident memory of this process so far, mapped pages included (`VmHWM`); none where the

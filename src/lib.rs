@@ -5,7 +5,7 @@
 //! | layer | modules | what lives there |
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
-//! | L1 | [`error`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
+//! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`refit`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`families`], [`demo`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`] | memory, the order of the passes, what verbs do |
@@ -20,6 +20,7 @@ pub mod emit;
 pub mod error;
 pub mod families;
 pub mod ingest;
+pub mod machine;
 pub mod merge;
 pub mod metrics;
 pub mod model;

@@ -47,7 +47,7 @@ fn no_gaussians_give_a_valid_empty_output() {
         assert!(index_map(&workplace.path("out.ply.index_map.npy")).is_empty());
         workplace.done(&format!("compress empty.ply --overwrite -o out.gseq --preset {preset}"));
         workplace.done("verify out.gseq");
-        workplace.done("score empty.ply --overwrite -o rows.npz");
+        workplace.done("score empty.ply --force -o rows.npz");
     }
 }
 

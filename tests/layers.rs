@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// Modules of each layer, from the vocabulary up.
 const LAYERS: [&[&str]; 5] = [
-    &["error", "model", "pass", "plan", "recipe"],
+    &["error", "machine", "model", "pass", "plan", "recipe"],
     &["deform", "stats", "score", "select", "merge", "render", "refit", "metrics"],
     &["ingest", "stream", "emit", "demo"],
     &["pipeline", "report"],

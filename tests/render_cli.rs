@@ -151,7 +151,7 @@ fn background_is_the_asked_one_else_the_cameras_else_black() {
     let corner = |extra: &str| {
         done(
             folder.path(),
-            &format!("render scene.gseq --cameras cameras.json --frame 0 --view 3 -o x.png --overwrite {extra}"),
+            &format!("render scene.gseq --cameras cameras.json --frame 0 --view 3 -o x.png --force {extra}"),
         );
         bytes(&folder.path().join("x.png"))[..3].to_vec()
     };

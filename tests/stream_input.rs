@@ -174,7 +174,7 @@ fn broken_streams_end_in_an_error_and_leave_nothing() {
 #[test]
 fn a_reader_that_has_seen_enough_of_a_stream_is_no_failure() {
     let workplace = Workplace::new();
-    let mut child = splatsieve(&workplace, "unpack {tiny} --stream").spawn().unwrap();
+    let mut child = splatsieve(&workplace, "unpack {tiny} --stream --quiet").spawn().unwrap();
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::RecipeFlags;
+use crate::emit::atomic::Replace;
 use crate::verbs::sweep::Method;
 
 const EXAMPLES: &str = "\
@@ -32,6 +33,9 @@ pub(super) struct Cli {
     /// Threads to work on; the result does not depend on it. Default: all.
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(super) threads: Option<u16>,
+    /// Show no progress: no bars on a terminal, no lines in a log
+    #[arg(long, global = true)]
+    pub(super) quiet: bool,
 }
 
 /// The verbs.
@@ -99,6 +103,27 @@ pub(super) struct Input {
     pub(super) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(super) memory: Memory,
+}
+
+/// What to do with what has the output's name.
+#[derive(Debug, Args)]
+pub(super) struct Earlier {
+    /// Replace an earlier result of splatsieve; files in its folder that are not its own stay
+    #[arg(long)]
+    pub(super) overwrite: bool,
+    /// Replace whatever is there, a folder with everything in it
+    #[arg(long)]
+    pub(super) force: bool,
+}
+
+impl Earlier {
+    pub(super) fn replace(&self) -> Replace {
+        match (self.force, self.overwrite) {
+            (true, _) => Replace::Any,
+            (false, true) => Replace::Ours,
+            (false, false) => Replace::Never,
+        }
+    }
 }
 
 /// How much memory to take.
@@ -180,9 +205,8 @@ pub(super) struct Compress {
     /// Say what would happen; write nothing
     #[arg(long)]
     pub(super) dry_run: bool,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
     /// Print the summary as JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -228,9 +252,8 @@ pub(super) struct Score {
     /// coverage) or rows.csv
     #[arg(short, long, value_name = "FILE")]
     pub(super) output: PathBuf,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
 }
@@ -263,9 +286,8 @@ pub(super) struct Render {
     /// NAME.png (8 bits, clamped) or NAME.npy (float32 [H, W, 3], not clamped); with --all a folder
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
 }
 
 /// Kinds of picture files.
@@ -326,9 +348,8 @@ pub(super) struct Report {
     /// Folder to write report.html into, and all it shows as JSON and CSV
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
-    /// Replace an earlier report
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
 }
 
 /// `evaluate`
@@ -339,9 +360,8 @@ pub(super) struct Evaluate {
     /// Write the scores of every picture
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
-    /// Replace an earlier file
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -370,9 +390,8 @@ pub(super) struct Sweep {
     /// Folder to write sweep.json and sweep.csv into
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -394,9 +413,8 @@ pub(super) struct Pack {
     /// zstd level
     #[arg(long, value_name = "1-19", default_value_t = 1, value_parser = clap::value_parser!(i32).range(1..=19))]
     pub(super) level: i32,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
 }
 
 /// `info`
@@ -432,9 +450,8 @@ pub(super) struct Unpack {
     /// Write a frame stream to standard output instead, for another program to read (format/STREAM.md)
     #[arg(long)]
     pub(super) stream: bool,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
 }
 
 /// `recover`
@@ -445,9 +462,8 @@ pub(super) struct Recover {
     /// Container to write
     #[arg(short, long, value_name = "FILE.gseq")]
     pub(super) output: PathBuf,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
 }
 
 /// `demo`
@@ -464,9 +480,8 @@ pub(super) struct Demo {
     pub(super) frames: u32,
     #[command(flatten)]
     pub(super) memory: Memory,
-    /// Replace an earlier output
-    #[arg(long)]
-    pub(super) overwrite: bool,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
 }

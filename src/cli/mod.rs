@@ -1,7 +1,9 @@
-//! Arguments and exit codes: 0 done, 1 failed, 2 misused. Data on stdout, everything else on stderr.
+//! Arguments and exit codes: 0 done, 1 failed, 2 misused, 128 + signal ended by one. Data on stdout, everything
+//! else on stderr.
 
 mod args;
 mod recipe_flags;
+mod signals;
 
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -12,6 +14,7 @@ use gseq::Compression;
 
 use crate::budget::{self, Budget};
 use crate::compress::{Only, Request, Target, compress};
+use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -20,6 +23,7 @@ use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions};
 use crate::scene::pictures::Part;
 use crate::scene::{InputOptions, scratch_beside};
+use crate::stream::{Mode, Progress};
 use crate::verbs::evaluate::EvaluateOptions;
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::{Method, SweepOptions};
@@ -36,6 +40,9 @@ pub fn main() -> ExitCode {
             return ExitCode::from(error.exit_code() as u8);
         }
     };
+    // Before anything is begun.
+    signals::install();
+    Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
     match run(cli) {
         Ok(()) => {
@@ -68,7 +75,7 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Score(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
-            let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.overwrite)?;
+            let report = score::score(&input, &args.output, &args.recipe.recipe()?, args.earlier.replace())?;
             notes(&report.notes);
             print(&format!(
                 "{}: {} Gaussians, of which the recipe keeps {} before merging\n",
@@ -86,7 +93,8 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
-            let options = EvaluateOptions { csv: args.csv, overwrite: args.overwrite, ..evaluate_options(args.models) };
+            let options =
+                EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models) };
             let found = evaluate::evaluate(&options)?;
             print(&if as_json { json(&found) } else { found.text() })
         }
@@ -101,7 +109,7 @@ fn run(cli: Cli) -> Result<()> {
                 evaluate: evaluate_options(args.models),
                 sweep: args.sweep,
                 output: args.output,
-                overwrite: args.overwrite,
+                overwrite: args.earlier.replace(),
             })?;
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.display()))
@@ -109,7 +117,7 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Pack(args) => {
             let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
-            let packed = container::pack(&input, &args.output, compression, args.overwrite)?;
+            let packed = container::pack(&input, &args.output, compression, args.earlier.replace())?;
             notes(&packed.notes);
             print(&format!(
                 "{}: {} Gaussians x {} frames in {} bytes\n",
@@ -146,13 +154,13 @@ fn run(cli: Cli) -> Result<()> {
                 notes(&container::unpack_stream(&input, stdout)?.notes);
                 return Ok(());
             };
-            let opened = container::unpack(&input, &output, args.overwrite)?;
+            let opened = container::unpack(&input, &output, args.earlier.replace())?;
             notes(&opened.notes);
             let frames = opened.input.source().info().times.len();
             print(&format!("{}: {frames} PLY files\n", output.display()))
         }
         Verb::Recover(args) => {
-            let report = container::recover(&args.input, &args.output, args.overwrite)?;
+            let report = container::recover(&args.input, &args.output, args.earlier.replace())?;
             print(&format!(
                 "{}: {} complete frames of {} seen, {} tiles\n",
                 args.output.display(),
@@ -165,7 +173,7 @@ fn run(cli: Cli) -> Result<()> {
             let recipe = args.recipe.recipe()?;
             let output = args.output.as_deref();
             let (gaussians, frames) = (args.gaussians as usize, args.frames as usize);
-            let report = demo::run(gaussians, frames, recipe, output, args.overwrite, budget_of(args.memory))?;
+            let report = demo::run(gaussians, frames, recipe, output, args.earlier.replace(), budget_of(args.memory))?;
             print(&report.text())?;
             if let Some(folder) = output {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
@@ -204,7 +212,7 @@ fn compress_options(args: Compress) -> Result<Request> {
         drop_ids: args.overrides.drop_ids,
         keep_box: args.overrides.keep_box,
         dry_run: args.dry_run,
-        overwrite: args.overwrite,
+        overwrite: args.earlier.replace(),
     })
 }
 
@@ -225,7 +233,7 @@ fn render_options(args: Render) -> RenderOptions {
         part: args.split.map_or(part, part_of),
         background: args.background.background,
         output: args.output,
-        overwrite: args.overwrite,
+        overwrite: args.earlier.replace(),
     }
 }
 
@@ -242,7 +250,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
         background: args.background.background,
         flip: args.flip,
         csv: None,
-        overwrite: false,
+        overwrite: Replace::Never,
     }
 }
 
@@ -257,7 +265,7 @@ fn sweep_options(args: Sweep) -> SweepOptions {
         max_frames: Some(args.max_frames as usize),
         background: args.background.background,
         output: args.output,
-        overwrite: args.overwrite,
+        overwrite: args.earlier.replace(),
     }
 }
 

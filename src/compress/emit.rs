@@ -9,7 +9,7 @@ use super::request::Request;
 use super::score::scored;
 use super::summary::Summary;
 use crate::budget::{Need, Workload};
-use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target, commit_files};
 use crate::emit::container::FRAME_BLOCK;
 use crate::emit::index_map::write_index_map;
 use crate::emit::kind::OutputKind;
@@ -47,7 +47,7 @@ pub struct Emit {
     /// Whether there may be proxies.
     pub merges: bool,
     output: PathBuf,
-    overwrite: bool,
+    overwrite: Replace,
 }
 
 impl Emit {
@@ -138,9 +138,7 @@ impl Emit {
         write_index_map(&map, index_map.path())?;
         let summary = summarise(journal, bytes);
         write_text(marker.path(), &summary.json())?;
-        for file in [staged, recipe_file, index_map, marker] {
-            file.commit()?;
-        }
+        commit_files(&[staged, recipe_file, index_map, marker])?;
         Ok(summary)
     }
 }

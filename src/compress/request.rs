@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::emit::atomic::Replace;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
@@ -52,7 +53,7 @@ pub struct Request {
     /// Write nothing.
     pub dry_run: bool,
     /// Replace an earlier output.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 impl Request {
@@ -69,7 +70,7 @@ impl Request {
             drop_ids: None,
             keep_box: None,
             dry_run: false,
-            overwrite: false,
+            overwrite: Replace::Never,
         }
     }
 }

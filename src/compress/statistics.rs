@@ -6,12 +6,12 @@
 use std::borrow::Cow;
 use std::fs::File;
 use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use bytemuck::{AnyBitPattern, NoUninit};
 
-use crate::emit::atomic::ScratchFile;
+use crate::emit::atomic::nameless;
 use crate::error::{Error, Result};
 use crate::model::{Flags, Rows};
 
@@ -21,11 +21,12 @@ pub(super) enum Statistics {
     Aside(Aside),
 }
 
-/// Rows in a file that lasts as long as this.
+/// Rows in a nameless file that lasts as long as this.
 pub(super) struct Aside {
     /// Locked from finding a place to having read it.
     file: Mutex<File>,
-    scratch: ScratchFile,
+    /// Where the file is.
+    folder: PathBuf,
     count: usize,
     has_peak: bool,
 }
@@ -38,17 +39,17 @@ const PEAK: usize = 6;
 impl Statistics {
     /// Writes `rows` to a file in `folder`.
     pub(super) fn aside(rows: Rows, folder: &Path) -> Result<Statistics> {
-        let scratch = ScratchFile::new(folder)?;
-        let io = |what| Error::io(what, scratch.path());
-        let mut out = BufWriter::new(scratch.create()?);
+        let io = |what| Error::io(what, folder);
+        let mut out = BufWriter::new(nameless(folder)?);
         let Rows { d, kappa, v, life, c, w, e, vis, flags } = &rows;
         let columns = [d, kappa, v, c, e, vis, w].map(|column| bytemuck::cast_slice::<f64, u8>(column));
         let written = columns.iter().try_for_each(|column| out.write_all(column));
         let written = written.and_then(|()| out.write_all(bytemuck::cast_slice(life)));
         let written = written.and_then(|()| flags.iter().try_for_each(|flags| out.write_all(&[flags.0])));
-        written.map_err(io("write"))?;
-        let file = out.into_inner().map_err(|error| io("write")(error.into_error()))?;
-        Ok(Statistics::Aside(Aside { file: Mutex::new(file), scratch, count: rows.len(), has_peak: !w.is_empty() }))
+        written.map_err(io("write a scratch file in"))?;
+        let file = out.into_inner().map_err(|error| io("write a scratch file in")(error.into_error()))?;
+        let (count, has_peak) = (rows.len(), !w.is_empty());
+        Ok(Statistics::Aside(Aside { file: Mutex::new(file), folder: folder.to_owned(), count, has_peak }))
     }
 
     /// All rows.
@@ -104,7 +105,7 @@ impl Aside {
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let read = file.seek(SeekFrom::Start(start));
         let read = read.and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)));
-        read.map_err(Error::io("read back", self.scratch.path()))?;
+        read.map_err(Error::io("read back a scratch file in", &self.folder))?;
         Ok(values)
     }
 }
@@ -114,7 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_set_aside_comes_back_bit_for_bit_and_the_file_goes() {
+    fn what_is_set_aside_comes_back_bit_for_bit_from_a_file_without_a_name() {
         let folder = tempfile::tempdir().unwrap();
         for (count, peak) in [(0, false), (1, true), (1000, true), (1000, false)] {
             let column = |by: f64| (0..count).map(|i| (i as f64 - 7.3) * by).collect::<Vec<_>>();
@@ -133,9 +134,8 @@ mod tests {
             assert_eq!(statistics.len(), count);
             assert_eq!(format!("{:?}", statistics.rows().unwrap()), format!("{rows:?}"));
             assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);
-            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         }
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         let message = Statistics::aside(Rows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
         assert!(message.contains("nowhere"), "{message}");
     }

@@ -1,28 +1,26 @@
 //! Outputs that appear whole or not at all.
 //!
-//! In: where the user wants the output. Out: a temporary name beside it to write under; `commit` syncs
-//! what was written and renames it. Dropped without commit, it is removed. Temporaries of runs
-//! that were killed are removed when the next output for the same target begins (where the system can
-//! say which processes run: Linux), and a folder that such a run had moved aside is put back.
+//! In: where the user wants the output. Out: a hidden name beside it to write under; `commit` syncs what was written
+//! and gives it its name. Dropped without commit it is removed, and so is, by [`withdraw_all`], everything begun
+//! when the process is told to end. What killed runs left is removed when the next output of the same name begins,
+//! and a folder that such a run had moved aside is put back. Runs may share folders between containers and machines.
+//!
+//! What overwriting does to files that are not this program's is said at [`Replace`].
 
-use std::ffi::{OsStr, OsString};
-use std::fs::{self, File, OpenOptions};
+mod named;
+mod workspace;
+
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::process;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::error::{Error, Result};
+use named::{Owner, entries, files_below, is_our_file, name_files, parts, present};
+use workspace::{SCRATCH, Workspace};
+pub use workspace::{Withdrawn, withdraw_all};
 
-/// The file by which a folder is known as this program's: a JSON object whose `tool` names it.
+/// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
+/// result's own; [`StagedFolder::commit`] and [`commit_files`] enter them.
 pub const MARKER: &str = "summary.json";
-
-/// Ends the name of an output being written.
-const WRITING: &str = "splatsieve-tmp";
-/// Ends the name of an earlier output about to be deleted.
-const REPLACED: &str = "splatsieve-old";
-
-/// What the names of scratch files are made of, in whatever folder.
-const SCRATCH: &str = "splatsieve-scratch";
 
 /// What an output is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,16 +31,29 @@ pub enum Kind {
     Folder,
 }
 
+/// What an output may replace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Replace {
+    /// Nothing.
+    #[default]
+    Never,
+    /// What is known as a result of this program. In its folder the files that its summary lists are replaced; every
+    /// other stays where it is, or with `.kept` behind its name where the new result has a file of that name. A single
+    /// file is known as a result if it is a container or a summary beside it lists it.
+    Ours,
+    /// Whatever is there; of a folder everything in it.
+    Any,
+}
+
 /// Confirms, before any work, that an output may be written to `target` by a run that reads `inputs`.
 ///
 /// Refused are: a target without a name or in a folder that does not exist; a target that is an input,
-/// holds one or lies inside one, overwriting or not, whatever links lead there; an existing target unless `overwrite`;
-/// and with it a file in place of a folder or the reverse, what is neither, and a folder that is neither
-/// empty nor known by its [`MARKER`]: `--overwrite` never deletes what this program did not write.
+/// holds one or lies inside one, overwriting or not, whatever links lead there; an existing target that `replace` does
+/// not let go; a file in place of a folder or the reverse, and what is neither.
 ///
 /// # Errors
 /// Each of these, as a matter of usage; a system that will not say what is there.
-pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool) -> Result<()> {
+pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> Result<()> {
     let shown = target.display();
     let (parent, name) = parts(target)?;
     let real_parent = fs::canonicalize(&parent).map_err(|_| {
@@ -74,7 +85,7 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool
         }
     }
     let Ok(found) = fs::symlink_metadata(target) else { return Ok(()) };
-    if !overwrite {
+    if replace == Replace::Never {
         return Err(exists(target));
     }
     match kind {
@@ -85,11 +96,7 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool
         Kind::Folder if !found.is_dir() => {
             Err(Error::usage(format!("{shown} is no folder; a folder cannot replace it")))
         }
-        Kind::Folder if !is_ours(target)? => Err(Error::usage(format!(
-            "{shown} is not a result of splatsieve (no {MARKER} of its own), so --overwrite leaves it alone\n  \
-             remove it yourself, or give another output"
-        ))),
-        _ => Ok(()),
+        _ => may_go(target, kind, replace),
     }
 }
 
@@ -98,17 +105,17 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool
 pub struct StagedFile(Staged);
 
 impl StagedFile {
-    /// Prepares to write `target`, which [`check_target`] has passed. Nothing is created yet.
+    /// Prepares to write `target`, which [`check_target`] has passed. The file itself is not created yet.
     ///
     /// # Errors
-    /// A target without a name; an existing one unless `overwrite`.
-    pub fn new(target: &Path, overwrite: bool) -> Result<StagedFile> {
-        Staged::new(target, overwrite).map(StagedFile)
+    /// A target without a name; an existing one that `replace` does not let go; the system refuses.
+    pub fn new(target: &Path, replace: Replace) -> Result<StagedFile> {
+        Staged::new(target, Kind::File, replace).map(StagedFile)
     }
 
     /// Where to write it meanwhile.
     pub fn path(&self) -> &Path {
-        &self.0.temporary
+        &self.0.content
     }
 
     /// Makes what was written durable and gives it its name, over an earlier output if that is allowed.
@@ -116,12 +123,36 @@ impl StagedFile {
     /// # Errors
     /// Nothing was written; the target appeared meanwhile; the system refuses. The target is then as it was.
     pub fn commit(self) -> Result<()> {
-        let Staged { target, temporary, .. } = &self.0;
-        sync(temporary)?;
-        self.0.refuse_newcomer()?;
-        fs::rename(temporary, target).map_err(Error::io("write", target))?;
-        sync(&parts(target)?.0)
+        commit_all(&[self])
     }
+}
+
+/// Commits a result of several files side by side, the last of which is its summary: it lists all of them.
+/// They get their names in order, so that the summary says that all are there.
+///
+/// # Errors
+/// A summary that is no JSON object; those of [`StagedFile::commit`] for each.
+pub fn commit_files(files: &[StagedFile]) -> Result<()> {
+    if let Some(summary) = files.last() {
+        let names = files.iter().map(|file| Ok(parts(&file.0.target)?.1.to_string_lossy().into_owned()));
+        let mut names = names.collect::<Result<Vec<String>>>()?;
+        names.sort();
+        name_files(summary.path(), &names)?;
+    }
+    commit_all(files)
+}
+
+fn commit_all(files: &[StagedFile]) -> Result<()> {
+    for file in files {
+        sync(file.path())?;
+        file.0.refuse_newcomer()?;
+    }
+    let named: Vec<_> = files.iter().map(|StagedFile(staged)| (&staged.workspace, staged.target.as_path())).collect();
+    workspace::rename_files(&named)?;
+    for file in files {
+        sync(&parts(&file.0.target)?.0)?;
+    }
+    Ok(())
 }
 
 /// A folder that appears under its name at [`StagedFolder::commit`].
@@ -129,206 +160,149 @@ impl StagedFile {
 pub struct StagedFolder(Staged);
 
 impl StagedFolder {
-    /// Creates an empty folder beside `target`, which [`check_target`] has passed.
+    /// Creates an empty folder for `target`, which [`check_target`] has passed.
     ///
     /// # Errors
-    /// A target without a name; an existing one unless `overwrite`; the system refuses.
-    pub fn new(target: &Path, overwrite: bool) -> Result<StagedFolder> {
-        let staged = Staged::new(target, overwrite)?;
-        fs::create_dir(&staged.temporary).map_err(Error::io("create", &staged.temporary))?;
+    /// A target without a name; an existing one that `replace` does not let go; the system refuses.
+    pub fn new(target: &Path, replace: Replace) -> Result<StagedFolder> {
+        let staged = Staged::new(target, Kind::Folder, replace)?;
+        fs::create_dir(&staged.content).map_err(Error::io("create", &staged.content))?;
         Ok(StagedFolder(staged))
     }
 
     /// The folder to write into meanwhile.
     pub fn path(&self) -> &Path {
-        &self.0.temporary
+        &self.0.content
     }
 
-    /// Makes everything in it durable and gives it its name. An earlier output is moved aside, replaced,
-    /// then deleted: a run killed in between leaves the old or the new one, whole.
+    /// Lists its files in its summary, if it has one, makes everything durable and gives it its name.
+    ///
+    /// An earlier output is moved aside, replaced, then deleted, and what was in it but not its own follows the name. A run
+    /// killed in between leaves the old or the new one whole; the foreign files are in it or in a hidden folder
+    /// beside it, from where the next output of that name moves them back.
     ///
     /// # Errors
-    /// The target appeared meanwhile, or is not this program's; the system refuses. The target is then
-    /// as it was.
+    /// A summary that is no JSON object; the target appeared meanwhile and may not be replaced; the system refuses.
+    /// The target is then as it was.
     pub fn commit(self) -> Result<()> {
-        let Staged { target, temporary, overwrite } = &self.0;
-        sync_tree(temporary)?;
+        let Staged { target, content, replace, workspace, .. } = &self.0;
+        let summary = content.join(MARKER);
+        if present(&summary) {
+            name_files(&summary, &files_below(content)?)?;
+        }
+        sync_tree(content)?;
         self.0.refuse_newcomer()?;
-        let parent = parts(target)?.0;
-        if !(*overwrite && present(target)) {
-            fs::rename(temporary, target).map_err(Error::io("write", target))?;
-            return sync(&parent);
-        }
-        if !is_ours(target)? {
-            // It passed `check_target` when the run began and is another folder now.
-            return Err(exists(target));
-        }
-        let aside = sibling(target, REPLACED)?;
-        fs::rename(target, &aside).map_err(Error::io("move aside", target))?;
-        if let Err(error) = fs::rename(temporary, target) {
-            let _ = fs::rename(&aside, target);
-            return Err(Error::io("write", target)(error));
-        }
-        sync(&parent)?;
-        fs::remove_dir_all(&aside).map_err(Error::io("remove the replaced", &aside))
+        workspace.replace_folder(*replace == Replace::Any)?;
+        sync(&parts(target)?.0)
     }
 }
 
-/// A file for as long as a run lasts: removed when this is dropped.
+/// A file for as long as a run lasts, for whoever needs a path: removed when this is dropped.
 #[derive(Debug)]
-pub struct ScratchFile(PathBuf);
+pub struct ScratchFile {
+    content: PathBuf,
+    _workspace: Workspace,
+}
 
 impl ScratchFile {
-    /// A name in `folder` that no other file has. Nothing is created yet; what killed runs left there is removed.
+    /// A name in `folder` that no other file has. The file itself is not created yet.
     ///
     /// # Errors
     /// A folder that does not exist; the system refuses.
     pub fn new(folder: &Path) -> Result<ScratchFile> {
-        let target = folder.join(SCRATCH);
-        tidy(&target)?;
-        sibling(&target, WRITING).map(ScratchFile)
+        let workspace = Workspace::beside(&folder.join(SCRATCH))?;
+        Ok(ScratchFile { content: workspace.content(), _workspace: workspace })
     }
 
     /// Where to write it.
     pub fn path(&self) -> &Path {
-        &self.0
+        &self.content
     }
+}
 
-    /// Creates it, to be written and read back.
+/// A folder for as long as a run lasts: removed when this is dropped.
+#[derive(Debug)]
+pub struct ScratchFolder(ScratchFile);
+
+impl ScratchFolder {
+    /// Creates an empty folder in `folder`.
     ///
     /// # Errors
-    /// The system refuses.
-    pub fn create(&self) -> Result<File> {
-        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&self.0);
-        file.map_err(Error::io("create", &self.0))
+    /// A folder that does not exist; the system refuses.
+    pub fn new(folder: &Path) -> Result<ScratchFolder> {
+        let scratch = ScratchFile::new(folder)?;
+        fs::create_dir(scratch.path()).map_err(Error::io("create", scratch.path()))?;
+        Ok(ScratchFolder(scratch))
+    }
+
+    /// The folder to write into.
+    pub fn path(&self) -> &Path {
+        self.0.path()
     }
 }
 
-impl Drop for ScratchFile {
-    fn drop(&mut self) {
-        remove(&self.0);
-    }
+/// A file without a name in `folder`, to be written and read back: the system removes it with the process.
+///
+/// # Errors
+/// A folder that does not exist; the system refuses.
+pub fn nameless(folder: &Path) -> Result<File> {
+    tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))
 }
 
-/// A target and the temporary name its content has meanwhile.
+/// A target and where its content is meanwhile.
 #[derive(Debug)]
 struct Staged {
     target: PathBuf,
-    temporary: PathBuf,
-    overwrite: bool,
+    content: PathBuf,
+    kind: Kind,
+    replace: Replace,
+    workspace: Workspace,
 }
 
 impl Staged {
-    fn new(target: &Path, overwrite: bool) -> Result<Staged> {
-        tidy(target)?;
-        tidy(&target.with_file_name(SCRATCH))?;
-        let staged = Staged { target: target.to_owned(), temporary: sibling(target, WRITING)?, overwrite };
+    fn new(target: &Path, kind: Kind, replace: Replace) -> Result<Staged> {
+        let workspace = Workspace::beside(target)?;
+        let staged = Staged { target: target.to_owned(), content: workspace.content(), kind, replace, workspace };
         staged.refuse_newcomer()?;
         Ok(staged)
     }
 
+    /// What has the name now may be another than when the run began.
     fn refuse_newcomer(&self) -> Result<()> {
-        if !self.overwrite && present(&self.target) { Err(exists(&self.target)) } else { Ok(()) }
-    }
-}
-
-impl Drop for Staged {
-    /// After a commit there is nothing left under the temporary name.
-    fn drop(&mut self) {
-        remove(&self.temporary);
+        if present(&self.target) { may_go(&self.target, self.kind, self.replace) } else { Ok(()) }
     }
 }
 
 fn exists(target: &Path) -> Error {
-    Error::usage(format!("{} exists already; --overwrite replaces a result of splatsieve", target.display()))
+    Error::usage(format!(
+        "{} exists already\n  --overwrite replaces a result of splatsieve, --force whatever is there",
+        target.display()
+    ))
 }
 
-/// Whether anything has that name, be it a link to nowhere.
-fn present(path: &Path) -> bool {
-    fs::symlink_metadata(path).is_ok()
-}
-
-/// The folder and the name of a target.
-fn parts(target: &Path) -> Result<(PathBuf, &OsStr)> {
-    let Some(name) = target.file_name() else {
-        return Err(Error::usage(format!("{:?} is no name for an output", target.display().to_string())));
-    };
-    let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty());
-    Ok((parent.unwrap_or(Path::new(".")).to_owned(), name))
-}
-
-/// Whether the folder is empty or holds the marker.
-fn is_ours(folder: &Path) -> Result<bool> {
-    if fs::read_dir(folder).map_err(Error::io("list", folder))?.next().is_none() {
-        return Ok(true);
-    }
-    let Ok(text) = fs::read_to_string(folder.join(MARKER)) else { return Ok(false) };
-    let summary: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-    Ok(summary["tool"].as_str().is_some_and(|tool| tool.starts_with("splatsieve")))
-}
-
-/// A hidden name beside `target` that no other output has: `.<name>.<process>-<number>.<suffix>`.
-fn sibling(target: &Path, suffix: &str) -> Result<PathBuf> {
-    static NUMBER: AtomicU64 = AtomicU64::new(0);
-    let (parent, name) = parts(target)?;
-    let mut hidden = prefix(name);
-    hidden.push(format!("{}-{}.{suffix}", process::id(), NUMBER.fetch_add(1, Ordering::Relaxed)));
-    Ok(parent.join(hidden))
-}
-
-fn prefix(name: &OsStr) -> OsString {
-    let mut prefix = OsString::from(".");
-    prefix.push(name);
-    prefix.push(".");
-    prefix
-}
-
-/// Removes what killed runs for the same target left; puts back a folder that one had moved aside.
-fn tidy(target: &Path) -> Result<()> {
-    let (parent, name) = parts(target)?;
-    let prefix = prefix(name);
-    let mut left: Vec<(PathBuf, bool)> = Vec::new();
-    for entry in fs::read_dir(&parent).map_err(Error::io("list", &parent))? {
-        let entry = entry.map_err(Error::io("list", &parent))?;
-        let name = entry.file_name();
-        let (bytes, prefix) = (name.as_encoded_bytes(), prefix.as_encoded_bytes());
-        // A container on its way to a temporary name has a hidden name of its own, made of that name.
-        let nested = bytes.strip_prefix(b".").and_then(|inner| inner.strip_prefix(prefix));
-        let Some(rest) = bytes.strip_prefix(prefix).or(nested) else { continue };
-        let Some((owner, suffix)) = std::str::from_utf8(rest).ok().and_then(|rest| rest.split_once('.')) else {
-            continue;
-        };
-        let Some((process, number)) = owner.split_once('-') else { continue };
-        let (Ok(process), Ok(_)) = (process.parse::<u32>(), number.parse::<u64>()) else { continue };
-        let writing =
-            suffix == WRITING || (nested.is_some() && suffix.starts_with(WRITING) && suffix.ends_with(".tmp"));
-        if !runs(process) && (writing || suffix == REPLACED) {
-            left.push((entry.path(), suffix == REPLACED));
-        }
-    }
-    // Listing order is the file system's; which leftover is put back must not depend on it.
-    left.sort();
-    for (path, replaced) in left {
-        if replaced && !present(target) {
-            fs::rename(&path, target).map_err(Error::io("put back", &path))?;
-        } else {
-            remove(&path);
-        }
-    }
-    Ok(())
-}
-
-/// Whether a process of that number may still be writing. Without `/proc` nobody is said to be gone.
-fn runs(process: u32) -> bool {
-    !cfg!(target_os = "linux") || Path::new("/proc").join(process.to_string()).exists()
-}
-
-/// Removes a file or a folder, if it is there. A leftover that cannot be removed harms nobody.
-fn remove(path: &Path) {
-    if fs::symlink_metadata(path).is_ok_and(|found| found.is_dir()) {
-        let _ = fs::remove_dir_all(path);
-    } else {
-        let _ = fs::remove_file(path);
+/// Confirms that what is at `target` may be replaced.
+fn may_go(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
+    let shown = target.display();
+    match (kind, replace) {
+        (_, Replace::Any) => Ok(()),
+        (_, Replace::Never) => Err(exists(target)),
+        (Kind::File, Replace::Ours) if is_our_file(target) => Ok(()),
+        (Kind::File, Replace::Ours) => Err(Error::usage(format!(
+            "{shown} exists already, and nothing says that splatsieve wrote it: it is no container, and no summary beside \
+             it lists it\n  --force replaces it all the same; or give another output"
+        ))),
+        (Kind::Folder, Replace::Ours) if entries(target)?.is_empty() => Ok(()),
+        (Kind::Folder, Replace::Ours) => match Owner::of(&target.join(MARKER)) {
+            Owner::Listed(_) => Ok(()),
+            Owner::Unlisted => Err(Error::usage(format!(
+                "{shown} is a result of a splatsieve that did not list its files yet, so nobody can tell what else is in \
+                 it\n  --force replaces it with all that is in it; or give another output"
+            ))),
+            Owner::Unknown => Err(Error::usage(format!(
+                "{shown} is not a result of splatsieve (no {MARKER} of its own), so --overwrite leaves it alone\n  \
+                 --force replaces it with all that is in it; or give another output"
+            ))),
+        },
     }
 }
 
@@ -342,8 +316,7 @@ fn sync(path: &Path) -> Result<()> {
 }
 
 fn sync_tree(folder: &Path) -> Result<()> {
-    for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
-        let path = entry.map_err(Error::io("list", folder))?.path();
+    for path in entries(folder)?.iter().map(|entry| folder.join(entry)) {
         if path.is_dir() { sync_tree(&path)? } else { sync(&path)? }
     }
     sync(folder)

@@ -27,7 +27,7 @@ use crate::compress::journal::Journal;
 use crate::compress::measure::{Measure, Stages};
 use crate::compress::score::{SCORED, Scored, UserOverrides};
 use crate::compress::summary::TermSummary;
-use crate::emit::atomic::{Kind as TargetKind, MARKER, StagedFolder, check_target};
+use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::model::{Schedule, Split};
@@ -57,7 +57,7 @@ pub struct ReportOptions {
     /// Folder to write.
     pub output: PathBuf,
     /// Replace an earlier report.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 /// Compares two models and writes the report.

@@ -20,7 +20,7 @@ pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};
 pub use merged::MergedSequence;
-pub use progress::Progress;
+pub use progress::{Mode, Progress, begin_run};
 pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;
 pub use scan::{RunningScan, Scanned, scan};

@@ -1,55 +1,230 @@
-//! Progress on stderr: rate and time left on a terminal, nothing when piped.
+//! Progress on stderr. On a terminal a bar with rate and time left; elsewhere, for logs, a line when a stage
+//! ends and at most one a minute within it; nothing when quiet.
 
-use std::io::IsTerminal;
-use std::time::Duration;
+use std::fmt::Write as _;
+use std::io::{self, IsTerminal, Write as _};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{HumanCount, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
-/// A bar over `total` units of work, e.g. Gaussians × frames. Cheap to advance from any thread.
+/// Seconds between two lines of one stage.
+const LINE_EVERY: u64 = 60;
+
+/// A library says nothing unasked.
+static QUIET: AtomicBool = AtomicBool::new(true);
+static STAGES: Mutex<Vec<&'static str>> = Mutex::new(Vec::new());
+
+/// What this process shows of its progress.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Mode {
+    /// Bars on a terminal, else lines.
+    Auto,
+    /// Nothing, until something else is asked for.
+    Quiet,
+}
+
+/// Names the stages that a run is made of, in order: from now on a bar or line of one of them says `[k/n]`. An empty list
+/// ends that.
+pub fn begin_run(stages: &[&'static str]) {
+    *STAGES.lock().unwrap_or_else(PoisonError::into_inner) = stages.to_vec();
+}
+
+/// Progress through `total` units of work, e.g. Gaussians × frames. Cheap to advance from any thread.
 #[derive(Debug)]
-pub struct Progress(ProgressBar);
+pub struct Progress(Shown);
+
+#[derive(Debug)]
+enum Shown {
+    Nothing,
+    Bar(ProgressBar),
+    Lines(Log),
+}
 
 impl Progress {
+    /// Decides for everything that begins from now on.
+    pub fn set_mode(mode: Mode) {
+        QUIET.store(mode == Mode::Quiet, Ordering::Relaxed);
+    }
+
     /// A bar named after what it does; `unit` is plural ("Gaussian frames").
     pub fn new(what: &'static str, unit: &str, total: u64) -> Self {
-        if !std::io::stderr().is_terminal() {
-            return Progress(ProgressBar::hidden());
-        }
-        let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(10));
-        let template = format!(
-            "{{prefix:>10}} [{{wide_bar}}] {{percent:>3}}% {{human_pos}}/{{human_len}} {unit}, {{per_sec}}, {{eta}} left"
-        );
-        if let Ok(style) = ProgressStyle::with_template(&template) {
-            bar.set_style(style.progress_chars("=> "));
-        }
-        bar.set_prefix(what);
-        bar.enable_steady_tick(Duration::from_millis(200));
-        Progress(bar)
+        Self::begin(what, unit, Some(total))
     }
 
     /// A counter of work whose amount nobody knows ahead.
     pub fn counting(what: &'static str, unit: &str) -> Self {
-        if !std::io::stderr().is_terminal() {
-            return Progress(ProgressBar::hidden());
+        Self::begin(what, unit, None)
+    }
+
+    fn begin(what: &'static str, unit: &str, total: Option<u64>) -> Self {
+        if QUIET.load(Ordering::Relaxed) {
+            return Progress(Shown::Nothing);
         }
-        let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr_with_hz(10));
-        let template = format!("{{prefix:>10}} {{spinner}} {{human_pos}} {unit}, {{per_sec}}");
+        let name = numbered(what, &STAGES.lock().unwrap_or_else(PoisonError::into_inner));
+        if !io::stderr().is_terminal() {
+            return Progress(Shown::Lines(Log::new(name, unit, total)));
+        }
+        let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(10));
+        let template = match total {
+            Some(_) => format!(
+                "{{prefix:>10}} [{{wide_bar}}] {{percent:>3}}% {{human_pos}}/{{human_len}} {unit}, {{rate}}, {{eta}} left"
+            ),
+            None => format!("{{prefix:>10}} {{spinner}} {{human_pos}} {unit}, {{rate}}"),
+        };
         if let Ok(style) = ProgressStyle::with_template(&template) {
-            bar.set_style(style);
+            let rate = |state: &ProgressState, out: &mut dyn std::fmt::Write| _ = out.write_str(&rate(state.per_sec()));
+            bar.set_style(style.with_key("rate", rate).progress_chars("=> "));
         }
-        bar.set_prefix(what);
+        bar.set_prefix(name);
         bar.enable_steady_tick(Duration::from_millis(200));
-        Progress(bar)
+        Progress(Shown::Bar(bar))
     }
 
     /// Marks `units` as done.
     pub fn advance(&self, units: u64) {
-        self.0.inc(units);
+        match &self.0 {
+            Shown::Nothing => (),
+            Shown::Bar(bar) => bar.inc(units),
+            Shown::Lines(log) => log.advance(units),
+        }
     }
 }
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        self.0.finish_and_clear();
+        match &self.0 {
+            Shown::Nothing => (),
+            Shown::Bar(bar) => bar.finish_and_clear(),
+            Shown::Lines(log) => log.end(),
+        }
+    }
+}
+
+/// A stage that is told of line by line.
+#[derive(Debug)]
+struct Log {
+    name: String,
+    unit: String,
+    total: Option<u64>,
+    start: Instant,
+    done: AtomicU64,
+    /// Seconds from the start to the next line.
+    next: AtomicU64,
+}
+
+impl Log {
+    fn new(name: String, unit: &str, total: Option<u64>) -> Log {
+        let (done, next) = (AtomicU64::new(0), AtomicU64::new(LINE_EVERY));
+        Log { name, unit: unit.to_owned(), total, start: Instant::now(), done, next }
+    }
+
+    fn advance(&self, units: u64) {
+        self.done.fetch_add(units, Ordering::Relaxed);
+        let (now, due) = (self.start.elapsed().as_secs(), self.next.load(Ordering::Relaxed));
+        let relaxed = Ordering::Relaxed;
+        // One of the threads that find a line due writes it.
+        if now >= due && self.next.compare_exchange(due, now + LINE_EVERY, relaxed, relaxed).is_ok() {
+            tell(&self.line(self.start.elapsed(), false));
+        }
+    }
+
+    fn end(&self) {
+        // What failed before its first step has nothing to tell.
+        if self.done.load(Ordering::Relaxed) > 0 {
+            tell(&self.line(self.start.elapsed(), true));
+        }
+    }
+
+    /// What is known `elapsed` after the start, within the stage or when it has ended.
+    fn line(&self, elapsed: Duration, ended: bool) -> String {
+        let done = self.done.load(Ordering::Relaxed);
+        let per_second = done as f64 / elapsed.as_secs_f64().max(1e-9);
+        let mut line = format!("{}  {}", self.name, HumanCount(done));
+        // Writing to a String cannot fail.
+        if let Some(total) = self.total.filter(|&total| total != done) {
+            let _ = write!(line, " of {}", HumanCount(total));
+        }
+        let _ = write!(line, " {}, {}, ", self.unit, rate(per_second));
+        let _ = match self.total.filter(|&total| total > done && !ended) {
+            Some(total) => write!(line, "{} left", duration((total - done) as f64 / per_second)),
+            None => write!(line, "{}", duration(elapsed.as_secs_f64())),
+        };
+        line
+    }
+}
+
+/// Says something on stderr; nobody listening is no failure.
+fn tell(line: &str) {
+    let _ = writeln!(io::stderr(), "{line}");
+}
+
+/// A stage's name with its place among the stages of the run, if it is one of them.
+fn numbered(what: &str, stages: &[&str]) -> String {
+    match stages.iter().position(|&stage| stage == what) {
+        Some(place) => format!("[{}/{}] {what}", place + 1, stages.len()),
+        None => what.to_owned(),
+    }
+}
+
+/// A rate as a person reads it: two digits or three.
+fn rate(per_second: f64) -> String {
+    let (value, unit) = match per_second {
+        more if more >= 999.5e6 => (more / 1e9, " G"),
+        more if more >= 999.5e3 => (more / 1e6, " M"),
+        more if more >= 999.5 => (more / 1e3, " k"),
+        few => (few, ""),
+    };
+    let digits = if value < 9.95 { 1 } else { 0 };
+    format!("{value:.digits$}{unit}/s")
+}
+
+fn duration(seconds: f64) -> String {
+    let whole = seconds.round() as u64;
+    match whole {
+        0..60 => format!("{seconds:.1} s"),
+        60..3600 => format!("{} min {:02} s", whole / 60, whole % 60),
+        _ => format!("{} h {:02} min", whole / 3600, whole % 3600 / 60),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_says_what_is_done_how_fast_and_how_long_it_took_or_will_take() {
+        let log = Log::new("scan".to_owned(), "Gaussian frames", Some(1_252_980));
+        log.advance(626_490);
+        let minute = Duration::from_secs(60);
+        assert_eq!(log.line(minute, false), "scan  626,490 of 1,252,980 Gaussian frames, 10 k/s, 1 min 00 s left");
+        assert_eq!(log.line(minute, true), "scan  626,490 of 1,252,980 Gaussian frames, 10 k/s, 1 min 00 s");
+        log.advance(626_490);
+        assert_eq!(log.line(Duration::from_millis(404), true), "scan  1,252,980 Gaussian frames, 3.1 M/s, 0.4 s");
+        let counter = Log::new("receive".to_owned(), "frames", None);
+        counter.advance(7);
+        assert_eq!(counter.line(Duration::from_secs(7200), false), "receive  7 frames, 0.0/s, 2 h 00 min");
+    }
+
+    #[test]
+    fn rates_are_rounded_to_what_a_person_reads() {
+        for (rate_of, text) in [
+            (0.5, "0.5/s"),
+            (12.4, "12/s"),
+            (999.6, "1.0 k/s"),
+            (45_600.0, "46 k/s"),
+            (3.14e6, "3.1 M/s"),
+            (2e9, "2.0 G/s"),
+        ] {
+            assert_eq!(rate(rate_of), text);
+        }
+    }
+
+    #[test]
+    fn stages_of_a_run_are_numbered_and_others_are_not() {
+        let stages = ["scan", "score", "emit"];
+        assert_eq!(numbered("score", &stages), "[2/3] score");
+        assert_eq!(numbered("motion", &stages), "motion");
     }
 }

@@ -16,12 +16,12 @@
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
 use super::{BLOCK, Progress};
-use crate::emit::atomic::ScratchFile;
+use crate::emit::atomic::nameless;
 use crate::emit::container::FRAME_BLOCK;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
@@ -38,10 +38,11 @@ const GAP: u32 = 32;
 /// Gaussians read at a time, at most.
 const RUN: u32 = 2048;
 
-/// Trajectories in a file that lasts as long as this.
+/// Trajectories in a nameless file that lasts as long as this.
 pub(super) struct Trajectories {
     file: File,
-    scratch: ScratchFile,
+    /// Where the file is.
+    folder: PathBuf,
     count: usize,
     frames: usize,
     /// Frames of a block.
@@ -65,24 +66,23 @@ impl Trajectories {
         let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
         let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
         places.par_sort_unstable();
-        let scratch = ScratchFile::new(folder)?;
-        let io = |what| Error::io(what, scratch.path());
-        let mut file = scratch.create()?;
+        let io = |what| Error::io(what, folder);
+        let mut file = nameless(folder)?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
         let progress = Progress::new("gather", "frames", frames as u64);
         let mut values = Vec::new();
         if frames > 0 {
             take(source, &places, 0..1, NEEDED, &mut values)?;
-            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write"))?;
+            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write a scratch file in"))?;
         }
         for start in (0..frames).step_by(block).take_while(|_| !columns.is_empty()) {
             let of_block = start..frames.min(start + block);
             take(source, &places, of_block.clone(), columns, &mut values)?;
-            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write"))?;
+            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write a scratch file in"))?;
             progress.advance(of_block.len() as u64);
         }
         let varying = numbers(columns);
-        Ok(Trajectories { file, scratch, count: ids.len(), frames, block, varying })
+        Ok(Trajectories { file, folder: folder.to_owned(), count: ids.len(), frames, block, varying })
     }
 
     /// Shows the moments of the Gaussians at `places` (increasing) frame after frame; only once if none varies.
@@ -129,7 +129,7 @@ impl Trajectories {
             self.file
                 .seek(at)
                 .and_then(|_| self.file.read_exact(bytes))
-                .map_err(Error::io("read", self.scratch.path()))?;
+                .map_err(Error::io("read back a scratch file in", &self.folder))?;
             let (of_run, rest) = out.split_at_mut(near.len() * width);
             for (to, &place) in of_run.chunks_exact_mut(width).zip(near) {
                 to.copy_from_slice(&values[(place as usize - low) * width..][..width]);

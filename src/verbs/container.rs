@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::budget::{Need, Plan, Workload};
 use crate::compress::summary::InputSummary;
-use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::container::write_container;
 use crate::emit::frame_stream::StreamWriter;
 use crate::emit::kind::OutputKind;
@@ -41,7 +41,7 @@ pub struct Packed {
 
 /// Packs any input into a container. That of a stream names no digest of its source, which is known only
 /// when the container's header has long been written.
-pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: bool) -> Result<Packed> {
+pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: Replace) -> Result<Packed> {
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     if input.is_stream() {
         let staged = StagedFile::new(output, overwrite)?;
@@ -96,7 +96,7 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
 }
 
 /// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
-pub fn unpack(input: &InputOptions, output: &Path, overwrite: bool) -> Result<Opened> {
+pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<Opened> {
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
     let opened = open_input(input)?;
     let source = opened.input.source();
@@ -119,7 +119,7 @@ pub fn verify(path: &Path) -> Result<VerifyReport> {
 }
 
 /// Saves the complete frames of a container that was cut short.
-pub fn recover(input: &Path, output: &Path, overwrite: bool) -> Result<RecoverReport> {
+pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
     check_target(output, Kind::File, &[input], overwrite)?;
     let staged = StagedFile::new(output, overwrite)?;
     let report = gseq::recover(input, staged.path())?;

@@ -8,7 +8,7 @@ use crate::budget::Budget;
 use crate::compress::summary::Summary;
 use crate::compress::{Request, compress_scene, keep_to_budget};
 use crate::demo::{self, Family};
-use crate::emit::atomic::{Kind, MARKER, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::families::trajectories::write_sequence;
@@ -33,7 +33,7 @@ pub fn run(
     frames: usize,
     recipe: Recipe,
     output: Option<&Path>,
-    overwrite: bool,
+    overwrite: Replace,
     memory: Budget,
 ) -> Result<DemoReport> {
     if let Some(output) = output {
@@ -43,7 +43,7 @@ pub fn run(
         staged.commit()?;
         return Ok(report);
     }
-    let folder = tempfile::tempdir().map_err(Error::io("create a folder in", &std::env::temp_dir()))?;
+    let folder = ScratchFolder::new(&std::env::temp_dir())?;
     run_in(folder.path(), gaussians, frames, recipe, memory)
 }
 

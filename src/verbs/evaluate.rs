@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::evaluation::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
 use crate::budget::{Budget, Need, Plan, Workload};
 use crate::compress::summary::CameraSummary;
-use crate::emit::atomic::{Kind, StagedFile, check_target};
+use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::error::{Error, Result};
 use crate::families::{self, Family, OpenOptions, Timing};
 use crate::ingest::image::read_png;
@@ -46,7 +46,7 @@ pub struct EvaluateOptions {
     /// File for the scores of every picture.
     pub csv: Option<PathBuf>,
     /// Replace an earlier file.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 /// Renders both models at the cameras' pictures and compares them.

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::budget::{Need, Workload};
 use crate::compress::summary::{CameraSummary, InputSummary};
-use crate::emit::atomic::{Kind, MARKER, StagedFile, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::image::{ImageFormat, write_image};
 use crate::error::{Error, Result};
 use crate::model::Camera;
@@ -46,7 +46,7 @@ pub struct RenderOptions {
     /// File or folder to write.
     pub output: PathBuf,
     /// Replace an earlier output.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 /// What was rendered.

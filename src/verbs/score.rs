@@ -6,14 +6,14 @@ use crate::compress::journal::Journal;
 use crate::compress::measure::{Measure, Outlook};
 use crate::compress::open_to_measure;
 use crate::compress::score::UserOverrides;
-use crate::emit::atomic::{Kind, StagedFile, check_target};
+use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::emit::rows::RowTable;
 use crate::error::{Error, Result};
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
 
 /// Writes the rows of an input as `.npz` or `.csv`, by the output's name.
-pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: bool) -> Result<ScoreReport> {
+pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Replace) -> Result<ScoreReport> {
     recipe.validate().map_err(Error::usage)?;
     let extension = output.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     if !matches!(extension.as_str(), "npz" | "csv") {

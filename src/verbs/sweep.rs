@@ -14,7 +14,7 @@ use super::evaluate::{EvaluateOptions, evaluate};
 use super::trade_off::{Point, TradeOff};
 use crate::budget::{peak_memory_bytes, reset_peak_memory};
 use crate::compress::{Only, Request, Target, compress};
-use crate::emit::atomic::{Kind, MARKER, StagedFolder, check_target};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::model::Split;
 use crate::recipe::{Coverage, Recipe, StaticTerm};
@@ -129,7 +129,7 @@ pub struct SweepOptions {
     /// Folder for `sweep.json`, `sweep.csv`.
     pub output: PathBuf,
     /// Replace an earlier folder.
-    pub overwrite: bool,
+    pub overwrite: Replace,
 }
 
 /// Runs every method at every fraction, and those that choose a size by themselves at that too. Scores by
@@ -254,7 +254,7 @@ fn measure(
         background: options.background,
         flip: false,
         csv: None,
-        overwrite: false,
+        overwrite: Replace::Never,
     })?;
     fs::remove_dir_all(scratch).map_err(Error::io("remove", scratch))?;
     found.pictures = evaluation.cameras.pairs;

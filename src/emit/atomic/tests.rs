@@ -16,12 +16,12 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 fn result_folder(path: &Path, content: &str) {
-    put(&path.join(MARKER), r#"{"tool": "splatsieve 0.1.0"}"#);
+    put(&path.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["content", "summary.json"]}"#);
     put(&path.join("content"), content);
 }
 
-fn refusal(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool) -> String {
-    let error = check_target(target, kind, inputs, overwrite).unwrap_err();
+fn refusal(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> String {
+    let error = check_target(target, kind, inputs, replace).unwrap_err();
     assert!(matches!(error, Error::Usage(_)), "{error}");
     error.to_string()
 }
@@ -30,7 +30,7 @@ fn refusal(target: &Path, kind: Kind, inputs: &[&Path], overwrite: bool) -> Stri
 fn a_file_appears_only_at_commit() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out.ply");
-    let staged = StagedFile::new(&target, false).unwrap();
+    let staged = StagedFile::new(&target, Replace::Never).unwrap();
     fs::write(staged.path(), "new").unwrap();
     assert!(!target.exists());
     staged.commit().unwrap();
@@ -44,10 +44,10 @@ fn what_is_dropped_leaves_nothing_and_the_old_output_whole() {
     let (file, folder) = (base.path().join("out.ply"), base.path().join("out"));
     put(&file, "old");
     result_folder(&folder, "old");
-    let staged = StagedFile::new(&file, true).unwrap();
+    let staged = StagedFile::new(&file, Replace::Any).unwrap();
     fs::write(staged.path(), "new").unwrap();
     drop(staged);
-    let staged = StagedFolder::new(&folder, true).unwrap();
+    let staged = StagedFolder::new(&folder, Replace::Ours).unwrap();
     put(&staged.path().join("deep/content"), "new");
     drop(staged);
     assert_eq!(names(base.path()), ["out", "out.ply"]);
@@ -56,13 +56,13 @@ fn what_is_dropped_leaves_nothing_and_the_old_output_whole() {
 }
 
 #[test]
-fn overwriting_replaces_the_whole_folder() {
+fn force_replaces_the_whole_folder() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
     result_folder(&target, "old");
     put(&target.join("only in the old one"), "");
-    check_target(&target, Kind::Folder, &[], true).unwrap();
-    let staged = StagedFolder::new(&target, true).unwrap();
+    check_target(&target, Kind::Folder, &[], Replace::Any).unwrap();
+    let staged = StagedFolder::new(&target, Replace::Any).unwrap();
     result_folder(staged.path(), "new");
     staged.commit().unwrap();
     assert_eq!(names(&target), ["content", MARKER]);
@@ -74,15 +74,16 @@ fn overwriting_replaces_the_whole_folder() {
 fn an_existing_target_is_refused_before_work_and_again_at_commit() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out.ply");
-    check_target(&target, Kind::File, &[], false).unwrap();
-    let staged = StagedFile::new(&target, false).unwrap();
+    check_target(&target, Kind::File, &[], Replace::Never).unwrap();
+    let staged = StagedFile::new(&target, Replace::Never).unwrap();
     fs::write(staged.path(), "new").unwrap();
     put(&target, "somebody else's");
     assert!(staged.commit().unwrap_err().to_string().contains("exists already"));
     assert_eq!(fs::read_to_string(&target).unwrap(), "somebody else's");
-    assert!(refusal(&target, Kind::File, &[], false).contains("--overwrite"));
-    assert!(StagedFile::new(&target, false).is_err());
-    check_target(&target, Kind::File, &[], true).unwrap();
+    assert!(refusal(&target, Kind::File, &[], Replace::Never).contains("--overwrite"));
+    assert!(StagedFile::new(&target, Replace::Never).is_err());
+    assert!(refusal(&target, Kind::File, &[], Replace::Ours).contains("nothing says that splatsieve wrote it"));
+    check_target(&target, Kind::File, &[], Replace::Any).unwrap();
     assert_eq!(names(base.path()), ["out.ply"]);
 }
 
@@ -93,17 +94,17 @@ fn the_input_what_holds_it_and_what_lies_in_it_are_never_a_target() {
     let cloud = model.join("point_cloud.ply");
     result_folder(&model, "");
     put(&cloud, "");
-    for overwrite in [false, true] {
-        assert!(refusal(&model, Kind::Folder, &[&model], overwrite).contains("input itself"));
-        assert!(refusal(&cloud, Kind::File, &[&cloud], overwrite).contains("input itself"));
-        assert!(refusal(&model, Kind::Folder, &[&cloud], overwrite).contains("contains the input"));
-        assert!(refusal(&base.path().join("scenes"), Kind::Folder, &[&model], overwrite).contains("contains"));
+    for replace in [Replace::Never, Replace::Ours, Replace::Any] {
+        assert!(refusal(&model, Kind::Folder, &[&model], replace).contains("input itself"));
+        assert!(refusal(&cloud, Kind::File, &[&cloud], replace).contains("input itself"));
+        assert!(refusal(&model, Kind::Folder, &[&cloud], replace).contains("contains the input"));
+        assert!(refusal(&base.path().join("scenes"), Kind::Folder, &[&model], replace).contains("contains"));
         let detour = model.join("../../scenes/model");
-        assert!(refusal(&detour, Kind::Folder, &[&model], overwrite).contains("input itself"));
-        assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], overwrite).contains("lies inside the input"));
+        assert!(refusal(&detour, Kind::Folder, &[&model], replace).contains("input itself"));
+        assert!(refusal(&model.join("smaller"), Kind::Folder, &[&model], replace).contains("lies inside the input"));
     }
     // A name that merely starts like the input's is another one.
-    check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], false).unwrap();
+    check_target(&base.path().join("scenes/model2"), Kind::Folder, &[&model], Replace::Never).unwrap();
 }
 
 #[cfg(unix)]
@@ -113,8 +114,8 @@ fn a_link_to_the_input_is_the_input() {
     let (model, link) = (base.path().join("model"), base.path().join("link"));
     result_folder(&model, "");
     std::os::unix::fs::symlink(&model, &link).unwrap();
-    assert!(refusal(&link, Kind::Folder, &[&model], true).contains("input itself"));
-    assert!(refusal(&model, Kind::Folder, &[&link], true).contains("input itself"));
+    assert!(refusal(&link, Kind::Folder, &[&model], Replace::Ours).contains("input itself"));
+    assert!(refusal(&model, Kind::Folder, &[&link], Replace::Ours).contains("input itself"));
 }
 
 #[test]
@@ -122,25 +123,28 @@ fn overwrite_deletes_only_folders_this_program_wrote() {
     let base = tempfile::tempdir().unwrap();
     let home = base.path().join("home");
     put(&home.join("thesis.txt"), "years of work");
-    assert!(refusal(&home, Kind::Folder, &[], true).contains("not a result of splatsieve"));
+    assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("not a result of splatsieve"));
     for foreign in ["{}", "[]", "no json", r#"{"tool": "another"}"#, r#"{"tool": 1}"#] {
         put(&home.join(MARKER), foreign);
-        assert!(refusal(&home, Kind::Folder, &[], true).contains("not a result of splatsieve"), "{foreign}");
+        assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("not a result of splatsieve"), "{foreign}");
     }
     put(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0"}"#);
-    check_target(&home, Kind::Folder, &[], true).unwrap();
+    assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("did not list its files"));
+    check_target(&home, Kind::Folder, &[], Replace::Any).unwrap();
+    put(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
+    check_target(&home, Kind::Folder, &[], Replace::Ours).unwrap();
     let empty = base.path().join("empty");
     fs::create_dir(&empty).unwrap();
-    check_target(&empty, Kind::Folder, &[], true).unwrap();
-    assert!(refusal(&home, Kind::File, &[], true).contains("is a folder"));
-    assert!(refusal(&home.join("thesis.txt"), Kind::Folder, &[], true).contains("is no folder"));
+    check_target(&empty, Kind::Folder, &[], Replace::Ours).unwrap();
+    assert!(refusal(&home, Kind::File, &[], Replace::Ours).contains("is a folder"));
+    assert!(refusal(&home.join("thesis.txt"), Kind::Folder, &[], Replace::Ours).contains("is no folder"));
 }
 
 #[test]
 fn a_folder_that_became_foreign_during_the_run_is_left_alone() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    let staged = StagedFolder::new(&target, true).unwrap();
+    let staged = StagedFolder::new(&target, Replace::Ours).unwrap();
     result_folder(staged.path(), "new");
     put(&target.join("thesis.txt"), "years of work");
     staged.commit().unwrap_err();
@@ -152,57 +156,159 @@ fn a_folder_that_became_foreign_during_the_run_is_left_alone() {
 fn impossible_targets_are_refused() {
     let base = tempfile::tempdir().unwrap();
     put(&base.path().join("file"), "");
-    assert!(refusal(&base.path().join("no/such/out"), Kind::Folder, &[], false).contains("create it first"));
-    assert!(refusal(&base.path().join("file/out"), Kind::File, &[], false).contains("is not a folder"));
+    assert!(refusal(&base.path().join("no/such/out"), Kind::Folder, &[], Replace::Never).contains("create it first"));
+    assert!(refusal(&base.path().join("file/out"), Kind::File, &[], Replace::Never).contains("is not a folder"));
     for nameless in ["", "/", ".."] {
-        assert!(refusal(Path::new(nameless), Kind::Folder, &[], true).contains("no name"), "{nameless}");
+        assert!(refusal(Path::new(nameless), Kind::Folder, &[], Replace::Ours).contains("no name"), "{nameless}");
     }
 }
 
-/// The number of a process that has ended.
-#[cfg(target_os = "linux")]
-fn ended() -> u32 {
-    let mut child = process::Command::new("true").spawn().unwrap();
-    child.wait().unwrap();
-    child.id()
+/// What a run leaves beside `base/out` that is killed: its folder, and the file whose lock it held.
+fn left_behind(base: &Path, random: &str) -> PathBuf {
+    let folder = base.join(format!(".out.{random}.splatsieve-tmp"));
+    put(&folder.join("lock"), "");
+    folder
 }
 
-#[cfg(target_os = "linux")]
 #[test]
 fn leftovers_of_killed_runs_go_and_those_of_running_ones_stay() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    let dead = ended();
-    put(&base.path().join(format!(".out.{dead}-0.{WRITING}/deep/part")), "half");
-    put(&base.path().join(format!(".out.{dead}-1.{WRITING}")), "half");
-    let kept = [
-        format!(".other.{dead}-0.{WRITING}"),
-        format!(".out.1-0.{WRITING}"),
-        format!(".out.notes.{WRITING}"),
-        format!(".out.{dead}-0.txt"),
-    ];
+    put(&left_behind(base.path(), "dead1").join("content/deep/part"), "half");
+    put(&left_behind(base.path(), "dead2").join("content"), "half");
+    fs::create_dir(base.path().join(".out.begun.splatsieve-tmp")).unwrap();
+    // A run of which this process knows nothing but its lock, as of one in another container.
+    let runs = left_behind(base.path(), "alive");
+    let lock = File::open(runs.join("lock")).unwrap();
+    fs4::FileExt::lock(&lock).unwrap();
+    put(&runs.join("content"), "half");
+    // Somebody else's, whatever they are called.
+    let kept = [".other.dead1.splatsieve-tmp/lock", ".out.a.b.splatsieve-tmp/lock", ".out.x.splatsieve-tmp/no lock"];
     kept.iter().for_each(|name| put(&base.path().join(name), ""));
-    let first = StagedFolder::new(&target, false).unwrap();
-    let second = StagedFolder::new(&target, false).unwrap();
-    assert!(first.path().exists() && first.path() != second.path());
+    let first = StagedFolder::new(&target, Replace::Never).unwrap();
+    let second = StagedFolder::new(&target, Replace::Never).unwrap();
+    assert!(first.path().exists() && second.path().exists() && first.path() != second.path());
     drop((first, second));
-    let mut expected = kept.to_vec();
+    let mut expected: Vec<String> = kept.iter().map(|name| name.split_once('/').unwrap().0.to_owned()).collect();
+    expected.push(".out.alive.splatsieve-tmp".to_owned());
     expected.sort();
     assert_eq!(names(base.path()), expected);
+    drop(lock);
+    drop(StagedFile::new(&target, Replace::Never).unwrap());
+    assert!(!runs.exists(), "its run has ended now");
 }
 
-#[cfg(target_os = "linux")]
 #[test]
 fn a_run_killed_between_its_renames_does_not_lose_the_old_output() {
+    for aside in ["replaced", "replaced-whole"] {
+        let base = tempfile::tempdir().unwrap();
+        let target = base.path().join("out");
+        result_folder(&left_behind(base.path(), "dead").join(aside), "old");
+        drop(StagedFolder::new(&target, Replace::Ours).unwrap());
+        assert_eq!(names(base.path()), ["out"]);
+        assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "old");
+    }
+}
+
+#[test]
+fn a_run_killed_after_its_renames_has_the_new_output_and_does_not_lose_foreign_files() {
+    for (aside, is_carried) in [("replaced", true), ("replaced-whole", false), ("discarded", false)] {
+        let base = tempfile::tempdir().unwrap();
+        let target = base.path().join("out");
+        result_folder(&target, "new");
+        let old = left_behind(base.path(), "dead").join(aside);
+        result_folder(&old, "old");
+        put(&old.join("test/one.png"), "precious");
+        drop(StagedFolder::new(&target, Replace::Ours).unwrap());
+        assert_eq!(names(base.path()), ["out"]);
+        assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "new");
+        assert_eq!(target.join("test/one.png").exists(), is_carried, "{aside}");
+    }
+}
+
+#[test]
+fn what_another_put_into_a_result_stays_and_where_the_new_one_has_its_place_lies_beside_it() {
     let base = tempfile::tempdir().unwrap();
     let target = base.path().join("out");
-    result_folder(&base.path().join(format!(".out.{}-1.{REPLACED}", ended())), "old");
-    drop(StagedFolder::new(&target, true).unwrap());
+    let staged = StagedFolder::new(&target, Replace::Never).unwrap();
+    for name in [MARKER, "a/own", "a/b/own", "only/own"] {
+        put(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
+    }
+    staged.commit().unwrap();
+    let foreign = ["a/theirs", "a/b/own2", "all/theirs/deep", "file", "folder/theirs", "file in the new one/theirs"];
+    foreign.iter().for_each(|name| put(&target.join(name), name));
+    fs::create_dir(target.join("empty")).unwrap();
+    let staged = StagedFolder::new(&target, Replace::Ours).unwrap();
+    for name in [MARKER, "a/own", "file", "folder/own", "file in the new one"] {
+        put(&staged.path().join(name), r#"{"tool": "splatsieve 0.1.0"}"#);
+    }
+    staged.commit().unwrap();
+    let found = named::files_below(&target).unwrap();
+    assert_eq!(
+        found,
+        [
+            "a/b/own2",
+            "a/own",
+            "a/theirs",
+            "all/theirs/deep",
+            "file",
+            "file in the new one",
+            "file in the new one.kept/theirs",
+            "file.kept",
+            "folder/own",
+            "folder/theirs",
+            MARKER
+        ]
+    );
+    assert!(target.join("empty").is_dir() && !target.join("only").exists());
+    for name in foreign {
+        let kept = found.iter().any(|found| fs::read_to_string(target.join(found)).unwrap() == *name);
+        assert!(kept, "{name} is lost");
+    }
     assert_eq!(names(base.path()), ["out"]);
-    assert_eq!(fs::read_to_string(target.join("content")).unwrap(), "old");
+}
+
+#[test]
+fn a_summary_lists_its_files_and_keeps_its_order() {
+    let base = tempfile::tempdir().unwrap();
+    let target = base.path().join("out");
+    let staged = StagedFolder::new(&target, Replace::Never).unwrap();
+    put(&staged.path().join(MARKER), "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1]\n}\n");
+    put(&staged.path().join("b/\"quoted\""), "");
+    staged.commit().unwrap();
+    let text = fs::read_to_string(target.join(MARKER)).unwrap();
+    let head = "{\n  \"tool\": \"splatsieve 0.1.0\",\n  \"a\": [1],\n  \"files\": [\n";
+    assert_eq!(text, format!("{head}    \"b/\\\"quoted\\\"\",\n    \"{MARKER}\"\n  ]\n}}\n"));
+    let staged = StagedFolder::new(&base.path().join("broken"), Replace::Never).unwrap();
+    put(&staged.path().join(MARKER), "no json");
+    assert!(staged.commit().unwrap_err().to_string().contains("expected a JSON object"));
+    assert_eq!(names(base.path()), ["out"]);
+}
+
+#[test]
+fn files_side_by_side_are_known_by_the_summary_that_lists_them() {
+    let base = tempfile::tempdir().unwrap();
+    let target = |name: &str| base.path().join(name);
+    let names_of = ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"];
+    let stage = |replace| names_of.map(|name| StagedFile::new(&target(name), replace).unwrap());
+    let files = stage(Replace::Never);
+    files.iter().for_each(|file| put(file.path(), r#"{"tool": "splatsieve 0.1.0"}"#));
+    commit_files(&files).unwrap();
+    drop(files);
+    assert_eq!(names(base.path()), names_of);
+    put(&target("x.ply.notes"), "precious");
+    put(&target("x.csv"), "precious");
+    for name in names_of {
+        check_target(&target(name), Kind::File, &[], Replace::Ours).unwrap();
+    }
+    for name in ["x.ply.notes", "x.csv"] {
+        assert!(refusal(&target(name), Kind::File, &[], Replace::Ours).contains("--force"));
+        check_target(&target(name), Kind::File, &[], Replace::Any).unwrap();
+    }
+    drop(stage(Replace::Ours));
 }
 
 #[test]
 fn a_bare_name_lands_in_the_working_folder() {
-    assert_eq!(parts(Path::new("out")).unwrap(), (PathBuf::from("."), OsStr::new("out")));
+    assert_eq!(parts(Path::new("out")).unwrap(), (PathBuf::from("."), "out".as_ref()));
 }
