@@ -159,9 +159,9 @@ pub(super) struct CameraFile {
 pub(super) struct Cameras {
     #[command(flatten)]
     pub(super) file: CameraFile,
-    /// Which of the cameras' pictures to score with
-    #[arg(long, value_enum, default_value_t = SplitArg::Train)]
-    pub(super) split: SplitArg,
+    /// Which of the cameras' pictures to score with [default: train]
+    #[arg(long, value_enum)]
+    pub(super) split: Option<SplitArg>,
 }
 
 /// A part of a data set.

@@ -13,7 +13,7 @@ use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
 use crate::budget::{self, Budget};
-use crate::compress::{Only, Request, Target, compress};
+use crate::compress::{Only, Request, Run, Target, compress};
 use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
@@ -197,20 +197,42 @@ fn compress_options(args: Compress) -> Result<Request> {
         args::OutputKind::PlySequence => OutputKind::PlySequence,
         args::OutputKind::Ply => OutputKind::Ply,
     });
+    let record = args.recipe.record()?;
+    let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
+    let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
+    // What the command line leaves open is as it was in the run that the recipe was written beside.
+    let run = match record.run {
+        Some(run) => {
+            if !has_split {
+                input.split = run.split;
+            }
+            // Frames go with the cameras that they replace.
+            if !has_cameras {
+                input.frames = input.frames.or(run.frames);
+            }
+            input.cameras = input.cameras.or_else(|| run.cameras.clone());
+            input.size = input.size.or(run.size);
+            input.iteration = input.iteration.or(run.iteration);
+            run
+        }
+        None => Run::default(),
+    };
+    let target = args.target_count.map(Target::Count).or(args.target_ratio.map(Target::Ratio));
     Ok(Request {
-        input: input_options(args.input, Some(args.cameras), Some(&args.output)),
+        input,
         output: args.output,
-        kind,
+        kind: kind.or(run.output),
         recipe,
+        made_for: record.provenance.map(|from| from.input_digest),
         only: match (args.prune_only, args.merge_only) {
             (true, _) => Only::Prune,
             (_, true) => Only::Merge,
-            _ => Only::Both,
+            _ => run.mode,
         },
-        target: args.target_count.map(Target::Count).or(args.target_ratio.map(Target::Ratio)),
-        keep_ids: args.overrides.keep_ids,
-        drop_ids: args.overrides.drop_ids,
-        keep_box: args.overrides.keep_box,
+        target: target.or(run.target_count.map(Target::Count)).or(run.target_ratio.map(Target::Ratio)),
+        keep_ids: args.overrides.keep_ids.or(run.keep_ids),
+        drop_ids: args.overrides.drop_ids.or(run.drop_ids),
+        keep_box: args.overrides.keep_box.or(run.keep_box),
         dry_run: args.dry_run,
         overwrite: args.earlier.replace(),
     })
@@ -288,9 +310,9 @@ fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) 
     if let Some(cameras) = cameras {
         options.look_from(cameras.file);
         options.split = match cameras.split {
-            SplitArg::Train => Some(Split::Train),
-            SplitArg::Test => Some(Split::Test),
-            SplitArg::All => None,
+            Some(SplitArg::Train) | None => Some(Split::Train),
+            Some(SplitArg::Test) => Some(Split::Test),
+            Some(SplitArg::All) => None,
         };
     }
     options

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
+use crate::compress::Record;
 use crate::error::{Error, Result};
 use crate::recipe::{MergePass, PRESETS, Recipe, parameters};
 
@@ -21,6 +22,13 @@ pub(super) struct RecipeFlags {
 }
 
 impl RecipeFlags {
+    /// What the recipe file, if there is one, says of the run it was written beside.
+    pub(super) fn record(&self) -> Result<Record> {
+        let Some(path) = &self.file else { return Ok(Record::default()) };
+        let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
+        Record::read(&text).map_err(|message| Error::usage(format!("{}: {message}", path.display())))
+    }
+
     /// The effective recipe.
     pub(super) fn recipe(&self) -> Result<Recipe> {
         let fallback = self.preset.as_deref().unwrap_or("default");
@@ -56,7 +64,7 @@ impl Args for RecipeFlags {
                     .long("recipe")
                     .value_name("FILE")
                     .value_parser(clap::value_parser!(PathBuf))
-                    .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run"),
+                    .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run, options and all"),
             );
         for parameter in parameters() {
             let mut arg = Arg::new(parameter.key.clone())

@@ -10,6 +10,7 @@ pub mod journal;
 pub mod measure;
 mod merge;
 mod prune;
+mod record;
 mod refit;
 mod request;
 mod rounds;
@@ -21,6 +22,7 @@ mod visible;
 
 pub use arrival::open_to_measure;
 pub use job::Job;
+pub use record::{Record, Run};
 pub use request::{Only, Request, Target};
 
 use crate::error::Result;
@@ -86,7 +88,11 @@ fn reduce(
     job.emit.check(&[&scene.path])?;
     journal.notes.extend(scene.notes.iter().cloned());
     let input = InputSummary::of(&*scene.input, &scene.path)?;
-    let recipe = request.recipe_text(&input.digest);
+    if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
+        let own = &input.digest;
+        journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
+    }
+    let recipe = Record::of(request, &job.measure.score.user, input.digest.clone()).text(request);
 
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
@@ -115,6 +121,7 @@ fn reduce(
     let map = reduction.index_map(scene.source().info().count);
     let summarise = |journal: Journal, output_bytes: Option<u64>| Summary {
         schema: summary::SCHEMA,
+        files: Vec::new(),
         tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
         cameras: CameraSummary::of(scene),
         gaussians: reduction.len(),

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use serde::{Deserialize, Serialize};
+
 use crate::emit::atomic::Replace;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -9,7 +11,8 @@ use crate::recipe::Recipe;
 use crate::scene::InputOptions;
 
 /// Which of pruning and merging to do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Only {
     /// Prune, then merge.
     #[default]
@@ -40,6 +43,8 @@ pub struct Request {
     pub kind: Option<OutputKind>,
     /// All hyper-parameters.
     pub recipe: Recipe,
+    /// Digest of the input that the recipe was written beside, if it was: another input is noted.
+    pub made_for: Option<String>,
     /// Which stages to run.
     pub only: Only,
     /// Exact size of the output, if asked for.
@@ -64,6 +69,7 @@ impl Request {
             output,
             kind: None,
             recipe,
+            made_for: None,
             only: Only::Both,
             target: None,
             keep_ids: None,
@@ -95,17 +101,5 @@ impl Target {
                 "--target-count: expected 1 to {count}, the Gaussians of the input, found {wanted}"
             ))),
         }
-    }
-}
-
-impl Request {
-    /// Text of `recipe.toml`: where it comes from, then every parameter.
-    pub fn recipe_text(&self, input_digest: &str) -> String {
-        format!(
-            "# What this result was made with; give it to --recipe to repeat the run.\n\
-             [provenance]\ntool = \"splatsieve {}\"\ninput_digest = \"{input_digest}\"\n\n{}",
-            env!("CARGO_PKG_VERSION"),
-            self.recipe.to_toml()
-        )
     }
 }

@@ -185,6 +185,9 @@ pub struct Summary {
     pub left_out: Vec<LeftOut>,
     /// Things a person should know.
     pub notes: Vec<String>,
+    /// Files of the result, relative to the summary's folder: what overwriting it replaces. Entered once all lie there.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<String>,
 }
 
 impl Summary {

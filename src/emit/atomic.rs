@@ -14,13 +14,10 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
+pub use named::MARKER;
 use named::{Owner, entries, files_below, is_our_file, name_files, parts, present};
 use workspace::{SCRATCH, Workspace};
 pub use workspace::{Withdrawn, withdraw_all};
-
-/// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
-/// result's own; [`StagedFolder::commit`] and [`commit_files`] enter them.
-pub const MARKER: &str = "summary.json";
 
 /// What an output is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

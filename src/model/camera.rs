@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
 
@@ -57,7 +58,8 @@ impl Camera {
 }
 
 /// The part of a data set a picture belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Split {
     /// Pictures the model was trained on; compression scores with these.
     Train,

@@ -264,7 +264,7 @@ impl Recipe {
     }
 
     /// A recipe file's text: any subset of the parameters, over the preset named by its first key
-    /// `preset` (or `fallback`). A table `[provenance]`, as written beside results, is ignored.
+    /// `preset` (or `fallback`). The tables `[provenance]` and `[run]`, as written beside results, are not looked at.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
         let recipe: Recipe =
@@ -364,6 +364,7 @@ pub fn preset_text(name: &str) -> Result<&'static str> {
 /// themselves may name one more.
 fn over_preset(mut over: toml::Table, fallback: Option<&str>) -> std::result::Result<toml::Table, String> {
     over.remove("provenance");
+    over.remove("run");
     let named = over.remove("preset");
     let base = match (&named, fallback) {
         (Some(toml::Value::String(name)), _) => name.as_str(),

@@ -8,8 +8,11 @@ use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::MARKER;
 use crate::error::{Error, Result};
+
+/// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
+/// result's own; [`super::StagedFolder::commit`] and [`super::commit_files`] enter them.
+pub const MARKER: &str = "summary.json";
 
 /// What a summary says of the files it stands for.
 #[derive(Debug, PartialEq, Eq)]

@@ -1,0 +1,160 @@
+//! What a run was asked for, as `recipe.toml` beside its result keeps it, so that the recipe repeats the run.
+//!
+//! The file: `[provenance]`, the tool and the digest of the input; `[run]`, everything beside the hyper-parameters that
+//! decides a byte of the result; then every hyper-parameter.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::request::{Only, Request, Target};
+use super::score::UserOverrides;
+use crate::emit::kind::OutputKind;
+use crate::model::Split;
+
+/// Where a recipe comes from.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Program and version.
+    pub tool: String,
+    /// Digest of the input.
+    pub input_digest: String,
+}
+
+/// What decides a result beside its hyper-parameters. What is none was not asked for.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Run {
+    /// Which of pruning and merging was done.
+    pub mode: Only,
+    /// Exact number of Gaussians in the output.
+    pub target_count: Option<u64>,
+    /// Exact fraction of them.
+    pub target_ratio: Option<f64>,
+    /// Ids to keep, as a list with ranges.
+    pub keep_ids: Option<String>,
+    /// Ids to drop, as a list with ranges.
+    pub drop_ids: Option<String>,
+    /// Box whose Gaussians are kept: low corner, high corner.
+    pub keep_box: Option<[f64; 6]>,
+    /// What was written, as `--as` names it.
+    pub output: Option<OutputKind>,
+    /// Training iteration of a model folder.
+    pub iteration: Option<u32>,
+    /// File or folder of the cameras.
+    pub cameras: Option<PathBuf>,
+    /// Part of their pictures that was scored; none: all.
+    pub split: Option<Split>,
+    /// Evenly spaced frames of a model that is continuous in time.
+    pub frames: Option<usize>,
+    /// Picture size where the cameras name none.
+    pub size: Option<(u32, u32)>,
+}
+
+/// A recipe file's tables beside its hyper-parameters.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// Where it comes from.
+    #[serde(default)]
+    pub provenance: Option<Provenance>,
+    /// What was asked for.
+    #[serde(default)]
+    pub run: Option<Run>,
+}
+
+impl Record {
+    /// Of `request`, whose ids are those of `user`.
+    pub(super) fn of(request: &Request, user: &UserOverrides, input_digest: String) -> Record {
+        let (target_count, target_ratio) = match request.target {
+            None => (None, None),
+            Some(Target::Count(count)) => (Some(count), None),
+            Some(Target::Ratio(ratio)) => (None, Some(ratio)),
+        };
+        let ids = |ids: &[u32]| (!ids.is_empty()).then(|| ranges(ids));
+        let input = &request.input;
+        let run = Run {
+            mode: request.only,
+            target_count,
+            target_ratio,
+            keep_ids: ids(&user.keep),
+            drop_ids: ids(&user.drop),
+            keep_box: request.keep_box,
+            output: request.kind,
+            iteration: input.iteration,
+            cameras: input.cameras.clone(),
+            split: input.split,
+            frames: input.frames,
+            size: input.size,
+        };
+        let tool = format!("splatsieve {}", env!("CARGO_PKG_VERSION"));
+        Record { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
+    }
+
+    /// What the text of a recipe file says beside its hyper-parameters.
+    ///
+    /// # Errors
+    /// A table that is not as [`Run`] has it, in words.
+    pub fn read(text: &str) -> std::result::Result<Record, String> {
+        toml::from_str(text).map_err(|error| error.to_string())
+    }
+
+    /// Text of `recipe.toml`.
+    pub(super) fn text(&self, request: &Request) -> String {
+        format!(
+            "# What this result was made with; give it to --recipe to repeat the run.\n{}\n{}",
+            toml::to_string(self).expect("a record is plain data"),
+            request.recipe.to_toml()
+        )
+    }
+}
+
+/// Increasing ids as a list with ranges, such as `3,10-20`.
+fn ranges(ids: &[u32]) -> String {
+    let runs = ids.chunk_by(|a, b| a + 1 == *b);
+    let texts = runs.map(|run| match (run[0], run[run.len() - 1]) {
+        (first, last) if first == last => first.to_string(),
+        (first, last) => format!("{first}-{last}"),
+    });
+    texts.collect::<Vec<_>>().join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compress::ids::parse_ids;
+    use crate::recipe::Recipe;
+    use crate::scene::InputOptions;
+
+    #[test]
+    fn a_record_reads_back_as_itself_and_leaves_the_recipe_as_it_was() {
+        let input = InputOptions {
+            cameras: Some("data, \"odd\" name".into()),
+            split: Some(Split::Test),
+            frames: Some(12),
+            size: Some((320, 200)),
+            ..InputOptions::default()
+        };
+        let mut request = Request::new(input, "out".into(), Recipe::preset("paper").unwrap());
+        (request.only, request.target) = (Only::Prune, Some(Target::Ratio(0.3)));
+        (request.keep_box, request.kind) = (Some([-1.0, 0.0, 0.5, 1.0, 2.0, 1e9]), Some(OutputKind::PlySequence));
+        let user = UserOverrides { keep: vec![1, 2, 3, 9], drop: Vec::new(), keep_box: request.keep_box };
+        let record = Record::of(&request, &user, "00ff".to_owned());
+        let text = record.text(&request);
+        assert_eq!(Record::read(&text).unwrap(), record, "{text}");
+        assert_eq!(Recipe::from_toml(&text, "default").unwrap(), request.recipe, "{text}");
+        assert_eq!(record.run.unwrap().keep_ids.as_deref(), Some("1-3,9"));
+    }
+
+    #[test]
+    fn a_misspelt_option_of_a_run_is_named() {
+        let message = Record::read("[run]\ntarget_rato = 0.3\n").unwrap_err();
+        assert!(message.contains("target_rato"), "{message}");
+    }
+
+    #[test]
+    fn ranges_parse_into_the_ids_they_stand_for() {
+        for ids in [&[][..], &[7], &[0, 1, 2], &[1, 3, 4, 5, 9, 11, 12]] {
+            assert_eq!(parse_ids(&ranges(ids), 20).unwrap(), ids);
+        }
+    }
+}
