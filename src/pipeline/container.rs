@@ -20,7 +20,7 @@ use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::model::Columns;
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
 
 /// What `pack` wrote.
@@ -75,7 +75,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let info = source.info();
     let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
     let held = Plan::fit(Workload::of_input(&opened.input), input.memory, unpacking)?.limits.frames_held;
-    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, held)?;
+    let wanted = Wanted::every().holding(held);
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, &wanted)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
         frames.read(0, Columns::ALL, &mut state)?;

@@ -24,7 +24,7 @@ use crate::error::{Error, Result};
 use crate::ingest::ply::Ply;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{FrameSource, Ids};
+use crate::pass::{FrameSource, Ids, Wanted};
 use crate::recipe::{Merge, Recipe};
 use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, gather_all};
 
@@ -266,7 +266,7 @@ impl Emission<'_> {
             let of_block = start..times.len().min(start + FRAME_BLOCK);
             writer.begin(&times[of_block.clone()])?;
             for part in &parts {
-                let mut frames = merged.together(part.clone(), FRAME_BLOCK)?;
+                let mut frames = merged.together(part.clone(), &Wanted::of(of_block.clone()).holding(FRAME_BLOCK))?;
                 let mut constant = Gaussians::zeros(0, *sh_degree);
                 if start == 0 {
                     frames.read(start, Columns::ALL.without(*varying), &mut constant)?;
