@@ -10,7 +10,7 @@ use splatsieve::demo::Scene;
 use splatsieve::emit::container::write_container;
 use splatsieve::ingest::container::Container;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::pass::{BlockReader, FrameSource, Ids};
+use splatsieve::pass::{BlockReader, FrameSource, Ids, Wanted};
 use splatsieve::stream::Frames;
 
 const COUNT: usize = 20_000;
@@ -44,7 +44,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
         most = most.max(status("RssFile:"));
     }
     // Frame by frame.
-    let mut frames = Frames::open(&container, Ids::Range(0..COUNT), varying, 1).unwrap();
+    let mut frames = Frames::open(&container, Ids::Range(0..COUNT), varying, &Wanted::every().holding(1)).unwrap();
     let mut state = frames.state();
     for frame in 0..FRAMES {
         frames.read(frame, varying, &mut state).unwrap();

@@ -3,8 +3,12 @@
 //! Positioned reads ([`MappedFile::read_at`]) of a file that was cut short end in an error. Access in
 //! place ([`MappedFile::in_place`]) compares the file's length with the place first, so it ends in an
 //! error too, unless the file shrinks after that, while the slice is in use: then the system may end
-//! the process (SIGBUS). Writers of this crate never shrink or rewrite a container; they replace it by
-//! renaming, which leaves maps of the old one intact.
+//! the process (SIGBUS). What is left of that race is the time from the comparison to the end of one
+//! tile's decoding or one frame's copy. Writers of this crate never shrink or rewrite a container; they
+//! replace it by renaming, which leaves maps of the old one intact.
+//!
+//! Pages that were touched in place count as this process's memory until they are released
+//! ([`MappedFile::release`]).
 
 use std::fs::{self, File};
 use std::io;
@@ -100,6 +104,47 @@ impl MappedFile {
     /// Elsewhere the system is left to guess.
     #[cfg(not(unix))]
     pub(crate) fn expect(&self, _range: std::ops::Range<u64>) {}
+
+    /// Brings the bytes of `range` from the disk, and waits for them. Nothing of them stays in this process.
+    pub(crate) fn fetch(&self, range: std::ops::Range<u64>, piece: &mut Vec<u8>) -> Result<()> {
+        self.read_pieces(range, piece, |_, _| Ok(()))
+    }
+
+    /// Whether reading the byte at `offset` would not wait for the disk; none where the system does not tell.
+    #[cfg(target_os = "linux")]
+    pub(crate) fn is_cached(&self, offset: u64) -> Option<bool> {
+        use rustix::io::{Errno, ReadWriteFlags, preadv2};
+        let mut byte = [0];
+        match preadv2(&self.file, &mut [io::IoSliceMut::new(&mut byte)], offset, ReadWriteFlags::NOWAIT) {
+            Ok(read) => Some(read == 1),
+            Err(Errno::AGAIN) => Some(false),
+            Err(_) => None,
+        }
+    }
+
+    /// Elsewhere nobody knows.
+    #[cfg(not(target_os = "linux"))]
+    pub(crate) fn is_cached(&self, _offset: u64) -> Option<bool> {
+        None
+    }
+
+    /// Gives the pages of `range` back to the system: they no longer count as this process's memory. Whoever still
+    /// reads them in place reads them from the file again.
+    #[cfg(unix)]
+    pub(crate) fn release(&self, range: std::ops::Range<u64>) {
+        let end = range.end.min(self.len());
+        if range.start < end {
+            let (start, len) = (range.start as usize, (end - range.start) as usize);
+            // SAFETY: the advice drops what was written to private pages. The map is read-only and backed by the file,
+            // so every page that is dropped comes back with the file's bytes: slices of it stay valid. The range lies
+            // within the map. A refusal leaves the pages where they are.
+            _ = unsafe { self.map.unchecked_advise_range(memmap2::UncheckedAdvice::DontNeed, start, len) };
+        }
+    }
+
+    /// Elsewhere the system takes pages back when it needs them.
+    #[cfg(not(unix))]
+    pub(crate) fn release(&self, _range: std::ops::Range<u64>) {}
 
     fn too_short(&self, offset: u64, len: u64) -> Error {
         let now = self.file.metadata().map_or(0, |metadata| metadata.len());

@@ -49,7 +49,7 @@ mod writer;
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
 pub use error::{Error, Result};
 pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
-pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo};
+pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TilesRead, Touched};
 pub use recover::{RecoverReport, recover};
 pub use verify::VerifyReport;
 pub use writer::Writer;

@@ -1,7 +1,8 @@
 //! Opens a finished container and hands out its tiles, from any number of threads.
 
+use std::ops::Range;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 use zstd::bulk::Decompressor;
@@ -14,7 +15,7 @@ use crate::layout::{FIXED_HEADER, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD, Record, TRAILER, TileRecord, align, trailer_from_bytes};
 use crate::writer::check_times;
 
-/// Tiles closer than this are expected together.
+/// Tiles closer than this are expected and released together.
 const NEAR: u64 = 1 << 12;
 
 /// A finished container. Memory: 8 bytes per frame, 1 per tile, some 80 per column and Gaussian block while opening;
@@ -33,6 +34,8 @@ pub struct Reader {
     /// Per tile whether its bytes in the map have matched their checksum.
     verified: Vec<AtomicBool>,
     digest: u64,
+    read_bytes: AtomicU64,
+    read_tiles: AtomicU64,
 }
 
 /// Room for tiles that have to be read and decoded; reuse it. Grows to three times the largest decoded tile.
@@ -47,11 +50,43 @@ pub struct TileBuffer {
 
 /// The frames of one tile, one at a time and best in order: see [`Reader::load`].
 ///
-/// Memory: of a packed tile 4 bytes per value of all its frames and 8 per value of one; of a raw tile nothing.
+/// Memory: of a packed tile 4 bytes per value of all its frames and 8 per value of one; of a raw tile nothing, but for
+/// what is used of it in place, until it is released.
 #[derive(Debug, Default)]
 pub struct TileFrames {
     tile: Option<TileRecord>,
     unfilter: Unfilter,
+    /// Whether a raw tile is used in place.
+    in_place: bool,
+    /// What of a raw tile has been counted as read.
+    counted: Counted,
+}
+
+/// What of a raw tile has been counted as read.
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
+enum Counted {
+    #[default]
+    Nothing,
+    /// The frame read last.
+    Frame(usize),
+    /// All of it, when it was verified.
+    Tile,
+}
+
+/// Tiles that were used in place and whose pages are to be released together: see [`Reader::release`].
+#[derive(Debug, Default)]
+pub struct Touched {
+    ranges: Vec<Range<u64>>,
+    bytes: u64,
+}
+
+/// What of a container's tiles was read from the file.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct TilesRead {
+    /// Stored bytes of tiles.
+    pub bytes: u64,
+    /// Tiles that were decoded or, if raw, taken into use.
+    pub tiles: u64,
 }
 
 /// The values of one tile.
@@ -188,7 +223,18 @@ impl Reader {
         let mut digest = Digest::new(&header, &times);
         let varies = index.check(&file, &layout, &mut piece, &mut digest)?;
         let verified = (0..footer.tiles).map(|_| AtomicBool::new(false)).collect();
-        Ok(Reader { file, layout, times, index, footer_offset, varies, verified, digest: digest.value() })
+        Ok(Reader {
+            file,
+            layout,
+            times,
+            index,
+            footer_offset,
+            varies,
+            verified,
+            digest: digest.value(),
+            read_bytes: AtomicU64::new(0),
+            read_tiles: AtomicU64::new(0),
+        })
     }
 
     /// The shape of the container.
@@ -249,11 +295,8 @@ impl Reader {
         let (index, tile) = self.record(at)?;
         if tile.encoding == Encoding::Raw && cfg!(target_endian = "little") {
             let bytes = self.file.in_place(tile.offset, tile.stored_bytes.into())?;
-            // Relaxed: the flag guards nothing but repeated work.
-            if !self.verified[index].load(Ordering::Relaxed) {
-                check_payload(&tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
-                self.verified[index].store(true, Ordering::Relaxed);
-            }
+            self.verify_in_place(index, &tile, bytes)?;
+            self.count(1, bytes.len());
             // Offsets are multiples of 64 and maps start at a page: the bytes are aligned.
             if let Ok(values) = bytemuck::try_cast_slice(bytes) {
                 return Ok(self.shaped(&tile, values));
@@ -269,16 +312,55 @@ impl Reader {
     }
 
     /// Makes `frames` give the frames of a tile: decompresses it, or, if it is raw, verifies it unless it has been.
-    /// No values of it stay in `buffer`. By ordinary reads, like [`Reader::read_tile`].
-    pub fn load(&self, at: TileId, buffer: &mut TileBuffer, frames: &mut TileFrames) -> Result<()> {
+    /// No values of it stay in `buffer`.
+    ///
+    /// With `touched` stored bytes are used where they lie in the map, with the promise of [`Reader::tile`], and noted
+    /// there, to be released ([`Reader::release`]): a packed tile's as soon as this returns, a raw one's once its
+    /// frames have been read. Without, by ordinary reads, like [`Reader::read_tile`]: cheaper where just a frame of a
+    /// raw tile is read before it is released.
+    pub fn load(
+        &self,
+        at: TileId,
+        buffer: &mut TileBuffer,
+        frames: &mut TileFrames,
+        touched: Option<&mut Touched>,
+    ) -> Result<()> {
         let (index, tile) = self.record(at)?;
         // Set last: after an error no frames are given.
         frames.tile = None;
-        match tile.encoding {
-            Encoding::Raw => self.verify_raw(index, &tile, &mut buffer.stored)?,
-            Encoding::Filtered { order } => {
-                read_stored(&self.file, &tile, &mut buffer.stored)?;
+        frames.in_place = touched.is_some();
+        frames.counted = Counted::Nothing;
+        let mapped = match touched {
+            Some(touched) => {
+                touched.add(&tile);
+                Some(self.file.in_place(tile.offset, tile.stored_bytes.into())?)
+            }
+            None => None,
+        };
+        match (tile.encoding, mapped) {
+            (Encoding::Raw, mapped) => {
+                let verified = match mapped {
+                    Some(bytes) => self.verify_in_place(index, &tile, bytes)?,
+                    None => self.verify_raw(index, &tile, &mut buffer.stored)?,
+                };
+                self.count(1, if verified { tile.stored_bytes as usize } else { 0 });
+                if verified {
+                    frames.counted = Counted::Tile;
+                }
+            }
+            (Encoding::Filtered { order }, mapped) => {
                 let TileBuffer { stored, zstd, .. } = buffer;
+                let stored = match mapped {
+                    Some(bytes) => {
+                        check_payload(&tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
+                        bytes
+                    }
+                    None => {
+                        read_stored(&self.file, &tile, stored)?;
+                        stored
+                    }
+                };
+                self.count(1, stored.len());
                 unfilter(&self.file, &self.layout, &tile, order, stored, zstd, &mut frames.unfilter)?;
             }
         }
@@ -287,24 +369,82 @@ impl Reader {
     }
 
     /// Writes the values of a frame, counted from the tile's first, into `out`: `[width, len]` of the tile that was
-    /// loaded. Of a raw tile just these bytes are read from the file.
+    /// loaded. Of a raw tile just these bytes are read from the file or, if it was loaded so, copied from the map.
     ///
     /// # Panics
     /// If `out` is of another size, or the tile that this reader loaded last into `frames` has no such frame, or no
     /// tile was.
     pub fn read_frame(&self, frames: &mut TileFrames, frame: usize, out: &mut [f32]) -> Result<()> {
-        let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
+        let (tile, frame) = self.frame_of(frames, frame);
         let plane = plane_of(&self.layout, &tile);
-        assert!(frame < tile.frames as usize && out.len() == plane, "frame {frame}, {} values of {tile:?}", out.len());
-        let frame = if tile.constant { 0 } else { frame };
+        assert!(out.len() == plane, "{} values for a frame of {tile:?}", out.len());
         match tile.encoding {
             Encoding::Raw => {
-                self.file.read_at(tile.offset + 4 * (frame * plane) as u64, bytemuck::cast_slice_mut(out))?;
+                self.count_frame(frames, frame, 4 * plane);
+                let (offset, bytes) = (frame_offset(&tile, frame, plane), bytemuck::cast_slice_mut(&mut *out));
+                match frames.in_place {
+                    true => bytes.copy_from_slice(self.file.in_place(offset, bytes.len() as u64)?),
+                    false => self.file.read_at(offset, bytes)?,
+                }
                 out.iter_mut().for_each(|value| *value = f32::from_bits(u32::from_le(value.to_bits())));
             }
             Encoding::Filtered { .. } => frames.unfilter.frame(frame, bytemuck::cast_slice_mut(out)),
         }
         Ok(())
+    }
+
+    /// The values of a frame, as [`Reader::read_frame`] gives them: where they lie in the map if the tile is raw and
+    /// was loaded so, else in `room`.
+    ///
+    /// # Panics
+    /// If the tile that this reader loaded last into `frames` has no such frame, or no tile was.
+    pub fn frame<'a>(&'a self, frames: &mut TileFrames, frame: usize, room: &'a mut Vec<f32>) -> Result<&'a [f32]> {
+        let (tile, stored) = self.frame_of(frames, frame);
+        let plane = plane_of(&self.layout, &tile);
+        if tile.encoding == Encoding::Raw && frames.in_place && cfg!(target_endian = "little") {
+            let bytes = self.file.in_place(frame_offset(&tile, stored, plane), 4 * plane as u64)?;
+            if let Ok(values) = bytemuck::try_cast_slice(bytes) {
+                self.count_frame(frames, stored, bytes.len());
+                return Ok(values);
+            }
+        }
+        room.resize(plane, 0.0);
+        self.read_frame(frames, frame, room)?;
+        Ok(room)
+    }
+
+    /// Writes all that is stored of the tile that was loaded to `out`, `[frames, width, len]`; of a constant one a
+    /// frame.
+    ///
+    /// # Panics
+    /// If `out` is of another size, or no tile was loaded.
+    pub fn read_frames(&self, frames: &mut TileFrames, out: &mut [f32]) -> Result<()> {
+        let (tile, _) = self.frame_of(frames, 0);
+        assert!(out.len() == tile.values(&self.layout), "{} values for {tile:?}", out.len());
+        let planes = out.chunks_exact_mut(plane_of(&self.layout, &tile)).enumerate();
+        planes.into_iter().try_for_each(|(frame, out)| self.read_frame(frames, frame, out))
+    }
+
+    /// Gives the pages of tiles that were used in place back to the system, so that they no longer count as this
+    /// process's memory.
+    pub fn release(&self, touched: &mut Touched) {
+        touched.bytes = 0;
+        touched.ranges.sort_unstable_by_key(|range| range.start);
+        let mut together: Range<u64> = 0..0;
+        for range in touched.ranges.drain(..) {
+            if range.start > together.end + NEAR {
+                self.file.release(std::mem::replace(&mut together, range));
+            } else {
+                together.end = together.end.max(range.end);
+            }
+        }
+        self.file.release(together);
+    }
+
+    /// What of the tiles has been read so far, by whomever. Bytes count as often as they are read; of a raw tile that
+    /// has been verified those of the frames read.
+    pub fn tiles_read(&self) -> TilesRead {
+        TilesRead { bytes: self.read_bytes.load(Ordering::Relaxed), tiles: self.read_tiles.load(Ordering::Relaxed) }
     }
 
     /// Tells the system that tiles will be read soon, so that the disk brings them while others are worked on.
@@ -323,11 +463,67 @@ impl Reader {
         self.file.expect(ahead);
     }
 
-    /// Verifies a raw tile, through `piece`, unless it has been: its frames are read one by one afterwards.
-    fn verify_raw(&self, index: usize, tile: &TileRecord, piece: &mut Vec<u8>) -> Result<()> {
+    /// Brings the stored bytes of tiles from the disk, and waits for them, so that whoever decodes them does not. Takes
+    /// a small buffer. That the file cannot be read shows when the tiles are.
+    pub fn fetch(&self, tiles: impl IntoIterator<Item = TileId>) {
+        let mut piece = Vec::new();
+        for (_, tile) in tiles.into_iter().filter_map(|at| self.record(at).ok()) {
+            _ = self.file.fetch(tile.offset..tile.offset + u64::from(tile.stored_bytes), &mut piece);
+        }
+    }
+
+    /// Whether the system holds the file in its memory, judged by `samples` places in it, evenly spread; none if it
+    /// does not tell.
+    pub fn is_cached(&self, samples: u64) -> Option<bool> {
+        let step = (self.file.len() / samples.max(1)).max(1);
+        let mut places = (0..self.file.len()).step_by(step as usize).map(|offset| self.file.is_cached(offset));
+        // Nine of ten: the odd page that was dropped costs less than another way of reading.
+        let (mut cached, mut all) = (0, 0);
+        places.try_for_each(|found| {
+            cached += u64::from(found?);
+            all += 1;
+            Some(())
+        })?;
+        Some(10 * cached >= 9 * all)
+    }
+
+    /// The tile that was loaded, and where the frame is that stands for `frame` in it.
+    fn frame_of(&self, frames: &TileFrames, frame: usize) -> (TileRecord, usize) {
+        let Some(tile) = frames.tile else { panic!("frame {frame} of no tile") };
+        assert!(frame < tile.frames as usize, "frame {frame} of {tile:?}");
+        (tile, if tile.constant { 0 } else { frame })
+    }
+
+    fn count(&self, tiles: u64, bytes: usize) {
+        // Relaxed: sums that are looked at when the reading is done.
+        self.read_tiles.fetch_add(tiles, Ordering::Relaxed);
+        self.read_bytes.fetch_add(bytes as u64, Ordering::Relaxed);
+    }
+
+    /// Counts the bytes of a raw tile's frame, unless they have been.
+    fn count_frame(&self, frames: &mut TileFrames, frame: usize, bytes: usize) {
+        if frames.counted != Counted::Tile && frames.counted != Counted::Frame(frame) {
+            frames.counted = Counted::Frame(frame);
+            self.count(0, bytes);
+        }
+    }
+
+    /// Verifies the bytes of a raw tile unless they have been; gives whether they were now.
+    fn verify_in_place(&self, index: usize, tile: &TileRecord, bytes: &[u8]) -> Result<bool> {
         // Relaxed: the flag guards nothing but repeated work.
         if self.verified[index].load(Ordering::Relaxed) {
-            return Ok(());
+            return Ok(false);
+        }
+        check_payload(tile, xxh3_64(bytes)).map_err(|fault| fault.at(self.file.path()))?;
+        self.verified[index].store(true, Ordering::Relaxed);
+        Ok(true)
+    }
+
+    /// Verifies a raw tile, through `piece`, unless it has been: its frames are read one by one afterwards. Gives
+    /// whether it was now.
+    fn verify_raw(&self, index: usize, tile: &TileRecord, piece: &mut Vec<u8>) -> Result<bool> {
+        if self.verified[index].load(Ordering::Relaxed) {
+            return Ok(false);
         }
         let mut hash = Xxh3::new();
         self.file.read_pieces(tile.offset..tile.offset + u64::from(tile.stored_bytes), piece, |_, bytes| {
@@ -336,7 +532,7 @@ impl Reader {
         })?;
         check_payload(tile, hash.digest()).map_err(|fault| fault.at(self.file.path()))?;
         self.verified[index].store(true, Ordering::Relaxed);
-        Ok(())
+        Ok(true)
     }
 
     /// Place of a tile in the index and what stands there.
@@ -350,6 +546,7 @@ impl Reader {
 
     fn read_record<'a>(&self, tile: &TileRecord, buffer: &'a mut TileBuffer) -> Result<Tile<'a>> {
         read_tile(&self.file, &self.layout, tile, buffer)?;
+        self.count(1, tile.stored_bytes as usize);
         Ok(self.shaped(tile, &buffer.values))
     }
 
@@ -368,6 +565,29 @@ impl TileFrames {
     /// Bytes it holds.
     pub fn memory(&self) -> usize {
         self.unfilter.memory()
+    }
+
+    /// Whether the tile is raw and used where it lies in the map.
+    pub fn is_in_place(&self) -> bool {
+        self.in_place && self.tile.is_some_and(|tile| tile.encoding == Encoding::Raw)
+    }
+}
+
+impl Touched {
+    /// Bytes of the map that wait to be released.
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Takes over what another waits to release.
+    pub fn append(&mut self, other: &mut Touched) {
+        self.ranges.append(&mut other.ranges);
+        self.bytes += std::mem::take(&mut other.bytes);
+    }
+
+    fn add(&mut self, tile: &TileRecord) {
+        self.bytes += u64::from(tile.stored_bytes);
+        self.ranges.push(tile.offset..tile.offset + u64::from(tile.stored_bytes));
     }
 }
 
@@ -430,6 +650,11 @@ fn unfilter(
     frames.load(stored, order, values / plane, plane, zstd).map_err(|found| {
         Fault::new(tile.offset, format!("{} bytes of {:?}", 4 * values, tile.id), found).at(file.path())
     })
+}
+
+/// Where a frame of a raw tile lies.
+fn frame_offset(tile: &TileRecord, frame: usize, plane: usize) -> u64 {
+    tile.offset + 4 * (frame * plane) as u64
 }
 
 /// Values of a tile in one frame.

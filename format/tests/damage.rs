@@ -5,7 +5,7 @@ mod scene;
 use std::fs;
 use std::path::Path;
 
-use gseq::{Compression, Error, Reader, TileBuffer, TileFrames, TileId, Writer, recover};
+use gseq::{Compression, Error, Reader, TileBuffer, TileFrames, TileId, Touched, Writer, recover};
 use scene::{Scene, layout};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -192,17 +192,23 @@ fn a_file_that_shrinks_under_the_map_ends_in_an_error() {
         scene.write(&path, compression, |_| ());
         let reader = Reader::open(&path).unwrap();
         let at = TileId { column: 0, gaussian_block: 0, frame_block: 1 };
-        let mut buffer = TileBuffer::default();
+        let (mut buffer, mut touched) = (TileBuffer::default(), Touched::default());
         reader.tile(at, &mut buffer).unwrap();
-        let mut frames = TileFrames::default();
-        reader.load(at, &mut buffer, &mut frames).unwrap();
+        let mut ways = [true, false].map(|in_place| (in_place, TileFrames::default()));
+        for (in_place, frames) in &mut ways {
+            reader.load(at, &mut buffer, frames, in_place.then_some(&mut touched)).unwrap();
+        }
         fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(4096).unwrap();
-        let next = match compression {
-            Compression::Raw => reader.read_frame(&mut frames, 1, &mut vec![0.0; 15_000]),
-            // The tile that was loaded is in memory.
-            Compression::Zstd(_) => reader.load(at, &mut buffer, &mut frames),
-        };
-        for found in [next, reader.tile(at, &mut buffer).map(drop), reader.verify().map(drop)] {
+        for (in_place, mut frames) in ways {
+            let next = match compression {
+                Compression::Raw => reader.read_frame(&mut frames, 1, &mut vec![0.0; 15_000]),
+                // The tile that was loaded is in memory.
+                Compression::Zstd(_) => reader.load(at, &mut buffer, &mut frames, in_place.then_some(&mut touched)),
+            };
+            assert!(matches!(next, Err(Error::Malformed { .. })), "in place {in_place}: {next:?}");
+        }
+        reader.release(&mut touched);
+        for found in [reader.tile(at, &mut buffer).map(drop), reader.verify().map(drop)] {
             assert!(matches!(found, Err(Error::Malformed { .. })), "{found:?}");
         }
     }

@@ -4,7 +4,10 @@ mod scene;
 
 use std::fs;
 
-use gseq::{Compression, Encoding, Error, Layout, Reader, TileBuffer, TileId, Writer, encode_tile};
+use gseq::{
+    Compression, Encoding, Error, Layout, Reader, TileBuffer, TileFrames, TileId, TilesRead, Touched, Writer,
+    encode_tile,
+};
 use proptest::prelude::*;
 use scene::{Scene, layout};
 use xxhash_rust::xxh3::xxh3_64;
@@ -137,6 +140,36 @@ fn raw_tiles_lie_aligned_in_the_file_and_are_used_in_place() {
         let mut buffers = [TileBuffer::default(), TileBuffer::default()];
         let [a, b] = buffers.each_mut().map(|buffer| reader.tile(id, buffer).unwrap().values().as_ptr());
         assert_eq!(a, b, "two buffers, one place");
+    }
+}
+
+#[test]
+fn reading_every_frame_counts_every_stored_byte_once_also_where_tiles_have_been_verified() {
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    let scene = Scene::new(layout(7, 3, 2, &[3, 1]), 5, 5);
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        scene.write(&path, compression, |_| ());
+        let reader = Reader::open(&path).unwrap();
+        assert_eq!(reader.tiles_read(), TilesRead::default(), "opening reads no tile");
+        let (mut buffer, mut frames, mut touched) = (TileBuffer::default(), TileFrames::default(), Touched::default());
+        for in_place in [true, false, true] {
+            let before = reader.tiles_read();
+            let mut stored = 0;
+            for id in scene.tiles() {
+                let info = reader.tile_info(id).unwrap();
+                stored += info.stored_bytes;
+                reader.load(id, &mut buffer, &mut frames, in_place.then_some(&mut touched)).unwrap();
+                let (_, _, width, len) = scene.tile(id);
+                let mut values = vec![0.0; (width * len) as usize];
+                for frame in 0..info.frames as usize {
+                    reader.read_frame(&mut frames, frame, &mut values).unwrap();
+                }
+            }
+            let read = reader.tiles_read();
+            assert_eq!(read.bytes - before.bytes, stored, "{compression:?}, in place {in_place}");
+            assert_eq!(read.tiles - before.tiles, scene.tiles().len() as u64);
+        }
     }
 }
 

@@ -12,7 +12,7 @@ use crate::emit::kind::OutputKind;
 use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::FrameSource;
+use crate::pass::{FrameSource, Wanted};
 use crate::reduction::Reduction;
 use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored};
 
@@ -79,7 +79,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
         let of_block = start..times.len().min(start + FRAME_BLOCK);
         writer.begin(&times[of_block.clone()])?;
         for part in &parts {
-            let mut frames = merged.together(part.clone(), FRAME_BLOCK)?;
+            let mut frames = merged.together(part.clone(), &Wanted::of(of_block.clone()).holding(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
                 frames.read(start, Columns::ALL.without(*varying), &mut constant)?;

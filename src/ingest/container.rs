@@ -13,15 +13,23 @@
 //! is mostly the first frame block of each block of Gaussians. Threads that fetch, over channels, could win no
 //! more than that, and would need a copy of their own of what they fetched.
 
+mod held;
+mod tiles;
+
 use std::ops::{Deref, DerefMut, Range};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
-use gseq::{Encoding, Reader, TileBuffer, TileFrames, TileId};
+use gseq::{Reader, TileBuffer, TileFrames, TileId, Touched};
 
+use self::held::HeldTiles;
+use self::tiles::TileReader;
 use crate::error::{Error, Result};
-use crate::model::{Columns, Gaussians, SequenceInfo, sh_coefficients};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::model::{Columns, SequenceInfo, sh_coefficients};
+use crate::pass::{Ahead, BlockReader, Count, FrameSource, Ids, Reads};
+
+/// Places of the file that are asked about to know whether the system holds it in memory.
+const SAMPLES: u64 = 64;
 
 /// An open container with all columns of a Gaussian model.
 pub struct Container {
@@ -32,9 +40,12 @@ pub struct Container {
     places: Vec<(Columns, u32)>,
     /// One for each thread at most, shared by all readers.
     scratch: Mutex<Vec<Scratch>>,
+    /// Made when the first tile may be held.
+    held: OnceLock<HeldTiles>,
+    states: Count,
 }
 
-/// What decoding a tile takes besides what is kept of it: about three times the tile.
+/// What decoding a tile takes besides what is kept of it.
 #[derive(Default)]
 struct Scratch {
     buffer: TileBuffer,
@@ -94,7 +105,15 @@ impl Container {
             }
         }
         let info = SequenceInfo { count, times: reader.times().to_vec(), sh_degree, varying };
-        Ok(Container { path: path.to_owned(), reader, info, places, scratch: Mutex::default() })
+        Ok(Container {
+            path: path.to_owned(),
+            reader,
+            info,
+            places,
+            scratch: Mutex::default(),
+            held: OnceLock::new(),
+            states: Count::default(),
+        })
     }
 
     /// The reader underneath.
@@ -110,6 +129,78 @@ impl Container {
     /// Hash that covers every tile, as 16 hexadecimal digits.
     pub fn digest(&self) -> String {
         format!("{:016x}", self.reader.digest())
+    }
+
+    /// Lets the values of tiles stay in memory once they have been decoded, in at most `bytes`, as long as this lives:
+    /// whoever reads them later does not read the file again. Nothing is held at first; more may be allowed at any time,
+    /// less has no effect. Values read are the same.
+    pub fn hold_decoded(&self, bytes: u64) {
+        let own = self.slots() as u64 * HeldTiles::BYTES_PER_SLOT;
+        if bytes > own {
+            self.held.get_or_init(|| HeldTiles::new(self.slots())).allow(bytes - own);
+        }
+    }
+
+    /// Bytes that holding every tile takes ([`Container::hold_decoded`]), at most: less where tiles of a column that
+    /// varies are constant.
+    pub fn decoded_bytes(&self) -> u64 {
+        let values = |&(column, _): &(Columns, u32)| {
+            let frames = if self.info.varying.contains(column) { self.info.times.len() } else { 1 };
+            (column.width(self.info.sh_degree) * frames) as u64 * self.info.count as u64
+        };
+        4 * self.places.iter().map(values).sum::<u64>() + self.slots() as u64 * HeldTiles::BYTES_PER_SLOT
+    }
+
+    /// Tiles that differ: of a column that does not vary those of one frame block.
+    fn slots(&self) -> usize {
+        self.slot(self.places.len(), 0, 0)
+    }
+
+    /// Place among the tiles that differ of that of column `index` of `places`; of one more, their number.
+    fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
+        let blocks = self.reader.layout().gaussian_blocks() as usize;
+        let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };
+        let before: usize = self.places[..index].iter().map(|&(column, _)| rows(column)).sum();
+        let varies = self.places.get(index).is_some_and(|&(column, _)| self.info.varying.contains(column));
+        (before + if varies { frame_block as usize } else { 0 }) * blocks + gaussian_block as usize
+    }
+
+    /// The values `[frames, width, len]` of a tile of column `index` of `places` (one frame of a constant tile), if they
+    /// are held or can be from now on.
+    fn held(&self, index: usize, at: TileId) -> Result<Option<&[f32]>> {
+        let Some(held) = self.held.get() else { return Ok(None) };
+        held.get_or_decode(
+            self.slot(index, at.gaussian_block, at.frame_block),
+            || {
+                let info = self.reader.tile_info(at)?;
+                let frames = if info.constant { 1 } else { info.frames as usize };
+                let range = self.reader.layout().gaussian_range(at.gaussian_block);
+                let width = self.places[index].0.width(self.info.sh_degree);
+                Ok(frames * width * (range.end - range.start) as usize)
+            },
+            |values| {
+                let Scratch { buffer, frames, .. } = &mut *self.scratch();
+                let mut touched = Touched::default();
+                self.reader.load(at, buffer, frames, Some(&mut touched))?;
+                self.reader.read_frames(frames, values)?;
+                self.reader.release(&mut touched);
+                Ok(())
+            },
+        )
+    }
+
+    /// Whether a tile of column `index` of `places` is held.
+    fn is_held(&self, index: usize, gaussian_block: u32, frame_block: u32) -> bool {
+        self.held.get().is_some_and(|held| held.has(self.slot(index, gaussian_block, frame_block)))
+    }
+
+    /// The tiles of `columns` that would have to be read.
+    fn unheld(&self, columns: Columns, gaussian_block: u32, frame_block: u32) -> impl Iterator<Item = TileId> {
+        let needed = move |&(index, &(column, _)): &(usize, &(Columns, u32))| {
+            columns.contains(column) && !self.is_held(index, gaussian_block, frame_block)
+        };
+        let at = move |(_, &(_, column)): (usize, &(Columns, u32))| TileId { column, gaussian_block, frame_block };
+        self.places.iter().enumerate().filter(needed).map(at)
     }
 
     fn scratch(&self) -> Lent<'_> {
@@ -143,218 +234,43 @@ impl FrameSource for Container {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        Ok(Box::new(self.tile_reader(&ids)))
+        Ok(Box::new(TileReader::new(self, &ids)))
+    }
+
+    fn reads(&self) -> Reads {
+        let read = self.reader.tiles_read();
+        Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
+    }
+
+    /// Not for a file that lies in memory: see the benchmark in the module's documentation.
+    fn ahead(&self) -> Option<&dyn Ahead> {
+        match self.reader.is_cached(SAMPLES) {
+            Some(true) => None,
+            _ => Some(self),
+        }
     }
 }
 
-impl Container {
-    fn tile_reader(&self, ids: &Ids<'_>) -> TileReader<'_> {
-        let block = self.reader.layout().gaussian_block as usize;
-        let mut runs: Vec<Run> = Vec::new();
-        for (to, id) in ids.iter().enumerate() {
-            let (tile, from) = ((id / block) as u32, id % block);
-            match runs.last_mut() {
-                Some(run) if run.gaussian_block == tile && run.from + run.len == from => run.len += 1,
-                _ => runs.push(Run { gaussian_block: tile, from, to, len: 1 }),
-            }
-        }
-        // Each tile is decoded once, in whatever order the Gaussians were asked for.
-        runs.sort_by_key(|run| run.gaussian_block);
-        let whole = match runs[..] {
-            [Run { gaussian_block, from: 0, len, .. }] => {
-                let range = self.reader.layout().gaussian_range(gaussian_block);
-                len as u64 == range.end - range.start
-            }
-            _ => false,
-        };
-        let kept = self.places.iter().map(|_| Kept::Nothing).collect();
-        TileReader { source: self, len: ids.len(), runs, whole, held: usize::MAX, expected: None, kept }
-    }
-}
-
-/// Gaussians that lie side by side in a tile and in the block read.
-struct Run {
-    gaussian_block: u32,
-    from: usize,
-    to: usize,
-    len: usize,
-}
-
-/// What a reader keeps of a column.
-enum Kept {
-    Nothing,
-    /// The one tile that a reader of just its Gaussians needs in a frame block, decompressed.
-    Tile(u32, TileFrames),
-    /// Values at some frames, `[frames, width, len]`; one frame for all of them if they are the same.
-    Values(Range<usize>, Vec<f32>),
-}
-
-/// Reads some Gaussians of a container.
-///
-/// Memory per Gaussian: 4 bytes × width × frames held for each column that varies, `frames held` being those of a
-/// frame block or what [`BlockReader::hold`] allows; 8 × width more where that is a whole block. Nothing if just one
-/// frame is held, nothing of raw tiles that are read whole, nothing of columns that do not vary.
-struct TileReader<'a> {
-    source: &'a Container,
-    len: usize,
-    runs: Vec<Run>,
-    /// Whether the Gaussians are those of one tile, in its order.
-    whole: bool,
-    /// Most frames to hold.
-    held: usize,
-    /// The last frame block whose tiles the system was told of.
-    expected: Option<u32>,
-    /// By place in [`Container::places`].
-    kept: Vec<Kept>,
-}
-
-impl TileReader<'_> {
-    /// Writes column `index` at `frame` to `out`, `[width, len]`.
-    fn read_column(&mut self, index: usize, frame: usize, out: &mut [f32]) -> Result<()> {
-        let reader = &self.source.reader;
-        let frame_block = (frame / reader.layout().frame_block as usize) as u32;
-        match &mut self.kept[index] {
-            Kept::Tile(of, frames) if *of == frame_block => {
-                return Ok(reader.read_frame(frames, frame % reader.layout().frame_block as usize, out)?);
-            }
-            Kept::Values(frames, values) if frames.contains(&frame) => {
-                let at = if values.len() == out.len() { 0 } else { (frame - frames.start) * out.len() };
-                out.copy_from_slice(&values[at..][..out.len()]);
-                return Ok(());
-            }
-            _ => (),
-        }
-        // What is not read again, or would be decoded again for its next frame anyway, goes where it is wanted.
-        let (column, place) = self.source.places[index];
-        if !self.source.info.varying.contains(column) {
-            return self.decode(place, frame..frame + 1, out);
-        }
-        let of_block = reader.layout().frame_range(frame_block, self.source.info.times.len() as u64);
-        let of_block = of_block.start as usize..of_block.end as usize;
-        if self.whole {
-            let at = TileId { column: place, gaussian_block: self.runs[0].gaussian_block, frame_block };
-            if (self.held > 1 && self.held >= of_block.len()) || reader.tile_info(at)?.encoding == Encoding::Raw {
-                let mut frames = match std::mem::replace(&mut self.kept[index], Kept::Nothing) {
-                    Kept::Tile(_, frames) => frames,
-                    _ => TileFrames::default(),
-                };
-                reader.load(at, &mut self.source.scratch().buffer, &mut frames)?;
-                reader.read_frame(&mut frames, frame - of_block.start, out)?;
-                self.kept[index] = Kept::Tile(frame_block, frames);
-                return Ok(());
-            }
-        }
-        if self.held == 1 {
-            return self.decode(place, frame..frame + 1, out);
-        }
-        let mut values = match std::mem::replace(&mut self.kept[index], Kept::Nothing) {
-            Kept::Values(_, values) => values,
-            _ => Vec::new(),
-        };
-        let mut frames = frame..of_block.end.min(frame.saturating_add(self.held));
-        let constant = self.is_constant(place, frame_block)?;
-        let stored = if constant { 1 } else { frames.len() };
-        values.resize(stored * out.len(), 0.0);
-        self.decode(place, frame..frame + stored, &mut values)?;
-        if constant {
-            frames = of_block;
-        }
-        out.copy_from_slice(&values[..out.len()]);
-        self.kept[index] = Kept::Values(frames, values);
-        Ok(())
+impl Ahead for Container {
+    fn frame_block(&self) -> usize {
+        self.reader.layout().frame_block as usize
     }
 
-    /// Whether no Gaussian's value changes within the frame block.
-    fn is_constant(&self, column: u32, frame_block: u32) -> Result<bool> {
-        for run in &self.runs {
-            let at = TileId { column, gaussian_block: run.gaussian_block, frame_block };
-            if !self.source.reader.tile_info(at)?.constant {
-                return Ok(false);
-            }
-        }
-        Ok(true)
-    }
-
-    /// Writes a column at `frames`, of one frame block, to `out`: `[frames, width, len]`.
-    fn decode(&self, column: u32, frames: Range<usize>, out: &mut [f32]) -> Result<()> {
-        let reader = &self.source.reader;
-        let layout = reader.layout();
-        let width = layout.columns[column as usize].width as usize;
-        let frame_block = (frames.start / layout.frame_block as usize) as u32;
-        let first = frames.start % layout.frame_block as usize;
-        let mut lent = self.source.scratch();
-        let Scratch { buffer, frames: tile, plane } = &mut *lent;
-        for runs in self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block) {
-            let gaussian_block = runs[0].gaussian_block;
-            let range = layout.gaussian_range(gaussian_block);
-            let len = (range.end - range.start) as usize;
-            reader.load(TileId { column, gaussian_block, frame_block }, buffer, tile)?;
-            for (k, out) in out.chunks_exact_mut(width * self.len).enumerate() {
-                if self.whole {
-                    reader.read_frame(tile, first + k, out)?;
-                    continue;
-                }
-                plane.resize(width * len, 0.0);
-                reader.read_frame(tile, first + k, plane)?;
-                for (from, to) in plane.chunks_exact(len).zip(out.chunks_exact_mut(self.len)) {
-                    for run in runs {
-                        to[run.to..run.to + run.len].copy_from_slice(&from[run.from..run.from + run.len]);
-                    }
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Tells the system of the tiles of `want` that come next, once per frame block. A reader that decodes a block
-    /// again and again would have their bytes take the place of those it still needs.
-    fn expect(&mut self, frame_block: u32, want: Columns) {
-        let reader = &self.source.reader;
-        if self.expected == Some(frame_block) || self.held < reader.layout().frame_block as usize {
+    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) {
+        if gaussians.is_empty() || frames.is_empty() {
             return;
         }
-        let varying = want & self.source.info.varying;
-        let blocks = match self.expected {
-            Some(_) => vec![(frame_block + 1, varying)],
-            None => vec![(frame_block, want), (frame_block + 1, varying)],
-        };
-        self.expected = Some(frame_block);
-        for (frame_block, columns) in blocks {
-            let of = |gaussian_block: u32| {
-                let places = self.source.places.iter().filter(move |(column, _)| columns.contains(*column));
-                places.map(move |&(_, column)| TileId { column, gaussian_block, frame_block })
-            };
-            let runs = self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block);
-            reader.expect(runs.flat_map(|runs| of(runs[0].gaussian_block)));
-        }
-    }
-}
-
-impl BlockReader for TileReader<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        if frame >= self.source.info.times.len() {
-            return Err(Error::usage(format!("{}: there is no frame {frame}", self.source.path.display())));
-        }
-        if self.len > 0 {
-            self.expect((frame / self.source.reader.layout().frame_block as usize) as u32, want);
-        }
-        for index in 0..self.kept.len() {
-            let column = self.source.places[index].0;
-            if !want.contains(column) {
-                continue;
-            }
-            let target = out.column_mut(column);
-            target.resize(self.len);
-            if self.len > 0 {
-                self.read_column(index, frame, target.planes_mut())?;
+        let layout = self.reader.layout();
+        let block = |id: usize, of: u32| (id / of as usize) as u32;
+        let of = layout.gaussian_block;
+        for frame_block in block(frames.start, layout.frame_block)..=block(frames.end - 1, layout.frame_block) {
+            for gaussian_block in block(gaussians.start, of)..=block(gaussians.end - 1, of) {
+                let tiles = || self.unheld(want, gaussian_block, frame_block);
+                // All at once, then waiting for one after the other.
+                self.reader.expect(tiles());
+                self.reader.fetch(tiles());
             }
         }
-        Ok(())
-    }
-
-    fn hold(&mut self, frames: usize) {
-        self.held = frames.max(1);
-        self.kept.fill_with(|| Kept::Nothing);
     }
 }
 

@@ -17,7 +17,7 @@ use super::digest::hash_file;
 use super::ply::{Ply, Property, check_ids};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, Count, FrameSource, Ids, Reads};
 
 /// A sequence of PLY files.
 #[derive(Debug)]
@@ -25,6 +25,8 @@ pub struct PlySequence {
     frames: Vec<PathBuf>,
     properties: Vec<Property>,
     info: SequenceInfo,
+    bytes: Count,
+    states: Count,
 }
 
 impl PlySequence {
@@ -65,7 +67,8 @@ impl PlySequence {
             sh_degree: first.sh_degree(),
             varying: if others.is_empty() { Columns::NONE } else { Columns::ALL },
         };
-        Ok(PlySequence { properties: first.properties().to_vec(), frames, info })
+        let (bytes, states) = (Count::default(), Count::default());
+        Ok(PlySequence { properties: first.properties().to_vec(), frames, info, bytes, states })
     }
 
     /// The same frames at other times, one per frame.
@@ -135,6 +138,10 @@ impl FrameSource for PlySequence {
         check_ids(&self.frames[0], &ids, self.info.count)?;
         Ok(Box::new(PlyBlock { sequence: self, ids: OwnedIds::of(ids) }))
     }
+
+    fn reads(&self) -> Reads {
+        Reads { bytes: self.bytes.get(), states: self.states.get(), ..Reads::default() }
+    }
 }
 
 /// Some Gaussians of a sequence of PLY files.
@@ -145,7 +152,10 @@ struct PlyBlock<'a> {
 
 impl BlockReader for PlyBlock<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        self.sequence.frame(frame)?.gather(&self.ids.borrow(), want, out)
+        let (ply, ids) = (self.sequence.frame(frame)?, self.ids.borrow());
+        self.sequence.bytes.add(ply.bytes_of(ids.len()));
+        self.sequence.states.add(ids.len() as u64);
+        ply.gather(&ids, want, out)
     }
 }
 

@@ -6,9 +6,9 @@ use super::BLOCK;
 use super::parts::Parts;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
 
-/// Open readers over Gaussians of a source.
+/// Readers over Gaussians of a source, open for all the frames that are wanted of it.
 ///
 /// Memory: per Gaussian its reader; per thread one block's state at one frame.
 pub struct Frames<'a> {
@@ -19,9 +19,8 @@ pub struct Frames<'a> {
 }
 
 impl<'a> Frames<'a> {
-    /// Opens readers for the columns `columns` of the Gaussians `ids`, which hold at most `held` frames each
-    /// ([`BlockReader::hold`]).
-    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns, held: usize) -> Result<Frames<'a>> {
+    /// Opens readers for the columns `columns` of the Gaussians `ids` at the frames `wanted`.
+    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns, wanted: &Wanted) -> Result<Frames<'a>> {
         let count = ids.len();
         let readers = (0..count.div_ceil(BLOCK))
             .into_par_iter()
@@ -32,7 +31,7 @@ impl<'a> Frames<'a> {
                     Ids::List(list) => Ids::List(&list[rows]),
                 };
                 let mut reader = source.open(ids)?;
-                reader.hold(held);
+                reader.expect(wanted);
                 Ok(reader)
             })
             .collect::<Result<_>>()?;
@@ -68,7 +67,21 @@ impl BlockReader for Frames<'_> {
         )
     }
 
-    fn hold(&mut self, frames: usize) {
-        self.readers.iter_mut().for_each(|reader| reader.hold(frames));
+    fn expect(&mut self, wanted: &Wanted) {
+        self.readers.iter_mut().for_each(|reader| reader.expect(wanted));
+    }
+}
+
+/// A reader of the columns `columns` of all Gaussians of a source at the frames `wanted`, to be kept open over them.
+///
+/// Memory: that of [`Frames`], or of the source's own ([`FrameSource::open_all`]).
+pub fn open_all<'a>(
+    source: &'a dyn FrameSource,
+    columns: Columns,
+    wanted: &Wanted,
+) -> Result<Box<dyn BlockReader + 'a>> {
+    match source.open_all(wanted) {
+        Some(opened) => opened,
+        None => Ok(Box::new(Frames::open(source, Ids::Range(0..source.info().count), columns, wanted)?)),
     }
 }

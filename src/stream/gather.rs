@@ -1,12 +1,13 @@
-//! The state of many Gaussians at one frame, read in blocks on all threads.
+//! The state of many Gaussians at one frame, read in blocks on all threads. Whoever reads more than a frame keeps
+//! readers open instead ([`super::Frames`], [`super::open_all`]), so that no tile is decoded for each.
 
 use rayon::prelude::*;
 
-use super::BLOCK;
 use super::parts::Parts;
+use super::{BLOCK, open_all};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Ids};
+use crate::pass::{FrameSource, Ids, Wanted};
 
 /// Columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
 ///
@@ -15,11 +16,12 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
     let sh_degree = source.info().sh_degree;
     let mut all = Gaussians::zeros(0, sh_degree);
     let parts = Parts::of(&mut all, want, ids.len());
+    let wanted = Wanted::of([frame]);
     ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
         || Gaussians::zeros(0, sh_degree),
         |block, (ids, parts)| {
             let mut reader = source.open(Ids::List(ids))?;
-            reader.hold(1);
+            reader.expect(&wanted);
             reader.read(frame, want, block)?;
             parts.write(block, want);
             Ok::<_, Error>(())
@@ -30,9 +32,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
 
 /// Columns `want` of all Gaussians at `frame`; all other columns are empty.
 pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
-    if let Some(found) = source.whole(frame, want) {
-        return found;
-    }
-    let ids: Vec<u32> = (0..source.info().count as u32).collect();
-    gather(source, &ids, frame, want)
+    let mut all = Gaussians::zeros(0, source.info().sh_degree);
+    open_all(source, want, &Wanted::of([frame]))?.read(frame, want, &mut all)?;
+    Ok(all)
 }

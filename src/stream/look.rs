@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use super::{Frames, Progress};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Schedule};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
 use crate::plan::Limits;
 use crate::recipe;
 
@@ -148,10 +148,8 @@ impl<W: Send> Looks<W> {
         if frames.is_empty() {
             return Ok(());
         }
-        // Frames are held for those that follow them soon.
-        let nearest = frames.windows(2).map(|pair| pair[1].0 - pair[0].0).min().unwrap_or(usize::MAX);
-        let held = if nearest < self.limits.frames_held { self.limits.frames_held } else { 1 };
-        let mut reader = Frames::open(source, ids, self.want, held)?;
+        let wanted = Wanted::of(frames.iter().map(|&(frame, _)| frame)).holding(self.limits.frames_held);
+        let mut reader = Frames::open(source, ids, self.want, &wanted)?;
         let threads = rayon::current_num_threads();
         for batch in batches(frames, PICTURES_PER_THREAD * threads, self.limits.frames_together) {
             for (slot, &(frame, _)) in batch.iter().enumerate() {

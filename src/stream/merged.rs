@@ -13,7 +13,7 @@ use super::Frames;
 use crate::error::Result;
 use crate::merge::proxy::{ProxyState, merge_state};
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Reads, Wanted};
 use crate::recipe::{Merge, Placement};
 
 /// Columns that follow from one another: moments mix position, rotation and scale, and opacity follows from areas.
@@ -56,13 +56,13 @@ impl<'a> MergedSequence<'a> {
 }
 
 impl MergedSequence<'_> {
-    /// A reader of the Gaussians `places` that reads what they are made of together, on all threads; readers of the
-    /// source hold `held` frames.
+    /// A reader of the Gaussians `places` at the frames `wanted` that reads what they are made of together, on all
+    /// threads.
     ///
     /// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
-    pub fn together(&self, places: Range<usize>, held: usize) -> Result<Box<dyn BlockReader + '_>> {
+    pub fn together(&self, places: Range<usize>, wanted: &Wanted) -> Result<Box<dyn BlockReader + '_>> {
         let merging = Merging::new(self, places);
-        let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::ALL, held)?;
+        let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::ALL, wanted)?;
         Ok(Box::new(MergedReader::new(self, Box::new(frames), merging)))
     }
 
@@ -83,12 +83,12 @@ impl FrameSource for MergedSequence<'_> {
         Ok(Box::new(MergedReader::new(self, reader, merging)))
     }
 
-    fn whole(&self, frame: usize, want: Columns) -> Option<Result<Gaussians>> {
-        Some(self.together(0..self.kept.len(), 1).and_then(|mut reader| {
-            let mut state = Gaussians::zeros(0, self.info.sh_degree);
-            reader.read(frame, want, &mut state)?;
-            Ok(state)
-        }))
+    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        Some(self.together(0..self.kept.len(), wanted))
+    }
+
+    fn reads(&self) -> Reads {
+        self.source.reads()
     }
 }
 
@@ -182,7 +182,7 @@ impl BlockReader for MergedReader<'_> {
         Ok(())
     }
 
-    fn hold(&mut self, frames: usize) {
-        self.reader.hold(frames);
+    fn expect(&mut self, wanted: &Wanted) {
+        self.reader.expect(wanted);
     }
 }

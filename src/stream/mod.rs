@@ -12,10 +12,11 @@ mod progress;
 mod recolored;
 mod removal;
 mod scan;
+mod stages;
 mod trajectories;
 
 pub use contribution::{Looking, Seen, visible_contribution};
-pub use frames::Frames;
+pub use frames::{Frames, open_all};
 pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};

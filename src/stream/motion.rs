@@ -18,7 +18,7 @@ use crate::merge::known::Likeness;
 use crate::merge::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merge::voxels::voxel_order;
 use crate::model::{Column, opacity};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
 use crate::recipe;
 
 /// Memory of one pair while it is measured: its sums, its two Gaussians while they are counted, its result.
@@ -127,7 +127,8 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = Progress::new("motion", "Gaussian frames", (ids.len() * frames) as u64);
-        let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, self.frames_held)?;
+        let wanted = Wanted::of(0..frames).holding(self.frames_held);
+        let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state();
         for frame in 0..frames {
             readers.read(frame, if frame == 0 { NEEDED } else { varying }, &mut state)?;

@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Reads, Wanted};
 
 /// A source whose base colours (`f_dc`) are changed, the same at every frame.
 pub struct Recolored<'a> {
@@ -31,14 +31,19 @@ impl FrameSource for Recolored<'_> {
         Ok(Box::new(RecoloredReader { reader: self.source.open(ids)?, change }))
     }
 
-    fn whole(&self, frame: usize, want: Columns) -> Option<Result<Gaussians>> {
-        let mut found = self.source.whole(frame, want)?;
-        if let Ok(state) = &mut found
-            && want.contains(Columns::SH)
-        {
-            recolor(state, self.change);
+    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        let opened = self.source.open_all(wanted)?;
+        if self.change.is_empty() {
+            return Some(opened);
         }
-        Some(found)
+        let recolored = |reader| -> Box<dyn BlockReader + '_> {
+            Box::new(RecoloredReader { reader, change: self.change.to_vec() })
+        };
+        Some(opened.map(recolored))
+    }
+
+    fn reads(&self) -> Reads {
+        self.source.reads()
     }
 }
 
@@ -56,8 +61,8 @@ impl BlockReader for RecoloredReader<'_> {
         Ok(())
     }
 
-    fn hold(&mut self, frames: usize) {
-        self.reader.hold(frames);
+    fn expect(&mut self, wanted: &Wanted) {
+        self.reader.expect(wanted);
     }
 }
 

@@ -25,7 +25,7 @@ use crate::emit::atomic::nameless;
 use crate::emit::container::FRAME_BLOCK;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Ids};
+use crate::pass::{FrameSource, Ids, Wanted};
 
 /// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
 pub(super) type Moment = [f32; 4];
@@ -156,10 +156,11 @@ fn take(
 ) -> Result<()> {
     let width = columns.width(0);
     values.resize(places.len() * frames.len() * width, 0.0);
+    let wanted = Wanted::of(frames.clone());
     let read = |block: &[(u32, u32)]| -> Result<Vec<Gaussians>> {
         let ids: Vec<u32> = block.iter().map(|&(id, _)| id).collect();
         let mut reader = source.open(Ids::List(&ids))?;
-        reader.hold(frames.len());
+        reader.expect(&wanted);
         let at = |frame| {
             let mut state = Gaussians::zeros(0, source.info().sh_degree);
             reader.read(frame, columns, &mut state)?;

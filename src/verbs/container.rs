@@ -21,7 +21,7 @@ use crate::families::{self, ColumnInfo, Family, OpenOptions, Timing};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::model::Columns;
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
 use crate::plan::Limits;
 use crate::scene::{InputOptions, Opened, check_memory, open_input, open_stream};
 use crate::stream::{Frames, Progress};
@@ -78,7 +78,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let info = source.info();
     let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
     let held = Plan::fit(workload(&*opened.input), input.memory, unpacking)?.limits.frames_held;
-    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, held)?;
+    let wanted = Wanted::every().holding(held);
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, &wanted)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
         frames.read(0, Columns::ALL, &mut state)?;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, Writer, encode_tile};
+use gseq::{ColumnSpec, Compression, Layout, Reader, TileBuffer, TileFrames, TileId, Touched, Writer, encode_tile};
 
 /// A temporary folder, in memory where the system has one: thousands of files are synced in these tests,
 /// which costs milliseconds each on a disk.
@@ -129,15 +129,19 @@ impl Scene {
                 let got: Vec<u32> = planes.flat_map(|(f, c)| tile.plane(f, c)).map(|v| v.to_bits()).collect();
                 assert!(got == bits, "{id:?}, in place {in_place}: wrong data");
             }
-            let mut one_by_one = TileFrames::default();
-            reader.load(id, &mut buffer, &mut one_by_one)?;
-            let mut values = vec![0.0; (width * len) as usize];
-            for (frame, bits) in bits.chunks_exact(values.len()).enumerate() {
-                reader.read_frame(&mut one_by_one, frame, &mut values)?;
-                assert!(
-                    values.iter().map(|v| v.to_bits()).eq(bits.iter().copied()),
-                    "{id:?}, frame {frame}: wrong data"
-                );
+            for in_place in [true, false] {
+                let (mut one_by_one, mut touched) = (TileFrames::default(), Touched::default());
+                reader.load(id, &mut buffer, &mut one_by_one, in_place.then_some(&mut touched))?;
+                let (mut values, mut room) = (vec![0.0; (width * len) as usize], Vec::new());
+                for (frame, bits) in bits.chunks_exact(values.len()).enumerate() {
+                    reader.read_frame(&mut one_by_one, frame, &mut values)?;
+                    let lent = reader.frame(&mut one_by_one, frame, &mut room)?;
+                    for values in [&values, lent] {
+                        let same = values.iter().map(|v| v.to_bits()).eq(bits.iter().copied());
+                        assert!(same, "{id:?}, frame {frame}, in place {in_place}: wrong data");
+                    }
+                    reader.release(&mut touched);
+                }
             }
         }
         Ok(())

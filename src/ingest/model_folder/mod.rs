@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::pass::{BlockReader, Count, FrameSource, Ids, Reads};
 
 use super::cfg_args::ModelConfig;
 use super::digest::hash_file;
@@ -109,6 +109,7 @@ pub struct ModelFolder {
     canonical: Arc<Gaussians>,
     field: Arc<Field>,
     info: SequenceInfo,
+    states: Count,
 }
 
 impl ModelFolder {
@@ -119,7 +120,8 @@ impl ModelFolder {
         let tensors = read_state_dict(&paths.deformation)?;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
         let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
-        Ok(ModelFolder { paths, config, canonical: Arc::new(canonical), field: Arc::new(field), info })
+        let (canonical, field, states) = (Arc::new(canonical), Arc::new(field), Count::default());
+        Ok(ModelFolder { paths, config, canonical, field, info, states })
     }
 
     /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
@@ -213,6 +215,10 @@ impl FrameSource for ModelFolder {
             deltas: Deltas::new(self.info.sh_degree),
         }))
     }
+
+    fn reads(&self) -> Reads {
+        Reads { states: self.states.get(), ..Reads::default() }
+    }
 }
 
 struct FieldReader<'a> {
@@ -229,6 +235,9 @@ impl BlockReader for FieldReader<'_> {
         let Some(&time) = times.get(frame) else {
             return Err(Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len())));
         };
+        if !want.is_empty() {
+            self.model.states.add(self.raw.len() as u64);
+        }
         self.model.field.deltas(&self.prepared, time, want, &mut self.scratch, &mut self.deltas)?;
         self.deltas.apply(&self.raw, want, out);
         Ok(())

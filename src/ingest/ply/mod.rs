@@ -49,15 +49,15 @@ pub struct Ply {
 enum Body {
     /// The whole file; the tables start after the header.
     Mapped { map: FileMap, start: usize },
-    /// The tables of a text file as little-endian rows.
-    Parsed(Vec<u8>),
+    /// The tables of a text file as little-endian rows, and how long the file is.
+    Parsed(Vec<u8>, u64),
 }
 
 impl Body {
     fn bytes(&self) -> &[u8] {
         match self {
             Body::Mapped { map, start } => &map[*start..],
-            Body::Parsed(bytes) => bytes,
+            Body::Parsed(bytes, _) => bytes,
         }
     }
 }
@@ -81,7 +81,7 @@ impl Ply {
             .map_err(|_| Error::input(path, "element vertex", "at most 4294967295 rows", vertex.count.to_string()))?;
         let start = header.text.len();
         let body = match header.encoding {
-            Encoding::Ascii => Body::Parsed(ascii::to_binary(path, &header, &map[start..])?),
+            Encoding::Ascii => Body::Parsed(ascii::to_binary(path, &header, &map[start..])?, map.len() as u64),
             Encoding::LittleEndian | Encoding::BigEndian => Body::Mapped { map, start },
         };
         let rows = vertex_rows(path, &header, body.bytes().len())?;
@@ -158,6 +158,14 @@ impl Ply {
         Ok(())
     }
 
+    /// Bytes of the file that reading `rows` Gaussians takes, whatever their columns: of a text file all.
+    pub(crate) fn bytes_of(&self, rows: usize) -> u64 {
+        match &self.body {
+            Body::Mapped { .. } => (rows * self.stride) as u64,
+            Body::Parsed(_, stored) => *stored,
+        }
+    }
+
     /// The header, for writers.
     pub(crate) fn header(&self) -> &Header {
         &self.header
@@ -187,7 +195,7 @@ impl Ply {
     pub(crate) fn check_unshrunk(&self) -> Result<()> {
         match &self.body {
             Body::Mapped { map, .. } => map.check(),
-            Body::Parsed(_) => Ok(()),
+            Body::Parsed(..) => Ok(()),
         }
     }
 }
