@@ -32,6 +32,9 @@ pub struct Budget {
 
 /// Resident before any Gaussian is: the program, its libraries, its threads' stacks and heaps, messages.
 const PROGRAM: u64 = 14 << 20;
+/// Tiles of a container are held if they take at most one part in so many of the budget: the file system's cache holds
+/// what is stored anyway, and a larger part would leave less to others without saving more than decoding.
+const HELD_PART: u64 = 16;
 /// Per thread.
 const PER_THREAD: u64 = 2 << 20;
 /// Resident per tile of an open container: whether it has been verified.
@@ -84,6 +87,12 @@ impl Workload {
             shots: 0,
             threads: rayon::current_num_threads() as u64,
         }
+    }
+
+    /// Of no Gaussians.
+    pub fn nothing() -> Workload {
+        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Columns::NONE };
+        Workload::new(&info, Residence::of_tiles(0))
     }
 
     /// The same as the cameras of `schedule`, of `rig`, see it.
@@ -170,9 +179,24 @@ impl Workload {
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }
 
-    /// Full reads of the frames that looking at `pictures` pictures, one after the other in time, takes at most.
-    pub fn sampled(&self, pictures: usize) -> f64 {
-        (pictures as u64).min(self.pictures) as f64 / self.frames.max(1) as f64
+    /// Full reads of the input that reading `frames` frames, evenly spread, takes at most: whole tiles, again and
+    /// again where readers may hold too few of their frames.
+    pub fn reads(&self, frames: u64, limits: &Limits) -> f64 {
+        let (all, together) = (self.frames.max(1), self.input.frame_block);
+        if self.frames == 0 || together == 0 {
+            return frames.min(all) as f64 / all as f64;
+        }
+        let blocks = self.frames.div_ceil(together);
+        let of_block = frames.div_ceil(blocks).min(together);
+        let again = of_block.div_ceil(limits.frames_held.max(1) as u64);
+        (frames.min(blocks) * again) as f64 / blocks as f64
+    }
+
+    /// [`Workload::reads`] of Gaussians that lie anywhere, block by block: a tile at the border of two blocks is read
+    /// for each.
+    pub fn scattered_reads(&self, frames: u64, limits: &Limits) -> f64 {
+        let shared = if self.input.frame_block == 0 { 1.0 } else { 2.0 };
+        shared * self.reads(frames, limits)
     }
 
     /// The whole input as it is known and seen, whatever its Gaussians hold.
@@ -268,6 +292,7 @@ impl Plan {
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1) as usize,
             rows_aside: false,
+            tiles_held: false,
         };
         // A model is read whole before anything else.
         let opening = vec![("file", work.input.opening)];
@@ -293,9 +318,24 @@ impl Plan {
             // Of equals the last one: what is cheapest to do without.
             match halved.max_by_key(saved) {
                 Some(other) => limits = other,
-                None => return plan,
+                None => return plan.with_held_tiles(),
             }
         }
+    }
+
+    /// The same plan, all tiles of the container held besides if that takes a small part of the budget: then nothing is
+    /// read twice.
+    fn with_held_tiles(mut self) -> Plan {
+        let decoded = self.work.input.decoded;
+        let fits = self.excess() == 0 && self.peak().saturating_add(decoded) <= self.budget;
+        self.limits.tiles_held = decoded > 0 && fits && decoded <= self.budget / HELD_PART;
+        self
+    }
+
+    /// Full reads of the input at most, all stages together.
+    pub fn reads(&self) -> f64 {
+        let sum: f64 = self.needs.iter().map(|need| need.reads).sum();
+        if self.limits.tiles_held { sum.min(1.0) } else { sum }
     }
 
     /// Bytes resident at most.
@@ -304,7 +344,8 @@ impl Plan {
     }
 
     fn base(&self) -> u64 {
-        PROGRAM + PER_THREAD * self.work.threads + self.work.known()
+        let held = if self.limits.tiles_held { self.work.input.decoded } else { 0 };
+        PROGRAM + PER_THREAD * self.work.threads + self.work.known() + held
     }
 
     /// Bytes by which stages pass the budget, all together.
@@ -344,9 +385,10 @@ impl Plan {
         );
         let _ = writeln!(
             out,
-            "  = {} program and threads + {} frames, cameras, index + the largest stage:",
-            size(self.base() - work.known()),
-            size(work.known())
+            "  = {} program and threads + {} frames, cameras, index + {} tiles held + the largest stage:",
+            size(PROGRAM + PER_THREAD * work.threads),
+            size(work.known()),
+            size(self.base() - PROGRAM - PER_THREAD * work.threads - work.known())
         );
         for need in &self.needs {
             let parts = |parts: &[Part], unit: fn(u64) -> String| -> String {
@@ -375,8 +417,9 @@ impl Plan {
         );
         let reads = self.needs.iter().filter(|need| need.reads > 0.0);
         let named: Vec<String> = reads.map(|need| format!("{:.2} {}", need.reads, need.stage)).collect();
-        let sum: f64 = self.needs.iter().map(|need| need.reads).sum();
-        let _ = writeln!(out, "full reads of the frames: at most {sum:.2} ({})", named.join(" + "));
+        let held = if limits.tiles_held { "every tile stays in memory once it is decoded; else " } else { "" };
+        let named = named.join(" + ");
+        let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.reads());
         out
     }
 }

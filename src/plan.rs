@@ -17,6 +17,8 @@ pub struct Limits {
     pub pairs_together: usize,
     /// Statistics wait in a scratch file once they have been scored.
     pub rows_aside: bool,
+    /// The tiles of a container stay in memory once they are decoded, all of them.
+    pub tiles_held: bool,
 }
 
 impl Limits {
@@ -29,5 +31,6 @@ impl Limits {
         gaussians_together: usize::MAX,
         pairs_together: usize::MAX,
         rows_aside: false,
+        tiles_held: false,
     };
 }

@@ -95,12 +95,11 @@ fn receive_measured<S: Stages>(
     })?;
     let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
     let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
-    let mut scene = Scene { limits: memory.limits, ..scene_of(opened, options)? };
+    let mut scene = scene_of(opened, options)?;
     // Now that the frames are counted; what they add is small, and no reason to throw away what has arrived.
     let counted = Budget { explain: false, ..options.memory };
-    if let Ok(plan) = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits)) {
-        scene.limits = plan.limits;
-    }
+    let counted = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits));
+    scene.follow(counted.as_ref().unwrap_or(&memory));
     let mut arrived = None;
     if let Some(measuring) = measuring {
         let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;

@@ -12,14 +12,14 @@ use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
 use crate::model::{Columns, Gaussians};
-use crate::pass::FrameSource;
+use crate::pass::{BlockReader, FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::recipe::{self, StaticTerm};
 use crate::reduction::Reduction;
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::scene::pictures::spread;
-use crate::stream::gather_all;
+use crate::stream::open_all;
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -60,12 +60,15 @@ impl Choose {
             ("clusters", CLUSTERED),
             ("states", 2 * work.state(Columns::ALL)),
             ("result", work.input.reduced),
+            ("readers", 2 * work.input.reader),
+            ("held", 2 * work.held(limits, Columns::ALL)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + AT_ONCE as u64);
+        let frames = (PICTURES as u64).min(work.pictures);
         Need {
             stage: NAME,
-            reads: 2.0 * work.sampled(PICTURES),
+            reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![work.arriving(), ("pictures", pictures)],
         }
@@ -168,6 +171,7 @@ impl Choose {
 /// Mean PSNR of every alternative against the original over `pictures`, dB.
 fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u32)]) -> Result<Vec<f64>> {
     let (source, background) = (scene.source(), scene.background);
+    let sh_degree = source.info().sh_degree;
     let results: Vec<Option<Box<dyn FrameSource + '_>>> = alternatives
         .iter()
         .map(|other| match other.reduction.clusters.is_empty() {
@@ -175,11 +179,17 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u3
             false => scene.input.reduced(&other.reduction).map(Some),
         })
         .collect::<Result<_>>()?;
+    let wanted = Wanted::of(pictures.iter().map(|&(frame, _)| frame)).holding(scene.limits.frames_held);
+    let open = |source| open_all(source, Columns::ALL, &wanted);
+    let mut of_source = open(source)?;
+    let mut of_results: Vec<Option<Box<dyn BlockReader + '_>>> =
+        results.iter().map(|result| result.as_deref().map(open).transpose()).collect::<Result<_>>()?;
+    let (mut original, mut state) = (Gaussians::zeros(0, sh_degree), Gaussians::zeros(0, sh_degree));
     let mut sums = vec![0.0; alternatives.len()];
     for of_frame in pictures.chunk_by(|a, b| a.0 == b.0).flat_map(|of_frame| of_frame.chunks(AT_ONCE)) {
         let frame = of_frame[0].0;
         let camera = |index: u32| &scene.schedule.cameras[index as usize];
-        let original = gather_all(source, frame, Columns::ALL)?;
+        of_source.read(frame, Columns::ALL, &mut original)?;
         let expected: Vec<Image> =
             of_frame.iter().map(|&(_, index)| render(&original, camera(index), background)).collect();
         let compare = |state: &Gaussians| -> f64 {
@@ -192,10 +202,10 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u3
         for (other, sum) in pruned {
             *sum += compare(&original.pick(&other.reduction.kept));
         }
-        drop(original);
-        for (result, sum) in results.iter().zip(&mut sums) {
+        for (result, sum) in of_results.iter_mut().zip(&mut sums) {
             if let Some(result) = result {
-                *sum += compare(&gather_all(&**result, frame, Columns::ALL)?);
+                result.read(frame, Columns::ALL, &mut state)?;
+                *sum += compare(&state);
             }
         }
     }

@@ -90,11 +90,22 @@ impl Emit {
             OutputKind::Gseq => (),
             // A file's rows and the proxies among them for each thread, or one state and what it is made of.
             _ => {
+                per_gaussian.push(("readers", work.input.reader));
+                per_gaussian.push(("held", work.held(limits, Columns::ALL)));
                 per_gaussian.push(("files", work.threads * (work.input.file + 2 * whole)));
                 per_gaussian.push(("members", CLUSTERED));
             }
         }
-        Need { stage: NAME, reads: if is_solved { 0.0 } else { 1.0 }, per_gaussian, fixed }
+        // Of a family that is solved only sequences take states; of others, merged ones are read part by part.
+        let parts = match self.kind {
+            OutputKind::Gseq if self.merges => work.gaussians.div_ceil(limits.gaussians_together as u64).max(1),
+            _ => 1,
+        };
+        let reads = match is_solved && !self.kind.holds_frames() {
+            true => 0.0,
+            false => parts as f64 * work.scattered_reads(work.frames, limits),
+        };
+        Need { stage: NAME, reads, per_gaussian, fixed }
     }
 
     /// Writes the result and what goes beside it; everything appears under its name at the end, a file
@@ -114,7 +125,7 @@ impl Emit {
         let map = reduction.index_map(scene.source().info().count);
         let mut write = |path: &Path| -> Result<u64> {
             journal.stage(NAME, reduction.len(), scene.source(), |journal| {
-                let notes = scene.input.write(reduction, self.kind, path, scene.limits.gaussians_together)?;
+                let notes = scene.input.write(reduction, self.kind, path, &scene.limits)?;
                 journal.notes.extend(notes);
                 Ok((bytes_below(path)?, reduction.len()))
             })
@@ -151,7 +162,7 @@ pub fn write_alone(input: &dyn Family, reduction: &Reduction, kind: OutputKind, 
     if kind.is_folder() {
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
-    input.write(reduction, kind, path, usize::MAX)?;
+    input.write(reduction, kind, path, &Limits::NONE)?;
     bytes_below(path)
 }
 

@@ -58,8 +58,9 @@ impl Job {
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
         let choose =
             || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
+        let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
         Ok(Job {
-            rounds: Rounds::of(&recipe.select).filter(|_| looks && prunes),
+            rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
             choose: (looks && prunes && recipe.select.choose_by_views).then(choose),
@@ -69,6 +70,11 @@ impl Job {
             target,
             has_cameras: outlook.has_cameras,
         })
+    }
+
+    /// Names of its stages that go over frames or pictures, in their order.
+    pub fn names(&self) -> Vec<&'static str> {
+        self.needs(&Workload::nothing(), &Limits::NONE).iter().map(|need| need.stage).collect()
     }
 
     /// Writes down the stages that the request leaves out.

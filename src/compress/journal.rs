@@ -11,6 +11,8 @@ use crate::pass::{FrameSource, Reads};
 /// The record of a run so far.
 #[derive(Debug, Default)]
 pub struct Journal {
+    /// What reading every frame once reads.
+    pub whole: Reads,
     /// Everything done, in order.
     pub stages: Vec<Stage>,
     /// What the scene did not need.
@@ -49,11 +51,14 @@ impl Journal {
     }
 
     fn add(&mut self, name: &str, gaussians_in: usize, gaussians_out: usize, start: Instant, reads: Reads) {
+        let Reads { bytes, states, .. } = self.whole;
+        let (read, whole) = if bytes > 0 { (reads.bytes, bytes) } else { (reads.states, states) };
         self.stages.push(Stage {
             name: name.to_owned(),
             gaussians_in,
             gaussians_out,
             reads,
+            full_reads: read as f64 / whole.max(1) as f64,
             seconds: start.elapsed().as_secs_f64(),
             peak_memory_bytes: peak_memory_bytes(),
         });

@@ -31,6 +31,9 @@ const NAME: &str = "merge";
 /// the ids while merging is tried on some of them.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<bool>();
 
+/// Sets of survivors that are tried at most until merging leaves the target: the bracket closes by the secant.
+const TRIALS: f64 = 16.0;
+
 /// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
 const GATHERED: usize = 16 * BLOCK;
 
@@ -72,9 +75,12 @@ impl Merge {
             ("readers", work.input.reader),
             ("followed", motion::bytes_per_gaussian(limits.frames_held) as u64),
         ];
+        // States once; every pass follows its pairs along all frames, of every set of survivors that is tried.
+        let trials = if self.target.is_some() && self.prunes { TRIALS } else { 1.0 };
+        let followed = trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
         Need {
             stage: NAME,
-            reads: 1.0,
+            reads: work.scattered_reads(1, limits) + followed,
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
         }

@@ -29,6 +29,7 @@ use crate::error::Result;
 use crate::recipe::Recipe;
 use crate::reduction::Reduction;
 use crate::scene::Scene;
+use crate::stream::begin_run;
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
@@ -87,6 +88,8 @@ fn reduce(
     scene.input.check_output(job.emit.kind, &request.output)?;
     job.emit.check(&[&scene.path])?;
     journal.notes.extend(scene.notes.iter().cloned());
+    journal.whole = scene.whole()?;
+    begin_run(&job.names());
     let input = InputSummary::of(&*scene.input, &scene.path)?;
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;
@@ -132,6 +135,7 @@ fn reduce(
         merge,
         left_out: journal.left_out,
         notes: journal.notes,
+        planned_reads: scene.planned_reads,
         stages: journal.stages,
         input,
     };

@@ -8,8 +8,8 @@ use super::score::{Scored, scored};
 use crate::budget::{Need, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
-use crate::model::{Camera, Columns, SH_C0};
-use crate::pass::FrameSource;
+use crate::model::{Camera, Columns, Gaussians, SH_C0};
+use crate::pass::{BlockReader, FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::recipe;
 use crate::reduction::Reduction;
@@ -17,7 +17,7 @@ use crate::refit::{self, Refit as Equations};
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::scene::pictures::spread;
-use crate::stream::{gather_all, recolor};
+use crate::stream::{open_all, recolor};
 
 /// What the stage is called.
 const NAME: &str = "refit";
@@ -57,10 +57,14 @@ impl Refit {
         let fitted = (self.pictures as u64).min(most);
         let tests = fitted.div_ceil(3);
         let sights = fitted.min(limits.sights_together as u64);
+        // Those whose footprints are not kept are looked at in every iteration.
+        let again = if sights < fitted { ITERATIONS as f64 + 1.0 } else { 0.0 };
         let per_gaussian = vec![
             ("kept", 24),
             ("states", 2 * work.state(Columns::ALL)),
             ("result", work.input.reduced),
+            ("readers", 2 * work.input.reader),
+            ("held", 2 * work.held(limits, Columns::ALL)),
             ("equations", refit::BYTES_PER_GAUSSIAN as u64),
             ("sights", sights * render::BYTES_PER_VISIBLE as u64),
             // Made at a time, with what they pull at: twice three f64.
@@ -68,7 +72,9 @@ impl Refit {
         ];
         Need {
             stage: NAME,
-            reads: work.sampled((fitted + 2 * tests) as usize),
+            reads: 2.0 * work.scattered_reads(fitted + tests, limits)
+                + again * work.scattered_reads(fitted - sights, limits)
+                + work.scattered_reads(tests, limits),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![
                 work.arriving(),
@@ -103,11 +109,14 @@ impl Refit {
             let mut equations = Equations::new(fixed, kept);
             let tests = look(scene, &*result, &pictures, &mut equations)?;
             let unkept: Vec<(usize, u32)> = fitted(&pictures).skip(kept).collect();
+            let mut state = Gaussians::zeros(0, scene.source().info().sh_degree);
             let colors = equations.solve(self.ridge, ITERATIONS, |see| {
+                let mut reader = open(scene, &*result, unkept.iter().map(|&(frame, _)| frame))?;
                 for of_frame in unkept.chunk_by(|a, b| a.0 == b.0) {
                     let cameras: Vec<&Camera> =
                         of_frame.iter().map(|&(_, camera)| &scene.schedule.cameras[camera as usize]).collect();
-                    see(&gather_all(&*result, of_frame[0].0, Columns::ALL)?, &cameras);
+                    reader.read(of_frame[0].0, Columns::ALL, &mut state)?;
+                    see(&state, &cameras);
                 }
                 Ok::<_, crate::error::Error>(())
             })?;
@@ -127,6 +136,15 @@ impl Refit {
         reduction.recolor = change;
         Ok(reduction)
     }
+}
+
+/// A reader of all of `source`, which is the scene's or made of it, at `frames`.
+fn open<'a>(
+    scene: &Scene,
+    source: &'a dyn FrameSource,
+    frames: impl IntoIterator<Item = usize>,
+) -> Result<Box<dyn BlockReader + 'a>> {
+    open_all(source, Columns::ALL, &Wanted::of(frames).holding(scene.limits.frames_held))
 }
 
 /// Whether picture `k` of `count` is for the test; a few pictures spare one too.
@@ -150,13 +168,16 @@ fn look(
     let background = scene.background;
     let camera = |index: u32| &scene.schedule.cameras[index as usize];
     let mut tests = Vec::new();
+    let frames = || pictures.iter().map(|&(frame, _)| frame);
+    let (mut of_result, mut of_source) = (open(scene, result, frames())?, open(scene, scene.source(), frames())?);
+    let sh_degree = scene.source().info().sh_degree;
+    let (mut state, mut original) = (Gaussians::zeros(0, sh_degree), Gaussians::zeros(0, sh_degree));
     let numbered: Vec<(usize, usize, u32)> =
         pictures.iter().enumerate().map(|(k, &(frame, camera))| (k, frame, camera)).collect();
     for of_frame in numbered.chunk_by(|a, b| a.1 == b.1) {
         let frame = of_frame[0].1;
-        // The result first: its members are in memory while it is made.
-        let state = gather_all(result, frame, Columns::ALL)?;
-        let original = gather_all(scene.source(), frame, Columns::ALL)?;
+        of_result.read(frame, Columns::ALL, &mut state)?;
+        of_source.read(frame, Columns::ALL, &mut original)?;
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         for &(k, _, index) in of_frame {
             let mut picture = render(&original, camera(index), background);
@@ -177,8 +198,10 @@ fn look(
 fn quality(scene: &Scene, result: &dyn FrameSource, tests: &[Test], change: &[[f32; 3]]) -> Result<[f64; 2]> {
     let background = scene.background;
     let mut sums = [0.0; 2];
+    let mut reader = open(scene, result, tests.iter().map(|test| test.frame))?;
+    let mut before = Gaussians::zeros(0, scene.source().info().sh_degree);
     for of_frame in tests.chunk_by(|a, b| a.frame == b.frame) {
-        let before = gather_all(result, of_frame[0].frame, Columns::ALL)?;
+        reader.read(of_frame[0].frame, Columns::ALL, &mut before)?;
         let mut after = before.clone();
         recolor(&mut after, change);
         for test in of_frame {

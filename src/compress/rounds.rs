@@ -30,22 +30,29 @@ pub struct Rounds {
     pub fraction: f64,
     /// Contrast that every Gaussian is taken to have at least with what it hides.
     pub contrast_floor: f64,
+    /// Part of the Gaussians that the last round is taken to leave at least, to say how many rounds there are at most.
+    pub fewest: f64,
 }
 
+/// Where no size is asked for, rounds are taken to leave this part of the Gaussians at least.
+const FEWEST: f64 = 0.05;
+
 impl Rounds {
-    /// The stage, unless `recipe` ranks once. Takes visible contributions.
-    pub fn of(recipe: &recipe::Select) -> Option<Rounds> {
+    /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
+    /// contributions.
+    pub fn of(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
         let recipe::Select { round_fraction: fraction, contrast_floor, .. } = *recipe;
-        (fraction < 1.0).then_some(Rounds { fraction, contrast_floor })
+        let fewest = target.unwrap_or(FEWEST);
+        (fraction < 1.0).then_some(Rounds { fraction, contrast_floor, fewest })
     }
 
     /// The ranking, and pictures of all that is left.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let (looking, fixed) = work.looking(limits, Columns::ALL, 8);
         let per_gaussian = [scored(limits), vec![("ranking", 32)], looking].concat();
-        // Each round reads what the round before left.
-        let rounds = 1.0 / (1.0 - self.fraction);
-        Need { stage: NAME, reads: rounds * work.sampled(PICTURES), per_gaussian, fixed }
+        let rounds = (self.fewest.ln() / self.fraction.ln()).ceil().max(0.0);
+        let reads = rounds * work.scattered_reads((PICTURES as u64).min(work.pictures), limits);
+        Need { stage: NAME, reads, per_gaussian, fixed }
     }
 
     /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
@@ -111,7 +118,7 @@ mod tests {
     fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranked, Ranked) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
-        let rounds = Rounds::of(&recipe.select).unwrap();
+        let rounds = Rounds::of(&recipe.select, None).unwrap();
         let found = rounds.run(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
         (scored.ranked(), found)
     }

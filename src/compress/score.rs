@@ -111,10 +111,10 @@ impl Order {
 
 impl Score {
     /// Statistics, scores and a selection, and the states at one frame.
-    pub fn need(&self, work: &Workload, _: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         Need {
             stage: NAME,
-            reads: 0.0,
+            reads: work.reads(1, limits),
             per_gaussian: vec![
                 ("rows", SCORED),
                 ("sorting", select::WORKING_BYTES_PER_GAUSSIAN as u64),

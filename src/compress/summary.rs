@@ -27,6 +27,8 @@ pub struct Stage {
     pub gaussians_out: usize,
     /// What it read of the input, counted where it happened.
     pub reads: Reads,
+    /// The same as full reads of the input: by bytes where it is stored in tiles, else by states.
+    pub full_reads: f64,
     /// Wall-clock time.
     pub seconds: f64,
     /// Largest resident memory of the process up to the end of this stage, where the system tells.
@@ -173,6 +175,8 @@ pub struct Summary {
     pub output_bytes: Option<u64>,
     /// Stages 1 and 2.
     pub selection: Counts,
+    /// Full reads of the input that the plan named at most; none where nothing was planned.
+    pub planned_reads: Option<f64>,
     /// Everything in order.
     pub stages: Vec<Stage>,
     /// Percentiles of every term.
@@ -191,6 +195,11 @@ pub struct Summary {
 }
 
 impl Summary {
+    /// Full reads of the input, all stages together.
+    pub fn full_reads(&self) -> f64 {
+        self.stages.iter().map(|stage| stage.full_reads).sum()
+    }
+
     /// As JSON, for programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("a summary is plain data");
@@ -221,9 +230,12 @@ impl Summary {
             let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
             let _ = writeln!(
                 out,
-                "  {:<7} {:>9} -> {:>9}  {:8.2} s{memory}",
-                stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds
+                "  {:<7} {:>9} -> {:>9}  {:8.2} s, {:.2} reads{memory}",
+                stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds, stage.full_reads
             );
+        }
+        if let Some(planned) = self.planned_reads {
+            let _ = writeln!(out, "full reads of the input: {:.2}, planned at most {planned:.2}", self.full_reads());
         }
         for left in &self.left_out {
             let _ = writeln!(out, "  left out: {} ({})", left.what, left.why);

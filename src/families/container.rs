@@ -10,6 +10,7 @@ use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::reduction::Reduction;
 
 /// A container.
@@ -46,8 +47,13 @@ impl Family for Container {
         Residence {
             gaussian_block: layout.gaussian_block.into(),
             columns: layout.columns.len() as u64,
+            decoded: self.decoded_bytes(),
             ..Residence::of_tiles(layout.frame_block.into())
         }
+    }
+
+    fn hold_decoded(&self) {
+        Container::hold_decoded(self, self.decoded_bytes());
     }
 
     fn timing(&self) -> Timing {
@@ -74,14 +80,8 @@ impl Family for Container {
         Ok(reduced_trajectories(self, reduction))
     }
 
-    fn write(
-        &self,
-        reduction: &Reduction,
-        kind: OutputKind,
-        path: &Path,
-        gaussians_together: usize,
-    ) -> Result<Vec<String>> {
-        write_trajectories(self, reduction, kind, path, gaussians_together)?;
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        write_trajectories(self, reduction, kind, path, limits)?;
         Ok(Vec::new())
     }
 }

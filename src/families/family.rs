@@ -10,6 +10,7 @@ use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 
@@ -33,8 +34,19 @@ pub trait Family: Send + Sync {
     /// A file that is not there any more.
     fn bytes(&self) -> Result<u64>;
 
+    /// Bytes of the files that its frames are read from.
+    ///
+    /// # Errors
+    /// A file that is not there any more.
+    fn stored_bytes(&self) -> Result<u64> {
+        self.bytes()
+    }
+
     /// What it keeps in memory, and how it is read.
     fn residence(&self) -> Residence;
+
+    /// Lets values that were decoded stay in memory, where [`Residence::decoded`] says that they can.
+    fn hold_decoded(&self) {}
 
     /// Where its frames get their times.
     fn timing(&self) -> Timing;
@@ -94,17 +106,11 @@ pub trait Family: Send + Sync {
     fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>>;
 
     /// Writes what `reduction` leaves to `path`, a new file or an empty folder; gives things a person should know.
-    /// Frames of at most about `gaussians_together` Gaussians wait together to be written.
+    /// What waits in memory to be written keeps to `limits`.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    fn write(
-        &self,
-        reduction: &Reduction,
-        kind: OutputKind,
-        path: &Path,
-        gaussians_together: usize,
-    ) -> Result<Vec<String>>;
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>>;
 }
 
 /// Where frames get their times.
@@ -139,6 +145,8 @@ pub struct Residence {
     pub gaussian_block: u64,
     /// Columns of a container.
     pub columns: u64,
+    /// Bytes of all values of a container, decoded; 0 where nothing is decoded, or where it cannot be kept.
+    pub decoded: u64,
 }
 
 impl Residence {
@@ -154,6 +162,7 @@ impl Residence {
             frame_block,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: Columns::ALL.iter().count() as u64,
+            decoded: 0,
         }
     }
 }

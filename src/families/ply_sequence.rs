@@ -15,6 +15,7 @@ use crate::error::Result;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids};
+use crate::plan::Limits;
 use crate::reduction::Reduction;
 use crate::stream::Progress;
 
@@ -67,6 +68,7 @@ impl Family for PlySequence {
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
+            decoded: 0,
         }
     }
 
@@ -90,15 +92,9 @@ impl Family for PlySequence {
         Ok(reduced_trajectories(self, reduction))
     }
 
-    fn write(
-        &self,
-        reduction: &Reduction,
-        kind: OutputKind,
-        path: &Path,
-        gaussians_together: usize,
-    ) -> Result<Vec<String>> {
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
         match kind {
-            OutputKind::Gseq => write_trajectories(self, reduction, kind, path, gaussians_together)?,
+            OutputKind::Gseq => write_trajectories(self, reduction, kind, path, limits)?,
             _ => write_files(self, reduction, kind, path)?,
         }
         Ok(Vec::new())

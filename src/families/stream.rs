@@ -21,6 +21,7 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::reduction::Reduction;
 use crate::stream::{HeldFrames, Progress};
 
@@ -75,8 +76,16 @@ impl Family for Streamed {
         Ok(self.received)
     }
 
+    fn stored_bytes(&self) -> Result<u64> {
+        self.container.bytes()
+    }
+
     fn residence(&self) -> Residence {
         self.container.residence()
+    }
+
+    fn hold_decoded(&self) {
+        Family::hold_decoded(&self.container);
     }
 
     fn timing(&self) -> Timing {
@@ -99,14 +108,8 @@ impl Family for Streamed {
         Ok(reduced_trajectories(&self.container, reduction))
     }
 
-    fn write(
-        &self,
-        reduction: &Reduction,
-        kind: OutputKind,
-        path: &Path,
-        gaussians_together: usize,
-    ) -> Result<Vec<String>> {
-        write_trajectories(&self.container, reduction, kind, path, gaussians_together)?;
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        write_trajectories(&self.container, reduction, kind, path, limits)?;
         Ok(Vec::new())
     }
 }

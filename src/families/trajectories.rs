@@ -13,8 +13,9 @@ use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{FrameSource, Wanted};
+use crate::plan::Limits;
 use crate::reduction::Reduction;
-use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored};
+use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, open_all};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -58,12 +59,12 @@ pub(super) fn write_trajectories(
     reduction: &Reduction,
     kind: OutputKind,
     path: &Path,
-    gaussians_together: usize,
+    limits: &Limits,
 ) -> Result<()> {
     if kind == OutputKind::Gseq && !reduction.clusters.is_empty() {
-        return write_merged(source, reduction, path, gaussians_together);
+        return write_merged(source, reduction, path, limits.gaussians_together);
     }
-    write_sequence(&*reduced_trajectories(source, reduction), kind, path)
+    write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held)
 }
 
 /// A container with proxies, whose members lie anywhere: a frame block at a time, of as many Gaussians together as
@@ -116,19 +117,22 @@ fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
     parts
 }
 
-/// Writes every frame of `source`: as a container, as a folder of PLY files, or its only frame as one.
+/// Writes every frame of `source`: as a container, as a folder of PLY files, or its only frame as one. Readers of whole
+/// frames hold at most `held` of those they decode together.
 ///
 /// # Errors
 /// Frames that cannot be read, a failed write.
-pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path) -> Result<()> {
+pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, held: usize) -> Result<()> {
     let info = source.info();
     if kind == OutputKind::Gseq {
         let progress = Progress::new("emit", "Gaussian frames", info.count as u64 * info.times.len() as u64);
         return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
     }
     let progress = Progress::new("emit", "frames", info.times.len() as u64);
+    let mut reader = open_all(source, Columns::ALL, &Wanted::every().holding(held))?;
+    let mut state = Gaussians::zeros(0, info.sh_degree);
     for frame in 0..info.times.len() {
-        let state = crate::stream::gather_all(source, frame, Columns::ALL)?;
+        reader.read(frame, Columns::ALL, &mut state)?;
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
             _ => path.join(format!("frame_{frame:05}.ply")),

@@ -11,7 +11,7 @@ use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::Result;
 use crate::families::Family;
 use crate::model::{Rig, Schedule, Split};
-use crate::pass::FrameSource;
+use crate::pass::{FrameSource, Reads};
 use crate::plan::Limits;
 
 pub use input::{InputOptions, Opened, load_cameras};
@@ -35,6 +35,8 @@ pub struct Scene {
     pub background: [f32; 3],
     /// What passes over it keep in memory at a time.
     pub limits: Limits,
+    /// Full reads of the input at most, of the plan that the limits are from.
+    pub planned_reads: Option<f64>,
     /// Folder for scratch files while the run lasts.
     pub scratch: PathBuf,
     /// Things a person should know.
@@ -49,8 +51,18 @@ impl Scene {
     pub fn new(path: PathBuf, input: Box<dyn Family>, rig: Rig, split: Option<Split>) -> Result<Scene> {
         let schedule = rig.schedule(&input.source().info().times, split)?;
         let background = rig.background.or(input.background()).unwrap_or([0.0; 3]);
-        let (limits, scratch, notes) = (Limits::NONE, std::env::temp_dir(), Vec::new());
-        Ok(Scene { path, input, rig, schedule, has_cameras: true, background, limits, scratch, notes })
+        Ok(Scene {
+            path,
+            input,
+            rig,
+            schedule,
+            has_cameras: true,
+            background,
+            limits: Limits::NONE,
+            planned_reads: None,
+            scratch: std::env::temp_dir(),
+            notes: Vec::new(),
+        })
     }
 
     /// Its frames.
@@ -68,7 +80,27 @@ impl Scene {
     /// # Errors
     /// A budget that cannot work.
     pub fn keep_to(&mut self, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
-        self.limits = Plan::fit(self.workload(), budget, needs)?.limits;
+        self.follow(&Plan::fit(self.workload(), budget, needs)?);
         Ok(())
+    }
+
+    /// Takes the limits of a plan.
+    pub fn follow(&mut self, plan: &Plan) {
+        self.limits = plan.limits;
+        self.planned_reads = Some(plan.reads());
+        if plan.limits.tiles_held {
+            self.input.hold_decoded();
+        }
+    }
+
+    /// What reading every frame once reads.
+    ///
+    /// # Errors
+    /// A file that is not there any more.
+    pub fn whole(&self) -> Result<Reads> {
+        let info = self.source().info();
+        let states = info.count as u64 * info.times.len() as u64;
+        let bytes = if self.input.residence().frame_block > 0 { self.input.stored_bytes()? } else { 0 };
+        Ok(Reads { bytes, tiles: 0, states })
     }
 }

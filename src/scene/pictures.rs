@@ -4,10 +4,10 @@ use super::Scene;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
-use crate::pass::FrameSource;
+use crate::pass::{FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::render;
-use crate::stream::gather_all;
+use crate::stream::open_all;
 
 /// The part of a rig's pictures that is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -120,17 +120,22 @@ pub fn spread(schedule: &Schedule, count: usize) -> Vec<(usize, u32)> {
 /// Hands every frame's state and its pictures to `visit`, in order, no more pictures at once than there
 /// are threads and `limits` allow; each state is read once.
 ///
-/// Memory: of each source the state of one frame.
+/// Memory: of each source its readers, the frames that they hold, and the state of one frame.
 pub fn for_each_batch<const S: usize>(
     sources: [&dyn FrameSource; S],
     pictures: &[Picture],
     limits: Limits,
     mut visit: impl FnMut(&[Gaussians; S], &[Picture]) -> Result<()>,
 ) -> Result<()> {
+    let wanted = Wanted::of(pictures.iter().map(|picture| picture.frame)).holding(limits.frames_held);
+    let mut readers = Vec::with_capacity(S);
+    for source in sources {
+        readers.push(open_all(source, Columns::ALL, &wanted)?);
+    }
+    let mut states: [Gaussians; S] = sources.map(|source| Gaussians::zeros(0, source.info().sh_degree));
     for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
-        let mut states: [Gaussians; S] = std::array::from_fn(|_| Gaussians::default());
-        for (state, source) in states.iter_mut().zip(sources) {
-            *state = gather_all(source, frame[0].frame, Columns::ALL)?;
+        for (state, reader) in states.iter_mut().zip(&mut readers) {
+            reader.read(frame[0].frame, Columns::ALL, state)?;
         }
         for batch in frame.chunks(rayon::current_num_threads().min(limits.pictures_together)) {
             visit(&states, batch)?;
@@ -160,6 +165,8 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
         reads: models as f64,
         per_gaussian: vec![
             ("states", models * work.state(Columns::ALL)),
+            ("readers", models * work.input.reader),
+            ("held", models * work.held(limits, Columns::ALL)),
             ("pictures", pictures * PICTURE_ON_ALL_THREADS),
         ],
         fixed: vec![work.arriving(), ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels))],

@@ -101,9 +101,9 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
     let opened = open_input(input)?;
     let source = opened.input.source();
-    Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
+    let held = Plan::fit(workload(&*opened.input), input.memory, unpacking)?.limits.frames_held;
     let staged = StagedFolder::new(output, overwrite)?;
-    write_sequence(source, OutputKind::PlySequence, staged.path())?;
+    write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
     let marker = serde_json::json!({
         "tool": format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
         "input": InputSummary::of(&*opened.input, &input.path)?,

@@ -50,7 +50,7 @@ pub fn run(
 fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory: Budget) -> Result<DemoReport> {
     let made = demo::Scene::new(gaussians, frames);
     let packed = folder.join("scene.gseq");
-    write_sequence(&made, OutputKind::Gseq, &packed)?;
+    write_sequence(&made, OutputKind::Gseq, &packed, 1)?;
     let rig = made.rig();
     let cameras = folder.join("cameras.json");
     fs::write(&cameras, cameras_json(&rig)).map_err(Error::io("write", &cameras))?;

@@ -19,6 +19,7 @@ use crate::ingest::ModelFolder;
 use crate::ingest::ply::Ply;
 use crate::model::{Columns, Gaussians};
 use crate::pass::FrameSource;
+use crate::plan::Limits;
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::stream::recolor;
@@ -69,6 +70,7 @@ impl Family for ModelFolder {
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
+            decoded: 0,
         }
     }
 
@@ -108,7 +110,7 @@ impl Family for ModelFolder {
         Ok(Box::new(self.with_canonical(canonical_cloud(self, reduction))))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, _: usize) -> Result<Vec<String>> {
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
         let mut notes = Vec::new();
         let paths = self.paths();
         match kind {
@@ -126,7 +128,9 @@ impl Family for ModelFolder {
                 }
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
-            OutputKind::Gseq | OutputKind::PlySequence => write_sequence(&*self.reduced(reduction)?, kind, path)?,
+            OutputKind::Gseq | OutputKind::PlySequence => {
+                write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?
+            }
         }
         Ok(notes)
     }
