@@ -22,8 +22,8 @@ const SIZE: (usize, usize) = (48, 36);
 fn scene() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let made = Scene::new(400, FRAMES);
-    write_sequence(&made, OutputKind::Gseq, &folder.path().join("scene.gseq")).unwrap();
-    write_sequence(&Scene::new(300, FRAMES), OutputKind::Gseq, &folder.path().join("smaller.gseq")).unwrap();
+    write_sequence(&made, OutputKind::Gseq, &folder.path().join("scene.gseq"), 1).unwrap();
+    write_sequence(&Scene::new(300, FRAMES), OutputKind::Gseq, &folder.path().join("smaller.gseq"), 1).unwrap();
     write_cameras(folder.path(), json!([0.0, 0.5, 1.0]));
     folder
 }
@@ -310,7 +310,7 @@ fn misuse_exits_with_2_and_leaves_nothing() {
 #[test]
 fn wrong_inputs_exit_with_1_and_leave_nothing() {
     let folder = scene();
-    write_sequence(&Scene::new(300, FRAMES + 1), OutputKind::Gseq, &folder.path().join("longer.gseq")).unwrap();
+    write_sequence(&Scene::new(300, FRAMES + 1), OutputKind::Gseq, &folder.path().join("longer.gseq"), 1).unwrap();
     let longer = "evaluate scene.gseq longer.gseq --cameras cameras.json --csv x.csv";
     refused(folder.path(), longer, 1, &["longer.gseq", "4 frames", "5 frames"]);
     done(folder.path(), "render scene.gseq --cameras cameras.json --all -o photos");

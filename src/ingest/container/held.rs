@@ -84,7 +84,15 @@ mod tests {
     use crate::error::Error;
 
     fn decode(held: &HeldTiles, slot: usize, count: usize) -> Option<&[f32]> {
-        held.get_or_decode(slot, || Ok(count), |values| Ok(values.fill(slot as f32))).unwrap()
+        held.get_or_decode(
+            slot,
+            || Ok(count),
+            |values| {
+                values.fill(slot as f32);
+                Ok(())
+            },
+        )
+        .unwrap()
     }
 
     #[test]

@@ -1,0 +1,132 @@
+//! What a run says about itself is true: its recipe repeats it, its summary reads back, its plan of reads holds, and a
+//! dry run says what the run would say.
+
+mod scene;
+
+use scene::{Run, Workplace, lasting_files, shared};
+use serde_json::Value;
+use splatsieve::compress::summary::{SCHEMA, Summary};
+
+/// Runs a compression twice: as asked, then by the recipe it wrote, and expects the same files.
+fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
+    let first = workplace.run(&format!("compress {arguments} -o {name}_first"));
+    assert_eq!(first.code, 0, "{}", first.stderr);
+    let input = arguments.split_whitespace().next().unwrap();
+    let recipe = match workplace.path(&format!("{name}_first")).is_dir() {
+        true => format!("{name}_first/recipe.toml"),
+        false => format!("{name}_first.recipe.toml"),
+    };
+    let again = workplace.run(&format!("compress {input} --recipe {recipe} -o {name}_again"));
+    assert_eq!(again.code, 0, "{}", again.stderr);
+    let [first, second] = ["first", "again"].map(|turn| lasting_files(&workplace.path(&format!("{name}_{turn}"))));
+    assert!(first == second, "{arguments}: the recipe does not repeat the run");
+    assert!(!first.is_empty());
+    again
+}
+
+#[test]
+fn the_recipe_beside_a_result_repeats_its_run() {
+    let workplace = Workplace::new();
+    for (k, options) in [
+        "--cameras {tiny} --target-ratio 0.4",
+        "--cameras {tiny} --target-count 77 --split test --preset paper",
+        "--cameras {tiny} --prune-only --mu 2",
+        "--cameras {tiny} --merge-only --preset strong --split all",
+        "--cameras {tiny} --keep-ids 3,10-20 --drop-ids 200-210 --keep-box -1,-1,-1,0,0,0.5",
+        "--cameras {tiny} --as ply-sequence",
+    ]
+    .iter()
+    .enumerate()
+    {
+        let run = repeats(&workplace, &format!("run{k}"), &format!("{{tiny}} {options}"));
+        assert!(!run.stdout.contains("another input"), "{}", run.stdout);
+    }
+}
+
+#[test]
+fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
+    let workplace = Workplace::new();
+    workplace.done("compress {tiny} --cameras {tiny} --target-ratio 0.5 -o half");
+    workplace.done("demo --gaussians 600 --frames 4 -o demo");
+    let demo = "demo/scene.gseq --cameras demo/cameras.json --recipe half/recipe.toml";
+    let summary = workplace.summary(&format!("{demo} -o other.gseq"));
+    assert_eq!(summary["gaussians"], 300);
+    let notes = summary["notes"].to_string();
+    assert!(notes.contains("another input"), "{notes}");
+    let summary = workplace.summary(&format!("{demo} --target-count 123 -o third.gseq"));
+    assert_eq!(summary["gaussians"], 123);
+}
+
+#[test]
+fn a_summary_reads_back_as_it_was_written_and_says_its_schema() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 900 --frames 6 -o demo");
+    for (k, options) in ["", "--preset strong", "--preset paper", "--prune-only"].iter().enumerate() {
+        workplace.done(&format!("compress demo/scene.gseq --cameras demo/cameras.json {options} -o out{k}.gseq"));
+        let text = std::fs::read_to_string(workplace.path(&format!("out{k}.gseq.summary.json"))).unwrap();
+        let summary: Summary = serde_json::from_str(&text).unwrap();
+        assert_eq!(summary.schema, SCHEMA);
+        let (before, after): (Value, Value) =
+            (serde_json::from_str(&text).unwrap(), serde_json::from_str(&summary.json()).unwrap());
+        assert_eq!(after, before, "{options}");
+    }
+}
+
+#[test]
+fn a_dry_run_says_what_the_run_would_say() {
+    let workplace = Workplace::new();
+    // Loose enough that proxies stray from their members.
+    let options = "{tiny} --cameras {tiny} --preset strong --placement mean --max-drift 0 --choose-by-views=false \
+                   --merge-pass 0.2,4,0.5,0.3";
+    let [dry, wet] = ["--dry-run", ""].map(|dry| workplace.summary(&format!("{options} {dry} -o out")));
+    let notes = |summary: &Value| -> Vec<String> {
+        let notes = summary["notes"].as_array().unwrap().iter().map(|note| note.as_str().unwrap().to_owned());
+        notes.filter(|note| !note.contains("dry run") && !note.contains("left out")).collect()
+    };
+    assert!(notes(&wet).iter().any(|note| note.contains("strayed")), "{:?}", notes(&wet));
+    assert_eq!(notes(&dry), notes(&wet));
+    assert_eq!(dry["merge"], wet["merge"]);
+    assert_eq!(dry["left_out"], wet["left_out"]);
+}
+
+/// Runs a compression of a container, and expects no more reads than its plan named; gives what it read.
+fn reads_as_planned(workplace: &Workplace, arguments: &str) -> f64 {
+    let summary = workplace.summary(arguments);
+    let planned = summary["planned_reads"].as_f64().unwrap();
+    let read: f64 =
+        summary["stages"].as_array().unwrap().iter().map(|stage| stage["full_reads"].as_f64().unwrap()).sum();
+    assert!(read > 0.5 && read <= 1.1 * planned, "{arguments}: read {read} times, planned at most {planned}");
+    read
+}
+
+#[test]
+fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 3000 --frames 64 -o demo");
+    for preset in ["default", "paper", "gentle", "strong"] {
+        for (k, options) in ["", "--memory 40MiB", "--merge-only --memory 44MiB", "--target-ratio 0.2 --memory 44MiB"]
+            .iter()
+            .enumerate()
+        {
+            if preset == "gentle" && options.contains("merge-only") {
+                continue;
+            }
+            let output = format!("{preset}{k}.gseq");
+            let arguments =
+                format!("demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} -o {output}");
+            let read = reads_as_planned(&workplace, &arguments);
+            // What fits into memory is read once.
+            assert!(k > 0 || read <= 1.0, "{preset}: {read}");
+        }
+    }
+}
+
+#[test]
+fn a_default_run_reads_the_container_of_a_trained_model_at_most_two_and_a_half_times() {
+    let Some(model) = shared("deform2") else { return };
+    let workplace = Workplace::new();
+    let model = model.display();
+    workplace.done(&format!("pack {model} --cameras {model} -o packed.gseq"));
+    let read = reads_as_planned(&workplace, &format!("packed.gseq --cameras {model} -o small.gseq"));
+    assert!(read <= 2.5, "{read}");
+}
