@@ -8,19 +8,33 @@
 //! is as fast as memory; the scan should run at half the speed of the first. `position` varies alone, or with
 //! rotation, scale and opacity; the constant columns are read once.
 //!
+//! How is the scan of a container best fed, on all threads? `blocks` has every thread read a block of Gaussians, with
+//! advice for its next frame block; `stages` fetches, decodes and accumulates on threads of their own. `warm_*`: from the
+//! page cache; `cold_*`: the page cache is told to drop the file first (Linux); `slow_*`: as if from a disk of
+//! [`SLOW`] bytes per second, which every way waits for as it would for a real one.
+//!
+//! What does it cost to use raw tiles in place, on all threads? `raw_frames/*` gives every frame to the state of a
+//! caller: `ordinary` by positioned reads, the others from the map, whose pages are released once per frame block of a
+//! block, frame by frame, or never, which lets the whole file become resident.
+//!
 //! `cargo bench --bench scan`
 
 use std::collections::BTreeMap;
 use std::hint::black_box;
+use std::ops::Range;
 use std::path::Path;
+use std::sync::Mutex;
+use std::thread;
+use std::time::{Duration, Instant};
 
-use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use gseq::{Compression, Reader, TileBuffer, TileId};
+use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use gseq::{Compression, Reader, TileBuffer, TileFrames, TileId, Touched};
+use rayon::prelude::*;
 use splatsieve::emit::container::write_container;
 use splatsieve::error::Result;
 use splatsieve::ingest::container::Container;
 use splatsieve::model::{Columns, Gaussians, Schedule, SequenceInfo};
-use splatsieve::pass::{BlockReader, FrameSource, Ids};
+use splatsieve::pass::{Ahead, BlockReader, FrameSource, Ids};
 use splatsieve::recipe::Recipe;
 use splatsieve::select::hash_id;
 use splatsieve::stats::ScanPlan;
@@ -28,6 +42,8 @@ use splatsieve::stream::scan;
 
 const GAUSSIANS: usize = 16_384;
 const FRAMES: usize = 64;
+/// Bytes per second of a slow disk.
+const SLOW: f64 = 300e6;
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
@@ -147,9 +163,200 @@ fn benches(criterion: &mut Criterion) {
     }
 }
 
+/// A disk that brings what is ordered, one order after the other.
+struct Disk(Mutex<Instant>);
+
+impl Disk {
+    /// Orders `bytes`; they are there at the time it gives.
+    fn order(&self, bytes: u64) -> Instant {
+        let mut busy = self.0.lock().unwrap();
+        *busy = (*busy).max(Instant::now()) + Duration::from_secs_f64(bytes as f64 / SLOW);
+        *busy
+    }
+}
+
+fn wait_for(ready: Instant) {
+    thread::sleep(ready.saturating_duration_since(Instant::now()));
+}
+
+/// A container fed in one way or the other, from where it lies or as if from a slow disk.
+struct Fed<'a> {
+    container: &'a Container,
+    in_stages: bool,
+    disk: Option<Disk>,
+}
+
+impl Fed<'_> {
+    fn bytes(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) -> u64 {
+        let reader = self.container.reader();
+        let layout = reader.layout();
+        let block = |id: usize, of: u32| (id / of as usize) as u32;
+        let mut sum = 0;
+        for (column, _) in Columns::ALL.iter().enumerate().filter(|&(_, column)| want.contains(column)) {
+            for gaussian_block in
+                block(gaussians.start, layout.gaussian_block)..=block(gaussians.end - 1, layout.gaussian_block)
+            {
+                let frame_block = block(frames.start, layout.frame_block);
+                let at = TileId { column: column as u32, gaussian_block, frame_block };
+                sum += reader.tile_info(at).unwrap().stored_bytes;
+            }
+        }
+        sum
+    }
+}
+
+impl FrameSource for Fed<'_> {
+    fn info(&self) -> &SequenceInfo {
+        self.container.info()
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let reader = self.container.open(ids.clone())?;
+        match ids {
+            Ids::Range(gaussians) if self.disk.is_some() && !self.in_stages => {
+                Ok(Box::new(Waiting { fed: self, gaussians, reader, coming: None }))
+            }
+            _ => Ok(reader),
+        }
+    }
+
+    fn ahead(&self) -> Option<&dyn Ahead> {
+        self.in_stages.then_some(self)
+    }
+}
+
+impl Ahead for Fed<'_> {
+    fn frame_block(&self) -> usize {
+        self.container.frame_block()
+    }
+
+    fn fetch(&self, gaussians: Range<usize>, frames: Range<usize>, want: Columns) {
+        match &self.disk {
+            Some(disk) => wait_for(disk.order(self.bytes(gaussians, frames, want))),
+            None => self.container.fetch(gaussians, frames, want),
+        }
+    }
+}
+
+/// Waits for a slow disk: for the first frame block, and for what is left of the next, which was ordered by advice.
+struct Waiting<'a> {
+    fed: &'a Fed<'a>,
+    gaussians: Range<usize>,
+    reader: Box<dyn BlockReader + 'a>,
+    /// The next frame block, and when it is there.
+    coming: Option<(usize, Instant)>,
+}
+
+impl BlockReader for Waiting<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let (of_block, info) = (self.fed.frame_block(), self.fed.info());
+        if frame.is_multiple_of(of_block)
+            && let Some(disk) = &self.fed.disk
+        {
+            let order = |start: usize, want| disk.order(self.fed.bytes(self.gaussians.clone(), start..start + 1, want));
+            let now = match self.coming {
+                Some((start, ready)) if start == frame => ready,
+                _ => order(frame, want),
+            };
+            let next = frame + of_block;
+            self.coming = (next < info.times.len()).then(|| (next, order(next, info.varying)));
+            wait_for(now);
+        }
+        self.reader.read(frame, want, out)
+    }
+}
+
+/// Has the page cache drop a file.
+#[cfg(target_os = "linux")]
+fn drop_cached(path: &Path) {
+    let file = std::fs::File::open(path).unwrap();
+    file.sync_all().unwrap();
+    rustix::fs::fadvise(&file, 0, None, rustix::fs::Advice::DontNeed).unwrap();
+}
+
+fn ways(criterion: &mut Criterion) {
+    let recipe = Recipe::preset("default").unwrap().scan;
+    let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
+    let schedule = Schedule { cameras: vec![], frames: vec![vec![]; FRAMES] };
+    let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
+    // Not where temporary files may lie in memory.
+    let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    let varying = Columns::ALL.without(Columns::SH);
+    let source = Curves(SequenceInfo { count: GAUSSIANS, times, sh_degree: 0, varying });
+    for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
+        let path = folder.path().join(format!("{kind}.gseq"));
+        pack(&source, &path, compression);
+        let container = Container::open(&path).unwrap();
+        for (speed, slow) in [("warm", false), ("cold", false), ("slow", true)] {
+            let mut group = criterion.benchmark_group(format!("{speed}_{kind}"));
+            group.sample_size(20).throughput(Throughput::Elements((GAUSSIANS * FRAMES) as u64));
+            for (way, in_stages) in [("blocks", false), ("stages", true)] {
+                let disk = slow.then(|| Disk(Mutex::new(Instant::now())));
+                let fed = Fed { container: &container, in_stages, disk };
+                group.bench_function(way, |bencher| {
+                    let before = || {
+                        #[cfg(target_os = "linux")]
+                        if speed == "cold" {
+                            drop_cached(&path);
+                        }
+                    };
+                    bencher.iter_batched(before, |()| scan(&fed, &schedule, &plan).unwrap(), BatchSize::PerIteration);
+                });
+            }
+        }
+        if kind == "raw" {
+            raw_frames(criterion, container.reader(), varying);
+        }
+    }
+}
+
+/// Every frame of raw tiles to the state of a caller.
+fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Columns) {
+    let columns: Vec<(u32, usize)> = Columns::ALL
+        .iter()
+        .zip(0..)
+        .filter(|&(column, _)| varying.contains(column))
+        .map(|(column, place)| (place, column.width(0)))
+        .collect();
+    let read = |in_place: bool, release_frames: usize| {
+        (0..reader.layout().gaussian_blocks()).into_par_iter().for_each(|gaussian_block| {
+            let len = reader.layout().gaussian_range(gaussian_block).count();
+            let (mut buffer, mut touched) = (TileBuffer::default(), Touched::default());
+            let mut state: Vec<Vec<f32>> = columns.iter().map(|&(_, width)| vec![0.0; width * len]).collect();
+            let mut tiles: Vec<TileFrames> = columns.iter().map(|_| TileFrames::default()).collect();
+            for frame_block in 0..reader.frame_blocks() {
+                for frame in 0..32 {
+                    for ((&(column, _), tile), out) in columns.iter().zip(&mut tiles).zip(&mut state) {
+                        if frame % release_frames == 0 {
+                            let at = TileId { column, gaussian_block, frame_block };
+                            reader.load(at, &mut buffer, tile, in_place.then_some(&mut touched)).unwrap();
+                        }
+                        reader.read_frame(tile, frame, out).unwrap();
+                    }
+                    if (frame + 1) % release_frames == 0 {
+                        reader.release(&mut touched);
+                    }
+                    black_box(&mut state);
+                }
+            }
+        });
+    };
+    let mut group = criterion.benchmark_group("raw_frames");
+    let state: usize = columns.iter().map(|&(_, width)| 4 * width).sum();
+    group.sample_size(20).throughput(Throughput::Bytes((GAUSSIANS * FRAMES * state) as u64));
+    for (name, in_place, release_frames) in [
+        ("ordinary", false, 32),
+        ("released_by_block", true, 32),
+        ("released_by_frame", true, 1),
+        ("left_mapped", true, usize::MAX),
+    ] {
+        group.bench_function(name, |bencher| bencher.iter(|| read(in_place, release_frames)));
+    }
+}
+
 fn pack(source: &Curves, path: &Path, compression: Compression) {
     write_container(source, path, compression, BTreeMap::new(), |_| ()).unwrap();
 }
 
-criterion_group!(all, benches);
+criterion_group!(all, benches, ways);
 criterion_main!(all);

@@ -1,17 +1,20 @@
 //! A `gseq` container as a source of frames.
 //!
-//! In: the file. Out: the state of any Gaussians at any frame. Memory: of the file nothing stays mapped; what a
-//! reader keeps is that of [`TileReader`], and each thread that decodes has one [`Scratch`].
+//! In: the file. Out: the state of any Gaussians at any frame. Memory: what a reader keeps is that of [`TileReader`],
+//! what is held for all readers that of [`HeldTiles`], and each thread that decodes has one [`Scratch`].
 //!
-//! Stored bytes are read, not mapped: pages that were touched count as resident until they are released, and
-//! releasing them costs more than the copy (raw frames into the caller's state, two cores of an EPYC 7003: 6.3 GB/s
-//! by positioned reads; 5.8 mapped and released tile by tile, 2.0 frame by frame; 14 left mapped).
+//! Raw tiles are used where they lie in the map, packed ones are decoded straight from there. Pages that were touched
+//! count as resident until they are released, so a reader releases what it used of a frame block when it enters another.
+//! Where it may keep less than a frame block, positioned reads stay: releasing frame by frame costs more than their
+//! copy. Raw frames into the caller's state (`cargo bench --bench scan`, `raw_frames`; two threads on two cores of an
+//! EPYC that others kept busy, so compare them with one another): 1.5 GB/s released by frame block, 0.6 frame by frame, 1.4
+//! by positioned reads, 2.3 left mapped.
 //!
-//! The disk works ahead by advice: when a reader that decodes whole frame blocks enters one, the system is told of
-//! the next. Measured on 32,768 Gaussians × 320 frames on two threads, from a cold page cache: 1.1 to 1.7 s with the
-//! advice, 2.5 to 3.2 without, 0.8 to 0.9 from a warm one (raw); 2.4 to 2.5, 2.8 to 3.1, 2.0 to 2.1 (packed). What is left
-//! is mostly the first frame block of each block of Gaussians. Threads that fetch, over channels, could win no
-//! more than that, and would need a copy of their own of what they fetched.
+//! A file that lies in memory is read block by block, and the disk works ahead by advice: when a reader that decodes
+//! whole frame blocks enters one, the system is told of the next. One that does not is scanned in stages
+//! ([`FrameSource::ahead`]). On the same machine, blocks and stages: from a cold page cache 95 and 71 ms (raw), 222 and
+//! 232 (packed); from a disk of 300 MB/s, simulated, 158 and 162, 216 and 206; from a warm one 46 and 45, 152 and 223,
+//! as a packed scan waits for no disk, but its stages for one another.
 
 mod held;
 mod tiles;
@@ -242,7 +245,7 @@ impl FrameSource for Container {
         Reads { bytes: read.bytes, tiles: read.tiles, states: self.states.get() }
     }
 
-    /// Not for a file that lies in memory: see the benchmark in the module's documentation.
+    /// Not for a file that lies in memory: see the figures at the top of this module.
     fn ahead(&self) -> Option<&dyn Ahead> {
         match self.reader.is_cached(SAMPLES) {
             Some(true) => None,
