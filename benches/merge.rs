@@ -1,14 +1,19 @@
 //! What does merging cost, on one thread?
 //!
-//! `neighbours`: the nearest neighbours within ε, per Gaussian: the tree, built and asked, over evenly strewn Gaussians
-//! with 3.5 candidates each and over a crowd at one point. Rivals: looking at all pairs, on few Gaussians, where it still
-//! has a chance; and a hash of voxels of side ε, asked cell by cell.
+//! `neighbours`: the nearest neighbours within ε, per Gaussian, `voxels` being the index of the program, built and asked:
+//! in trained models with the ε of the presets, among Gaussians strewn evenly, with some or many neighbours each, and in
+//! clusters, and in crowds: all in one voxel, and all at one point. Rivals: one `tree` over all points, asked in voxel
+//! order too, which is what the program had; `all_pairs`, on few Gaussians, where that still has a chance; and a
+//! `plain_hash`, whose voxels list their points, looked up for each point anew.
 //! `pairs`: the motion of a pair, per pair and frame, positions in memory.
 //! `measure`: the same from a packed container, per pair and frame: at once, and in eight partitions, whose cost over
 //! the first is what gathering and reading again costs.
 //! `merge`: a whole pass without motion, per survivor: neighbours, gates, clusters, proxies.
 //!
 //! `cargo bench --bench merge`
+
+#[path = "../tests/models/mod.rs"]
+mod models;
 
 use std::collections::{BTreeMap, HashMap};
 use std::convert::Infallible;
@@ -20,8 +25,10 @@ use splatsieve::demo;
 use splatsieve::emit::container::write_container;
 use splatsieve::ingest::container::Container;
 use splatsieve::merge::motion::{MotionGate, PairMotion};
-use splatsieve::merge::neighbors::{PointIndex, Search};
+use splatsieve::merge::neighbors::PointIndex;
 use splatsieve::merge::proxy::Importance;
+use splatsieve::merge::tree::{Nearest, Point, Tree};
+use splatsieve::merge::voxels::voxel_order;
 use splatsieve::merge::{self, Asked, Survivors};
 use splatsieve::model::{Column, Columns, Gaussians};
 use splatsieve::pass::FrameSource;
@@ -30,7 +37,8 @@ use splatsieve::select::hash_id;
 use splatsieve::stream::gather;
 use splatsieve::stream::motion::PairMeter;
 
-const NEIGHBOURS: usize = 8;
+/// As many as the presets look at.
+const NEIGHBOURS: usize = 32;
 
 fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
@@ -50,12 +58,31 @@ fn strewn(n: usize) -> (Gaussians, f64) {
     (states, 1.2 * spacing)
 }
 
+/// Number of neighbours found in all, from positions and ε.
+type Find = fn(&Column, f64) -> usize;
+
+fn points(position: &Column) -> Vec<Point> {
+    (0..position.len()).map(|i| Point { at: position.row(i), index: i as u32 }).collect()
+}
+
+fn by_voxels(position: &Column, epsilon: f64) -> usize {
+    let index = PointIndex::new(points(position), epsilon);
+    let mut search = index.search();
+    index.points().iter().map(|point| search.nearest(point.index, point.at, NEIGHBOURS).0.len()).sum()
+}
+
 fn by_tree(position: &Column, epsilon: f64) -> usize {
-    let index = PointIndex::new(position.len(), |i| Some(position.row(i)));
-    let mut search = Search::default();
-    (0..position.len())
-        .map(|i| index.nearest(i as u32, position.row(i), NEIGHBOURS, epsilon, &mut search).0.len())
-        .sum()
+    let rows: Vec<u32> = (0..position.len() as u32).collect();
+    let order = voxel_order(&rows, |row| position.row(row as usize), epsilon);
+    let mut points = points(position);
+    let tree = Tree::new(&mut points);
+    let mut nearest = Nearest::default();
+    let mut of_one = |row: u32| {
+        nearest.start(row, position.row(row as usize), NEIGHBOURS + 1, epsilon);
+        tree.search(&points, &mut nearest);
+        nearest.sorted().len().min(NEIGHBOURS)
+    };
+    order.into_iter().map(&mut of_one).sum()
 }
 
 fn squared(a: [f32; 3], b: [f32; 3]) -> f64 {
@@ -81,7 +108,7 @@ fn by_all_pairs(position: &Column, epsilon: f64) -> usize {
     (0..position.len()).map(of_one).sum()
 }
 
-fn by_voxels(position: &Column, epsilon: f64) -> usize {
+fn by_plain_hash(position: &Column, epsilon: f64) -> usize {
     let voxel = |i: usize| position.row::<3>(i).map(|x| (f64::from(x) / epsilon).floor() as i32);
     let mut voxels: HashMap<[i32; 3], Vec<u32>> = HashMap::new();
     (0..position.len()).for_each(|i| voxels.entry(voxel(i)).or_default().push(i as u32));
@@ -103,36 +130,77 @@ fn by_voxels(position: &Column, epsilon: f64) -> usize {
     (0..position.len()).map(of_one).sum()
 }
 
+/// `n` points in clusters of 200, each some 0.005 wide.
+fn clustered(n: usize) -> Column {
+    let mut position = Column::zeros(3, n);
+    for i in 0..n {
+        let cluster = hash_id(i as u64) as usize % (n / 200);
+        let spread = |c: usize| (0..3).map(|k| random(16 * i + 3 * k + c) - 0.5).sum::<f32>();
+        position.set_row::<3>(i, std::array::from_fn(|c| random((1 << 30) + 4 * cluster + c) + 0.003 * spread(c)));
+    }
+    position
+}
+
+/// Largest side of the box between the 1st and the 99th percentile, as of a scene.
+fn extent(position: &Column) -> f64 {
+    let side = |c: usize| {
+        let mut plane = position.plane(c).to_vec();
+        plane.sort_unstable_by(f32::total_cmp);
+        f64::from(plane[plane.len() * 99 / 100]) - f64::from(plane[plane.len() / 100])
+    };
+    (0..3).map(side).fold(0.0, f64::max)
+}
+
 fn neighbours(criterion: &mut Criterion) {
-    let mut group = criterion.benchmark_group("neighbours");
-    group.sample_size(10);
-    for n in [2_000, 100_000] {
+    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let mut cases: Vec<(String, Column, f64)> = Vec::new();
+    if let Some(folder) = models::folder() {
+        for name in models::NAMES {
+            let model = models::Model::open(&folder, name);
+            let position = model.state(model.frames()[0]).position;
+            let unit = extent(&position);
+            // Those of `default` and `strong`, of the extent, and of `paper`, in scene units.
+            for (preset, epsilon) in [("0.005", 0.005 * unit), ("0.01", 0.01 * unit), ("paper", 0.02)] {
+                cases.push((format!("{name} {preset}"), position.clone(), epsilon));
+            }
+        }
+    }
+    for n in [2_000, 100_000, 1_000_000] {
         let (states, epsilon) = strewn(n);
-        let position = &states.position;
-        assert_eq!(by_tree(position, epsilon), by_voxels(position, epsilon));
-        group.throughput(Throughput::Elements(n as u64));
-        group.bench_function(BenchmarkId::new("tree", n), |b| b.iter(|| black_box(by_tree(position, epsilon))));
-        group.bench_function(BenchmarkId::new("voxel_hash", n), |b| b.iter(|| black_box(by_voxels(position, epsilon))));
-        if n <= 2_000 {
-            assert_eq!(by_tree(position, epsilon), by_all_pairs(position, epsilon));
-            group.bench_function(BenchmarkId::new("all_pairs", n), |b| {
-                b.iter(|| black_box(by_all_pairs(position, epsilon)));
+        cases.push((format!("strewn {n}"), states.position.clone(), epsilon));
+        cases.push((format!("strewn densely {n}"), states.position, 2.5 * epsilon));
+        cases.push((format!("clustered {n}"), clustered(n), 0.001));
+        cases.push((format!("clustered densely {n}"), clustered(n), 0.01));
+    }
+    cases.push(("one voxel".into(), strewn(100_000).0.position, 2.0));
+    cases.push(("one point".into(), Column::zeros(3, 100_000), 0.1));
+    for (name, position, epsilon) in cases {
+        let mut group = criterion.benchmark_group(format!("neighbours/{name}"));
+        group.sample_size(10).throughput(Throughput::Elements(position.len() as u64));
+        let mut rivals: Vec<(&str, Find)> = vec![("voxels", by_voxels), ("tree", by_tree)];
+        if name.starts_with("strewn") && position.len() <= 100_000 {
+            rivals.push(("plain_hash", by_plain_hash));
+        }
+        if position.len() <= 2_000 {
+            rivals.push(("all_pairs", by_all_pairs));
+        }
+        let expected = by_tree(&position, epsilon);
+        for (rival, find) in rivals {
+            assert_eq!(find(&position, epsilon), expected, "{rival}");
+            group.bench_function(rival, |bencher| {
+                bencher.iter(|| one_thread.install(|| black_box(find(&position, epsilon))));
             });
         }
     }
-    let crowd = Column::zeros(3, 2_000);
-    group.throughput(Throughput::Elements(2_000));
-    group.bench_function("crowd/tree", |b| b.iter(|| black_box(by_tree(&crowd, 0.1))));
-    group.bench_function("crowd/voxel_hash", |b| b.iter(|| black_box(by_voxels(&crowd, 0.1))));
 }
 
 /// Each with its nearest neighbours of higher index.
 fn pairs_of(position: &Column) -> Vec<(u32, u32)> {
-    let index = PointIndex::new(position.len(), |i| Some(position.row(i)));
-    let mut search = Search::default();
+    let index = PointIndex::new(points(position), f64::INFINITY);
+    let mut search = index.search();
     let mut pairs = Vec::new();
     for i in 0..position.len() as u32 {
-        let (near, _) = index.nearest(i, position.row(i as usize), NEIGHBOURS, f64::INFINITY, &mut search);
+        let (near, _) = search.nearest(i, position.row(i as usize), 8);
         pairs.extend(near.filter(|&j| i < j).map(|j| (i, j)));
     }
     pairs

@@ -11,7 +11,8 @@ use splatsieve::emit::container::write_container;
 use splatsieve::ingest::container::Container;
 use splatsieve::merge::known::KNOWN_BYTES;
 use splatsieve::merge::motion::MotionGate;
-use splatsieve::merge::neighbors::{PointIndex, Search};
+use splatsieve::merge::neighbors::PointIndex;
+use splatsieve::merge::tree::Point;
 use splatsieve::model::Columns;
 use splatsieve::recipe::Recipe;
 use splatsieve::stream::gather;
@@ -55,11 +56,12 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let container = Container::open(&path).unwrap();
     let ids: Vec<u32> = (0..COUNT as u32).collect();
     let reference = gather(&container, &ids, 0, Columns::POSITION).unwrap().position;
-    let index = PointIndex::new(COUNT, |i| Some(reference.row(i)));
-    let mut search = Search::default();
+    let point = |&index: &u32| Point { at: reference.row(index as usize), index };
+    let index = PointIndex::new(ids.iter().map(point).collect(), f64::INFINITY);
+    let mut search = index.search();
     let mut pairs = Vec::new();
     for &i in &ids {
-        let (near, _) = index.nearest(i, reference.row(i as usize), 6, f64::INFINITY, &mut search);
+        let (near, _) = search.nearest(i, reference.row(i as usize), 6);
         pairs.extend(near.filter(|&j| i < j).map(|j| (i, j)));
     }
     let recipe = Recipe::preset("default").unwrap();

@@ -22,6 +22,7 @@ pub mod moments;
 pub mod motion;
 pub mod neighbors;
 pub mod proxy;
+pub mod tree;
 pub mod voxels;
 
 use rayon::prelude::*;
@@ -35,11 +36,11 @@ pub use groups::Groups;
 use known::KNOWN_BYTES;
 use neighbors::{PointIndex, Search};
 use proxy::Importance;
-use voxels::voxel_order;
+use tree::Point;
 
 /// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
-/// rank 4, the larger of the neighbour index, 30 and a flag, and the clustering, 24; and the voxel order, 20.
-pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 31 + 20;
+/// rank 4, and the larger of the neighbour index, 46, and the clustering, 24.
+pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Memory per candidate pair of those handed on together, beside what measuring takes: the pair, the same pair as one
 /// to be measured, what is known of it and of another of earlier passes ([`known::KnownPairs`]), and its likeness.
@@ -235,28 +236,26 @@ fn each_candidate<E>(
     most: usize,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<usize, E> {
-    let usable: Vec<bool> = (0..nodes.len()).map(|node| nodes.is_usable(node)).collect();
-    let index = PointIndex::new(nodes.len(), |node| usable[node].then(|| nodes.position(node)));
+    let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
+    let points = usable.map(|node| Point { at: nodes.position(node), index: node as u32 }).collect();
+    let index = PointIndex::new(points, pass.epsilon * unit);
     let gates = Gates::new(recipe, pass);
-    let epsilon = pass.epsilon * unit;
-    let of_chunk = |search: &mut Search, leaders: &[u32]| {
+    let of_chunk = |search: &mut Search<'_>, leaders: &[Point]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
-        for &i in leaders {
-            let (look, at) = (nodes.look(i as usize), nodes.position(i as usize));
-            let (near, cut) = index.nearest(i, at, recipe.max_neighbors, epsilon, search);
+        for &Point { at, index: i } in leaders {
+            let look = nodes.look(i as usize);
+            let (near, cut) = search.nearest(i, at, recipe.max_neighbors);
             truncated += usize::from(cut);
             let behind = near.filter(|&j| rank[i as usize] < rank[j as usize]);
             pairs.extend(behind.filter(|&j| gates.pass(&look, &nodes.look(j as usize))).map(|j| (i, j)));
         }
         (pairs, truncated)
     };
-    let leaders: Vec<u32> = (0..nodes.len() as u32).filter(|&node| usable[node as usize]).collect();
-    let leaders = voxel_order(&leaders, |node| nodes.position(node as usize), epsilon);
     let (mut pairs, mut truncated, mut is_part) = (Vec::new(), 0, false);
     // One batch of chunks at a time bounds the pairs that wait beside those that are handed on.
-    for batch in leaders.chunks(2 * CHUNK * rayon::current_num_threads()) {
+    for batch in index.points().chunks(2 * CHUNK * rayon::current_num_threads()) {
         let chunks: Vec<(Vec<(u32, u32)>, usize)> =
-            batch.par_chunks(CHUNK).map_init(Search::default, of_chunk).collect();
+            batch.par_chunks(CHUNK).map_init(|| index.search(), of_chunk).collect();
         for (of_chunk, cut) in chunks {
             pairs.extend(of_chunk);
             truncated += cut;

@@ -1,217 +1,211 @@
-//! The nearest neighbours of every Gaussian, by a k-d tree that stays fast when points coincide.
+//! The nearest neighbours of every Gaussian, by a hash of voxels as wide as they may be apart.
 //!
 //! In: positions. Out: for a Gaussian the at most K nearest others within ε, nearest first, ties by
-//! index. The answer is defined by (distance, index) alone, so it does not depend on the tree, on
-//! threads or on any partition of space. Memory: 16 bytes per point and 28 per node of the tree, two
-//! nodes for every 4 to 8 points: 23 to 30 bytes per point.
+//! index. The answer is defined by (distance, index) alone, so it does not depend on voxels, hashes, threads or any
+//! partition of space.
 //!
-//! Every node of the tree knows the smallest index below it, and a subtree is skipped unless it can
-//! hold a pair (distance, index) below the worst one kept. With ten million points at one place all
-//! distances are equal, the K smallest indices are found at once and all else is skipped; a tree
-//! that prunes by distance alone visits every point for every point.
+//! Points stand in the order of their voxels, and a table tells where each voxel starts. What is within ε of a point is
+//! in its own voxel or in one of the 26 around it: those are looked up once for all points of a voxel, and skipped where
+//! they are farther than the worst neighbour kept. A voxel of very many points has a [`Tree`] over them, so that a crowd
+//! in one voxel, or an ε that reaches everywhere, costs what a tree costs.
+//! Memory: 16 bytes per point, and 13 bytes for each slot of the table, of which there are at most 16 for 7 voxels: at
+//! most 46 bytes per point, 40 while points are sorted.
+//!
+//! Source: spatial hashing after M. Teschner et al., "Optimized spatial hashing for collision detection of deformable
+//! objects", 2003.
 
-use std::collections::BinaryHeap;
+use std::ops::Range;
 
-/// Points in a leaf, at most.
-const LEAF: usize = 8;
-/// Subtrees smaller than this are built by one thread.
-const PARALLEL: usize = 1 << 14;
+use hashbrown::HashTable;
+use rayon::prelude::*;
 
-#[derive(Debug, Clone, Copy, Default)]
-struct Point {
-    at: [f32; 3],
-    index: u32,
-}
+use super::tree::{Nearest, Point, Tree};
+use super::voxels::{Voxels, along, voxel_of};
+use crate::select::hash_id;
 
-#[derive(Debug, Clone, Copy)]
-struct Node {
-    low: [f32; 3],
-    high: [f32; 3],
-    smallest: u32,
-}
+/// Points in a voxel without a tree, at most. Trees in voxels of 8 to 64 points cost up to a third more among evenly
+/// strewn points and gain 7% among clusters.
+const SPARSE: usize = 64;
+/// Part of a voxel's side by which places may be wrong: they are up to 2²¹ sides, rounded to 53 bits a few times.
+const MARGIN: f64 = 1.0 / (1 << 20) as f64;
 
-/// A perfect binary tree over points: nodes in preorder, all leaves at one depth.
+/// Finite points, to be asked for the neighbours of each within ε.
 #[derive(Debug)]
 pub struct PointIndex {
+    epsilon: f64,
+    voxels: Voxels,
+    /// By voxel.
     points: Vec<Point>,
-    nodes: Vec<Node>,
-    depth: u32,
+    /// Of the voxels that have one.
+    trees: Vec<Tree>,
+    table: HashTable<Occupied>,
 }
 
-/// A candidate: squared distance as bits, whose order is that of the values (≥ 0), then index.
-type Found = (u64, u32);
+/// A voxel that holds points.
+#[derive(Debug, Clone, Copy)]
+struct Occupied {
+    start: u32,
+    len: u32,
+    /// Its place among the trees; any beyond them if it has none.
+    tree: u32,
+}
 
-/// Working memory of [`PointIndex::nearest`], to be used again by the same thread.
-#[derive(Debug, Default)]
-pub struct Search {
-    heap: BinaryHeap<Found>,
-    found: Vec<Found>,
+impl Occupied {
+    fn points(self) -> Range<usize> {
+        self.start as usize..self.start as usize + self.len as usize
+    }
 }
 
 impl PointIndex {
-    /// Indexes those of `count` points that `position` has a place for and that are finite.
-    pub fn new(count: usize, position: impl Fn(usize) -> Option<[f32; 3]>) -> Self {
-        let mut points: Vec<Point> = Vec::with_capacity(count);
-        let finite = |at: &[f32; 3]| at.iter().all(|x| x.is_finite());
-        let point = |i| Some(Point { at: position(i).filter(finite)?, index: i as u32 });
-        points.extend((0..count).filter_map(point));
-        let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
-        let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
-        let mut nodes = vec![empty; (2usize << depth) - 1];
-        build(&mut points, &mut nodes);
-        PointIndex { points, nodes, depth }
+    /// Indexes those of `points` that are finite, at most 2³² − 2, each of an index of its own.
+    ///
+    /// Edges: ε = 0 finds exact duplicates, an infinite ε reaches all points.
+    pub fn new(mut points: Vec<Point>, epsilon: f64) -> Self {
+        points.retain(|point| point.at.iter().all(|x| x.is_finite()));
+        // Wider than ε, lest rounding put what is exactly ε away two voxels away.
+        let voxels = Voxels::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * MARGIN));
+        let rows: Vec<u32> = (0..points.len() as u32).collect();
+        let order = voxels.order(&rows, |row| points[row as usize].at);
+        drop(rows);
+        points = order.into_iter().map(|row| points[row as usize]).collect();
+        let number = |point: &Point| voxels.number(point.at);
+        let same = |a: &Point, b: &Point| number(a) == number(b);
+        let trees: Vec<Tree> = points.par_chunk_by_mut(same).filter(|all| all.len() > SPARSE).map(Tree::new).collect();
+        let mut table = HashTable::with_capacity(points.chunk_by(same).count());
+        let (mut start, mut tree) = (0, 0);
+        for all in points.chunk_by(same) {
+            let is_sparse = all.len() <= SPARSE;
+            let voxel = Occupied { start, len: all.len() as u32, tree: if is_sparse { u32::MAX } else { tree } };
+            table.insert_unique(hash(number(&all[0])), voxel, |voxel| hash(number(&points[voxel.start as usize])));
+            start += voxel.len;
+            tree += u32::from(!is_sparse);
+        }
+        PointIndex { epsilon, voxels, points, trees, table }
     }
 
+    /// All points, those of a voxel together: the fastest order to ask for their neighbours in.
+    pub fn points(&self) -> &[Point] {
+        &self.points
+    }
+
+    /// What asks for neighbours: one for each thread, to be used again.
+    pub fn search(&self) -> Search<'_> {
+        Search { index: self, entered: None, around: Vec::new(), nearest: Nearest::default() }
+    }
+
+    fn find(&self, number: u64) -> Option<Occupied> {
+        let is_it = |voxel: &Occupied| self.voxels.number(self.points[voxel.start as usize].at) == number;
+        self.table.find(hash(number), is_it).copied()
+    }
+}
+
+/// The hash of a voxel's number. Eight voxels that make up a cube follow one another in the table: what surrounds a
+/// voxel is then in 8 places of memory, not in 27. The table compares the highest bits first, so they differ too.
+fn hash(number: u64) -> u64 {
+    let corner = number & 7;
+    (hash_id(number >> 3) & !7 | corner) ^ corner << 60
+}
+
+/// Asks an index for neighbours, and remembers what surrounds the voxel asked about last.
+#[derive(Debug)]
+pub struct Search<'a> {
+    index: &'a PointIndex,
+    entered: Option<[u32; 3]>,
+    /// The occupied voxels around that one and itself, the step to each along the axes, as in [`STEPS`].
+    around: Vec<([u8; 3], Occupied)>,
+    nearest: Nearest,
+}
+
+impl Search<'_> {
     /// The at most `k` nearest indexed points other than `query` whose distance to `at` is at most
-    /// `epsilon`, nearest first, equal distances by index; and whether there were more than `k`.
+    /// ε, nearest first, equal distances by index; and whether there were more than `k`.
     ///
     /// Squared distances are summed in f64 and compared with ε². Edges: a point that is not finite
-    /// has no neighbours; ε = 0 finds exact duplicates.
-    pub fn nearest<'s>(
-        &self,
-        query: u32,
-        at: [f32; 3],
-        k: usize,
-        epsilon: f64,
-        search: &'s mut Search,
-    ) -> (impl ExactSizeIterator<Item = u32> + 's, bool) {
-        search.heap.clear();
-        if at.iter().all(|x| x.is_finite()) && !self.points.is_empty() {
-            let at = at.map(f64::from);
-            // One more than k tells whether the list was cut.
-            let query = Query { own: query, at, wanted: k + 1, limit: ((epsilon * epsilon).to_bits(), u32::MAX) };
-            let entry = self.nodes[0].nearest_possible(at);
-            self.visit(&query, 0, self.depth, 0..self.points.len(), entry, &mut search.heap);
-        }
-        search.found.clear();
-        search.found.extend(search.heap.drain());
-        search.found.sort_unstable();
-        let truncated = search.found.len() > k;
-        search.found.truncate(k);
-        (search.found.iter().map(|&(_, index)| index), truncated)
-    }
-
-    fn visit(
-        &self,
-        query: &Query,
-        node: usize,
-        depth: u32,
-        range: std::ops::Range<usize>,
-        bound: Found,
-        heap: &mut BinaryHeap<Found>,
-    ) {
-        if bound > query.worst(heap) {
-            return;
-        }
-        if depth == 0 {
-            for point in &self.points[range] {
-                let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - query.at[c])), point.index);
-                if point.index != query.own && found <= query.worst(heap) {
-                    if heap.len() == query.wanted {
-                        heap.pop();
+    /// has no neighbours.
+    pub fn nearest(&mut self, query: u32, at: [f32; 3], k: usize) -> (impl ExactSizeIterator<Item = u32>, bool) {
+        let index = self.index;
+        // One more than k tells whether the list was cut.
+        self.nearest.start(query, at, k + 1, index.epsilon);
+        if at.iter().all(|x| x.is_finite()) {
+            let place = index.voxels.place(at);
+            let voxel = voxel_of(place);
+            if self.entered != Some(voxel) {
+                self.enter(voxel);
+            }
+            // By step and axis, the least squared distance, which adds up over the axes.
+            let gap = |part: f64| ((part - MARGIN).max(0.0) * index.voxels.side()).powi(2);
+            let gaps: [[f64; 3]; 3] = std::array::from_fn(|c| {
+                let inside = place[c] - f64::from(voxel[c]);
+                [0.0, gap(inside), gap(1.0 - inside)]
+            });
+            for &(step, occupied) in &self.around {
+                if self.nearest.reaches((0..3).map(|c| gaps[c][usize::from(step[c])]).sum()) {
+                    let points = &index.points[occupied.points()];
+                    match index.trees.get(occupied.tree as usize) {
+                        Some(tree) => tree.search(points, &mut self.nearest),
+                        None => self.nearest.scan(points),
                     }
-                    heap.push(found);
                 }
             }
-            return;
         }
-        let middle = range.start + range.len() / 2;
-        let left = node + 1;
-        let right = node + (1 << depth);
-        let near = self.nodes[left].nearest_possible(query.at);
-        let far = self.nodes[right].nearest_possible(query.at);
-        if near <= far {
-            self.visit(query, left, depth - 1, range.start..middle, near, heap);
-            self.visit(query, right, depth - 1, middle..range.end, far, heap);
-        } else {
-            self.visit(query, right, depth - 1, middle..range.end, far, heap);
-            self.visit(query, left, depth - 1, range.start..middle, near, heap);
+        let found = self.nearest.sorted();
+        (found[..found.len().min(k)].iter().map(|&(_, index)| index), found.len() > k)
+    }
+
+    /// Looks up what surrounds `voxel`.
+    fn enter(&mut self, voxel: [u32; 3]) {
+        self.entered = Some(voxel);
+        // The one below the first wraps to a number that is beyond the last.
+        let numbers: [[Option<u64>; 3]; 3] =
+            std::array::from_fn(|c| [voxel[c], voxel[c].wrapping_sub(1), voxel[c] + 1].map(|number| along(c, number)));
+        let index = self.index;
+        self.around.clear();
+        self.around.extend(STEPS.iter().filter_map(|&step| {
+            let [x, y, z] = std::array::from_fn(|c| numbers[c][usize::from(step[c])]);
+            Some((step, index.find(x? | y? | z?)?))
+        }));
+    }
+}
+
+/// To a voxel itself and the 26 around it, by axis: 0 stays, 1 goes down, 2 goes up. First itself, then those that
+/// share a side, an edge and a corner: the nearer they are, the sooner the farther ones can be skipped.
+const STEPS: [[u8; 3]; 27] = {
+    let mut steps = [[0; 3]; 27];
+    let (mut filled, mut moved) = (0, 0);
+    while moved <= 3 {
+        let mut k = 0;
+        while k < 27 {
+            let step = [k % 3, k / 3 % 3, k / 9];
+            if (step[0] > 0) as u8 + (step[1] > 0) as u8 + (step[2] > 0) as u8 == moved {
+                steps[filled] = step;
+                filled += 1;
+            }
+            k += 1;
         }
+        moved += 1;
     }
-}
-
-struct Query {
-    own: u32,
-    at: [f64; 3],
-    wanted: usize,
-    limit: Found,
-}
-
-impl Query {
-    /// What a find must not exceed.
-    fn worst(&self, heap: &BinaryHeap<Found>) -> Found {
-        match heap.peek() {
-            Some(&worst) if heap.len() == self.wanted => worst,
-            _ => self.limit,
-        }
-    }
-}
-
-impl Node {
-    /// A lower bound of (distance, index) below this node. Each step of the sum is monotone in f64,
-    /// so rounding cannot lift the bound above the distance of a point in the box.
-    fn nearest_possible(&self, at: [f64; 3]) -> Found {
-        let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
-        (squared(std::array::from_fn(outside)), self.smallest)
-    }
-}
-
-fn squared(d: [f64; 3]) -> u64 {
-    (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).to_bits()
-}
-
-/// Fills `nodes`, the preorder of a perfect subtree over `points`, splitting at the median of the
-/// widest side; equal coordinates split by index, so that low indices are met first.
-fn build(points: &mut [Point], nodes: &mut [Node]) {
-    let Some((node, below)) = nodes.split_first_mut() else { return };
-    for point in points.iter() {
-        for c in 0..3 {
-            node.low[c] = node.low[c].min(point.at[c]);
-            node.high[c] = node.high[c].max(point.at[c]);
-        }
-        node.smallest = node.smallest.min(point.index);
-    }
-    if below.is_empty() || points.is_empty() {
-        return;
-    }
-    let side = |c: usize| f64::from(node.high[c]) - f64::from(node.low[c]);
-    let widest = (1..3).fold(0, |best, c| if side(c) > side(best) { c } else { best });
-    let middle = points.len() / 2;
-    points.select_nth_unstable_by(middle, |a, b| a.at[widest].total_cmp(&b.at[widest]).then(a.index.cmp(&b.index)));
-    let (left, right) = points.split_at_mut(middle);
-    let (left_nodes, right_nodes) = below.split_at_mut(below.len() / 2);
-    if left.len() >= PARALLEL {
-        rayon::join(|| build(left, left_nodes), || build(right, right_nodes));
-    } else {
-        build(left, left_nodes);
-        build(right, right_nodes);
-    }
-}
+    steps
+};
 
 #[cfg(test)]
 mod tests {
     use std::time::Instant;
 
     use proptest::prelude::*;
-    use rayon::prelude::*;
 
     use super::*;
-    use crate::model::Column;
 
-    fn column(points: &[[f32; 3]]) -> Column {
-        let mut column = Column::zeros(3, points.len());
-        for (i, &point) in points.iter().enumerate() {
-            column.set_row(i, point);
-        }
-        column
+    fn named(points: &[[f32; 3]]) -> Vec<Point> {
+        points.iter().zip(0..).map(|(&at, index)| Point { at, index }).collect()
     }
 
-    fn indexed(position: &Column, k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
-        let index = PointIndex::new(position.len(), |i| Some(position.row(i)));
-        let mut search = Search::default();
-        (0..position.len())
-            .map(|i| {
-                let (found, truncated) = index.nearest(i as u32, position.row(i), k, epsilon, &mut search);
+    fn indexed(points: &[[f32; 3]], k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
+        let index = PointIndex::new(named(points), epsilon);
+        let mut search = index.search();
+        named(points)
+            .iter()
+            .map(|point| {
+                let (found, truncated) = search.nearest(point.index, point.at, k);
                 (found.collect(), truncated)
             })
             .collect()
@@ -241,7 +235,7 @@ mod tests {
             k in 1usize..9,
             epsilon in 0.0..1.5f64,
         ) {
-            prop_assert_eq!(indexed(&column(&points), k, epsilon), brute_force(&points, k, epsilon));
+            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
         // A coarse lattice: many points coincide, most distances tie.
@@ -252,38 +246,90 @@ mod tests {
             epsilon in prop::sample::select(vec![0.0, 1.0, 2.0, 4.0]),
         ) {
             let points: Vec<[f32; 3]> = cells.iter().map(|cell| cell.map(f32::from)).collect();
-            prop_assert_eq!(indexed(&column(&points), k, epsilon), brute_force(&points, k, epsilon));
+            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+
+        // Clusters far narrower and far wider than ε: voxels with and without trees, and borders between them.
+        #[test]
+        fn neighbours_equal_brute_force_among_clusters_far_from_the_origin(
+            centres in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 1..5),
+            within in prop::collection::vec((0usize..5, prop::array::uniform3(-1.0..1.0f32)), 0..500),
+            width in prop::sample::select(vec![1e-3f32, 0.03, 1.0]),
+            offset in prop::sample::select(vec![0.0f32, -3.0, 1e4, -1e7, 1e30]),
+            k in 1usize..40,
+            epsilon in prop::sample::select(vec![1e-30, 1e-3, 0.02, 0.25, 2.0, 1e6, f64::INFINITY]),
+        ) {
+            let centre = |c: usize| centres[c % centres.len()];
+            let place = |(c, d): &(usize, [f32; 3])| std::array::from_fn(|x| offset + centre(*c)[x] + width * d[x]);
+            let points: Vec<[f32; 3]> = within.iter().map(place).collect();
+            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+        }
+
+        // One point at the edge of what f32 holds makes voxels wider than everything else.
+        #[test]
+        fn neighbours_equal_brute_force_beside_a_point_at_the_end_of_the_world(
+            points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..150),
+            k in 1usize..9,
+            epsilon in 0.0..1.5f64,
+        ) {
+            let points = [vec![[f32::MAX, f32::MIN, 0.0]], points, vec![[f32::MIN; 3]]].concat();
+            prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
+        }
+    }
+
+    // Neighbours exactly ε away, on the borders of voxels, wherever the grid begins and however wide ε is.
+    #[test]
+    fn what_is_exactly_epsilon_away_is_found() {
+        for unit in [1.0f32, 0.1, 3e-7, 7e9] {
+            let points: Vec<[f32; 3]> = (0..1000u16).map(|i| [f32::from(i) * unit, unit, -unit]).collect();
+            for steps in [1, 2, 3] {
+                let epsilon = f64::from(points[steps][0]);
+                assert_eq!(indexed(&points, 8, epsilon), brute_force(&points, 8, epsilon), "{steps} steps of {unit}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_order_in_which_points_are_given_changes_nothing() {
+        let points: Vec<[f32; 3]> = (0..2000).map(|i| [i % 7, i % 11, i % 13].map(|x| x as f32 * 0.1)).collect();
+        let mut turned = named(&points);
+        turned.reverse();
+        let (index, turned) = (PointIndex::new(named(&points), 0.15), PointIndex::new(turned, 0.15));
+        let (mut search, mut other) = (index.search(), turned.search());
+        for point in named(&points) {
+            let (found, cut) = search.nearest(point.index, point.at, 5);
+            let (expected, expected_cut) = other.nearest(point.index, point.at, 5);
+            assert!(found.eq(expected) && cut == expected_cut, "{point:?}");
         }
     }
 
     #[test]
     fn points_that_are_not_finite_have_no_neighbours_and_are_none() {
-        let points = column(&[[0.0; 3], [f32::NAN, 0.0, 0.0], [0.0; 3], [f32::INFINITY; 3]]);
+        let points = [[0.0; 3], [f32::NAN, 0.0, 0.0], [0.0; 3], [f32::INFINITY; 3]];
         let found = indexed(&points, 4, f64::MAX.sqrt());
         assert_eq!(found.iter().map(|(list, _)| list.clone()).collect::<Vec<_>>(), [vec![2], vec![], vec![0], vec![]]);
     }
 
     #[test]
     fn excluded_points_do_not_take_a_place_among_the_k() {
-        let points = column(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
-        let index = PointIndex::new(3, |i| (i != 1).then(|| points.row(i)));
-        let mut search = Search::default();
-        let (found, truncated) = index.nearest(0, [0.0; 3], 1, 5.0, &mut search);
+        let mut points = named(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
+        points.remove(1);
+        let index = PointIndex::new(points, 5.0);
+        let mut search = index.search();
+        let (found, truncated) = search.nearest(0, [0.0; 3], 1);
         assert_eq!((found.collect::<Vec<_>>(), truncated), (vec![2], false));
     }
 
     /// Seconds for all neighbours of `points`, and how many lists were cut.
     fn timed(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
-        let position = column(points);
         let start = Instant::now();
-        let index = PointIndex::new(points.len(), |i| Some(points[i]));
-        let cut = (0..points.len())
-            .into_par_iter()
-            .map_init(Search::default, |search, i| {
-                let (_, truncated) = index.nearest(i as u32, position.row(i), k, epsilon, search);
-                usize::from(truncated)
-            })
-            .sum();
+        let index = PointIndex::new(named(points), epsilon);
+        let ask = |search: &mut Search<'_>, point: &Point| usize::from(search.nearest(point.index, point.at, k).1);
+        let cut = index.points().par_iter().map_init(|| index.search(), ask).sum();
         (start.elapsed().as_secs_f64(), cut)
     }
 

@@ -1,37 +1,79 @@
-//! Gaussians in voxel order: those that lie together follow one another.
+//! A grid of voxels: cubes of one side, in Morton order (G. M. Morton, "A computer oriented geodetic data base", 1966).
 //!
-//! The voxels are cubes of side ε, in Morton order (G. M. Morton, "A computer oriented geodetic data base", 1966).
-//! A piece of that order together with what lies within ε of it, its ghosts, is all that the pairs led from the piece
-//! consist of. Only the speed of reading depends on the order, no result does.
-//! Memory: 20 bytes per Gaussian beside the output.
+//! In that order Gaussians that lie together follow one another. A piece of it together with what lies within a voxel's
+//! side of it, its ghosts, is all that the pairs led from the piece consist of. Only the speed of reading depends on the
+//! order, no result does.
+//! Memory of ordering: 20 bytes per Gaussian beside the output.
 
 use rayon::prelude::*;
 
 /// Voxels along an axis, at most: three of their numbers make up 63 bits.
 const MOST: u32 = 1 << 21;
 
-/// `rows` by the voxel they lie in, `at` telling their positions, scene units; ties by row.
-///
-/// Voxels are `side` wide, or wider where there would be more than 2²¹ along an axis. Edges: all at one place, and a
-/// side of zero: one voxel. A position that is not finite lies in any voxel.
-pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
-    let at = |row: u32| at(row).map(f64::from);
-    let (mut low, mut widest) = ([0.0; 3], 0.0f64);
-    for (c, low) in low.iter_mut().enumerate() {
-        let plane = rows.iter().map(|&row| at(row)[c]).filter(|x| x.is_finite());
-        let (least, most) = plane.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
-        (*low, widest) = (least, widest.max(most - least));
+/// The voxels around some points.
+#[derive(Debug, Clone, Copy)]
+pub struct Voxels {
+    low: [f64; 3],
+    side: f64,
+    per_unit: f64,
+}
+
+impl Voxels {
+    /// Voxels of that `side` from the lowest coordinates of `points` on, or wider ones where there would be more than
+    /// 2²¹ along an axis. Edges: points all at one place and a side of zero, one voxel. Coordinates that are not finite
+    /// are passed over.
+    pub fn around(points: impl Iterator<Item = [f32; 3]>, side: f64) -> Self {
+        let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+        for point in points {
+            for c in (0..3).filter(|&c| point[c].is_finite()) {
+                low[c] = low[c].min(point[c].into());
+                high[c] = high[c].max(point[c].into());
+            }
+        }
+        let widest = (0..3).map(|c| high[c] - low[c]).fold(0.0, f64::max);
+        let side = side.max(widest / f64::from(MOST));
+        Voxels { low, side, per_unit: side.recip() }
     }
-    let side = side.max(widest / f64::from(MOST));
-    let voxel = |row: u32| {
-        let at = at(row);
-        // A cast takes what is beyond the range to its end, and NaN, which 0/0 is, to 0.
-        let number = |c: usize| u64::from((((at[c] - low[c]) / side) as u32).min(MOST - 1));
-        spread(number(0)) | spread(number(1)) << 1 | spread(number(2)) << 2
-    };
-    let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (voxel(row), row)).collect();
-    keyed.par_sort_unstable();
-    keyed.into_iter().map(|(_, row)| row).collect()
+
+    /// Their side, scene units.
+    pub fn side(&self) -> f64 {
+        self.side
+    }
+
+    /// Where `at` is, in voxels from the corner where they start.
+    pub fn place(&self, at: [f32; 3]) -> [f64; 3] {
+        std::array::from_fn(|c| (f64::from(at[c]) - self.low[c]) * self.per_unit)
+    }
+
+    /// The number in Morton order of the voxel that holds `at`.
+    pub fn number(&self, at: [f32; 3]) -> u64 {
+        let voxel = voxel_of(self.place(at));
+        (0..3).filter_map(|c| along(c, voxel[c])).sum()
+    }
+
+    /// `rows` by the voxel they lie in, `at` telling their positions, scene units; ties by row.
+    pub fn order(&self, rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync) -> Vec<u32> {
+        let mut keyed: Vec<(u64, u32)> = rows.par_iter().map(|&row| (self.number(at(row)), row)).collect();
+        keyed.par_sort_unstable();
+        keyed.into_iter().map(|(_, row)| row).collect()
+    }
+}
+
+/// [`Voxels::order`] of `rows` among voxels of that `side` around themselves.
+pub fn voxel_order(rows: &[u32], at: impl Fn(u32) -> [f32; 3] + Sync, side: f64) -> Vec<u32> {
+    Voxels::around(rows.iter().map(|&row| at(row)), side).order(rows, at)
+}
+
+/// The voxel at a [place](Voxels::place), by its number along each axis; outside of all, the nearest one. What is not a
+/// number is in the first.
+pub fn voxel_of(place: [f64; 3]) -> [u32; 3] {
+    // A cast takes what is beyond the range to its end, and NaN, which 0·∞ is, to 0.
+    place.map(|x| (x as u32).min(MOST - 1))
+}
+
+/// What being the `number`-th along `axis` adds to a voxel's number in Morton order; none where there is no such voxel.
+pub fn along(axis: usize, number: u32) -> Option<u64> {
+    (number < MOST).then(|| spread(number.into()) << axis)
 }
 
 /// Bit k of the lowest 21 moved to bit 3k.

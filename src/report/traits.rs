@@ -10,7 +10,8 @@ use rayon::prelude::*;
 use crate::budget::{Need, Workload};
 use crate::compress::score::{SCORED, Scored};
 use crate::error::Result;
-use crate::merge::neighbors::{PointIndex, Search};
+use crate::merge::neighbors::PointIndex;
+use crate::merge::tree::Point;
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
 use crate::pass::FrameSource;
 use crate::stream::gather;
@@ -135,12 +136,14 @@ fn bending(
     if ids.is_empty() {
         return Ok(Vec::new());
     }
-    let index = PointIndex::new(reference.len(), |i| visible(i).then(|| reference.position.row(i)));
+    let point = |i: usize| Point { at: reference.position.row(i), index: i as u32 };
+    let index = PointIndex::new((0..reference.len()).filter(|&i| visible(i)).map(point).collect(), f64::INFINITY);
     let near: Vec<Vec<u32>> = ids
         .par_iter()
-        .map_init(Search::default, |search, &id| {
-            index.nearest(id, reference.position.row(id as usize), NEIGHBOURS, f64::INFINITY, search).0.collect()
-        })
+        .map_init(
+            || index.search(),
+            |search, &id| search.nearest(id, reference.position.row(id as usize), NEIGHBOURS).0.collect(),
+        )
         .collect();
     let mut followed: Vec<u32> = near.iter().flatten().chain(ids).copied().collect();
     followed.sort_unstable();

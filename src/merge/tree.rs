@@ -1,0 +1,172 @@
+//! A k-d tree that stays fast when points coincide, and the list of the nearest points found so far.
+//!
+//! In: points. Out: the nearest of them, by (distance, index) alone. Memory: 28 bytes per node, two nodes for every 4 to
+//! 8 points: 7 to 14 bytes per point.
+//!
+//! Every node knows the smallest index below it, and a subtree is skipped unless it can hold a pair (distance, index)
+//! below the worst one kept. With ten million points at one place all distances are equal, the K smallest indices are
+//! found at once and all else is skipped; a tree that prunes by distance alone visits every point for every point.
+
+/// Points in a leaf, at most.
+const LEAF: usize = 8;
+/// Subtrees smaller than this are built by one thread.
+const PARALLEL: usize = 1 << 14;
+
+/// A point and the index by which it is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    /// Its position.
+    pub at: [f32; 3],
+    /// Decides between equal distances.
+    pub index: u32,
+}
+
+/// A candidate: squared distance as bits, whose order is that of the values (≥ 0), then index.
+type Found = (u64, u32);
+
+/// The nearest points found so far around a place, no more than are wanted.
+///
+/// Twice as many wait unsorted before the farther half goes: a heap moves about log K of them for each one found.
+#[derive(Debug, Default)]
+pub struct Nearest {
+    own: u32,
+    at: [f64; 3],
+    wanted: usize,
+    worst: Found,
+    found: Vec<Found>,
+}
+
+impl Nearest {
+    /// Starts anew: the `wanted` nearest points other than `own` whose distance to `at` is at most `epsilon`.
+    ///
+    /// Squared distances are summed in f64 and compared with ε².
+    pub fn start(&mut self, own: u32, at: [f32; 3], wanted: usize, epsilon: f64) {
+        self.found.clear();
+        (self.own, self.at, self.wanted) = (own, at.map(f64::from), wanted);
+        self.worst = ((epsilon * epsilon).to_bits(), u32::MAX);
+    }
+
+    /// Looks at every one of `points`.
+    pub fn scan(&mut self, points: &[Point]) {
+        for point in points {
+            let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
+            if found <= self.worst && point.index != self.own {
+                self.found.push(found);
+                if self.found.len() == 2 * self.wanted {
+                    self.cut();
+                }
+            }
+        }
+    }
+
+    /// Whether a point whose squared distance is at least `bound` can still be among the nearest.
+    pub fn reaches(&self, bound: f64) -> bool {
+        bound.to_bits() <= self.worst.0
+    }
+
+    /// What was found, nearest first, equal distances by index.
+    pub fn sorted(&mut self) -> &[(u64, u32)] {
+        if self.found.len() > self.wanted {
+            self.cut();
+        }
+        self.found.sort_unstable();
+        &self.found
+    }
+
+    fn cut(&mut self) {
+        self.worst = *self.found.select_nth_unstable(self.wanted - 1).1;
+        self.found.truncate(self.wanted);
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Node {
+    low: [f32; 3],
+    high: [f32; 3],
+    smallest: u32,
+}
+
+/// A perfect binary tree over points: nodes in preorder, all leaves at one depth.
+#[derive(Debug)]
+pub struct Tree {
+    nodes: Vec<Node>,
+    depth: u32,
+}
+
+impl Tree {
+    /// Brings `points` into the order of a tree over them.
+    pub fn new(points: &mut [Point]) -> Self {
+        let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
+        let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
+        let mut nodes = vec![empty; (2usize << depth) - 1];
+        build(points, &mut nodes);
+        Tree { nodes, depth }
+    }
+
+    /// Looks at those of `points`, in the order of the tree, that can be among the `nearest`.
+    pub fn search(&self, points: &[Point], nearest: &mut Nearest) {
+        self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
+    }
+
+    fn visit(&self, node: usize, depth: u32, points: &[Point], bound: Found, nearest: &mut Nearest) {
+        if bound > nearest.worst {
+            return;
+        }
+        if depth == 0 {
+            nearest.scan(points);
+            return;
+        }
+        let (before, behind) = points.split_at(points.len() / 2);
+        let (left, right) = (node + 1, node + (1 << depth));
+        let near = self.nodes[left].nearest_possible(nearest.at);
+        let far = self.nodes[right].nearest_possible(nearest.at);
+        if near <= far {
+            self.visit(left, depth - 1, before, near, nearest);
+            self.visit(right, depth - 1, behind, far, nearest);
+        } else {
+            self.visit(right, depth - 1, behind, far, nearest);
+            self.visit(left, depth - 1, before, near, nearest);
+        }
+    }
+}
+
+impl Node {
+    /// A lower bound of (distance, index) below this node. Each step of the sum is monotone in f64,
+    /// so rounding cannot lift the bound above the distance of a point in the box.
+    fn nearest_possible(&self, at: [f64; 3]) -> Found {
+        let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
+        (squared(std::array::from_fn(outside)), self.smallest)
+    }
+}
+
+fn squared(d: [f64; 3]) -> u64 {
+    (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).to_bits()
+}
+
+/// Fills `nodes`, the preorder of a perfect subtree over `points`, splitting at the median of the
+/// widest side; equal coordinates split by index, so that low indices are met first.
+fn build(points: &mut [Point], nodes: &mut [Node]) {
+    let Some((node, below)) = nodes.split_first_mut() else { return };
+    for point in points.iter() {
+        for c in 0..3 {
+            node.low[c] = node.low[c].min(point.at[c]);
+            node.high[c] = node.high[c].max(point.at[c]);
+        }
+        node.smallest = node.smallest.min(point.index);
+    }
+    if below.is_empty() || points.is_empty() {
+        return;
+    }
+    let side = |c: usize| f64::from(node.high[c]) - f64::from(node.low[c]);
+    let widest = (1..3).fold(0, |best, c| if side(c) > side(best) { c } else { best });
+    let middle = points.len() / 2;
+    points.select_nth_unstable_by(middle, |a, b| a.at[widest].total_cmp(&b.at[widest]).then(a.index.cmp(&b.index)));
+    let (left, right) = points.split_at_mut(middle);
+    let (left_nodes, right_nodes) = below.split_at_mut(below.len() / 2);
+    if left.len() >= PARALLEL {
+        rayon::join(|| build(left, left_nodes), || build(right, right_nodes));
+    } else {
+        build(left, left_nodes);
+        build(right, right_nodes);
+    }
+}
