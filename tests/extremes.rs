@@ -130,8 +130,7 @@ fn movers_around_one_percent_are_kept_whatever_their_number() {
             }
             workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
         }
-        // Exact percentiles: the middle of a sketch's bucket may lie above the value that all movers share.
-        let default = "--preset default --tau-static 0.99 --tau-dynamic 1 --exact-percentiles";
+        let default = "--preset default --tau-static 0.99 --tau-dynamic 1";
         for request in ["--preset paper --target-count 20", default] {
             workplace.done(&format!("compress frames -o out --overwrite --prune-only {request}"));
             let map = index_map(&workplace.path("out/index_map.npy"));

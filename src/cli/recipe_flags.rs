@@ -139,10 +139,10 @@ mod tests {
     #[test]
     fn flags_override_the_preset() {
         let recipe =
-            parse(&["--preset", "paper", "--mu", "2", "--exact-percentiles", "--low-priority", "rescue"]).unwrap();
+            parse(&["--preset", "paper", "--mu", "2", "--weigh-motion-by-life", "--low-priority", "rescue"]).unwrap();
         let mut expected = Recipe::preset("paper").unwrap();
         expected.score.mu = 2.0;
-        expected.score.exact_percentiles = true;
+        expected.score.weigh_motion_by_life = true;
         expected.select.low_priority = crate::recipe::LowPriority::Rescue;
         assert_eq!(recipe, expected);
     }

@@ -24,6 +24,9 @@ pub const PRESETS: [(&str, &str); 4] = [
     ("strong", include_str!("strong.toml")),
 ];
 
+/// Parameters of earlier versions, by table and key, and why they went: recipes written beside results name all.
+const REMOVED: [(&str, &str, &str); 1] = [("score", "exact_percentiles", "as percentiles are always exact")];
+
 /// All hyper-parameters; see `paper.toml` for the meaning of each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -106,7 +109,6 @@ pub struct Score {
     pub weigh_motion_by_life: bool,
     pub norm_epsilon: f64,
     pub clip_norm: bool,
-    pub exact_percentiles: bool,
 }
 
 /// What S_static starts from.
@@ -267,6 +269,11 @@ impl Recipe {
     /// `preset` (or `fallback`). The tables `[provenance]` and `[run]`, as written beside results, are not looked at.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
+        for (section, key, reason) in REMOVED {
+            if over.get(section).is_some_and(|table| table.get(key).is_some()) {
+                return Err(format!("{section}.{key} is no parameter any more, {reason}: delete its line"));
+            }
+        }
         let recipe: Recipe =
             over_preset(over, Some(fallback))?.try_into().map_err(|e: toml::de::Error| e.to_string())?;
         recipe.validate()?;
@@ -416,6 +423,15 @@ mod tests {
         let mut expected = Recipe::preset("paper").unwrap();
         expected.score.mu = 2.0;
         assert_eq!(recipe, expected);
+    }
+
+    #[test]
+    fn a_recipe_of_an_earlier_version_is_told_which_line_to_delete() {
+        for value in ["true", "false"] {
+            let text = format!("preset = \"paper\"\n[score]\nmu = 2.0\nexact_percentiles = {value}\n");
+            let message = Recipe::from_toml(&text, "default").unwrap_err();
+            assert!(message.contains("score.exact_percentiles") && message.contains("delete its line"), "{message}");
+        }
     }
 
     #[test]

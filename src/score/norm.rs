@@ -22,14 +22,8 @@ impl Norm {
     /// The normalisation of a set of values; NaN and infinities are passed over.
     pub fn of<I: Iterator<Item = f64>>(values: impl Fn() -> I, recipe: &recipe::Score) -> Self {
         let sketch = FloatSketch::of(values());
-        let sketched = |p| sketch.percentile(p).unwrap_or(0.0);
-        let (mut p1, mut p99) = (sketched(1.0), sketched(99.0));
-        // In one bucket, a constant cannot be told from a narrow spread, nor what is above P99.
-        if recipe.exact_percentiles || p1 == p99 {
-            let exact = |p| sketch.exact_percentile(p, values()).unwrap_or(0.0);
-            (p1, p99) = (exact(1.0), exact(99.0));
-        }
-        Norm { p1, p99, epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
+        let percentile = |p| sketch.percentile(p, values()).unwrap_or(0.0);
+        Norm { p1: percentile(1.0), p99: percentile(99.0), epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
     }
 
     /// Whether the percentiles differ, so that the term grades rather than splits.
@@ -57,7 +51,7 @@ mod tests {
     }
 
     #[test]
-    fn constant_term_is_inactive_and_zero_although_no_bucket_middle_equals_it() {
+    fn a_constant_term_is_inactive_and_zero() {
         for preset in ["paper", "default"] {
             let norm = norm_of(preset, &[0.3; 1000]);
             assert!(!norm.is_active() && norm.apply(0.3) == 0.0 && norm.apply(0.300_000_1) == 1.0, "{norm:?}");

@@ -33,7 +33,7 @@ pub struct Selection {
     pub keep: Vec<bool>,
     /// All Gaussians but those dropped by the user, best first; the first `counts.kept` are those of `keep`.
     pub ranking: Ranking,
-    /// How it came about.
+    /// How many each stage kept and pruned.
     pub counts: Counts,
 }
 
