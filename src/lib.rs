@@ -10,6 +10,8 @@
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`families`], [`demo`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
+//!
+//! [`method`] derives what is computed.
 
 pub mod budget;
 pub mod cli;
@@ -22,6 +24,9 @@ pub mod families;
 pub mod ingest;
 pub mod machine;
 pub mod merge;
+/// How what is computed follows from what is wanted; comments elsewhere cite its sections.
+#[doc = include_str!("method.md")]
+pub mod method {}
 pub mod metrics;
 pub mod model;
 pub mod pass;

@@ -1,4 +1,4 @@
-//! Clusters and proxies of whole models against METHOD section 5 written down plainly: neighbours by looking
+//! Clusters and proxies of whole models against method.md, section 5 written down plainly: neighbours by looking
 //! at all pairs, gates by their formulas, leaders one after the other.
 
 mod scene;

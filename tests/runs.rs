@@ -73,6 +73,26 @@ fn a_summary_reads_back_as_it_was_written_and_says_its_schema() {
 }
 
 #[test]
+fn every_field_of_a_summary_is_described() {
+    let workplace = Workplace::new();
+    let summary = workplace.summary("{tiny} --cameras {tiny} --preset strong -o out");
+    let described = include_str!("../format/SUMMARY.md");
+    let mut pending = vec![("".to_owned(), &summary)];
+    while let Some((name, value)) = pending.pop() {
+        // Counts of a pass are described where they are counted.
+        let inner: Vec<(String, &Value)> = match value {
+            Value::Object(fields) if name != "passes" => fields.iter().map(|(k, v)| (k.clone(), v)).collect(),
+            Value::Array(values) => values.iter().map(|value| (name.clone(), value)).collect(),
+            _ => Vec::new(),
+        };
+        for (field, value) in inner {
+            assert!(described.contains(&format!("`{field}`")), "{field} is not described");
+            pending.push((field, value));
+        }
+    }
+}
+
+#[test]
 fn a_dry_run_says_what_the_run_would_say() {
     let workplace = Workplace::new();
     // Loose enough that proxies stray from their members.

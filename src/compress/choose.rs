@@ -1,7 +1,6 @@
 //! Stage `choose`: letting pictures choose among alternatives at one count, rendered beside the original.
 //!
-//! No rule wins everywhere, and merging pays on some scenes only (METHOD section 6: "let scoring views choose
-//! among rules").
+//! No rule wins everywhere, and merging pays on some scenes only (method.md, section 6.1).
 //! Memory: statistics and scores while the alternatives are made, then two states of one frame, the original's and an
 //! alternative's, and [`AT_ONCE`] pictures.
 

@@ -22,7 +22,7 @@ use crate::stream::{open_all, recolor};
 /// What the stage is called.
 const NAME: &str = "refit";
 
-/// Iterations: METHOD section 6 takes 12; not tuned here.
+/// Iterations: not tuned (method.md, section 6.2).
 const ITERATIONS: usize = 10;
 /// Of the pictures looked at every fourth is kept for the test.
 const TEST_EVERY: usize = 4;

@@ -1,12 +1,13 @@
 //! What a run did, for people and for programs: counts in and out of every stage, what was left out
 //! and why, memory and time. The only output whose bytes differ between runs.
 //!
-//! These types are the one schema of `summary.json`: `compress` writes it by them and `report` reads it by them.
+//! These types are the one schema of `summary.json`: `compress` writes it by them and `report` reads it by them. What
+//! its fields mean to other programs stands in `format/SUMMARY.md`.
 
 use std::fmt::Write as _;
 use std::path::Path;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::error::Result;
 use crate::families::Family;
@@ -113,11 +114,18 @@ pub struct TermSummary {
     /// C, W, sqrt(C*W), E, D, kappa, V, Life, S_static or S_dynamic.
     pub name: String,
     /// 1st percentile.
+    #[serde(deserialize_with = "number")]
     pub p1: f64,
     /// 99th percentile.
+    #[serde(deserialize_with = "number")]
     pub p99: f64,
     /// Whether the percentiles differ, so that the term grades rather than splits.
     pub active: bool,
+}
+
+/// A number as JSON has it: null stands for what is not finite.
+fn number<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<f64, D::Error> {
+    Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::NAN))
 }
 
 /// Counts of odd Gaussians.

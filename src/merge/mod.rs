@@ -1,4 +1,4 @@
-//! Motion-consistent merging by moment matching (METHOD section 5).
+//! Motion-consistent merging by moment matching (method.md, section 5).
 //!
 //! ```text
 //! states at the reference frame ─▶ neighbors ─▶ gates ─▶ pairs ─▶ motion ─▶ greedy ─▶ proxy

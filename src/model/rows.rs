@@ -1,4 +1,4 @@
-//! One row of statistics per Gaussian (METHOD section 1), as arrays over Gaussians.
+//! One row of statistics per Gaussian (method.md, section 1), as arrays over Gaussians.
 
 /// What was odd about a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

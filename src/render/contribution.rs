@@ -1,6 +1,6 @@
 //! How much of the pictures each Gaussian is.
 
-/// Visible contribution of N Gaussians over any number of pictures (METHOD section 1: C `visible`, and W).
+/// Visible contribution of N Gaussians over any number of pictures (method.md, section 1: C `visible`, and W).
 ///
 /// Both figures are the same whatever the order of pictures and the number of threads. Memory: 12 bytes
 /// per Gaussian.

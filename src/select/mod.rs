@@ -1,4 +1,4 @@
-//! Sampling and pruning (METHOD section 4): which Gaussians stay.
+//! Sampling and pruning (method.md, section 4): which Gaussians stay.
 //!
 //! In: scores. Out: a mask, and a ranking of all Gaussians of which the mask is a prefix, so that any
 //! other number can be kept by the same rule. Memory per Gaussian: [`BYTES_PER_GAUSSIAN`], and

@@ -1,4 +1,4 @@
-//! Statistics of every Gaussian in one pass over the frames (METHOD section 1).
+//! Statistics of every Gaussian in one pass over the frames (method.md, section 1).
 //!
 //! In: the columns of a block of Gaussians, frame after frame, with the cameras of each frame.
 //! Out: one row per Gaussian. Memory: [`BYTES_PER_GAUSSIAN`] for every Gaussian of a block, whatever

@@ -1,4 +1,4 @@
-//! The statistics over again, slowly: whole sequences in memory, METHOD's definitions written out in
+//! The statistics over again, slowly: whole sequences in memory, the definitions of method.md written out in
 //! f64, sharing no code with the streaming scan.
 
 use crate::model::{Camera, Gaussians, Schedule};

@@ -1,6 +1,6 @@
 //! Visible contribution: what every Gaussian adds to the scored pictures, occlusion included.
 //!
-//! In: a source, its cameras frame by frame, which pictures to look at. Out: C `visible` and W (METHOD
+//! In: a source, its cameras frame by frame, which pictures to look at. Out: C `visible` and W (method.md,
 //! section 1). Sums of integers and maxima: the same bits whatever the order, the threads and the batches.
 
 use std::num::NonZeroU32;

@@ -1,5 +1,5 @@
 //! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is
-//! the merged one (METHOD section 5, "Motion").
+//! the merged one (method.md, section 5.6).
 
 use crate::deform::Deltas;
 use crate::error::Result;

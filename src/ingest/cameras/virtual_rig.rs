@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use crate::model::{Camera, Rig, Shot, Split};
 
-/// Cameras of the rig: as many scoring views as the figures of METHOD section 6 were taken with.
+/// Cameras of the rig: as many scoring views as the static models of the README have.
 const CAMERAS: u32 = 12;
 /// Distance from the centre in extents. At 60° the picture then spans 2.3 extents, so that a scene of
 /// equal sides is seen whole from every corner.
