@@ -95,5 +95,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
         touched > 8 << 20 && mapped > touched - (1 << 20),
         "{mapped} bytes resident of {touched} touched in the map"
     );
-    println!("{file} bytes read, {grown} resident, {held} where {block} may be held; {touched} touched in the map, {mapped} resident");
+    println!(
+        "{file} bytes read, {grown} resident, {held} where {block} may be held; {touched} touched in the map, {mapped} resident"
+    );
 }
