@@ -142,12 +142,15 @@ mod tests {
     use crate::stats::ScanPlan;
     use crate::stream::{BLOCK, Scanned, scan};
 
+    /// Gaussians, frames and columns.
+    type Fetched = (Range<usize>, Range<usize>, Columns);
+
     /// A scene that wants to be fetched, by `frame_block` frames, and whose frames from one on cannot be read.
     struct Slow {
         scene: Scene,
         frame_block: Option<usize>,
         fails_from: usize,
-        fetched: Mutex<Vec<(Range<usize>, Range<usize>, Columns)>>,
+        fetched: Mutex<Vec<Fetched>>,
     }
 
     impl Slow {
