@@ -21,6 +21,10 @@ use crate::error::{Error, Fault, Result};
 /// Bytes read at a time where all of a long stretch is gone through: whole records.
 pub(crate) const PIECE: usize = 1 << 16;
 
+/// Bytes about a page that is touched which the system may map with it, as Linux does.
+#[cfg(unix)]
+const AROUND: u64 = 1 << 16;
+
 pub(crate) struct MappedFile {
     path: PathBuf,
     file: File,
@@ -128,13 +132,13 @@ impl MappedFile {
         None
     }
 
-    /// Gives the pages of `range` back to the system: they no longer count as this process's memory. Whoever still
-    /// reads them in place reads them from the file again.
+    /// Gives the pages of `range`, and those that came with them, back to the system: they no longer count as this
+    /// process's memory. Whoever still reads them in place reads them from the file again.
     #[cfg(unix)]
     pub(crate) fn release(&self, range: std::ops::Range<u64>) {
-        let end = range.end.min(self.len());
-        if range.start < end {
-            let (start, len) = (range.start as usize, (end - range.start) as usize);
+        let (start, end) = (range.start.saturating_sub(AROUND), range.end.saturating_add(AROUND).min(self.len()));
+        if !range.is_empty() && start < end {
+            let (start, len) = (start as usize, (end - start) as usize);
             // SAFETY: the advice drops what was written to private pages. The map is read-only and backed by the file,
             // so every page that is dropped comes back with the file's bytes: slices of it stay valid. The range lies
             // within the map. A refusal leaves the pages where they are.

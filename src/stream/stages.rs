@@ -142,7 +142,7 @@ mod tests {
     use crate::stats::ScanPlan;
     use crate::stream::{BLOCK, Scanned, scan};
 
-    /// Gaussians, frames and columns that were asked for.
+    /// Gaussians, frames and columns.
     type Fetched = (Range<usize>, Range<usize>, Columns);
 
     /// A scene that wants to be fetched, by `frame_block` frames, and whose frames from one on cannot be read.

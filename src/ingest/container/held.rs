@@ -84,15 +84,11 @@ mod tests {
     use crate::error::Error;
 
     fn decode(held: &HeldTiles, slot: usize, count: usize) -> Option<&[f32]> {
-        held.get_or_decode(
-            slot,
-            || Ok(count),
-            |values| {
-                values.fill(slot as f32);
-                Ok(())
-            },
-        )
-        .unwrap()
+        let fill = |values: &mut [f32]| {
+            values.fill(slot as f32);
+            Ok(())
+        };
+        held.get_or_decode(slot, || Ok(count), fill).unwrap()
     }
 
     #[test]
