@@ -46,7 +46,7 @@ def main():
         sys.exit(2)
     binary, data = sys.argv[1], Path(sys.argv[2])
     presets = sys.argv[3:] or ["default", "paper", "gentle", "strong"]
-    print("| model | preset | Gaussians | point cloud | PSNR dB / SSIM to the original | PSNR dB to photographs | time | peak memory |")
+    print("| model | preset | Gaussians | whole model | PSNR dB / SSIM to the original | PSNR dB to photographs | time | peak memory |")
     print("|---|---|---|---|---|---|---|---|")
     for model in sorted(path.parent for path in data.glob("*/cfg_args")):
         for preset in presets:

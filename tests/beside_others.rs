@@ -272,9 +272,9 @@ fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
     let run = workplace.run("compress {tiny} -o out.gseq");
     assert_eq!(run.code, 0, "{}", run.stderr);
     for stage in ["scan", "emit"] {
-        let lines: Vec<&str> = run.stderr.lines().filter(|line| line.starts_with(stage)).collect();
+        let lines: Vec<&str> = run.stderr.lines().filter(|line| line.contains(&format!("] {stage}  "))).collect();
         assert_eq!(lines.len(), 1, "{stage}: {}", run.stderr);
-        assert!(lines[0].contains("/s, ") && lines[0].ends_with(" s"), "{}", lines[0]);
+        assert!(lines[0].starts_with('[') && lines[0].contains("/s, ") && lines[0].ends_with(" s"), "{}", lines[0]);
     }
     assert!(!run.stderr.contains('\r') && !run.stderr.contains('\x1b'), "{:?}", run.stderr);
     let quiet = workplace.run("compress {tiny} -o quiet.gseq --quiet");

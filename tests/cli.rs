@@ -327,7 +327,7 @@ fn outputs_onto_around_or_inside_the_input_are_refused() {
 fn kinds_that_do_not_fit_are_refused() {
     let workplace = Workplace::new();
     workplace.done("pack {tiny} -o scene.gseq");
-    workplace.refused(2, "compress scene.gseq -o out --as model", &["only a 4DGaussians model"]);
+    workplace.refused(2, "compress scene.gseq -o out --as model", &["only a trained model"]);
     workplace.refused(2, "compress scene.gseq -o out.ply", &["10 frames do not fit"]);
     workplace.refused(2, "compress scene.gseq -o out --iteration 3", &["--iteration"]);
 }

@@ -138,7 +138,7 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
         let least = least(&workplace, &arguments);
         let run = workplace.run(&format!("{arguments} --memory {least}MiB --explain"));
         assert_eq!(run.code, 0, "{}", run.stderr);
-        for part in ["memory: at most", "N x", "full reads of the frames"] {
+        for part in ["memory: at most", "N x", "full reads of the input"] {
             assert!(run.stderr.contains(part), "{arguments}: {part:?} is not in {:?}", run.stderr);
         }
         // Where the system says so.
@@ -157,7 +157,7 @@ fn a_plan_is_explained_before_it_is_refused_and_nonsense_is_no_size() {
     workplace.refused(
         2,
         "compress demo/scene.gseq -o x.gseq --memory 2MiB --explain",
-        &["full reads of the frames", "--memory 2.0 MiB: expected at least", "MiB"],
+        &["full reads of the input", "--memory 2.0 MiB: expected at least", "MiB"],
     );
     for size in ["0", "lots", "-5MiB"] {
         workplace.refused(2, &format!("compress demo/scene.gseq -o x.gseq --memory={size}"), &["512MiB"]);

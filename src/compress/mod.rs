@@ -44,7 +44,7 @@ pub fn compress(request: &Request) -> Result<Summary> {
     let mut journal = Journal::default();
     let plan = |outlook| {
         let job = Job::new(request, outlook)?;
-        job.emit.check(&[])?;
+        job.emit.check(&[&request.input.path])?;
         Ok(job)
     };
     let (scene, job, arrived) = open_to_measure(&request.input, plan, &mut journal)?;

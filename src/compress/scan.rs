@@ -23,7 +23,8 @@ pub struct Scan {
 impl Scan {
     /// A block of Gaussians at a time, then the rows of all, joined.
     pub fn need(&self, work: &Workload, _: &Limits) -> Need {
-        let block = stats::BYTES_PER_GAUSSIAN as u64 + work.held(&Limits::NONE, Columns::ALL);
+        // In stages a second reader decodes while the first is read.
+        let block = stats::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::ALL);
         Need {
             stage: NAME,
             reads: 1.0,

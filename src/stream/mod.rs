@@ -1,5 +1,6 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
+mod blocks;
 mod contribution;
 mod frames;
 mod gather;

@@ -16,7 +16,7 @@ use std::thread;
 
 use crossbeam_channel::{Receiver, Sender, bounded};
 
-use super::scan::BlockScans;
+use super::blocks::BlockScans;
 use crate::error::{Error, Result};
 use crate::model::Rows;
 use crate::pass::{Ahead, BlockReader, Ids};

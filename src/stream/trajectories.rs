@@ -69,7 +69,7 @@ impl Trajectories {
         let io = |what| Error::io(what, folder);
         let mut file = nameless(folder)?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
-        let progress = Progress::new("gather", "frames", frames as u64);
+        let progress = Progress::new("merge", "frames", frames as u64);
         let mut values = Vec::new();
         if frames > 0 {
             take(source, &places, 0..1, NEEDED, &mut values)?;

@@ -120,7 +120,7 @@ pub struct Evaluation {
     pub path: Both<String>,
     /// Gaussians.
     pub count: Both<usize>,
-    /// Bytes of the files that grow with the Gaussians.
+    /// Bytes of everything a model consists of.
     pub bytes: Both<u64>,
     /// From where they were looked at.
     pub cameras: CameraSummary,

@@ -18,7 +18,7 @@ pub struct TradeOff {
     pub digest: String,
     /// Gaussians of the input.
     pub gaussians: usize,
-    /// Bytes of its files that grow with the Gaussians.
+    /// Bytes of everything the model consists of.
     pub bytes: u64,
     /// Threads at work.
     pub threads: usize,
@@ -41,7 +41,7 @@ pub struct Point {
     pub asked: Option<f64>,
     /// Gaussians in the result.
     pub count: usize,
-    /// Bytes of the result's files that grow with the Gaussians.
+    /// Bytes of everything the result consists of.
     pub bytes: u64,
     /// Mean PSNR against the original's own pictures, dB.
     pub psnr: f64,

@@ -1,0 +1,80 @@
+//! The blocks of Gaussians of one scan: what they share, and how one of them is gone through.
+
+use std::ops::Range;
+use std::sync::{Mutex, PoisonError};
+
+use super::{BLOCK, Progress};
+use crate::error::Result;
+use crate::model::{Camera, Columns, Gaussians, Rows};
+use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::stats::{BlockScan, ScanPlan};
+
+/// What the scans of all blocks share.
+pub(super) struct BlockScans<'a> {
+    pub(super) source: &'a dyn FrameSource,
+    pub(super) cameras: Vec<Vec<&'a Camera>>,
+    pub(super) plan: &'a ScanPlan,
+    pub(super) progress: Progress,
+    /// Living Gaussians in each frame. Sums of integers: the order in which blocks finish does not show.
+    pub(super) alive: Mutex<Vec<u32>>,
+}
+
+impl<'a> BlockScans<'a> {
+    pub(super) fn blocks(&self) -> usize {
+        self.source.info().count.div_ceil(BLOCK)
+    }
+
+    pub(super) fn frames(&self) -> usize {
+        self.source.info().times.len()
+    }
+
+    /// The Gaussians of a block.
+    pub(super) fn range(&self, block: usize) -> Range<usize> {
+        block * BLOCK..self.source.info().count.min((block + 1) * BLOCK)
+    }
+
+    /// What may have changed since the frame before.
+    pub(super) fn changed(&self, frame: usize) -> Columns {
+        if frame == 0 { Columns::ALL } else { self.source.info().varying }
+    }
+
+    pub(super) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {
+        let range = self.range(block);
+        let state = Gaussians::zeros(range.len(), self.source.info().sh_degree);
+        (BlockScan::new(range.len(), range.start, self.plan), state)
+    }
+
+    /// Adds the next frames of a block.
+    pub(super) fn add(
+        &self,
+        (scan, state): &mut (BlockScan<'a>, Gaussians),
+        frames: Range<usize>,
+        reader: &mut dyn BlockReader,
+    ) -> Result<()> {
+        for frame in frames {
+            let changed = self.changed(frame);
+            reader.read(frame, changed, state)?;
+            scan.frame(frame, state, &self.cameras[frame], changed);
+            self.progress.advance(state.len() as u64);
+        }
+        Ok(())
+    }
+
+    /// The rows of a block of which all frames have been added, and its largest coordinate.
+    pub(super) fn finish(&self, (scan, _): (BlockScan<'a>, Gaussians)) -> (Rows, f32) {
+        let found = scan.finish();
+        let mut alive = self.alive.lock().unwrap_or_else(PoisonError::into_inner);
+        for (sum, count) in alive.iter_mut().zip(found.alive_per_frame) {
+            *sum += count;
+        }
+        (found.rows, found.largest_coordinate)
+    }
+
+    /// A block from first to last.
+    pub(super) fn block(&self, block: usize) -> Result<(Rows, f32)> {
+        let mut scan = self.begin(block);
+        let mut reader = self.source.open(Ids::Range(self.range(block)))?;
+        self.add(&mut scan, 0..self.frames(), &mut *reader)?;
+        Ok(self.finish(scan))
+    }
+}
