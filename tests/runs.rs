@@ -32,7 +32,8 @@ fn the_recipe_beside_a_result_repeats_its_run() {
         "--cameras {tiny} --target-count 77 --split test --preset paper",
         "--cameras {tiny} --prune-only --mu 2",
         "--cameras {tiny} --merge-only --preset strong --split all",
-        "--cameras {tiny} --keep-ids 3,10-20 --drop-ids 200-210 --keep-box -1,-1,-1,0,0,0.5",
+        "--cameras {tiny} --keep-ids 3,10-20 --drop-ids 200-210",
+        "--cameras {tiny} --keep-box -1,-1,-1,0,0,0.5",
         "--cameras {tiny} --as ply-sequence",
     ]
     .iter()
@@ -95,9 +96,8 @@ fn every_field_of_a_summary_is_described() {
 #[test]
 fn a_dry_run_says_what_the_run_would_say() {
     let workplace = Workplace::new();
-    // Loose enough that proxies stray from their members.
-    let options = "{tiny} --cameras {tiny} --preset strong --placement mean --max-drift 0 --choose-by-views=false \
-                   --merge-pass 0.2,4,0.5,0.3";
+    // Proxies at the mean stray from their members as soon as no drift at all is allowed.
+    let options = "{tiny} --cameras {tiny} --merge-only --placement mean --max-drift 0 --merge-pass 0.2,4,0.5,0.3";
     let [dry, wet] = ["--dry-run", ""].map(|dry| workplace.summary(&format!("{options} {dry} -o out")));
     let notes = |summary: &Value| -> Vec<String> {
         let notes = summary["notes"].as_array().unwrap().iter().map(|note| note.as_str().unwrap().to_owned());
@@ -135,8 +135,8 @@ fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
             let arguments =
                 format!("demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} -o {output}");
             let read = reads_as_planned(&workplace, &arguments);
-            // What fits into memory is read once.
-            assert!(k > 0 || read <= 1.0, "{preset}: {read}");
+            // What fits into memory is read once; two threads may begin the same tile at once.
+            assert!(k > 0 || read <= 1.1, "{preset}: {read}");
         }
     }
 }
