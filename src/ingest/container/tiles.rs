@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use gseq::{Encoding, TileFrames, TileId, Touched};
 
-use super::{Container, Scratch};
+use super::store::{Container, Scratch};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::pass::{BlockReader, Ids, Wanted};

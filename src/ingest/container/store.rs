@@ -1,0 +1,214 @@
+//! An open container: its columns, what is held of it, and what decoding takes.
+
+use std::ops::{Deref, DerefMut};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, OnceLock, PoisonError};
+
+use gseq::{Reader, TileBuffer, TileFrames, TileId, Touched};
+
+use super::held::HeldTiles;
+use crate::error::{Error, Result};
+use crate::model::{Columns, SequenceInfo, sh_coefficients};
+use crate::pass::Count;
+
+/// An open container with all columns of a Gaussian model.
+pub struct Container {
+    pub(super) path: PathBuf,
+    pub(super) reader: Reader,
+    pub(super) info: SequenceInfo,
+    /// Place of each column in the container, in the order of [`Columns::ALL`].
+    pub(super) places: Vec<(Columns, u32)>,
+    /// One for each thread at most, shared by all readers.
+    pub(super) scratch: Mutex<Vec<Scratch>>,
+    /// Made when the first tile may be held.
+    pub(super) held: OnceLock<HeldTiles>,
+    pub(super) states: Count,
+}
+
+/// What decoding a tile takes besides what is kept of it.
+#[derive(Default)]
+pub(super) struct Scratch {
+    pub(super) buffer: TileBuffer,
+    pub(super) frames: TileFrames,
+    /// One frame of the tile.
+    pub(super) plane: Vec<f32>,
+}
+
+/// A [`Scratch`] on loan.
+pub(super) struct Lent<'a> {
+    from: &'a Mutex<Vec<Scratch>>,
+    scratch: Scratch,
+}
+
+impl Container {
+    /// Opens the container and checks that it holds Gaussians: position, rotation, log_scale,
+    /// opacity_logit and sh, each of its width.
+    pub fn open(path: &Path) -> Result<Container> {
+        let reader = Reader::open(path)?;
+        let layout = reader.layout();
+        let mut places = Vec::new();
+        let mut sh_degree = 0;
+        for column in Columns::ALL.iter() {
+            let place = layout.column(column.name()).ok_or_else(|| {
+                let names: Vec<&str> = layout.columns.iter().map(|c| c.name.as_str()).collect();
+                Error::input(path, "columns", format!("a column {:?}", column.name()), format!("{names:?}"))
+            })?;
+            let width = layout.columns[place as usize].width as usize;
+            let legal = match column {
+                Columns::ROTATION => width == 4,
+                Columns::OPACITY => width == 1,
+                Columns::SH => (0..=3).any(|degree| width == 3 * sh_coefficients(degree)),
+                _ => width == 3,
+            };
+            if !legal {
+                let place = format!("column {:?}", column.name());
+                return Err(Error::input(
+                    path,
+                    place,
+                    "the width of its kind (see SPEC.md)",
+                    format!("{width} components"),
+                ));
+            }
+            if column == Columns::SH {
+                sh_degree = (0..=3).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
+            }
+            places.push((column, place));
+        }
+        let count = usize::try_from(layout.gaussians)
+            .ok()
+            .filter(|&count| count <= u32::MAX as usize)
+            .ok_or_else(|| Error::input(path, "header", "fewer than 2^32 Gaussians", layout.gaussians.to_string()))?;
+        let mut varying = Columns::NONE;
+        for &(column, place) in &places {
+            if reader.varies(place) {
+                varying = varying | column;
+            }
+        }
+        let info = SequenceInfo { count, times: reader.times().to_vec(), sh_degree, varying };
+        Ok(Container {
+            path: path.to_owned(),
+            reader,
+            info,
+            places,
+            scratch: Mutex::default(),
+            held: OnceLock::new(),
+            states: Count::default(),
+        })
+    }
+
+    /// The reader underneath.
+    pub fn reader(&self) -> &Reader {
+        &self.reader
+    }
+
+    /// Where it lies.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Hash that covers every tile, as 16 hexadecimal digits.
+    pub fn digest(&self) -> String {
+        format!("{:016x}", self.reader.digest())
+    }
+
+    /// Lets the values of tiles stay in memory once they have been decoded, in at most `bytes`, as long as this lives:
+    /// whoever reads them later does not read the file again. Nothing is held at first; more may be allowed at any time,
+    /// less has no effect. Values read are the same.
+    pub fn hold_decoded(&self, bytes: u64) {
+        let own = self.slots() as u64 * HeldTiles::BYTES_PER_SLOT;
+        if bytes > own {
+            self.held.get_or_init(|| HeldTiles::new(self.slots())).allow(bytes - own);
+        }
+    }
+
+    /// Bytes that holding every tile takes ([`Container::hold_decoded`]), at most: less where tiles of a column that
+    /// varies are constant.
+    pub fn decoded_bytes(&self) -> u64 {
+        let values = |&(column, _): &(Columns, u32)| {
+            let frames = if self.info.varying.contains(column) { self.info.times.len() } else { 1 };
+            (column.width(self.info.sh_degree) * frames) as u64 * self.info.count as u64
+        };
+        4 * self.places.iter().map(values).sum::<u64>() + self.slots() as u64 * HeldTiles::BYTES_PER_SLOT
+    }
+
+    /// Tiles that differ: of a column that does not vary those of one frame block.
+    pub(super) fn slots(&self) -> usize {
+        self.slot(self.places.len(), 0, 0)
+    }
+
+    /// Place among the tiles that differ of that of column `index` of `places`; of one more, their number.
+    pub(super) fn slot(&self, index: usize, gaussian_block: u32, frame_block: u32) -> usize {
+        let blocks = self.reader.layout().gaussian_blocks() as usize;
+        let rows = |column| if self.info.varying.contains(column) { self.reader.frame_blocks() as usize } else { 1 };
+        let before: usize = self.places[..index].iter().map(|&(column, _)| rows(column)).sum();
+        let varies = self.places.get(index).is_some_and(|&(column, _)| self.info.varying.contains(column));
+        (before + if varies { frame_block as usize } else { 0 }) * blocks + gaussian_block as usize
+    }
+
+    /// The values `[frames, width, len]` of a tile of column `index` of `places` (one frame of a constant tile), if they
+    /// are held or can be from now on.
+    pub(super) fn held(&self, index: usize, at: TileId) -> Result<Option<&[f32]>> {
+        let Some(held) = self.held.get() else { return Ok(None) };
+        held.get_or_decode(
+            self.slot(index, at.gaussian_block, at.frame_block),
+            || {
+                let info = self.reader.tile_info(at)?;
+                let frames = if info.constant { 1 } else { info.frames as usize };
+                let range = self.reader.layout().gaussian_range(at.gaussian_block);
+                let width = self.places[index].0.width(self.info.sh_degree);
+                Ok(frames * width * (range.end - range.start) as usize)
+            },
+            |values| {
+                let Scratch { buffer, frames, .. } = &mut *self.scratch();
+                let mut touched = Touched::default();
+                self.reader.load(at, buffer, frames, Some(&mut touched))?;
+                self.reader.read_frames(frames, values)?;
+                self.reader.release(&mut touched);
+                Ok(())
+            },
+        )
+    }
+
+    /// Whether a tile of column `index` of `places` is held.
+    pub(super) fn is_held(&self, index: usize, gaussian_block: u32, frame_block: u32) -> bool {
+        self.held.get().is_some_and(|held| held.has(self.slot(index, gaussian_block, frame_block)))
+    }
+
+    /// The tiles of `columns` that would have to be read.
+    pub(super) fn unheld(
+        &self,
+        columns: Columns,
+        gaussian_block: u32,
+        frame_block: u32,
+    ) -> impl Iterator<Item = TileId> {
+        let needed = move |&(index, &(column, _)): &(usize, &(Columns, u32))| {
+            columns.contains(column) && !self.is_held(index, gaussian_block, frame_block)
+        };
+        let at = move |(_, &(_, column)): (usize, &(Columns, u32))| TileId { column, gaussian_block, frame_block };
+        self.places.iter().enumerate().filter(needed).map(at)
+    }
+
+    pub(super) fn scratch(&self) -> Lent<'_> {
+        let scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        Lent { from: &self.scratch, scratch: scratch.unwrap_or_default() }
+    }
+}
+
+impl Deref for Lent<'_> {
+    type Target = Scratch;
+    fn deref(&self) -> &Scratch {
+        &self.scratch
+    }
+}
+
+impl DerefMut for Lent<'_> {
+    fn deref_mut(&mut self) -> &mut Scratch {
+        &mut self.scratch
+    }
+}
+
+impl Drop for Lent<'_> {
+    fn drop(&mut self) {
+        self.from.lock().unwrap_or_else(PoisonError::into_inner).push(std::mem::take(&mut self.scratch));
+    }
+}
