@@ -96,14 +96,14 @@ fn every_field_of_a_summary_is_described() {
 #[test]
 fn a_dry_run_says_what_the_run_would_say() {
     let workplace = Workplace::new();
-    // Proxies at the mean stray from their members as soon as no drift at all is allowed.
-    let options = "{tiny} --cameras {tiny} --merge-only --placement mean --max-drift 0 --merge-pass 0.2,4,0.5,0.3";
+    // Proxies are solved, and checked along the frames, whether they are written or not.
+    let options = "{tiny} --cameras {tiny} --merge-only --placement mean --merge-pass 0.2,4,0.5,0.3";
     let [dry, wet] = ["--dry-run", ""].map(|dry| workplace.summary(&format!("{options} {dry} -o out")));
     let notes = |summary: &Value| -> Vec<String> {
         let notes = summary["notes"].as_array().unwrap().iter().map(|note| note.as_str().unwrap().to_owned());
         notes.filter(|note| !note.contains("dry run") && !note.contains("left out")).collect()
     };
-    assert!(notes(&wet).iter().any(|note| note.contains("strayed")), "{:?}", notes(&wet));
+    assert!(dry["merge"]["deviation"].as_f64().is_some_and(|deviation| deviation > 0.0), "{}", dry["merge"]);
     assert_eq!(notes(&dry), notes(&wet));
     assert_eq!(dry["merge"], wet["merge"]);
     assert_eq!(dry["left_out"], wet["left_out"]);
@@ -124,7 +124,7 @@ fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 3000 --frames 64 -o demo");
     for preset in ["default", "paper", "gentle", "strong"] {
-        for (k, options) in ["", "--memory 40MiB", "--merge-only --memory 44MiB", "--target-ratio 0.2 --memory 44MiB"]
+        for (k, options) in ["", "--memory 48MiB", "--merge-only --memory 48MiB", "--target-ratio 0.2 --memory 48MiB"]
             .iter()
             .enumerate()
         {

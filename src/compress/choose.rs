@@ -11,7 +11,7 @@ use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
 use crate::model::{Columns, Gaussians};
-use crate::pass::{BlockReader, FrameSource, Wanted};
+use crate::pass::{FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::recipe::{self, StaticTerm};
 use crate::reduction::Reduction;
@@ -181,14 +181,22 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u3
     let wanted = Wanted::of(pictures.iter().map(|&(frame, _)| frame)).holding(scene.limits.frames_held);
     let open = |source| open_all(source, Columns::ALL, &wanted);
     let mut of_source = open(source)?;
-    let mut of_results: Vec<Option<Box<dyn BlockReader + '_>>> =
-        results.iter().map(|result| result.as_deref().map(open).transpose()).collect::<Result<_>>()?;
-    let (mut original, mut state) = (Gaussians::zeros(0, sh_degree), Gaussians::zeros(0, sh_degree));
+    let mut of_results = Vec::with_capacity(results.len());
+    for result in &results {
+        of_results.push(match result.as_deref() {
+            Some(result) => Some((result.info().varying, open(result)?, Gaussians::zeros(0, sh_degree))),
+            None => None,
+        });
+    }
+    let mut original = Gaussians::zeros(0, sh_degree);
+    // What does not vary is read once.
+    let mut known = false;
+    let asked = |varying, known: bool| if known { varying } else { Columns::ALL };
     let mut sums = vec![0.0; alternatives.len()];
     for of_frame in pictures.chunk_by(|a, b| a.0 == b.0).flat_map(|of_frame| of_frame.chunks(AT_ONCE)) {
         let frame = of_frame[0].0;
         let camera = |index: u32| &scene.schedule.cameras[index as usize];
-        of_source.read(frame, Columns::ALL, &mut original)?;
+        of_source.read(frame, asked(source.info().varying, known), &mut original)?;
         let expected: Vec<Image> =
             of_frame.iter().map(|&(_, index)| render(&original, camera(index), background)).collect();
         let compare = |state: &Gaussians| -> f64 {
@@ -202,11 +210,12 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u3
             *sum += compare(&original.pick(&other.reduction.kept));
         }
         for (result, sum) in of_results.iter_mut().zip(&mut sums) {
-            if let Some(result) = result {
-                result.read(frame, Columns::ALL, &mut state)?;
-                *sum += compare(&state);
+            if let Some((varying, reader, state)) = result {
+                reader.read(frame, asked(*varying, known), state)?;
+                *sum += compare(state);
             }
         }
+        known = true;
     }
     Ok(sums.into_iter().map(|sum| sum / pictures.len().max(1) as f64).collect())
 }

@@ -112,10 +112,12 @@ impl Refit {
             let mut state = Gaussians::zeros(0, scene.source().info().sh_degree);
             let colors = equations.solve(self.ridge, ITERATIONS, |see| {
                 let mut reader = open(scene, &*result, unkept.iter().map(|&(frame, _)| frame))?;
+                let mut want = Columns::ALL;
                 for of_frame in unkept.chunk_by(|a, b| a.0 == b.0) {
                     let cameras: Vec<&Camera> =
                         of_frame.iter().map(|&(_, camera)| &scene.schedule.cameras[camera as usize]).collect();
-                    reader.read(of_frame[0].0, Columns::ALL, &mut state)?;
+                    reader.read(of_frame[0].0, want, &mut state)?;
+                    want = result.info().varying;
                     see(&state, &cameras);
                 }
                 Ok::<_, crate::error::Error>(())
@@ -172,12 +174,15 @@ fn look(
     let (mut of_result, mut of_source) = (open(scene, result, frames())?, open(scene, scene.source(), frames())?);
     let sh_degree = scene.source().info().sh_degree;
     let (mut state, mut original) = (Gaussians::zeros(0, sh_degree), Gaussians::zeros(0, sh_degree));
+    // What does not vary is read once.
+    let mut wants = [Columns::ALL; 2];
     let numbered: Vec<(usize, usize, u32)> =
         pictures.iter().enumerate().map(|(k, &(frame, camera))| (k, frame, camera)).collect();
     for of_frame in numbered.chunk_by(|a, b| a.1 == b.1) {
         let frame = of_frame[0].1;
-        of_result.read(frame, Columns::ALL, &mut state)?;
-        of_source.read(frame, Columns::ALL, &mut original)?;
+        of_result.read(frame, wants[0], &mut state)?;
+        of_source.read(frame, wants[1], &mut original)?;
+        wants = [result.info().varying, scene.source().info().varying];
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         for &(k, _, index) in of_frame {
             let mut picture = render(&original, camera(index), background);
@@ -200,8 +205,10 @@ fn quality(scene: &Scene, result: &dyn FrameSource, tests: &[Test], change: &[[f
     let mut sums = [0.0; 2];
     let mut reader = open(scene, result, tests.iter().map(|test| test.frame))?;
     let mut before = Gaussians::zeros(0, scene.source().info().sh_degree);
+    let mut want = Columns::ALL;
     for of_frame in tests.chunk_by(|a, b| a.frame == b.frame) {
-        reader.read(of_frame[0].frame, Columns::ALL, &mut before)?;
+        reader.read(of_frame[0].frame, want, &mut before)?;
+        want = result.info().varying;
         let mut after = before.clone();
         recolor(&mut after, change);
         for test in of_frame {

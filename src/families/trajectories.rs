@@ -132,7 +132,7 @@ pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, h
     let mut reader = open_all(source, Columns::ALL, &Wanted::every().holding(held))?;
     let mut state = Gaussians::zeros(0, info.sh_degree);
     for frame in 0..info.times.len() {
-        reader.read(frame, Columns::ALL, &mut state)?;
+        reader.read(frame, if frame == 0 { Columns::ALL } else { info.varying }, &mut state)?;
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
             _ => path.join(format!("frame_{frame:05}.ply")),

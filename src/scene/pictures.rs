@@ -133,10 +133,13 @@ pub fn for_each_batch<const S: usize>(
         readers.push(open_all(source, Columns::ALL, &wanted)?);
     }
     let mut states: [Gaussians; S] = sources.map(|source| Gaussians::zeros(0, source.info().sh_degree));
+    // What does not vary is read once.
+    let mut wants = [Columns::ALL; S];
     for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
-        for (state, reader) in states.iter_mut().zip(&mut readers) {
-            reader.read(frame[0].frame, Columns::ALL, state)?;
+        for ((state, reader), want) in states.iter_mut().zip(&mut readers).zip(wants) {
+            reader.read(frame[0].frame, want, state)?;
         }
+        wants = sources.map(|source| source.info().varying);
         for batch in frame.chunks(rayon::current_num_threads().min(limits.pictures_together)) {
             visit(&states, batch)?;
         }

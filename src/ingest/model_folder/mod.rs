@@ -14,7 +14,8 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, Count, FrameSource, Ids, Reads};
+use crate::pass::{BlockReader, Count, FrameSource, Ids, Reads, Wanted};
+use crate::stream::gather;
 
 use super::cfg_args::ModelConfig;
 use super::digest::hash_file;
@@ -216,8 +217,29 @@ impl FrameSource for ModelFolder {
         }))
     }
 
+    /// Nothing is decoded together, so that nothing is gained by what readers of all Gaussians would keep.
+    fn open_all(&self, _: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        Some(Ok(Box::new(WholeModel { model: self, ids: (0..self.info.count as u32).collect() })))
+    }
+
     fn reads(&self) -> Reads {
         Reads { states: self.states.get(), ..Reads::default() }
+    }
+}
+
+/// Reads all Gaussians of a model, each block by a reader that lasts for one frame.
+struct WholeModel<'a> {
+    model: &'a ModelFolder,
+    ids: Vec<u32>,
+}
+
+impl BlockReader for WholeModel<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        // What is replaced goes first.
+        out.columns_mut(want).for_each(|column| *column = Column::default());
+        let mut found = gather(self.model, &self.ids, frame, want)?;
+        out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(to, from)| std::mem::swap(to, from));
+        Ok(())
     }
 }
 
