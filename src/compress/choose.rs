@@ -18,7 +18,7 @@ use crate::reduction::Reduction;
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::scene::pictures::spread;
-use crate::stream::open_all;
+use crate::stream::States;
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -169,8 +169,7 @@ impl Choose {
 
 /// Mean PSNR of every alternative against the original over `pictures`, dB.
 fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u32)]) -> Result<Vec<f64>> {
-    let (source, background) = (scene.source(), scene.background);
-    let sh_degree = source.info().sh_degree;
+    let background = scene.background;
     let results: Vec<Option<Box<dyn FrameSource + '_>>> = alternatives
         .iter()
         .map(|other| match other.reduction.clusters.is_empty() {
@@ -179,26 +178,17 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u3
         })
         .collect::<Result<_>>()?;
     let wanted = Wanted::of(pictures.iter().map(|&(frame, _)| frame)).holding(scene.limits.frames_held);
-    let open = |source| open_all(source, Columns::ALL, &wanted);
-    let mut of_source = open(source)?;
-    let mut of_results = Vec::with_capacity(results.len());
-    for result in &results {
-        of_results.push(match result.as_deref() {
-            Some(result) => Some((result.info().varying, open(result)?, Gaussians::zeros(0, sh_degree))),
-            None => None,
-        });
-    }
-    let mut original = Gaussians::zeros(0, sh_degree);
-    // What does not vary is read once.
-    let mut known = false;
-    let asked = |varying, known: bool| if known { varying } else { Columns::ALL };
+    let open = |source| States::open(source, &wanted);
+    let mut of_source = open(scene.source())?;
+    let mut of_results: Vec<Option<States<'_>>> =
+        results.iter().map(|result| result.as_deref().map(open).transpose()).collect::<Result<_>>()?;
     let mut sums = vec![0.0; alternatives.len()];
     for of_frame in pictures.chunk_by(|a, b| a.0 == b.0).flat_map(|of_frame| of_frame.chunks(AT_ONCE)) {
         let frame = of_frame[0].0;
         let camera = |index: u32| &scene.schedule.cameras[index as usize];
-        of_source.read(frame, asked(source.info().varying, known), &mut original)?;
+        let original = of_source.at(frame)?;
         let expected: Vec<Image> =
-            of_frame.iter().map(|&(_, index)| render(&original, camera(index), background)).collect();
+            of_frame.iter().map(|&(_, index)| render(original, camera(index), background)).collect();
         let compare = |state: &Gaussians| -> f64 {
             let of_picture = |(&(_, index), expected): (&(usize, u32), &Image)| {
                 psnr(&render(state, camera(index), background), expected)
@@ -210,12 +200,10 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u3
             *sum += compare(&original.pick(&other.reduction.kept));
         }
         for (result, sum) in of_results.iter_mut().zip(&mut sums) {
-            if let Some((varying, reader, state)) = result {
-                reader.read(frame, asked(*varying, known), state)?;
-                *sum += compare(state);
+            if let Some(states) = result {
+                *sum += compare(states.at(frame)?);
             }
         }
-        known = true;
     }
     Ok(sums.into_iter().map(|sum| sum / pictures.len().max(1) as f64).collect())
 }

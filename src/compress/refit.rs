@@ -8,8 +8,8 @@ use super::score::{Scored, scored};
 use crate::budget::{Need, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
-use crate::model::{Camera, Columns, Gaussians, SH_C0};
-use crate::pass::{BlockReader, FrameSource, Wanted};
+use crate::model::{Camera, Columns, SH_C0};
+use crate::pass::{FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::recipe;
 use crate::reduction::Reduction;
@@ -17,7 +17,7 @@ use crate::refit::{self, Refit as Equations};
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::scene::pictures::spread;
-use crate::stream::{open_all, recolor};
+use crate::stream::{States, recolor};
 
 /// What the stage is called.
 const NAME: &str = "refit";
@@ -109,16 +109,12 @@ impl Refit {
             let mut equations = Equations::new(fixed, kept);
             let tests = look(scene, &*result, &pictures, &mut equations)?;
             let unkept: Vec<(usize, u32)> = fitted(&pictures).skip(kept).collect();
-            let mut state = Gaussians::zeros(0, scene.source().info().sh_degree);
             let colors = equations.solve(self.ridge, ITERATIONS, |see| {
-                let mut reader = open(scene, &*result, unkept.iter().map(|&(frame, _)| frame))?;
-                let mut want = Columns::ALL;
+                let mut states = open(scene, &*result, unkept.iter().map(|&(frame, _)| frame))?;
                 for of_frame in unkept.chunk_by(|a, b| a.0 == b.0) {
                     let cameras: Vec<&Camera> =
                         of_frame.iter().map(|&(_, camera)| &scene.schedule.cameras[camera as usize]).collect();
-                    reader.read(of_frame[0].0, want, &mut state)?;
-                    want = result.info().varying;
-                    see(&state, &cameras);
+                    see(states.at(of_frame[0].0)?, &cameras);
                 }
                 Ok::<_, crate::error::Error>(())
             })?;
@@ -140,13 +136,9 @@ impl Refit {
     }
 }
 
-/// A reader of all of `source`, which is the scene's or made of it, at `frames`.
-fn open<'a>(
-    scene: &Scene,
-    source: &'a dyn FrameSource,
-    frames: impl IntoIterator<Item = usize>,
-) -> Result<Box<dyn BlockReader + 'a>> {
-    open_all(source, Columns::ALL, &Wanted::of(frames).holding(scene.limits.frames_held))
+/// The states of `source`, which is the scene's or made of it, at `frames`.
+fn open<'a>(scene: &Scene, source: &'a dyn FrameSource, frames: impl IntoIterator<Item = usize>) -> Result<States<'a>> {
+    States::open(source, &Wanted::of(frames).holding(scene.limits.frames_held))
 }
 
 /// Whether picture `k` of `count` is for the test; a few pictures spare one too.
@@ -172,29 +164,23 @@ fn look(
     let mut tests = Vec::new();
     let frames = || pictures.iter().map(|&(frame, _)| frame);
     let (mut of_result, mut of_source) = (open(scene, result, frames())?, open(scene, scene.source(), frames())?);
-    let sh_degree = scene.source().info().sh_degree;
-    let (mut state, mut original) = (Gaussians::zeros(0, sh_degree), Gaussians::zeros(0, sh_degree));
-    // What does not vary is read once.
-    let mut wants = [Columns::ALL; 2];
     let numbered: Vec<(usize, usize, u32)> =
         pictures.iter().enumerate().map(|(k, &(frame, camera))| (k, frame, camera)).collect();
     for of_frame in numbered.chunk_by(|a, b| a.1 == b.1) {
         let frame = of_frame[0].1;
-        of_result.read(frame, wants[0], &mut state)?;
-        of_source.read(frame, wants[1], &mut original)?;
-        wants = [result.info().varying, scene.source().info().varying];
+        let (state, original) = (of_result.at(frame)?, of_source.at(frame)?);
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         for &(k, _, index) in of_frame {
-            let mut picture = render(&original, camera(index), background);
+            let mut picture = render(original, camera(index), background);
             if is_test(k, pictures.len()) {
                 tests.push(Test { frame, camera: index, original: picture });
                 continue;
             }
-            let now = render(&state, camera(index), background);
+            let now = render(state, camera(index), background);
             picture.data.iter_mut().zip(&now.data).for_each(|(lack, now)| *lack -= now);
             lacks.push((camera(index), picture));
         }
-        equations.add(&state, &lacks);
+        equations.add(state, &lacks);
     }
     Ok(tests)
 }
@@ -203,17 +189,14 @@ fn look(
 fn quality(scene: &Scene, result: &dyn FrameSource, tests: &[Test], change: &[[f32; 3]]) -> Result<[f64; 2]> {
     let background = scene.background;
     let mut sums = [0.0; 2];
-    let mut reader = open(scene, result, tests.iter().map(|test| test.frame))?;
-    let mut before = Gaussians::zeros(0, scene.source().info().sh_degree);
-    let mut want = Columns::ALL;
+    let mut states = open(scene, result, tests.iter().map(|test| test.frame))?;
     for of_frame in tests.chunk_by(|a, b| a.frame == b.frame) {
-        reader.read(of_frame[0].frame, want, &mut before)?;
-        want = result.info().varying;
+        let before = states.at(of_frame[0].frame)?;
         let mut after = before.clone();
         recolor(&mut after, change);
         for test in of_frame {
             let camera = &scene.schedule.cameras[test.camera as usize];
-            for (sum, state) in sums.iter_mut().zip([&before, &after]) {
+            for (sum, state) in sums.iter_mut().zip([before, &after]) {
                 *sum += psnr(&render(state, camera, background), &test.original);
             }
         }

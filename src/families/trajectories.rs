@@ -15,7 +15,7 @@ use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::reduction::Reduction;
-use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, open_all};
+use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, States};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -129,15 +129,13 @@ pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, h
         return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
     }
     let progress = Progress::new("emit", "frames", info.times.len() as u64);
-    let mut reader = open_all(source, Columns::ALL, &Wanted::every().holding(held))?;
-    let mut state = Gaussians::zeros(0, info.sh_degree);
+    let mut states = States::open(source, &Wanted::every().holding(held))?;
     for frame in 0..info.times.len() {
-        reader.read(frame, if frame == 0 { Columns::ALL } else { info.varying }, &mut state)?;
         let file = match kind {
             OutputKind::Ply => path.to_owned(),
             _ => path.join(format!("frame_{frame:05}.ply")),
         };
-        write_inria(&state, &[], &file)?;
+        write_inria(states.at(frame)?, &[], &file)?;
         progress.advance(1);
     }
     Ok(())

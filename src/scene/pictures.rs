@@ -7,7 +7,7 @@ use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
 use crate::pass::{FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::render;
-use crate::stream::open_all;
+use crate::stream::States;
 
 /// The part of a rig's pictures that is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -125,23 +125,19 @@ pub fn for_each_batch<const S: usize>(
     sources: [&dyn FrameSource; S],
     pictures: &[Picture],
     limits: Limits,
-    mut visit: impl FnMut(&[Gaussians; S], &[Picture]) -> Result<()>,
+    mut visit: impl FnMut([&Gaussians; S], &[Picture]) -> Result<()>,
 ) -> Result<()> {
     let wanted = Wanted::of(pictures.iter().map(|picture| picture.frame)).holding(limits.frames_held);
-    let mut readers = Vec::with_capacity(S);
+    let mut all = Vec::with_capacity(S);
     for source in sources {
-        readers.push(open_all(source, Columns::ALL, &wanted)?);
+        all.push(States::open(source, &wanted)?);
     }
-    let mut states: [Gaussians; S] = sources.map(|source| Gaussians::zeros(0, source.info().sh_degree));
-    // What does not vary is read once.
-    let mut wants = [Columns::ALL; S];
     for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
-        for ((state, reader), want) in states.iter_mut().zip(&mut readers).zip(wants) {
-            reader.read(frame[0].frame, want, state)?;
+        for states in &mut all {
+            states.at(frame[0].frame)?;
         }
-        wants = sources.map(|source| source.info().varying);
         for batch in frame.chunks(rayon::current_num_threads().min(limits.pictures_together)) {
-            visit(&states, batch)?;
+            visit(std::array::from_fn(|k| all[k].now()), batch)?;
         }
     }
     Ok(())

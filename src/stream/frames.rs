@@ -75,7 +75,7 @@ impl BlockReader for Frames<'_> {
 /// A reader of the columns `columns` of all Gaussians of a source at the frames `wanted`, to be kept open over them.
 ///
 /// Memory: that of [`Frames`], or of the source's own ([`FrameSource::open_all`]).
-pub fn open_all<'a>(
+pub(super) fn open_all<'a>(
     source: &'a dyn FrameSource,
     columns: Columns,
     wanted: &Wanted,

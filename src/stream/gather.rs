@@ -1,10 +1,11 @@
 //! The state of many Gaussians at one frame, read in blocks on all threads. Whoever reads more than a frame keeps
-//! readers open instead ([`super::Frames`], [`super::open_all`]), so that no tile is decoded for each.
+//! readers open instead ([`super::Frames`], [`super::States`]), so that no tile is decoded for each.
 
 use rayon::prelude::*;
 
+use super::BLOCK;
+use super::frames::open_all;
 use super::parts::Parts;
-use super::{BLOCK, open_all};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids, Wanted};

@@ -14,10 +14,11 @@ mod recolored;
 mod removal;
 mod scan;
 mod stages;
+mod states;
 mod trajectories;
 
 pub use contribution::{Looking, Seen, visible_contribution};
-pub use frames::{Frames, open_all};
+pub use frames::Frames;
 pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};
@@ -26,6 +27,7 @@ pub use progress::{Mode, Progress, begin_run};
 pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;
 pub use scan::{RunningScan, Scanned, scan};
+pub use states::States;
 
 /// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.
 /// Results do not depend on it.

@@ -198,7 +198,7 @@ impl SideBySide {
         for_each_batch(self.sources(), &chosen, self.scene.limits, |states, batch| {
             for picture in batch {
                 let taken = self.take(picture, states)?;
-                found.push(see(places[found.len()], &states[0], &self.scene.rig.cameras[picture.camera], taken));
+                found.push(see(places[found.len()], states[0], &self.scene.rig.cameras[picture.camera], taken));
             }
             Ok(())
         })?;
@@ -234,7 +234,7 @@ impl SideBySide {
                 .map(|picture| {
                     let taken = self.take(picture, states)?;
                     let scores = taken.scores(before.get(&picture.view), self.flip);
-                    let seen = observe(&states[0], &self.scene.rig.cameras[picture.camera], &taken);
+                    let seen = observe(states[0], &self.scene.rig.cameras[picture.camera], &taken);
                     progress.advance(1);
                     Ok((taken, scores, seen))
                 })
@@ -253,7 +253,7 @@ impl SideBySide {
         Ok((all, observed))
     }
 
-    fn take(&self, picture: &Picture, [original, compressed]: &[Gaussians; 2]) -> Result<Taken> {
+    fn take(&self, picture: &Picture, [original, compressed]: [&Gaussians; 2]) -> Result<Taken> {
         let camera = &self.scene.rig.cameras[picture.camera];
         let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
         let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
