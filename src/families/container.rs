@@ -1,17 +1,11 @@
 //! Containers (`.gseq`) as a family.
 
-use std::path::{Path, PathBuf};
-
 use gseq::{Encoding, Reader, TileId};
 
 use super::family::{ColumnInfo, Entry, Family, Residence, Timing, bytes_of};
-use super::trajectories::{check_output, reduced_trajectories, write_trajectories};
-use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::pass::FrameSource;
-use crate::plan::Limits;
-use crate::reduction::Reduction;
 
 /// A container.
 pub(super) const ENTRY: Entry = Entry {
@@ -38,7 +32,7 @@ impl Family for Container {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of([&PathBuf::from(self.path())])
+        bytes_of([self.path()])
     }
 
     fn residence(&self) -> Residence {
@@ -66,23 +60,6 @@ impl Family for Container {
 
     fn columns(&self) -> Result<Vec<ColumnInfo>> {
         columns(self.reader())
-    }
-
-    fn own_output(&self) -> OutputKind {
-        OutputKind::PlySequence
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        check_output(self.info().times.len(), kind, path)
-    }
-
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(reduced_trajectories(self, reduction))
-    }
-
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
-        write_trajectories(self, reduction, kind, path, limits)?;
-        Ok(Vec::new())
     }
 }
 

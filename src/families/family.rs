@@ -1,10 +1,11 @@
 //! What a kind of input can do.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::Serialize;
 
+use super::trajectories::{OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -15,6 +16,9 @@ use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 
 /// An open input of some kind.
+///
+/// What has a body here is right for explicit trajectories, of which each state stands in every frame; a family whose
+/// frames follow from raw parameters has its own.
 pub trait Family: Send + Sync {
     /// What it is, for people.
     fn kind(&self) -> &'static str;
@@ -81,13 +85,17 @@ pub trait Family: Send + Sync {
     }
 
     /// The kind of a result to which neither the user nor its name gives one.
-    fn own_output(&self) -> OutputKind;
+    fn own_output(&self) -> OutputKind {
+        OWN_OUTPUT
+    }
 
     /// Confirms that a result can be of `kind`, written to `path`.
     ///
     /// # Errors
     /// A kind that this input cannot be written as, naming those that it can.
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()>;
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        check_output(self.source().info().times.len(), kind, path)
+    }
 
     /// Raw parameters of the proxies that `clusters` become, compared at `reference`. A family without raw
     /// parameters has nothing to solve: its proxies follow from their members frame by frame.
@@ -103,14 +111,19 @@ pub trait Family: Send + Sync {
     ///
     /// # Errors
     /// A field that cannot be evaluated.
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>>;
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(reduced_trajectories(self.source(), reduction))
+    }
 
     /// Writes what `reduction` leaves to `path`, a new file or an empty folder; gives things a person should know.
     /// What waits in memory to be written keeps to `limits`.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>>;
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        write_trajectories(self.source(), reduction, kind, path, limits)?;
+        Ok(Vec::new())
+    }
 }
 
 /// Where frames get their times.
@@ -234,6 +247,6 @@ impl OpenOptions {
 }
 
 /// Sum of the sizes of files, bytes.
-pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a PathBuf>) -> Result<u64> {
+pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
     paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
 }

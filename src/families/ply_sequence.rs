@@ -2,12 +2,12 @@
 //!
 //! What is written back has the properties, comments and names that the files had.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
 use super::family::{Entry, Family, OpenOptions, Residence, Timing, bytes_of};
-use super::trajectories::{merged, reduced_trajectories, state_bytes, write_trajectories};
+use super::trajectories::{merged, state_bytes, write_trajectories};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
@@ -53,7 +53,7 @@ impl Family for PlySequence {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of(self.paths())
+        bytes_of(self.paths().iter().map(PathBuf::as_path))
     }
 
     fn residence(&self) -> Residence {
@@ -78,18 +78,6 @@ impl Family for PlySequence {
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
         Ok(Box::new(PlySequence::with_times(*self, times)?))
-    }
-
-    fn own_output(&self) -> OutputKind {
-        OutputKind::PlySequence
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        super::trajectories::check_output(self.info().times.len(), kind, path)
-    }
-
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(reduced_trajectories(self, reduction))
     }
 
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {

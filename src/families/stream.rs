@@ -12,17 +12,13 @@ use crossbeam_channel::bounded;
 use gseq::Compression;
 
 use super::family::{Family, Residence, Timing};
-use super::trajectories::{check_output, reduced_trajectories, write_trajectories};
 use crate::emit::atomic::ScratchFile;
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK};
-use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
 use crate::pass::FrameSource;
-use crate::plan::Limits;
-use crate::reduction::Reduction;
 use crate::stream::{HeldFrames, Progress};
 
 /// Most bytes of frames that are held together, if that is one frame at least.
@@ -94,23 +90,6 @@ impl Family for Streamed {
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn Family>> {
         Err(Error::usage("a frame stream says itself when its frames are"))
-    }
-
-    fn own_output(&self) -> OutputKind {
-        self.container.own_output()
-    }
-
-    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        check_output(self.container.info().times.len(), kind, path)
-    }
-
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(reduced_trajectories(&self.container, reduction))
-    }
-
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
-        write_trajectories(&self.container, reduction, kind, path, limits)?;
-        Ok(Vec::new())
     }
 }
 

@@ -20,6 +20,9 @@ use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, States};
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
 
+/// The kind of a result of explicit trajectories to which nothing else gives one.
+pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
+
 /// Bytes of the columns `of` of one Gaussian at one frame.
 pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {
     of.iter().map(|column| 4 * column.width(sh_degree) as u64).sum()

@@ -7,7 +7,7 @@ mod proxies;
 
 use std::fs::{self, File};
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::family::{Entry, Family, Residence, Timing, bytes_of};
 use super::trajectories::{state_bytes, write_sequence};
@@ -48,10 +48,9 @@ impl Family for ModelFolder {
 
     fn bytes(&self) -> Result<u64> {
         let paths = self.paths();
-        let training = [&paths.deformation_table, &paths.deformation_accum];
-        bytes_of(
-            [&paths.point_cloud, &paths.deformation, &paths.cfg_args].into_iter().chain(training.into_iter().flatten()),
-        )
+        let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
+        let all = [&paths.point_cloud, &paths.deformation, &paths.cfg_args].into_iter().chain(training);
+        bytes_of(all.map(PathBuf::as_path))
     }
 
     fn residence(&self) -> Residence {
