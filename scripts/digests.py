@@ -14,6 +14,7 @@ tables of one machine. --only WORD runs the cases whose names hold it. Standard 
 
 import argparse
 import hashlib
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -71,7 +72,7 @@ def cases(binary, data, scratch):
     bare = scratch / "bare"
     bare.mkdir()
     for part in ("cfg_args", "point_cloud"):
-        subprocess.run(["cp", "-r", str(small / part), str(bare)], check=True)
+        run(["cp", "-r", small / part, bare])
 
     yield "demo folder", lambda out: run([binary, "demo", "-o", out]), "demo"
     for model in models:
@@ -160,7 +161,7 @@ def main():
             changed += bool(differs)
             print(line + ("  DIFFERS" if differs else ""), flush=True)
             lines.append(line)
-            subprocess.run(["rm", "-rf", str(place)], check=True)
+            shutil.rmtree(place)
     if args.table:
         args.table.write_text("\n".join(lines) + "\n")
     if args.against:

@@ -13,6 +13,9 @@
 //!
 //! [`method`] derives what is computed.
 
+/// Program and version, by which results name what made them.
+pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
+
 pub mod budget;
 pub mod cli;
 pub mod compress;

@@ -1,4 +1,4 @@
-//! Norm, scores, thresholds and the kept set against method.md, section 2 to 4 written down plainly: sorted
+//! Norm, scores, thresholds and the kept set against method.md, sections 2 to 4 written down plainly: sorted
 //! values for percentiles, loops for sums, a sort for each stage.
 
 mod scene;

@@ -33,8 +33,6 @@ pub struct Job {
     pub refit: Option<Refit>,
     /// Writes.
     pub emit: Emit,
-    /// Exact size of the output, if asked for.
-    pub target: Option<usize>,
     has_cameras: bool,
 }
 
@@ -67,7 +65,6 @@ impl Job {
             refit: Refit::of(&recipe.refit).filter(|_| looks),
             emit: Emit::new(request, outlook.own_output, merges),
             measure,
-            target,
             has_cameras: outlook.has_cameras,
         })
     }

@@ -31,7 +31,8 @@ const NAME: &str = "merge";
 /// the ids while merging is tried on some of them.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<bool>();
 
-/// Sets of survivors that are tried at most until merging leaves the target: the bracket closes by the secant.
+/// Sets of survivors that are taken to be tried until merging leaves the target, to say how much is read: the bracket
+/// closes by the secant, mostly in fewer.
 const TRIALS: f64 = 16.0;
 
 /// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.

@@ -25,6 +25,7 @@ pub use job::Job;
 pub use record::{Record, Run};
 pub use request::{Only, Request, Target};
 
+use crate::TOOL;
 use crate::error::Result;
 use crate::recipe::Recipe;
 use crate::reduction::Reduction;
@@ -57,6 +58,7 @@ pub fn compress(request: &Request) -> Result<Summary> {
 /// Those of [`compress`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
     let job = Job::new(request, Outlook::of(scene))?;
+    job.emit.check(&[&scene.path])?;
     reduce(scene, &job, None, request, Journal::default())
 }
 
@@ -86,10 +88,9 @@ fn reduce(
     mut journal: Journal,
 ) -> Result<(Summary, Vec<Option<u32>>)> {
     scene.input.check_output(job.emit.kind, &request.output)?;
-    job.emit.check(&[&scene.path])?;
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.whole()?;
-    begin_run(&job.names());
+    let _numbered = begin_run(&job.names());
     let input = InputSummary::of(&*scene.input, &scene.path)?;
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;
@@ -100,7 +101,7 @@ fn reduce(
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
     if let Some(rounds) = &job.rounds {
-        let fewest = job.target.unwrap_or(scored.selection.counts.kept);
+        let fewest = job.prune.target.unwrap_or(scored.selection.counts.kept);
         ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
     }
     let survivors = job.prune.run(scene, &scored, &ranked, &mut journal)?;
@@ -125,7 +126,7 @@ fn reduce(
     let summarise = |journal: Journal, output_bytes: Option<u64>| Summary {
         schema: summary::SCHEMA,
         files: Vec::new(),
-        tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        tool: TOOL.to_owned(),
         cameras: CameraSummary::of(scene),
         gaussians: reduction.len(),
         output_bytes,

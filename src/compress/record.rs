@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::request::{Only, Request, Target};
 use super::score::UserOverrides;
+use crate::TOOL;
 use crate::emit::kind::OutputKind;
 use crate::model::Split;
 
@@ -86,7 +87,7 @@ impl Record {
             frames: input.frames,
             size: input.size,
         };
-        let tool = format!("splatsieve {}", env!("CARGO_PKG_VERSION"));
+        let tool = TOOL.to_owned();
         Record { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
     }
 

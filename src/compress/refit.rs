@@ -6,7 +6,7 @@
 use super::journal::Journal;
 use super::score::{Scored, scored};
 use crate::budget::{Need, Workload};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::metrics::psnr;
 use crate::model::{Camera, Columns, SH_C0};
 use crate::pass::{FrameSource, Wanted};
@@ -116,7 +116,7 @@ impl Refit {
                         of_frame.iter().map(|&(_, camera)| &scene.schedule.cameras[camera as usize]).collect();
                     see(states.at(of_frame[0].0)?, &cameras);
                 }
-                Ok::<_, crate::error::Error>(())
+                Ok::<_, Error>(())
             })?;
             drop(equations);
             let change: Vec<[f32; 3]> = colors.iter().map(|rgb| rgb.map(|x| (f64::from(x) / SH_C0) as f32)).collect();

@@ -11,7 +11,7 @@ use super::html::{bytes, count, escape, figure, percent};
 use super::run::Run;
 use super::shown::Shown;
 use super::trade_off;
-use crate::compress::summary::Summary;
+use crate::compress::summary::{Stage, Summary};
 use crate::verbs::evaluation::{Comparison, FrameMeans, Means, ViewMeans};
 
 const STYLE: &str = include_str!("page.css");
@@ -305,16 +305,12 @@ fn stages(run: &Run) -> String {
     out += &format!("<tr><th>together</th><td></td><td></td><th>{total:.2} s</th><td></td></tr>\n</table>\n");
     out += "<div class=\"charts\">\n";
     out += &figure_of("Time per stage", &stage_bars(summary, "seconds", |stage| Some(stage.seconds)));
-    let mib = |stage: &crate::compress::summary::Stage| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
+    let mib = |stage: &Stage| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
     out += &figure_of("Largest memory up to the end of each stage", &stage_bars(summary, "MiB", mib));
     out + "</div>\n"
 }
 
-fn stage_bars(
-    summary: &Summary,
-    label: &str,
-    value: impl Fn(&crate::compress::summary::Stage) -> Option<f64>,
-) -> String {
+fn stage_bars(summary: &Summary, label: &str, value: impl Fn(&Stage) -> Option<f64>) -> String {
     let bars = summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
     Bars { title: format!("{label} per stage"), label: label.to_owned(), bars }.svg()
 }

@@ -1,4 +1,4 @@
-//! Robust normalisation and scores (method.md, section 2 and 3).
+//! Robust normalisation and scores (method.md, sections 2 and 3).
 //!
 //! In: rows of statistics. Out: S, its static and dynamic parts, and these normalised. Memory: six
 //! f64 per Gaussian at most, and one sketch at a time. Source: "Temporally-Aware Pruning for Compact

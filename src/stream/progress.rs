@@ -25,10 +25,22 @@ pub enum Mode {
     Quiet,
 }
 
-/// Names the stages that a run is made of, in order: from now on a bar or line of one of them says `[k/n]`. An empty list
-/// ends that.
-pub fn begin_run(stages: &[&'static str]) {
+/// Names the stages that a run is made of, in order: as long as what it gives lives, a bar or line of one of them says
+/// `[k/n]`.
+pub fn begin_run(stages: &[&'static str]) -> RunOfStages {
     *STAGES.lock().unwrap_or_else(PoisonError::into_inner) = stages.to_vec();
+    RunOfStages(())
+}
+
+/// A run whose stages are numbered.
+#[must_use = "stages are numbered as long as this lives"]
+#[derive(Debug)]
+pub struct RunOfStages(());
+
+impl Drop for RunOfStages {
+    fn drop(&mut self) {
+        STAGES.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    }
 }
 
 /// Progress through `total` units of work, e.g. Gaussians × frames. Cheap to advance from any thread.

@@ -8,6 +8,7 @@ use std::path::Path;
 use gseq::{Compression, Reader, RecoverReport, VerifyReport};
 use serde::Serialize;
 
+use crate::TOOL;
 use crate::budget::{Need, Plan, Workload};
 use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
@@ -105,7 +106,7 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     let staged = StagedFolder::new(output, overwrite)?;
     write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
     let marker = serde_json::json!({
-        "tool": format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        "tool": TOOL,
         "input": InputSummary::of(&*opened.input, &input.path)?,
     });
     let path = staged.path().join(MARKER);

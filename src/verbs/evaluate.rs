@@ -11,6 +11,7 @@ use hashbrown::{HashMap, HashSet};
 use rayon::prelude::*;
 
 use super::evaluation::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
+use crate::TOOL;
 use crate::budget::{Budget, Need, Plan, Workload};
 use crate::compress::summary::CameraSummary;
 use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
@@ -162,7 +163,7 @@ impl SideBySide {
         let path =
             Both { original: scene.path.display().to_string(), compressed: self.compressed_path.display().to_string() };
         let evaluation = Evaluation {
-            tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+            tool: TOOL.to_owned(),
             path,
             count: Both { original: count(&*scene.input), compressed: count(&*self.compressed) },
             bytes: Both { original: scene.input.bytes()?, compressed: self.compressed.bytes()? },

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+use crate::TOOL;
 use crate::budget::{Need, Workload};
 use crate::compress::summary::{CameraSummary, InputSummary};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
@@ -92,7 +93,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         let name = |picture: &Picture| format!("{}.{}", picture.name(), format.extension());
         job.write(&chosen, |picture| staged.path().join(name(picture)))?;
         let marker = serde_json::json!({
-            "tool": format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+            "tool": TOOL,
             "input": InputSummary::of(&*scene.input, &scene.path)?,
             "cameras": CameraSummary {
                 origin: scene.rig.origin.clone(),

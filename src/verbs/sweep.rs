@@ -12,6 +12,7 @@ use std::time::Instant;
 use super::baseline::{Baseline, prune_by};
 use super::evaluate::{EvaluateOptions, evaluate};
 use super::trade_off::{Point, TradeOff};
+use crate::TOOL;
 use crate::budget::{peak_memory_bytes, reset_peak_memory};
 use crate::compress::{Only, Request, Target, compress};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
@@ -191,7 +192,7 @@ fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&train(&options.input))?;
     let name = if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" };
     let found = TradeOff {
-        tool: format!("splatsieve {}", env!("CARGO_PKG_VERSION")),
+        tool: TOOL.to_owned(),
         path: scene.path.display().to_string(),
         digest: scene.input.digest()?,
         gaussians: scene.source().info().count,
