@@ -65,10 +65,10 @@ fn deform(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("deform");
     group.throughput(Throughput::Elements(BLOCK as u64));
     for (name, field, want) in [
-        ("dnerf_all", field(64, 32, three), Columns::ALL),
+        ("dnerf_all", field(64, 32, three), Columns::all()),
         ("dnerf_position", field(64, 32, three), Columns::POSITION),
-        ("dynerf_all", field(128, 16, Columns::ALL), Columns::ALL),
-        ("dynerf_position_opacity", field(128, 16, Columns::ALL), Columns::POSITION | Columns::OPACITY),
+        ("dynerf_all", field(128, 16, Columns::all()), Columns::all()),
+        ("dynerf_position_opacity", field(128, 16, Columns::all()), Columns::POSITION | Columns::OPACITY),
     ] {
         let prepared = field.prepare(&position);
         let mut scratch = Scratch::default();

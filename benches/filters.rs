@@ -104,7 +104,7 @@ fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u3
 type Tiles = Vec<(Vec<u32>, usize)>;
 
 fn benches(criterion: &mut Criterion) {
-    let mut columns: Vec<(Columns, Tiles)> = Columns::ALL.iter().map(|column| (column, Vec::new())).collect();
+    let mut columns: Vec<(Columns, Tiles)> = Columns::all().iter().map(|column| (column, Vec::new())).collect();
     let names: Vec<String> = filters().map(|filter| filter.name()).collect();
     eprintln!("| scene | column | {} |\n|---|---|{}", names.join(" | "), "---|".repeat(names.len()));
     for (name, scene) in trajectories::scenes() {

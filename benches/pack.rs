@@ -38,7 +38,7 @@ fn write(scene: &HeldFrames, path: &Path, compression: Compression) {
 
 fn decode_all(reader: &Reader, varying: Columns, buffer: &mut TileBuffer) {
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
-        for (column, of) in Columns::ALL.iter().enumerate() {
+        for (column, of) in Columns::all().iter().enumerate() {
             if varying.contains(of) {
                 let at = TileId { column: column as u32, gaussian_block, frame_block: 0 };
                 black_box(reader.read_tile(at, buffer).unwrap().values());

@@ -49,7 +49,7 @@ fn projection(c: &mut Criterion) {
     let scan = Recipe::preset("default").unwrap().scan;
     let block = block();
     let mut group = c.benchmark_group("scan");
-    for (views, changed) in [(16, Columns::POSITION), (1, Columns::ALL)] {
+    for (views, changed) in [(16, Columns::POSITION), (1, Columns::all())] {
         let cameras = cameras(views);
         let schedule = Schedule { cameras: cameras.clone(), frames: vec![(0..views as u32).map(|v| (v, v)).collect()] };
         let plan = ScanPlan::new(&scan, &[0.0], &schedule).unwrap();

@@ -90,7 +90,7 @@ fn each_tile(reader: &Reader, varying: Columns, mut take: impl FnMut(&[f32])) {
     let mut buffer = TileBuffer::default();
     for gaussian_block in 0..reader.layout().gaussian_blocks() {
         for frame_block in 0..reader.frame_blocks() {
-            for (column, of) in Columns::ALL.iter().enumerate() {
+            for (column, of) in Columns::all().iter().enumerate() {
                 if frame_block == 0 || varying.contains(of) {
                     let at = TileId { column: column as u32, gaussian_block, frame_block };
                     take(reader.tile(at, &mut buffer).unwrap().values());
@@ -107,7 +107,7 @@ fn benches(criterion: &mut Criterion) {
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    let dynamic = Columns::ALL.without(Columns::SH);
+    let dynamic = Columns::all().difference(Columns::SH);
     for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
         for (name, varying) in [("position", Columns::POSITION), ("all_but_sh", dynamic)] {
             let source = Curves(SequenceInfo { count: GAUSSIANS, times: times.clone(), sh_degree: 0, varying });
@@ -192,7 +192,7 @@ impl Fed<'_> {
         let layout = reader.layout();
         let block = |id: usize, of: u32| (id / of as usize) as u32;
         let mut sum = 0;
-        for (column, _) in Columns::ALL.iter().enumerate().filter(|&(_, column)| want.contains(column)) {
+        for (column, _) in Columns::all().iter().enumerate().filter(|&(_, column)| want.contains(column)) {
             for gaussian_block in
                 block(gaussians.start, layout.gaussian_block)..=block(gaussians.end - 1, layout.gaussian_block)
             {
@@ -281,7 +281,7 @@ fn ways(criterion: &mut Criterion) {
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     // Not where temporary files may lie in memory.
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
-    let varying = Columns::ALL.without(Columns::SH);
+    let varying = Columns::all().difference(Columns::SH);
     let source = Curves(SequenceInfo { count: GAUSSIANS, times, sh_degree: 0, varying });
     for (kind, compression) in [("packed", Compression::Zstd(1)), ("raw", Compression::Raw)] {
         let path = folder.path().join(format!("{kind}.gseq"));
@@ -312,7 +312,7 @@ fn ways(criterion: &mut Criterion) {
 
 /// Every frame of raw tiles to the state of a caller.
 fn raw_frames(criterion: &mut Criterion, reader: &Reader, varying: Columns) {
-    let columns: Vec<(u32, usize)> = Columns::ALL
+    let columns: Vec<(u32, usize)> = Columns::all()
         .iter()
         .zip(0..)
         .filter(|&(column, _)| varying.contains(column))

@@ -91,7 +91,7 @@ impl Workload {
 
     /// Of no Gaussians.
     pub fn nothing() -> Workload {
-        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Columns::NONE };
+        let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Columns::empty() };
         Workload::new(&info, Residence::of_tiles(0))
     }
 
@@ -145,7 +145,7 @@ impl Workload {
 
     /// One block of each thread on its way from a reader, and what decoding it takes.
     pub fn arriving(&self) -> Part {
-        let block = BLOCK as u64 * (self.state(Columns::ALL) + self.input.reader);
+        let block = BLOCK as u64 * (self.state(Columns::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
@@ -153,7 +153,7 @@ impl Workload {
     fn decoding(&self) -> u64 {
         let Residence { frame_block, gaussian_block, .. } = self.input;
         let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
-        let largest = Columns::ALL.iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
+        let largest = Columns::all().iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
     }
 
@@ -175,7 +175,7 @@ impl Workload {
     /// Buffers of a container, or of a frame's file, in the making.
     pub fn writing(&self) -> Vec<Part> {
         let varying = FRAME_BLOCK as u64 * self.state(self.varying);
-        let block = GAUSSIAN_BLOCK as u64 * (2 * self.state(Columns::ALL) + 3 * varying + self.input.reader);
+        let block = GAUSSIAN_BLOCK as u64 * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }
 
@@ -214,7 +214,7 @@ impl Workload {
 
     /// What a container knows while it is written.
     fn written_index(&self) -> u64 {
-        let slots = Columns::ALL.iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
+        let slots = Columns::all().iter().count() as u64 * self.gaussians.div_ceil(GAUSSIAN_BLOCK as u64);
         PER_SLOT * slots + PER_WRITTEN_FRAME * self.frames
     }
 }

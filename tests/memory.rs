@@ -29,7 +29,12 @@ struct Restless(SequenceInfo);
 impl Restless {
     fn new() -> Self {
         let times = (0..FRAMES).map(|t| t as f64).collect();
-        Restless(SequenceInfo { count: GAUSSIANS, times, sh_degree: 1, varying: Columns::ALL.without(Columns::SH) })
+        Restless(SequenceInfo {
+            count: GAUSSIANS,
+            times,
+            sh_degree: 1,
+            varying: Columns::all().difference(Columns::SH),
+        })
     }
 }
 

@@ -136,8 +136,8 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
         let mut nodes = whole.frames[whole.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
         for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
             let members = weighted(scored, group);
-            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge, Columns::ALL).write(
-                Columns::ALL,
+            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge, Columns::all()).write(
+                Columns::all(),
                 node,
                 &mut nodes,
             );
@@ -236,7 +236,7 @@ fn proxies_are_solved_at_their_leaders(
     let at_reference = &whole.frames[whole.reference];
     for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
         let leader = group[0];
-        let merged = merge_state(&weighted(scored, group), at_reference, leader as u32, merge, Columns::ALL);
+        let merged = merge_state(&weighted(scored, group), at_reference, leader as u32, merge, Columns::all());
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
         // (property, merged state, state of the leader), then the state found in the result.
         let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();

@@ -40,7 +40,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     for start in (0..COUNT).step_by(1024) {
         let mut reader = container.open(Ids::Range(start..COUNT.min(start + 1024))).unwrap();
         for frame in 0..FRAMES {
-            reader.read(frame, if frame == 0 { Columns::ALL } else { varying }, &mut state).unwrap();
+            reader.read(frame, if frame == 0 { Columns::all() } else { varying }, &mut state).unwrap();
         }
         most = most.max(status("RssFile:"));
     }

@@ -50,7 +50,7 @@ fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Containe
 /// Values of the scene at `frame` as float32 files, one per column, Gaussian after Gaussian.
 fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
     let state = state(scene, frame);
-    for column in Columns::ALL.iter() {
+    for column in Columns::all().iter() {
         let values = state.column(column);
         let bytes: Vec<u8> = (0..values.len())
             .flat_map(|i| (0..values.width()).flat_map(move |c| values.plane(c)[i].to_le_bytes()))
@@ -224,7 +224,7 @@ fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again(
     let again = packed(&workplace, &mut exporter(&["500", "70"]), "b.gseq");
     let info = found.info();
     assert_eq!((info.count, info.times.len(), info.sh_degree), (500, 70, 3));
-    assert_eq!(info.varying, Columns::ALL.without(Columns::SH));
+    assert_eq!(info.varying, Columns::all().difference(Columns::SH));
     // A period apart the curves are where they were, but for the noise.
     for (frame, other) in [(0, 1), (33, 34), (5, 65)] {
         let (one, two) = (state(&found, frame), state(&found, other));

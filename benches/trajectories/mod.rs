@@ -45,7 +45,7 @@ fn trained(folder: &Path, name: &str) -> HeldFrames {
 /// Smooth curves with 1e-4 of noise in every column but the harmonics.
 fn curves() -> HeldFrames {
     let random = |k: usize| (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32;
-    let varying = Columns::ALL.without(Columns::SH);
+    let varying = Columns::all().difference(Columns::SH);
     let mut held = HeldFrames::new(GAUSSIANS, 0, varying, Gaussians::zeros(GAUSSIANS, 0));
     for frame in 0..FRAMES {
         let mut state = Gaussians::zeros(GAUSSIANS, 0);

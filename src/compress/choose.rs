@@ -57,10 +57,10 @@ impl Choose {
         let per_gaussian = vec![
             ("alternatives", 24),
             ("clusters", CLUSTERED),
-            ("states", 2 * work.state(Columns::ALL)),
+            ("states", 2 * work.state(Columns::all())),
             ("result", work.input.reduced),
             ("readers", 2 * work.input.reader),
-            ("held", 2 * work.held(limits, Columns::ALL)),
+            ("held", 2 * work.held(limits, Columns::all())),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + AT_ONCE as u64);

@@ -74,15 +74,15 @@ impl Emit {
 
     /// What is left, and buffers of what is written.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
-        let whole = work.state(Columns::ALL);
+        let whole = work.state(Columns::all());
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian = [scored(limits), vec![("kept", 40), ("result", work.input.reduced)]].concat();
         let mut fixed = work.writing();
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
                 // Of each that is merged and of each that comes of it the frames of a block, and a state.
-                let mixed = Columns::ALL.without(Columns::SH) | work.varying;
-                let waiting = work.held(&Limits::NONE, Columns::ALL) + FRAME_BLOCK as u64 * work.state(mixed);
+                let mixed = Columns::all().difference(Columns::SH) | work.varying;
+                let waiting = work.held(&Limits::NONE, Columns::all()) + FRAME_BLOCK as u64 * work.state(mixed);
                 let together = (limits.gaussians_together as u64).min(work.gaussians);
                 per_gaussian.push(("members", CLUSTERED));
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
@@ -91,7 +91,7 @@ impl Emit {
             // A file's rows and the proxies among them for each thread, or one state and what it is made of.
             _ => {
                 per_gaussian.push(("readers", work.input.reader));
-                per_gaussian.push(("held", work.held(limits, Columns::ALL)));
+                per_gaussian.push(("held", work.held(limits, Columns::all())));
                 per_gaussian.push(("files", work.threads * (work.input.file + 2 * whole)));
                 per_gaussian.push(("members", CLUSTERED));
             }

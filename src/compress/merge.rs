@@ -65,7 +65,7 @@ impl Merge {
         let pairs = (merge::BYTES_PER_PAIR + motion::BYTES_PER_PAIR) as u64;
         // Of the colours the first band; of proxies at most one for every two, before a pass and after it, then with
         // all colours.
-        let proxies = state_bytes(0, Columns::ALL).max(work.state(Columns::ALL).div_ceil(2));
+        let proxies = state_bytes(0, Columns::all()).max(work.state(Columns::all()).div_ceil(2));
         let per_gaussian = vec![
             // C and Vis are read back.
             ("importance", if limits.rows_aside { 16 } else { 0 }),
@@ -268,7 +268,7 @@ fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gau
         return Ok((states, finite));
     }
     for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
-        let whole = gather(source, ids, frame, Columns::ALL)?;
+        let whole = gather(source, ids, frame, Columns::all())?;
         states.write_rows(start, &whole);
         for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
             *finite = merge::is_finite(&whole, row);

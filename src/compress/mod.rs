@@ -178,7 +178,7 @@ pub(crate) mod tests {
             count: gaussians as usize,
             times: Vec::new(),
             sh_degree: 3,
-            varying: Columns::ALL.without(Columns::SH),
+            varying: Columns::all().difference(Columns::SH),
         };
         Workload {
             frames: 600,

@@ -61,10 +61,10 @@ impl Refit {
         let again = if sights < fitted { ITERATIONS as f64 + 1.0 } else { 0.0 };
         let per_gaussian = vec![
             ("kept", 24),
-            ("states", 2 * work.state(Columns::ALL)),
+            ("states", 2 * work.state(Columns::all())),
             ("result", work.input.reduced),
             ("readers", 2 * work.input.reader),
-            ("held", 2 * work.held(limits, Columns::ALL)),
+            ("held", 2 * work.held(limits, Columns::all())),
             ("equations", refit::BYTES_PER_GAUSSIAN as u64),
             ("sights", sights * render::BYTES_PER_VISIBLE as u64),
             // Made at a time, with what they pull at: twice three f64.

@@ -48,7 +48,7 @@ impl Rounds {
 
     /// The ranking, and pictures of all that is left.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
-        let (looking, fixed) = work.looking(limits, Columns::ALL, 8);
+        let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let per_gaussian = [scored(limits), vec![("ranking", 32)], looking].concat();
         let rounds = (self.fewest.ln() / self.fraction.ln()).ceil().max(0.0);
         let reads = rounds * work.scattered_reads((PICTURES as u64).min(work.pictures), limits);
@@ -144,7 +144,7 @@ mod tests {
         for target in [150, 500] {
             let quality = |kept: &[u32]| -> f64 {
                 let of_picture = |&(frame, camera): &(usize, u32)| {
-                    let original = gather(scene.source(), &all, frame, Columns::ALL).unwrap();
+                    let original = gather(scene.source(), &all, frame, Columns::all()).unwrap();
                     let camera = &scene.schedule.cameras[camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };

@@ -24,7 +24,7 @@ impl Scan {
     /// A block of Gaussians at a time, then the rows of all, joined.
     pub fn need(&self, work: &Workload, _: &Limits) -> Need {
         // In stages a second reader decodes while the first is read.
-        let block = stats::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::ALL);
+        let block = stats::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::all());
         Need {
             stage: NAME,
             reads: 1.0,

@@ -204,7 +204,7 @@ fn inside(corners: &[f64; 6], position: [f32; 3]) -> bool {
 }
 
 fn non_finite(rows: &Rows) -> impl Iterator<Item = u32> {
-    (0..rows.len() as u32).filter(|&id| rows.flags[id as usize].has(Flags::NON_FINITE))
+    (0..rows.len() as u32).filter(|&id| rows.flags[id as usize].contains(Flags::NON_FINITE))
 }
 
 fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
@@ -222,7 +222,7 @@ fn refuse_non_finite(scene: &Scene, rows: &Rows) -> Result<()> {
 
 /// Counts of odd Gaussians.
 fn flags(rows: &Rows) -> FlagSummary {
-    let count = |bits| rows.flags.iter().filter(|flags| flags.has(bits)).count();
+    let count = |flag| rows.flags.iter().filter(|flags| flags.contains(flag)).count();
     FlagSummary {
         non_finite: count(Flags::NON_FINITE),
         zero_rotation: count(Flags::ZERO_ROTATION),
@@ -313,7 +313,7 @@ impl Scored {
             let why = format!("{} frame{}", info.times.len(), if info.times.len() == 1 { "" } else { "s" });
             journal.leave_out("motion, curvature, opacity variance", why);
         } else {
-            for column in Columns::ALL.without(info.varying).iter() {
+            for column in Columns::all().difference(info.varying).iter() {
                 journal.leave_out(constant(column), format!("{} is the same in every frame", column.name()));
             }
         }

@@ -45,7 +45,7 @@ impl Statistics {
         let columns = [d, kappa, v, c, e, vis, w].map(|column| bytemuck::cast_slice::<f64, u8>(column));
         let written = columns.iter().try_for_each(|column| out.write_all(column));
         let written = written.and_then(|()| out.write_all(bytemuck::cast_slice(life)));
-        let written = written.and_then(|()| flags.iter().try_for_each(|flags| out.write_all(&[flags.0])));
+        let written = written.and_then(|()| flags.iter().try_for_each(|flags| out.write_all(&[flags.bits()])));
         written.map_err(io("write a scratch file in"))?;
         let file = out.into_inner().map_err(|error| io("write a scratch file in")(error.into_error()))?;
         let (count, has_peak) = (rows.len(), !w.is_empty());
@@ -91,7 +91,7 @@ impl Aside {
             w: if self.has_peak { self.column(PEAK)? } else { Vec::new() },
             e: self.column(4)?,
             vis: self.column(VISIBILITY)?,
-            flags: flags.into_iter().map(Flags).collect(),
+            flags: flags.into_iter().map(Flags::from_bits_retain).collect(),
         })
     }
 
@@ -128,7 +128,7 @@ mod tests {
                 w: if peak { column(0.01) } else { Vec::new() },
                 e: column(1e12),
                 vis: column(0.3),
-                flags: (0..count).map(|i| Flags(i as u8)).collect(),
+                flags: (0..count).map(|i| Flags::from_bits_retain(i as u8)).collect(),
             };
             let statistics = Statistics::aside(rows.clone(), folder.path()).unwrap();
             assert_eq!(statistics.len(), count);

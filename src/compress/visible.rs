@@ -32,7 +32,7 @@ impl Visible {
 
     /// The rows scanned so far, C and W, and pictures in the making.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
-        let (mut per_gaussian, fixed) = work.looking(limits, Columns::ALL.without(Columns::SH), 12);
+        let (mut per_gaussian, fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
         per_gaussian.insert(0, ("rows", Rows::BYTES_PER_GAUSSIAN as u64 + 16));
         Need { stage: NAME, reads: work.reads(frames, limits), per_gaussian, fixed }

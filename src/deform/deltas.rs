@@ -22,7 +22,7 @@ pub struct Deltas {
 impl Deltas {
     /// An empty block for a cloud of `sh_degree`, to be filled by [`Field::deltas`](super::Field::deltas).
     pub fn new(sh_degree: usize) -> Self {
-        Deltas { delta: Gaussians::zeros(0, sh_degree), mask: None, active: Columns::NONE, multiply_rotation: false }
+        Deltas { delta: Gaussians::zeros(0, sh_degree), mask: None, active: Columns::empty(), multiply_rotation: false }
     }
 
     pub(super) fn begin(&mut self, rows: usize, active: Columns, multiply_rotation: bool) {

@@ -200,7 +200,7 @@ impl Field {
             return Err(Error::usage(format!("the field deforms {} values of {name}", head.output.outputs)));
         }
         out.begin(prepared.rows, want, self.config.apply_rotation);
-        let masked = !want.without(Columns::ROTATION).is_empty();
+        let masked = !want.difference(Columns::ROTATION).is_empty();
         match (&self.mask, &prepared.voxel) {
             (Mask::None, _) => out.mask = None,
             (Mask::Head, _) => out.mask = masked.then(|| vec![0.0; prepared.rows]),

@@ -19,7 +19,7 @@ const CHANNELS: usize = 5;
 
 fn plain() -> FieldConfig {
     FieldConfig {
-        active: Columns::ALL,
+        active: Columns::all(),
         static_mlp: false,
         empty_voxel: false,
         grid_pe: 0,
@@ -82,7 +82,7 @@ fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
 fn cloud(len: usize) -> Gaussians {
     let mut noise = Noise(99);
     let mut cloud = Gaussians::zeros(len, 3);
-    for column in Columns::ALL.iter() {
+    for column in Columns::all().iter() {
         cloud.column_mut(column).planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
     }
     cloud
@@ -110,7 +110,7 @@ fn agrees_with_oracle(what: &str, config: FieldConfig, depth: usize) {
     let field = build(&config, depth);
     let raw = cloud(40);
     for time in [0.0, 0.37, 1.0] {
-        let (state, _) = states(&field, &raw, time, Columns::ALL);
+        let (state, _) = states(&field, &raw, time, Columns::all());
         for i in 0..raw.len() {
             let expected = oracle.state(
                 &Parameters {
@@ -168,11 +168,11 @@ fn every_trunk_depth_agrees_with_the_f64_oracle() {
 
 #[test]
 fn every_head_can_be_off_and_its_column_is_then_raw_and_unmasked() {
-    for column in Columns::ALL.iter() {
-        let config = FieldConfig { active: Columns::ALL.without(column), static_mlp: true, ..plain() };
+    for column in Columns::all().iter() {
+        let config = FieldConfig { active: Columns::all().difference(column), static_mlp: true, ..plain() };
         agrees_with_oracle(&format!("without {}", column.name()), config, 1);
     }
-    agrees_with_oracle("no head at all", FieldConfig { active: Columns::NONE, ..plain() }, 1);
+    agrees_with_oracle("no head at all", FieldConfig { active: Columns::empty(), ..plain() }, 1);
 }
 
 #[test]
@@ -180,15 +180,15 @@ fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_columns()
     let config = FieldConfig { static_mlp: true, ..plain() };
     let field = build(&config, 2);
     let raw = cloud(1100);
-    let (all, _) = states(&field, &raw, 0.6, Columns::ALL);
+    let (all, _) = states(&field, &raw, 0.6, Columns::all());
     for (start, len) in [(0, 1), (3, 7), (255, 2), (250, 513), (1099, 1)] {
         let mut part = Gaussians::zeros(len, 3);
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             for c in 0..raw.column(column).width() {
                 part.column_mut(column).plane_mut(c).copy_from_slice(&raw.column(column).plane(c)[start..start + len]);
             }
         }
-        for want in [Columns::ALL, Columns::POSITION, Columns::OPACITY | Columns::SH, Columns::ROTATION] {
+        for want in [Columns::all(), Columns::POSITION, Columns::OPACITY | Columns::SH, Columns::ROTATION] {
             let (state, _) = states(&field, &part, 0.6, want);
             for column in want.iter() {
                 for c in 0..state.column(column).width() {
@@ -214,13 +214,13 @@ fn raw_parameters_solved_from_a_state_lead_back_to_it() {
     for apply_rotation in [false, true] {
         let field = build(&FieldConfig { static_mlp: true, apply_rotation, ..plain() }, 1);
         let raw = cloud(50);
-        let (state, deltas) = states(&field, &raw, 0.4, Columns::ALL);
+        let (state, deltas) = states(&field, &raw, 0.4, Columns::all());
         let mask = deltas.mask.as_ref().unwrap();
         let mut solved = Gaussians::zeros(0, 3);
-        deltas.solve(&state, Columns::ALL, &mut solved);
+        deltas.solve(&state, Columns::all(), &mut solved);
         let mut again = Gaussians::zeros(0, 3);
-        deltas.apply(&solved, Columns::ALL, &mut again);
-        for column in Columns::ALL.iter() {
+        deltas.apply(&solved, Columns::all(), &mut again);
+        for column in Columns::all().iter() {
             for (i, mask) in mask.iter().enumerate() {
                 let (got, expected) = (values(again.column(column), i), values(state.column(column), i));
                 for (got, expected) in got.into_iter().zip(expected) {
@@ -241,12 +241,12 @@ fn raw_parameters_solved_from_a_state_lead_back_to_it() {
 fn a_position_that_is_nan_gives_nan_and_touches_no_other_gaussian() {
     let field = build(&FieldConfig { empty_voxel: true, ..plain() }, 1);
     let raw = cloud(20);
-    let (clean, _) = states(&field, &raw, 0.5, Columns::ALL);
+    let (clean, _) = states(&field, &raw, 0.5, Columns::all());
     let mut broken = raw.clone();
     for (i, value) in [(4, f32::NAN), (5, f32::INFINITY), (6, f32::NEG_INFINITY), (7, f32::MAX)] {
         broken.position.set_row(i, [value; 3]);
     }
-    let (state, _) = states(&field, &broken, 0.5, Columns::ALL);
+    let (state, _) = states(&field, &broken, 0.5, Columns::all());
     assert!(state.position.row::<3>(4).iter().all(|x| x.is_nan()) && state.opacity_logit.row::<1>(4)[0].is_nan());
     for i in (0..20).filter(|i| !(4..8).contains(i)) {
         assert_eq!(state.position.row::<3>(i), clean.position.row::<3>(i), "Gaussian {i}");
@@ -258,13 +258,13 @@ fn a_zero_quaternion_product_stays_zero() {
     let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 1);
     let mut raw = cloud(3);
     raw.rotation.set_row(1, [0.0; 4]);
-    assert_eq!(states(&field, &raw, 0.5, Columns::ALL).0.rotation.row::<4>(1), [0.0; 4]);
+    assert_eq!(states(&field, &raw, 0.5, Columns::all()).0.rotation.row::<4>(1), [0.0; 4]);
 }
 
 #[test]
 fn an_empty_block_is_empty() {
     let field = build(&plain(), 1);
-    assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Columns::ALL).0.is_empty());
+    assert!(states(&field, &Gaussians::zeros(0, 3), 0.5, Columns::all()).0.is_empty());
 }
 
 fn refusal(config: FieldConfig, change: impl FnOnce(&mut Tensors)) -> String {
@@ -329,7 +329,7 @@ fn a_time_that_is_not_finite_is_refused() {
     let field = build(&plain(), 1);
     let prepared = field.prepare(&cloud(1).position);
     let error = field
-        .deltas(&prepared, f64::NAN, Columns::ALL, &mut Scratch::default(), &mut Deltas::new(3))
+        .deltas(&prepared, f64::NAN, Columns::all(), &mut Scratch::default(), &mut Deltas::new(3))
         .expect_err("must be refused");
     assert_says(&error.to_string(), &["NaN"]);
 }

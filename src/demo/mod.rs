@@ -123,7 +123,7 @@ impl BlockReader for Reader<'_> {
             return Err(Error::usage(format!("demo scene: no frame {frame}, it has {}", self.times.len())));
         };
         out.resize(self.parts.len());
-        let moving = want & (Columns::POSITION | Columns::ROTATION | Columns::OPACITY) != Columns::NONE;
+        let moving = want.intersects(Columns::POSITION | Columns::ROTATION | Columns::OPACITY);
         for (i, part) in self.parts.iter().enumerate() {
             if moving {
                 let now = part.at(time);

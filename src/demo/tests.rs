@@ -7,7 +7,7 @@ const ALPHA_MIN: f64 = 0.01;
 
 fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
     let mut out = Gaussians::zeros(0, SH_DEGREE);
-    scene.open(ids).unwrap().read(frame, Columns::ALL, &mut out).unwrap();
+    scene.open(ids).unwrap().read(frame, Columns::all(), &mut out).unwrap();
     out
 }
 
@@ -44,7 +44,7 @@ fn gaussian_and_frame_give_the_same_bits_in_any_block() {
         let picked = frame(&scene, Ids::List(&some), t);
         let check = |ids: &[usize], part: &Gaussians| {
             assert_eq!(part.len(), ids.len());
-            for column in Columns::ALL.iter() {
+            for column in Columns::all().iter() {
                 let (whole, part) = (whole.column(column), part.column(column));
                 for c in 0..whole.width() {
                     for (i, &id) in ids.iter().enumerate() {
@@ -70,7 +70,7 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
         assert_eq!(Family::ALL.iter().map(|&family| scene.members(family).len()).sum::<usize>(), count);
         for t in 0..frames {
             let state = frame(&scene, Ids::Range(0..count), t);
-            for column in Columns::ALL.iter() {
+            for column in Columns::all().iter() {
                 assert!(state.column(column).planes().iter().all(|x| x.is_finite()), "{} of {count}", column.name());
             }
             for i in 0..count {
@@ -87,7 +87,7 @@ fn still_families_do_not_change_by_a_bit_and_constant_columns_never_do() {
     for family in Family::ALL {
         let film = film(&scene, family);
         let still = matches!(family, Family::Wall | Family::Double | Family::Buried | Family::Dust | Family::Wire);
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             let constant = film.iter().all(|state| bits(state.column(column)) == bits(film[0].column(column)));
             let must = still || !scene.info().varying.contains(column);
             assert!(constant || !must, "{family:?} {}", column.name());
@@ -259,7 +259,7 @@ fn what_the_scene_does_not_have_is_refused() {
     assert!(scene.open(Ids::Range(5..11)).err().unwrap().to_string().contains("no Gaussian 10"));
     assert!(scene.open(Ids::List(&[3, 99])).err().unwrap().to_string().contains("no Gaussian 99"));
     let mut out = Gaussians::zeros(0, SH_DEGREE);
-    let error = scene.open(Ids::Range(0..10)).unwrap().read(2, Columns::ALL, &mut out).unwrap_err();
+    let error = scene.open(Ids::Range(0..10)).unwrap().read(2, Columns::all(), &mut out).unwrap_err();
     assert!(error.to_string().contains("no frame 2"));
 }
 

@@ -62,7 +62,7 @@ impl ContainerWriter {
             gaussians: count as u64,
             gaussian_block: GAUSSIAN_BLOCK as u32,
             frame_block: frame_block as u32,
-            columns: Columns::ALL.iter().map(column).collect(),
+            columns: Columns::all().iter().map(column).collect(),
             attributes,
         };
         Ok(ContainerWriter { writer: Writer::create(path, layout)?, compression, frame_blocks: 0 })
@@ -99,7 +99,7 @@ impl ContainerWriter {
         let info = source.info();
         let frame_block = self.frame_blocks as u32 - 1;
         // A column that never varies is encoded for the first block alone.
-        let columns = if frame_block == 0 { Columns::ALL } else { info.varying };
+        let columns = if frame_block == 0 { Columns::all() } else { info.varying };
         let first = (first / GAUSSIAN_BLOCK) as u32;
         let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
         // One batch of blocks at a time bounds the tiles that wait for the writer.
@@ -146,12 +146,13 @@ fn encode_block(
     let len = gaussians.len();
     let mut reader = source.open(Ids::Range(gaussians))?;
     let mut state = Gaussians::zeros(len, info.sh_degree);
-    let mut values: Vec<Vec<f32>> = Columns::ALL.iter().map(|_| Vec::new()).collect();
+    let mut values: Vec<Vec<f32>> = Columns::all().iter().map(|_| Vec::new()).collect();
     for frame in frames.clone() {
         // A column that never varies is one frame for all; the container stores it once.
         let want = if frame == frames.start { columns } else { info.varying };
         reader.read(frame, want, &mut state)?;
-        for (values, column) in values.iter_mut().zip(Columns::ALL.iter()).filter(|(_, column)| want.contains(*column))
+        for (values, column) in
+            values.iter_mut().zip(Columns::all().iter()).filter(|(_, column)| want.contains(*column))
         {
             values.extend_from_slice(state.column(column).planes());
         }
@@ -164,5 +165,5 @@ fn encode_block(
         let stored = if info.varying.contains(column) { frames.len() } else { 1 };
         Ok(Some(encode_tile(values, stored as u32, width, len as u32, compression)?))
     };
-    values.iter().zip(Columns::ALL.iter()).map(encode).collect()
+    values.iter().zip(Columns::all().iter()).map(encode).collect()
 }

@@ -26,7 +26,7 @@ impl<W: Write> StreamWriter<W> {
     pub fn new(to: W, name: &Path, header: StreamHeader, constant: &Gaussians) -> Result<StreamWriter<W>> {
         let mut stream = StreamWriter { to, name: name.to_owned(), header, frames: 0, last_time: None };
         stream.put(&header.to_bytes())?;
-        stream.columns(Columns::ALL.without(header.varying), constant)?;
+        stream.columns(Columns::all().difference(header.varying), constant)?;
         Ok(stream)
     }
 

@@ -144,7 +144,7 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians) -> Result<()
 /// Replaces what a proxy changes in the bytes of its leader's row.
 fn replace(row: &mut [u8], template: &Ply, proxies: &Gaussians, proxy: usize) {
     let big_endian = template.header().encoding == Encoding::BigEndian;
-    for column in Columns::ALL.iter() {
+    for column in Columns::all().iter() {
         for (c, plane) in template.layout().planes(column).iter().enumerate() {
             if let Plane::Property(property) = plane {
                 put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);

@@ -173,7 +173,7 @@ mod tests {
             w: ramp(0.2),
             e: vec![1.0, 1e12, f64::INFINITY],
             vis: ramp(0.3),
-            flags: vec![Flags::default(); N],
+            flags: vec![Flags::empty(); N],
         }
     }
 

@@ -174,7 +174,7 @@ impl Residence {
             fixed: 0,
             frame_block,
             gaussian_block: GAUSSIAN_BLOCK as u64,
-            columns: Columns::ALL.iter().count() as u64,
+            columns: Columns::all().iter().count() as u64,
             decoded: 0,
         }
     }

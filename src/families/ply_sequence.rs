@@ -63,7 +63,7 @@ impl Family for PlySequence {
             reader: 4,
             reduced: 0,
             // Normals and the like stand beside the values.
-            file: state_bytes(self.info().sh_degree, Columns::ALL) + 24,
+            file: state_bytes(self.info().sh_degree, Columns::all()) + 24,
             fixed: 0,
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
@@ -97,7 +97,7 @@ fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, 
     let progress = Progress::new("emit", "frames", sequence.paths().len() as u64);
     let write = |&frame: &usize| {
         let mut proxies = Gaussians::zeros(0, sequence.info().sh_degree);
-        result.open(Ids::List(&places))?.read(frame, Columns::ALL, &mut proxies)?;
+        result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut proxies)?;
         let template = sequence.frame(frame)?;
         let target = match (kind, template.path().file_name()) {
             (OutputKind::PlySequence, Some(name)) => path.join(name),

@@ -86,7 +86,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
             let mut frames = merged.together(part.clone(), &Wanted::of(of_block.clone()).holding(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
-                frames.read(start, Columns::ALL.without(*varying), &mut constant)?;
+                frames.read(start, Columns::all().difference(*varying), &mut constant)?;
             }
             let mut held = HeldFrames::new(part.len(), *sh_degree, *varying, constant);
             for frame in of_block.clone() {

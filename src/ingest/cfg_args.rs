@@ -118,7 +118,7 @@ impl ModelConfig {
             (self.no_dshs, Columns::SH),
         ];
         FieldConfig {
-            active: off.iter().filter(|(off, _)| !off).fold(Columns::NONE, |set, &(_, column)| set | column),
+            active: off.iter().filter(|(off, _)| !off).fold(Columns::empty(), |set, &(_, column)| set | column),
             static_mlp: self.static_mlp,
             empty_voxel: self.empty_voxel,
             grid_pe: self.grid_pe,
@@ -245,7 +245,7 @@ mod tests {
                 apply_rotation: true,
             }
         );
-        assert_eq!(config.field().active, Columns::ALL);
+        assert_eq!(config.field().active, Columns::all());
     }
 
     #[test]

@@ -65,7 +65,7 @@ impl PlySequence {
             count: first.count(),
             times: (0..frames.len()).map(|i| i as f64 / frames.len() as f64).collect(),
             sh_degree: first.sh_degree(),
-            varying: if others.is_empty() { Columns::NONE } else { Columns::ALL },
+            varying: if others.is_empty() { Columns::empty() } else { Columns::all() },
         };
         let (bytes, states) = (Count::default(), Count::default());
         Ok(PlySequence { properties: first.properties().to_vec(), frames, info, bytes, states })

@@ -274,7 +274,7 @@ fn each_candidate<E>(
 
 /// Whether every value of a row is finite.
 pub fn is_finite(states: &Gaussians, row: usize) -> bool {
-    let columns = Columns::ALL.iter().map(|column| states.column(column));
+    let columns = Columns::all().iter().map(|column| states.column(column));
     columns.into_iter().all(|column| (0..column.width()).all(|c| column.plane(c)[row].is_finite()))
 }
 

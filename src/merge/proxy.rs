@@ -160,11 +160,11 @@ pub fn merge_groups(
                 let rows = groups.members(group);
                 let weights = weights(rows, importance, states);
                 let members: Vec<(u32, f64)> = rows.iter().copied().zip(weights).collect();
-                merge_state(&members, states, groups.leaders()[group], merge, Columns::ALL)
+                merge_state(&members, states, groups.leaders()[group], merge, Columns::all())
             })
             .collect();
         for (row, proxy) in (first..).zip(&proxies) {
-            proxy.write(Columns::ALL, row, &mut out);
+            proxy.write(Columns::all(), row, &mut out);
         }
     }
     out
@@ -276,7 +276,7 @@ mod tests {
                 for scale in [[-3.0, -5.0, -4.0], [-4.0, -4.0, -9.0], [0.0; 3]] {
                     let mut states = copies(3, scale, [0.9, -1.3, 0.2, 0.4]);
                     states.opacity_logit.plane_mut(0).fill(logit(0.2) as f32);
-                    let got = merge_state(&alike(3), &states, 1, &recipe(placement, rule), Columns::ALL);
+                    let got = merge_state(&alike(3), &states, 1, &recipe(placement, rule), Columns::all());
                     assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(1));
                     assert_eq!(got.log_scale.map(|x| x as f32), scale);
                     assert_eq!(got.sh.iter().map(|&x| x as f32).collect::<Vec<_>>(), states.sh.row::<12>(1));
@@ -298,7 +298,7 @@ mod tests {
                 let mut states = copies(2, [0.0, -1.0, -2.0], [1.0, 0.0, 0.0, 0.0]);
                 states.opacity_logit.plane_mut(0).fill(logit);
                 let got =
-                    merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, rule), Columns::ALL).opacity_logit;
+                    merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, rule), Columns::all()).opacity_logit;
                 assert!(got.is_finite() && got.abs() < 17.0, "{rule:?} of {logit}: {got}");
             }
         }
@@ -311,7 +311,7 @@ mod tests {
             [needle, [1e-12f32.ln(); 3], [1e6f32.ln(); 3], [1e6f32.ln(), 1e-12f32.ln(), 1e-12f32.ln()], [-800.0; 3]]
         {
             let states = copies(2, scale, [0.9, -1.3, 0.2, 0.4]);
-            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::ALL);
+            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::all());
             for (got, expected) in got.log_scale.iter().zip(scale.map(|x| f64::from(x).max(f64::MIN_POSITIVE.ln()))) {
                 assert!((got - expected).abs() < 1e-12, "got {got}, expected {expected}");
             }
@@ -321,7 +321,7 @@ mod tests {
     #[test]
     fn a_zero_quaternion_is_the_identity() {
         let states = copies(2, [0.0, -1.0, -2.0], [0.0; 4]);
-        let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Columns::ALL);
+        let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Sum), Columns::all());
         assert_eq!(got.rotation, [1.0, 0.0, 0.0, 0.0]);
     }
 
@@ -335,15 +335,20 @@ mod tests {
             &states,
             0,
             &recipe(Placement::Leader, ProxyOpacity::Area),
-            Columns::ALL,
+            Columns::all(),
         );
         assert_eq!(got.position.to_array().map(|x| x as f32), states.position.row(0));
         let leader = unit_rotation(states.rotation.row(0));
         let rotation = DQuat::from_xyzw(got.rotation[1], got.rotation[2], got.rotation[3], got.rotation[0]);
         assert!(rotation.dot(leader) > 0.8, "{rotation:?} for {leader:?}");
         assert!(got.log_scale[1] > got.log_scale[0] && got.log_scale[0] > got.log_scale[2]);
-        let mean =
-            merge_state(&[(0, 0.3), (1, 0.7)], &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::ALL);
+        let mean = merge_state(
+            &[(0, 0.3), (1, 0.7)],
+            &states,
+            0,
+            &recipe(Placement::Mean, ProxyOpacity::Area),
+            Columns::all(),
+        );
         assert!((mean.position.x - (1000.25 * 0.3 + f64::from(1000.3f32) * 0.7)).abs() < 1e-9);
         assert!(mean.log_scale[1] < got.log_scale[1], "moments about the leader exceed those about the mean");
     }
@@ -396,7 +401,7 @@ mod tests {
             let mut states = copies(2, [-2.0, -3.0, -5.0], [0.5, 0.5, -0.1, 0.7]);
             states.position.set_row(1, [1000.25 + spread[0], -7.125 + spread[1], 0.1 + spread[2]]);
             states.opacity_logit.plane_mut(0).copy_from_slice(&logits);
-            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::ALL);
+            let got = merge_state(&alike(2), &states, 0, &recipe(Placement::Mean, ProxyOpacity::Area), Columns::all());
             let before: f64 = (0..2).map(|i| opacity(&states, i) * mean_area(scales(&states, i))).sum();
             let after = mean_area(DVec3::from(got.log_scale.map(f64::exp))) / (1.0 + (-got.opacity_logit).exp());
             prop_assert!((after / before - 1.0).abs() < 1e-12, "before {before}, after {after}");

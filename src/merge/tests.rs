@@ -184,7 +184,7 @@ fn scene_translated_rotated_and_scaled_merges_alike() {
 #[test]
 fn exact_duplicates_merge_to_one() {
     let mut scene = Scene::strewn(60);
-    for column in Columns::ALL.iter() {
+    for column in Columns::all().iter() {
         for c in 0..scene.states.column(column).width() {
             let plane = scene.states.column_mut(column).plane_mut(c);
             (0..60).for_each(|i| plane[i] = plane[i % 20]);
@@ -247,7 +247,7 @@ fn order_of_rows_changes_no_cluster() {
     let (scene, mut turned) = (Scene::strewn(n), Scene::strewn(n));
     let new_row = |row: usize| (row * 7 + 3) % n;
     for row in 0..n {
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             for c in 0..scene.states.column(column).width() {
                 turned.states.column_mut(column).plane_mut(c)[new_row(row)] = scene.states.column(column).plane(c)[row];
             }

@@ -1,6 +1,6 @@
 //! The state of a block of Gaussians at one instant, as planes of f32.
 
-use std::ops::{BitAnd, BitOr};
+use bitflags::bitflags;
 
 use super::sh_coefficients;
 
@@ -130,7 +130,7 @@ impl Gaussians {
 
     /// Makes room for `len` Gaussians; the values are unspecified until written.
     pub fn resize(&mut self, len: usize) {
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             self.column_mut(column).resize(len);
         }
     }
@@ -151,7 +151,7 @@ impl Gaussians {
     /// # Panics
     /// If there are not as many rows.
     pub fn write_rows(&mut self, first: usize, block: &Gaussians) {
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             let (from, to) = (block.column(column), self.column_mut(column));
             for c in 0..to.width() {
                 to.plane_mut(c)[first..][..from.len()].copy_from_slice(from.plane(c));
@@ -174,11 +174,11 @@ impl Gaussians {
         }
     }
 
-    /// The columns `which`, to write, in the order of [`Columns::ALL`].
+    /// The columns `which`, to write, in the order of [`Columns::all`].
     pub fn columns_mut(&mut self, which: Columns) -> impl Iterator<Item = &mut Column> {
         let Gaussians { position, rotation, log_scale, opacity_logit, sh } = self;
         let all = [position, rotation, log_scale, opacity_logit, sh];
-        Columns::ALL.iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
+        Columns::all().iter().zip(all).filter(move |(column, _)| which.contains(*column)).map(|(_, column)| column)
     }
 
     /// The column of a single-column set, to write.
@@ -197,61 +197,24 @@ impl Gaussians {
     }
 }
 
-/// A set of columns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Columns(u8);
+bitflags! {
+    /// A set of columns, in storage order from bit 0; frame streams hold these bits.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub struct Columns: u32 {
+        /// `position`.
+        const POSITION = 1;
+        /// `rotation`.
+        const ROTATION = 2;
+        /// `log_scale`.
+        const LOG_SCALE = 4;
+        /// `opacity_logit`.
+        const OPACITY = 8;
+        /// `sh`.
+        const SH = 16;
+    }
+}
 
 impl Columns {
-    /// No column.
-    pub const NONE: Columns = Columns(0);
-    /// `position`.
-    pub const POSITION: Columns = Columns(1);
-    /// `rotation`.
-    pub const ROTATION: Columns = Columns(2);
-    /// `log_scale`.
-    pub const LOG_SCALE: Columns = Columns(4);
-    /// `opacity_logit`.
-    pub const OPACITY: Columns = Columns(8);
-    /// `sh`.
-    pub const SH: Columns = Columns(16);
-    /// Every column.
-    pub const ALL: Columns = Columns(31);
-
-    /// Whether every column of `other` is in this set.
-    pub const fn contains(self, other: Columns) -> bool {
-        self.0 & other.0 == other.0
-    }
-
-    /// Whether the set is empty.
-    pub const fn is_empty(self) -> bool {
-        self.0 == 0
-    }
-
-    /// This set and the columns of `other`.
-    pub const fn with(self, other: Columns) -> Columns {
-        Columns(self.0 | other.0)
-    }
-
-    /// This set without the columns of `other`.
-    pub const fn without(self, other: Columns) -> Columns {
-        Columns(self.0 & !other.0)
-    }
-
-    /// The columns of the set, one at a time, in storage order.
-    pub fn iter(self) -> impl Iterator<Item = Columns> {
-        (0..5).map(|bit| Columns(1 << bit)).filter(move |&one| self.contains(one))
-    }
-
-    /// The set as bits, in storage order from bit 0: position, rotation, log_scale, opacity_logit, sh.
-    pub const fn bits(self) -> u8 {
-        self.0
-    }
-
-    /// The inverse of [`Columns::bits`]; none for bits that stand for no column.
-    pub fn from_bits(bits: u32) -> Option<Columns> {
-        u8::try_from(bits).ok().filter(|&bits| bits <= Columns::ALL.0).map(Columns)
-    }
-
     /// Components per Gaussian of all columns of the set together, for harmonics of degree `sh_degree`.
     pub fn width(self, sh_degree: usize) -> usize {
         let of = |column: Columns| match column {
@@ -273,19 +236,5 @@ impl Columns {
             Columns::SH => "sh",
             _ => "several columns",
         }
-    }
-}
-
-impl BitOr for Columns {
-    type Output = Columns;
-    fn bitor(self, other: Columns) -> Columns {
-        self.with(other)
-    }
-}
-
-impl BitAnd for Columns {
-    type Output = Columns;
-    fn bitand(self, other: Columns) -> Columns {
-        Columns(self.0 & other.0)
     }
 }

@@ -1,22 +1,19 @@
 //! One row of statistics per Gaussian (method.md, section 1), as arrays over Gaussians.
 
-/// What was odd about a Gaussian.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Flags(pub u8);
+use bitflags::bitflags;
 
-impl Flags {
-    /// Some value in some frame was NaN or infinite.
-    pub const NON_FINITE: u8 = 1;
-    /// The quaternion was zero in some frame; the identity was used.
-    pub const ZERO_ROTATION: u8 = 2;
-    /// D fell below the noise floor of its f32 positions and was set to 0.
-    pub const SNAPPED_D: u8 = 4;
-    /// κ fell below the noise floor of its f32 positions and was set to 0.
-    pub const SNAPPED_KAPPA: u8 = 8;
-
-    /// Whether any of `bits` is set.
-    pub fn has(self, bits: u8) -> bool {
-        self.0 & bits != 0
+bitflags! {
+    /// What was odd about a Gaussian.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub struct Flags: u8 {
+        /// Some value in some frame was NaN or infinite.
+        const NON_FINITE = 1;
+        /// The quaternion was zero in some frame; the identity was used.
+        const ZERO_ROTATION = 2;
+        /// D fell below the noise floor of its f32 positions and was set to 0.
+        const SNAPPED_D = 4;
+        /// κ fell below the noise floor of its f32 positions and was set to 0.
+        const SNAPPED_KAPPA = 8;
     }
 }
 

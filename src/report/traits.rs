@@ -241,7 +241,7 @@ mod tests {
     }
 
     fn info(count: usize, frames: usize) -> SequenceInfo {
-        SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Columns::ALL }
+        SequenceInfo { count, times: (0..frames).map(|t| t as f64).collect(), sh_degree: 0, varying: Columns::all() }
     }
 
     /// Bending of a 5 × 5 × 5 lattice that `place` moves.

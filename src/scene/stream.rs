@@ -60,7 +60,7 @@ pub fn check_memory(options: &InputOptions, header: &StreamHeader) -> Result<()>
 /// What it takes to pack a stream of which `held` frames are in memory together, and to scan it on the way unless
 /// `measuring` is none; if it says so, to look at pictures too.
 pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<bool>) -> Need {
-    let whole = work.state(Columns::ALL);
+    let whole = work.state(Columns::all());
     let mut per_gaussian =
         vec![("frames", held * work.state(work.varying)), ("constant columns", whole - work.state(work.varying))];
     let mut fixed = work.writing();
@@ -69,7 +69,7 @@ pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<
         fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
         if visible {
             let nothing_held = Workload { input: Residence { frame_block: 0, ..work.input }, ..*work };
-            let (more, pictures) = nothing_held.looking(limits, Columns::ALL.without(Columns::SH), 12);
+            let (more, pictures) = nothing_held.looking(limits, Columns::all().difference(Columns::SH), 12);
             per_gaussian.extend(more);
             fixed.extend(pictures);
         }

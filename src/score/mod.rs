@@ -50,7 +50,7 @@ pub struct Term {
 /// Rows with [`Flags::NON_FINITE`] count in no percentile and score 0 throughout. `rows.e` is used
 /// only when λ > 0. No rows give empty scores.
 pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
-    let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.has(Flags::NON_FINITE)).collect();
+    let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
     let motion_weight = |i: usize| if recipe.weigh_motion_by_life { life(i) } else { 1.0 };
 
@@ -120,7 +120,7 @@ mod tests {
             w: Vec::new(),
             e: ramp(2.0),
             vis: ramp(0.0),
-            flags: vec![Flags::default(); n],
+            flags: vec![Flags::empty(); n],
         }
     }
 
@@ -169,7 +169,7 @@ mod tests {
             w: Vec::new(),
             e: vec![0.0; 200],
             vis: vec![0.0; 200],
-            flags: vec![Flags(Flags::NON_FINITE); 200],
+            flags: vec![Flags::NON_FINITE; 200],
         };
         odd.append(&mut zeros.clone());
         for name in ["paper", "default"] {

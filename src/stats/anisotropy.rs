@@ -25,9 +25,9 @@ pub fn fill_anisotropy(rows: &mut Rows, log_scale: &Column, kind: Anisotropy, ex
         .map(|i| {
             let mut log: [f32; 3] = log_scale.row(i);
             if !log.iter().all(|x| x.is_finite()) {
-                rows.flags[i].0 |= Flags::NON_FINITE;
+                rows.flags[i] |= Flags::NON_FINITE;
             }
-            if rows.flags[i].has(Flags::NON_FINITE) {
+            if rows.flags[i].contains(Flags::NON_FINITE) {
                 return 0.0;
             }
             log.sort_unstable_by(f32::total_cmp);
@@ -48,7 +48,7 @@ mod tests {
     fn anisotropy(log_scale: [f32; 3], kind: Anisotropy, extent: f64) -> (f64, Flags) {
         let mut column = Column::zeros(3, 1);
         column.set_row(0, log_scale);
-        let mut rows = Rows { d: vec![0.0], flags: vec![Flags::default()], ..Rows::default() };
+        let mut rows = Rows { d: vec![0.0], flags: vec![Flags::empty()], ..Rows::default() };
         fill_anisotropy(&mut rows, &column, kind, extent);
         (rows.e[0], rows.flags[0])
     }
@@ -76,7 +76,7 @@ mod tests {
     fn scales_that_are_not_finite_are_flagged_and_harmless() {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             let (e, flags) = anisotropy([0.0, bad, 1.0], Anisotropy::Ratio, 1.0);
-            assert!(e == 0.0 && flags.has(Flags::NON_FINITE));
+            assert!(e == 0.0 && flags.contains(Flags::NON_FINITE));
         }
     }
 }

@@ -37,12 +37,12 @@ pub fn snap(rows: &mut Rows, largest_coordinate: f32) -> Snapped {
     }
 }
 
-fn snap_below(values: &mut [f64], floor: f64, flags: &mut [Flags], flag: u8) -> usize {
+fn snap_below(values: &mut [f64], floor: f64, flags: &mut [Flags], flag: Flags) -> usize {
     let mut snapped = 0;
     for (value, flags) in values.iter_mut().zip(flags) {
         if *value > 0.0 && *value < floor {
             *value = 0.0;
-            flags.0 |= flag;
+            *flags |= flag;
             snapped += 1;
         }
     }
@@ -67,11 +67,11 @@ mod tests {
         let mut rows = Rows {
             d: vec![0.0, floor * 0.99, floor],
             kappa: vec![floor, 2.0 * floor, 0.0],
-            flags: vec![Flags::default(); 3],
+            flags: vec![Flags::empty(); 3],
             ..Rows::default()
         };
         assert_eq!(snap(&mut rows, 1e6), Snapped { d: 1, kappa: 1 });
         assert_eq!((rows.d, rows.kappa), (vec![0.0, 0.0, floor], vec![0.0, 2.0 * floor, 0.0]));
-        assert_eq!(rows.flags, [Flags(Flags::SNAPPED_KAPPA), Flags(Flags::SNAPPED_D), Flags(0)]);
+        assert_eq!(rows.flags, [Flags::SNAPPED_KAPPA, Flags::SNAPPED_D, Flags::empty()]);
     }
 }

@@ -24,7 +24,7 @@ const CHUNK: usize = 256;
 const CARRY_BITS: u32 = 52;
 
 /// Columns a scan needs whatever the model; SH may be left out.
-pub const NEEDED: Columns = Columns::ALL.without(Columns::SH);
+pub const NEEDED: Columns = Columns::all().difference(Columns::SH);
 
 /// The running statistics of consecutive Gaussians.
 pub struct BlockScan<'a> {
@@ -212,7 +212,7 @@ impl<'a> BlockScan<'a> {
 }
 
 fn clear_non_finite(rows: &mut Rows) {
-    for (i, _) in rows.flags.iter().enumerate().filter(|(_, flags)| flags.has(Flags::NON_FINITE)) {
+    for (i, _) in rows.flags.iter().enumerate().filter(|(_, flags)| flags.contains(Flags::NON_FINITE)) {
         for values in [&mut rows.d, &mut rows.kappa, &mut rows.v, &mut rows.c, &mut rows.vis] {
             values[i] = 0.0;
         }
@@ -259,7 +259,7 @@ mod tests {
                     let frame = made(t, of);
                     let changed = t > 0 && of != opacities[t - 1];
                     all.frame(t, &frame, &[], NEEDED);
-                    let opacity = if changed { Columns::OPACITY } else { Columns::NONE };
+                    let opacity = if changed { Columns::OPACITY } else { Columns::empty() };
                     named.frame(t, &frame, &[], Columns::POSITION | opacity);
                 }
                 let (all, named) = (all.finish(), named.finish());

@@ -27,7 +27,7 @@ impl State {
         State {
             opacity: vec![0.0; len],
             axes: std::array::from_fn(|_| vec![0.0; len]),
-            flags: vec![Flags::default(); len],
+            flags: vec![Flags::empty(); len],
             largest_coordinate: 0.0,
         }
     }
@@ -55,7 +55,7 @@ impl State {
         if changed.contains(Columns::ROTATION) {
             self.flag_zero_rotation(&gaussians.rotation);
         }
-        if projected && !(changed & (Columns::ROTATION | Columns::LOG_SCALE)).is_empty() {
+        if projected && changed.intersects(Columns::ROTATION | Columns::LOG_SCALE) {
             self.update_axes(gaussians);
         }
     }
@@ -63,7 +63,7 @@ impl State {
     fn flag_non_finite(&mut self, column: &Column) {
         for c in 0..column.width() {
             for (flags, x) in self.flags.iter_mut().zip(column.plane(c)) {
-                flags.0 |= u8::from(!x.is_finite()) * Flags::NON_FINITE;
+                *flags |= if x.is_finite() { Flags::empty() } else { Flags::NON_FINITE };
             }
         }
     }
@@ -74,7 +74,7 @@ impl State {
         let [w, x, y, z]: [&[f32]; 4] = std::array::from_fn(|c| &rotation.plane(c)[..n]);
         for (i, flags) in self.flags.iter_mut().enumerate() {
             let zero = (w[i] == 0.0) & (x[i] == 0.0) & (y[i] == 0.0) & (z[i] == 0.0);
-            flags.0 |= u8::from(zero) * Flags::ZERO_ROTATION;
+            *flags |= if zero { Flags::ZERO_ROTATION } else { Flags::empty() };
         }
     }
 

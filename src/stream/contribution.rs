@@ -14,7 +14,7 @@ use crate::plan::Limits;
 use crate::render::{Contribution, Renderer};
 
 /// What contributions depend on: all but colour.
-const GEOMETRY: Columns = Columns::ALL.without(Columns::SH);
+const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
 
 /// What was seen of N Gaussians.
 #[derive(Debug, Clone, PartialEq)]
@@ -122,7 +122,7 @@ mod tests {
             let mut pictures = 0;
             for (turn, t) in (0..7).step_by(frame as usize).enumerate() {
                 let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
-                scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::ALL, &mut state).unwrap();
+                scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::all(), &mut state).unwrap();
                 for &(_, camera) in schedule.frames[t].iter().skip(turn % view as usize).step_by(view as usize) {
                     let camera = &schedule.cameras[camera as usize];
                     render::contribution(&state, camera, scan.pixel_stride, &mut plain);
@@ -215,7 +215,7 @@ mod tests {
             state.log_scale.set_row(i, [size, if size > 0.0 { -5.0 } else { size }, size]);
             state.opacity_logit.set_row(i, [logit]);
         }
-        let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Columns::NONE };
+        let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Columns::empty() };
         let rig = Rig {
             cameras: vec![Camera::look_at(glam::DVec3::new(0.0, -4.0, 0.0), glam::DVec3::ZERO, 1.0, (64, 48))],
             shots: vec![crate::model::Shot { view: 0, camera: 0, time: None, split: Split::Train, image: None }],
@@ -239,7 +239,7 @@ mod tests {
             w: seen.peak,
             e: zeros(),
             vis: vec![1.0; count],
-            flags: vec![Flags::default(); count],
+            flags: vec![Flags::empty(); count],
         };
         let scores = score::score(&rows, 2, &recipe.score);
         let selection = select(&scores, &recipe.select, &Overrides::default()).unwrap();

@@ -17,7 +17,7 @@ use crate::pass::{BlockReader, FrameSource, Ids, Reads, Wanted};
 use crate::recipe::{Merge, Placement};
 
 /// Columns that follow from one another: moments mix position, rotation and scale, and opacity follows from areas.
-const MIXED: Columns = Columns::ALL.without(Columns::SH);
+const MIXED: Columns = Columns::all().difference(Columns::SH);
 
 /// Proxies made at a time.
 const BATCH: usize = 4096;
@@ -48,7 +48,7 @@ impl<'a> MergedSequence<'a> {
         }
         let mut varying = source.info().varying;
         if !(varying & MIXED).is_empty() && members.iter().any(|members| !members.is_empty()) {
-            varying = varying | MIXED;
+            varying |= MIXED;
         }
         let info = SequenceInfo { count: kept.len(), varying, ..source.info().clone() };
         MergedSequence { source, info, kept, members, merge: Merge { placement: Placement::Mean, ..merge.clone() } }
@@ -62,7 +62,7 @@ impl MergedSequence<'_> {
     /// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
     pub fn together(&self, places: Range<usize>, wanted: &Wanted) -> Result<Box<dyn BlockReader + '_>> {
         let merging = Merging::new(self, places);
-        let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::ALL, wanted)?;
+        let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::all(), wanted)?;
         Ok(Box::new(MergedReader::new(self, Box::new(frames), merging)))
     }
 
@@ -169,15 +169,15 @@ struct MergedReader<'a> {
 impl<'a> MergedReader<'a> {
     fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, merging: Merging) -> Self {
         let state = Gaussians::zeros(merging.ids.len(), sequence.info.sh_degree);
-        MergedReader { sequence, reader, state, known: Columns::NONE, merging }
+        MergedReader { sequence, reader, state, known: Columns::empty(), merging }
     }
 }
 
 impl BlockReader for MergedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let needed = self.merging.needed(want);
-        self.reader.read(frame, needed.without(self.known), &mut self.state)?;
-        self.known = self.known | needed.without(self.sequence.source.info().varying);
+        self.reader.read(frame, needed.difference(self.known), &mut self.state)?;
+        self.known |= needed.difference(self.sequence.source.info().varying);
         self.merging.write(&self.state, want, &self.sequence.merge, out);
         Ok(())
     }

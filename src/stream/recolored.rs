@@ -86,7 +86,7 @@ mod tests {
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
                 let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
-                source.open(ids.clone()).unwrap().read(2, Columns::ALL, &mut state).unwrap();
+                source.open(ids.clone()).unwrap().read(2, Columns::all(), &mut state).unwrap();
                 state
             };
             let (mut expected, got) = (read(&plain), read(&recolored));
@@ -101,10 +101,10 @@ mod tests {
         Recolored::new(Box::new(Scene::new(40, 3)), &[])
             .open(Ids::Range(0..40))
             .unwrap()
-            .read(1, Columns::ALL, &mut untouched)
+            .read(1, Columns::all(), &mut untouched)
             .unwrap();
         let mut expected = untouched.clone();
-        plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::ALL, &mut expected).unwrap();
+        plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut expected).unwrap();
         assert!(untouched == expected);
     }
 }

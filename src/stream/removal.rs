@@ -24,7 +24,7 @@ pub fn removal_error(
     let found = look(
         source,
         Ids::List(ids),
-        Columns::ALL,
+        Columns::all(),
         sample,
         ("rounds", limits),
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
@@ -50,7 +50,7 @@ mod tests {
         let background = [0.1, 0.2, 0.3];
         let mut plain = RemovalError::new(ids.len(), 0.1);
         for (t, views) in schedule.frames.iter().enumerate() {
-            let state = gather(&scene, &ids, t, Columns::ALL).unwrap();
+            let state = gather(&scene, &ids, t, Columns::all()).unwrap();
             for &(_, camera) in views {
                 Renderer::new().removal_error(&state, &schedule.cameras[camera as usize], background, &mut plain);
             }

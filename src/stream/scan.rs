@@ -85,7 +85,7 @@ impl<'a> RunningScan<'a> {
                 let mut state = Gaussians::zeros(range.len(), info.sh_degree);
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
-                    let changed = if first + t == 0 { Columns::ALL } else { info.varying };
+                    let changed = if first + t == 0 { Columns::all() } else { info.varying };
                     // The state is new, though the accumulators know what does not vary.
                     let want = if t == 0 { changed | NEEDED } else { changed };
                     reader.read(t, want, &mut state)?;

@@ -217,7 +217,7 @@ mod tests {
             let mut states = 0;
             for (gaussians, frames, want) in slow.fetched.into_inner().unwrap() {
                 states += gaussians.len() * frames.len();
-                assert_eq!(want, if frames.start == 0 { Columns::ALL } else { slow.scene.info().varying });
+                assert_eq!(want, if frames.start == 0 { Columns::all() } else { slow.scene.info().varying });
             }
             assert_eq!(states, slow.scene.info().count * 7, "each unit is fetched once");
         }

@@ -24,9 +24,9 @@ impl<'a> States<'a> {
     pub fn open(source: &'a dyn FrameSource, wanted: &Wanted) -> Result<States<'a>> {
         let info = source.info();
         Ok(States {
-            reader: open_all(source, Columns::ALL, wanted)?,
+            reader: open_all(source, Columns::all(), wanted)?,
             varying: info.varying,
-            unknown: Columns::ALL,
+            unknown: Columns::all(),
             now: Gaussians::zeros(0, info.sh_degree),
         })
     }
@@ -61,13 +61,13 @@ mod tests {
         let scene = crate::demo::Scene::new(1500, 40);
         write_container(&scene, &path, gseq::Compression::Zstd(1), Default::default(), |_| ()).unwrap();
         let container = Container::open(&path).unwrap();
-        let constant = Columns::ALL.without(container.info().varying);
+        let constant = Columns::all().difference(container.info().varying);
         assert!(!constant.is_empty(), "the scene has no constant column to tell by");
         let frames = [0, 3, 31, 32, 39];
         let mut states = States::open(&container, &Wanted::of(frames)).unwrap();
         assert!(states.now().is_empty());
         for frame in frames {
-            let expected = gather_all(&scene, frame, Columns::ALL).unwrap();
+            let expected = gather_all(&scene, frame, Columns::all()).unwrap();
             assert!(*states.at(frame).unwrap() == expected && *states.now() == expected, "frame {frame}");
         }
         // Two blocks of Gaussians; a tile of each varying column for both blocks of frames.

@@ -31,7 +31,7 @@ use crate::pass::{FrameSource, Ids, Wanted};
 pub(super) type Moment = [f32; 4];
 
 /// The columns of a [`Moment`].
-pub(super) const NEEDED: Columns = Columns::POSITION.with(Columns::OPACITY);
+pub(super) const NEEDED: Columns = Columns::POSITION.union(Columns::OPACITY);
 
 /// Gaussians between two that are wanted which are rather read than skipped.
 const GAP: u32 = 32;
@@ -242,7 +242,7 @@ mod tests {
         // Neighbours, gaps narrow and wide, both ends.
         let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
         let of_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
-        for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::NONE] {
+        for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {
             let source = Still::new(varying);
             for frames_together in [1, 3, usize::MAX] {
                 let mut gathered = Trajectories::gather(&source, &ids, frames_together, folder.path()).unwrap();

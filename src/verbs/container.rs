@@ -80,10 +80,10 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
     let held = Plan::fit(workload(&*opened.input), input.memory, unpacking)?.limits.frames_held;
     let wanted = Wanted::every().holding(held);
-    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::ALL, &wanted)?;
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
-        frames.read(0, Columns::ALL, &mut state)?;
+        frames.read(0, Columns::all(), &mut state)?;
     }
     let progress = Progress::new("unpack", "frames", info.times.len() as u64);
     let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
@@ -169,8 +169,8 @@ fn packing(work: &Workload, _: &Limits) -> Vec<Need> {
 
 /// What it takes to write every frame by itself.
 fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
-    let states = ("states", work.state(Columns::ALL));
-    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::ALL))];
+    let states = ("states", work.state(Columns::all()));
+    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
     vec![Need { stage: "unpack", reads: 1.0, per_gaussian, fixed: vec![work.arriving()] }]
 }
 

@@ -41,13 +41,13 @@ pub(crate) fn scene(model: &Path) -> Scene {
 /// All columns of every Gaussian at `frame`.
 pub(crate) fn state(source: &dyn FrameSource, frame: usize) -> Gaussians {
     let ids: Vec<u32> = (0..source.info().count as u32).collect();
-    gather(source, &ids, frame, Columns::ALL).unwrap()
+    gather(source, &ids, frame, Columns::all()).unwrap()
 }
 
 /// Every value of row `i`, column after column, as bits.
 pub(crate) fn bits(state: &Gaussians, i: usize) -> Vec<u32> {
     let planes = |column: Columns| (0..state.column(column).width()).map(move |c| (column, c));
-    Columns::ALL.iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
+    Columns::all().iter().flat_map(planes).map(|(column, c)| state.column(column).plane(c)[i].to_bits()).collect()
 }
 
 /// A folder to write into, and the program to run in it.

@@ -33,14 +33,14 @@ fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutRow> {
 
 fn all(ply: &Ply) -> Gaussians {
     let mut out = Gaussians::zeros(0, ply.sh_degree());
-    ply.gaussians(0..ply.count(), Columns::ALL, &mut out).unwrap();
+    ply.gaussians(0..ply.count(), Columns::all(), &mut out).unwrap();
     out
 }
 
 /// `len` Gaussians, every value different and exact in an i16.
 fn proxies(len: usize, sh_degree: usize) -> Gaussians {
     let mut out = Gaussians::zeros(len, sh_degree);
-    for (k, column) in Columns::ALL.iter().enumerate() {
+    for (k, column) in Columns::all().iter().enumerate() {
         let fill = |(i, value): (usize, &mut f32)| *value = (1000 * (k + 1) + i) as f32;
         out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
     }
@@ -129,7 +129,7 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
             let folder = Scratch::new();
             let out = folder.open(&written);
             let (before, after) = (all(&ply), all(&out));
-            for column in Columns::ALL.iter() {
+            for column in Columns::all().iter() {
                 for plane in 0..after.column(column).width() {
                     let source = |of: &Gaussians, i: usize| of.column(column).plane(plane)[i];
                     let expected = [source(&proxies, 1), source(&before, 2), source(&proxies, 0)];
@@ -183,7 +183,7 @@ fn the_inria_layout_reads_back_bit_for_bit_at_every_degree() {
         let ply = Ply::open(&path).unwrap();
         assert_eq!(ply.comments(), ["SplatRenderMode: mip", "two lines"]);
         let back = all(&ply);
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             assert_eq!(bits(back.column(column)), bits(gaussians.column(column)), "{degree} {}", column.name());
         }
         if degree == 3 {

@@ -54,7 +54,7 @@ impl Family for ModelFolder {
     }
 
     fn residence(&self) -> Residence {
-        let whole = state_bytes(self.info().sh_degree, Columns::ALL);
+        let whole = state_bytes(self.info().sh_degree, Columns::all());
         Residence {
             per_gaussian: whole,
             // Normals and the like stand beside the values.
@@ -149,7 +149,7 @@ fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
     let mut cloud = ModelFolder::canonical(model).pick(&reduction.kept);
     if let Some(raw) = &reduction.proxies.raw {
         for (proxy, cluster) in reduction.clusters.iter().enumerate() {
-            for column in Columns::ALL.iter() {
+            for column in Columns::all().iter() {
                 for c in 0..raw.column(column).width() {
                     cloud.column_mut(column).plane_mut(c)[cluster.output as usize] = raw.column(column).plane(c)[proxy];
                 }

@@ -30,8 +30,8 @@ pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, 
     }
     // At the leader, the canonical position is the leader's to the bit, and so is the path.
     let solved = match merge.placement {
-        Placement::Mean => Columns::ALL,
-        Placement::Leader => Columns::ALL.without(Columns::POSITION),
+        Placement::Mean => Columns::all(),
+        Placement::Leader => Columns::all().difference(Columns::POSITION),
     };
     for (clusters, first) in all.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
         let of_leaders = model.canonical().pick(&leaders[first..first + clusters.len()]);
@@ -64,14 +64,14 @@ pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, 
 fn merged_states(model: &ModelFolder, reference: Reference, clusters: &[Cluster], merge: &Merge) -> Result<Gaussians> {
     let mut states = Gaussians::zeros(clusters.len(), model.info().sh_degree);
     let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
-    let of_members = gather(model, &ids, reference.frame, Columns::ALL)?;
+    let of_members = gather(model, &ids, reference.frame, Columns::all())?;
     let mut rows = 0..;
     for (proxy, cluster) in clusters.iter().enumerate() {
         let members: Vec<(u32, f64)> =
             cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
         let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
-        merge_state(&members, &of_members, members[leader].0, merge, Columns::ALL).write(
-            Columns::ALL,
+        merge_state(&members, &of_members, members[leader].0, merge, Columns::all()).write(
+            Columns::all(),
             proxy,
             &mut states,
         );
@@ -96,7 +96,7 @@ fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaus
 
 /// Gives rows with a value that is not finite the leader's parameters; counts them.
 fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
-    let columns: Vec<Columns> = Columns::ALL.iter().collect();
+    let columns: Vec<Columns> = Columns::all().iter().collect();
     let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
         columns
             .iter()

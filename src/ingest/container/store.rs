@@ -16,7 +16,7 @@ pub struct Container {
     pub(super) path: PathBuf,
     pub(super) reader: Reader,
     pub(super) info: SequenceInfo,
-    /// Place of each column in the container, in the order of [`Columns::ALL`].
+    /// Place of each column in the container, in the order of [`Columns::all`].
     pub(super) places: Vec<(Columns, u32)>,
     /// One for each thread at most, shared by all readers.
     pub(super) scratch: Mutex<Vec<Scratch>>,
@@ -48,7 +48,7 @@ impl Container {
         let layout = reader.layout();
         let mut places = Vec::new();
         let mut sh_degree = 0;
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             let place = layout.column(column.name()).ok_or_else(|| {
                 let names: Vec<&str> = layout.columns.iter().map(|c| c.name.as_str()).collect();
                 Error::input(path, "columns", format!("a column {:?}", column.name()), format!("{names:?}"))
@@ -78,10 +78,10 @@ impl Container {
             .ok()
             .filter(|&count| count <= u32::MAX as usize)
             .ok_or_else(|| Error::input(path, "header", "fewer than 2^32 Gaussians", layout.gaussians.to_string()))?;
-        let mut varying = Columns::NONE;
+        let mut varying = Columns::empty();
         for &(column, place) in &places {
             if reader.varies(place) {
-                varying = varying | column;
+                varying |= column;
             }
         }
         let info = SequenceInfo { count, times: reader.times().to_vec(), sh_degree, varying };

@@ -103,7 +103,7 @@ fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
                 reader.expect(&Wanted::every().holding(held));
                 for k in 0..3 * FRAMES / 2 {
                     let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
-                    let want = if k % 7 == 0 { Columns::ALL } else { made.info().varying };
+                    let want = if k % 7 == 0 { Columns::all() } else { made.info().varying };
                     let mut got = Gaussians::zeros(0, 1);
                     reader.read(frame, want, &mut got).unwrap();
                     let expected = made.expected(&ids, frame, want);
@@ -126,7 +126,7 @@ fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
             reader.expect(&Wanted::every().holding(held));
             let mut state = Gaussians::zeros(0, 1);
             for frame in 0..FRAMES {
-                reader.read(frame, Columns::ALL, &mut state).unwrap();
+                reader.read(frame, Columns::all(), &mut state).unwrap();
                 let values = |kept: &Kept| match kept {
                     Kept::Nothing => 0,
                     Kept::Tile(_, frames) => frames.memory() / 4,
@@ -167,7 +167,7 @@ fn scan(made: &Made, container: &Container) {
         let mut reader = container.open(ids.clone()).unwrap();
         let mut got = Gaussians::zeros(0, 1);
         for frame in 0..FRAMES {
-            let want = if frame == 0 { Columns::ALL } else { made.info().varying };
+            let want = if frame == 0 { Columns::all() } else { made.info().varying };
             reader.read(frame, want, &mut got).unwrap();
             assert!(got.position == made.expected(&ids, frame, Columns::POSITION).position, "{ids:?}, frame {frame}");
         }
@@ -234,8 +234,8 @@ fn tiles_that_are_held_are_read_once_by_whomever_and_hold_the_same_values() {
                     reader.expect(&wanted);
                     for frame in [0, 7, 8, 40, FRAMES - 1, 7] {
                         let mut got = Gaussians::zeros(0, 1);
-                        reader.read(frame, Columns::ALL, &mut got).unwrap();
-                        let expected = made.expected(&ids, frame, Columns::ALL);
+                        reader.read(frame, Columns::all(), &mut got).unwrap();
+                        let expected = made.expected(&ids, frame, Columns::all());
                         assert!(got == expected, "{compression:?}, {ids:?}, {capacity} bytes: frame {frame} is wrong");
                     }
                 }

@@ -54,7 +54,7 @@ impl StreamHeader {
         bytes[8..12].copy_from_slice(&VERSION.to_le_bytes());
         bytes[12..16].copy_from_slice(&(self.sh_degree as u32).to_le_bytes());
         bytes[16..24].copy_from_slice(&(self.count as u64).to_le_bytes());
-        bytes[24..28].copy_from_slice(&u32::from(self.varying.bits()).to_le_bytes());
+        bytes[24..28].copy_from_slice(&self.varying.bits().to_le_bytes());
         bytes
     }
 

@@ -53,7 +53,7 @@ impl<R: Read> FrameStream<R> {
         }
         let header = StreamHeader::from_bytes(&header).map_err(|illegal| bytes.error(0, None, illegal))?;
         let mut constant = Gaussians::zeros(0, header.sh_degree);
-        for column in Columns::ALL.without(header.varying).iter() {
+        for column in Columns::all().difference(header.varying).iter() {
             if !bytes.column(header.count, constant.column_mut(column))? {
                 return Err(bytes.ended(&format!("the constant column {}", column.name()), None));
             }

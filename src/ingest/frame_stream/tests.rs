@@ -28,7 +28,7 @@ fn states(scene: &Scene) -> Vec<Gaussians> {
     (0..T)
         .map(|t| {
             let mut state = Gaussians::zeros(N, scene.info().sh_degree);
-            reader.read(t, Columns::ALL, &mut state).unwrap();
+            reader.read(t, Columns::all(), &mut state).unwrap();
             state
         })
         .collect()
@@ -76,7 +76,7 @@ fn what_is_written_is_read_bit_for_bit_however_it_drips() {
 
 #[test]
 fn odd_bits_and_columns_that_all_vary_or_none_survive() {
-    for varying in [Columns::NONE, Columns::ALL, Columns::SH] {
+    for varying in [Columns::empty(), Columns::all(), Columns::SH] {
         let mut state = Gaussians::zeros(2, 0);
         for (i, bits) in [0x7fc0_1234, 0x8000_0000, 0xff80_0000, 1].into_iter().enumerate() {
             state.rotation.plane_mut(i)[1] = f32::from_bits(bits);

@@ -130,7 +130,7 @@ impl ModelFolder {
         let paths = ModelPaths::locate(root, iteration)?;
         let ply = Ply::open(&paths.point_cloud)?;
         let mut canonical = Gaussians::zeros(ply.count(), ply.sh_degree());
-        ply.gaussians(0..ply.count(), Columns::ALL, &mut canonical)?;
+        ply.gaussians(0..ply.count(), Columns::all(), &mut canonical)?;
         Self::with_cloud(paths, canonical, ply.sh_degree())
     }
 
@@ -185,7 +185,7 @@ impl ModelFolder {
     pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
         let prepared = self.field.prepare(position);
         let mut deltas = Deltas::new(self.info.sh_degree);
-        self.field.deltas(&prepared, time, Columns::ALL, &mut Scratch::default(), &mut deltas)?;
+        self.field.deltas(&prepared, time, Columns::all(), &mut Scratch::default(), &mut deltas)?;
         Ok(deltas)
     }
 }
@@ -201,7 +201,7 @@ impl FrameSource for ModelFolder {
             return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
-        for column in Columns::ALL.iter() {
+        for column in Columns::all().iter() {
             let (from, to) = (self.canonical.column(column), raw.column_mut(column));
             for c in 0..from.width() {
                 let plane = from.plane(c);

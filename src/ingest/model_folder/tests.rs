@@ -81,7 +81,7 @@ fn states_agree(name: &str) {
     let mut state = Gaussians::zeros(0, 3);
     let mut worst = [0f64; 5];
     for (frame, t) in arrays["frames"].iter().enumerate() {
-        reader.read(frame, Columns::ALL, &mut state).unwrap();
+        reader.read(frame, Columns::all(), &mut state).unwrap();
         for i in 0..n {
             let row = frame * n + i;
             let at = |what: &str| format!("{name}, {what} of Gaussian {i} at frame {t}");
@@ -142,13 +142,13 @@ fn any_list_of_gaussians_reads_the_bits_of_the_whole() {
     let n = model.info().count;
     let read = |ids: Ids<'_>, frame| {
         let mut state = Gaussians::zeros(0, 3);
-        model.open(ids).unwrap().read(frame, Columns::ALL, &mut state).unwrap();
+        model.open(ids).unwrap().read(frame, Columns::all(), &mut state).unwrap();
         state
     };
     let whole = read(Ids::Range(0..n), 1);
     let list: Vec<u32> = (0..n as u32).rev().step_by(37).collect();
     let part = std::thread::scope(|scope| scope.spawn(|| read(Ids::List(&list), 1)).join().unwrap());
-    for column in Columns::ALL.iter() {
+    for column in Columns::all().iter() {
         for c in 0..whole.column(column).width() {
             for (at, &id) in list.iter().enumerate() {
                 let (got, expected) = (part.column(column).plane(c)[at], whole.column(column).plane(c)[id as usize]);
@@ -177,9 +177,9 @@ fn deltas_at_the_canonical_positions_lead_to_the_states() {
     let deltas = model.deltas_at(&model.canonical().position, 0.3).unwrap();
     let model = model.with_times(vec![0.3]).unwrap();
     let mut state = Gaussians::zeros(0, 3);
-    model.open(Ids::Range(0..model.info().count)).unwrap().read(0, Columns::ALL, &mut state).unwrap();
+    model.open(Ids::Range(0..model.info().count)).unwrap().read(0, Columns::all(), &mut state).unwrap();
     let mut applied = Gaussians::zeros(0, 3);
-    deltas.apply(model.canonical(), Columns::ALL, &mut applied);
+    deltas.apply(model.canonical(), Columns::all(), &mut applied);
     assert!(applied == state, "apply(deltas_at) differs from read");
 }
 
@@ -197,7 +197,7 @@ fn times_that_do_not_increase_are_refused_with_their_frames() {
     let model = model.with_times(vec![0.0]).unwrap();
     assert!(model.open(Ids::List(&[1 << 30])).is_err(), "a Gaussian beyond the last");
     let mut reader = model.open(Ids::Range(0..1)).unwrap();
-    assert!(reader.read(1, Columns::ALL, &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
+    assert!(reader.read(1, Columns::all(), &mut Gaussians::zeros(0, 3)).is_err(), "a frame beyond the last");
 }
 
 /// A folder laid out like a model, with empty files.

@@ -66,7 +66,7 @@ impl Layout {
 
     /// The planes of a single column.
     pub(crate) fn planes(&self, column: Columns) -> &[Plane] {
-        let index = Columns::ALL.iter().take_while(|&one| one != column).count();
+        let index = Columns::all().iter().take_while(|&one| one != column).count();
         &self.planes[index]
     }
 }

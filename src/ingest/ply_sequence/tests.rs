@@ -6,7 +6,7 @@ const N: usize = 7;
 /// A frame whose every value tells frame, column and place.
 fn state(frame: usize, count: usize) -> Gaussians {
     let mut out = Gaussians::zeros(count, 1);
-    for column in Columns::ALL.iter() {
+    for column in Columns::all().iter() {
         let fill = |(i, value): (usize, &mut f32)| *value = (1000 * frame + i) as f32;
         out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
     }
@@ -29,15 +29,15 @@ fn frames_come_in_natural_order_at_even_times() {
     let folder = folder(12);
     let sequence = PlySequence::open(folder.path()).unwrap();
     let info = sequence.info();
-    assert_eq!((info.count, info.sh_degree, info.varying), (N, 1, Columns::ALL));
+    assert_eq!((info.count, info.sh_degree, info.varying), (N, 1, Columns::all()));
     assert_eq!(info.times, (0..12).map(|t| t as f64 / 12.0).collect::<Vec<_>>());
     let mut reader = FrameSource::open(&sequence, Ids::Range(0..N)).unwrap();
     let mut out = Gaussians::zeros(0, 1);
     for t in [11, 2, 10, 0] {
-        reader.read(t, Columns::ALL, &mut out).unwrap();
+        reader.read(t, Columns::all(), &mut out).unwrap();
         assert_eq!(out, state(t, N), "frame {t}");
     }
-    assert!(reader.read(12, Columns::ALL, &mut out).unwrap_err().to_string().contains("frame 12"));
+    assert!(reader.read(12, Columns::all(), &mut out).unwrap_err().to_string().contains("frame 12"));
 }
 
 #[test]
@@ -61,7 +61,7 @@ fn a_block_reads_the_same_bits_as_the_whole() {
     let whole = state(2, N);
     let mut out = Gaussians::zeros(0, 1);
     let ids = [6, 0, 3, 3];
-    FrameSource::open(&sequence, Ids::List(&ids)).unwrap().read(2, Columns::ALL, &mut out).unwrap();
+    FrameSource::open(&sequence, Ids::List(&ids)).unwrap().read(2, Columns::all(), &mut out).unwrap();
     for (i, &id) in ids.iter().enumerate() {
         assert_eq!(out.sh.row::<12>(i), whole.sh.row::<12>(id as usize));
     }
@@ -75,9 +75,9 @@ fn a_single_file_is_one_frame_in_which_nothing_varies() {
     let folder = folder(1);
     for sequence in [PlySequence::single(&folder.path().join("f_0.ply")), PlySequence::open(folder.path())] {
         let sequence = sequence.unwrap();
-        assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Columns::NONE, &[0.0][..]));
+        assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Columns::empty(), &[0.0][..]));
         let mut out = Gaussians::zeros(0, 1);
-        FrameSource::open(&sequence, Ids::Range(0..N)).unwrap().read(0, Columns::ALL, &mut out).unwrap();
+        FrameSource::open(&sequence, Ids::Range(0..N)).unwrap().read(0, Columns::all(), &mut out).unwrap();
         assert_eq!(out, state(0, N));
     }
 }
@@ -101,7 +101,7 @@ fn a_frame_that_changed_since_it_was_opened_is_named() {
     let sequence = PlySequence::open(folder.path()).unwrap();
     write(folder.path(), "f_1.ply", &state(1, N + 2));
     let mut reader = FrameSource::open(&sequence, Ids::Range(0..N)).unwrap();
-    let message = reader.read(1, Columns::ALL, &mut Gaussians::zeros(0, 1)).unwrap_err().to_string();
+    let message = reader.read(1, Columns::all(), &mut Gaussians::zeros(0, 1)).unwrap_err().to_string();
     assert!(message.contains("f_1.ply") && message.contains("found 9"), "{message}");
 }
 

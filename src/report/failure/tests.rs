@@ -53,7 +53,7 @@ impl Looked {
         let left: Vec<u32> = all.iter().copied().filter(|&i| !lost(i as usize)).collect();
         let (mut seen, mut names) = (Vec::new(), Vec::new());
         for frame in (0..self.made.info().times.len()).step_by(3) {
-            let state = gather(&self.made, &all, frame, crate::model::Columns::ALL).unwrap();
+            let state = gather(&self.made, &all, frame, crate::model::Columns::all()).unwrap();
             for view in [1usize, 2, 4] {
                 let camera = &rig.cameras[view];
                 let taken = Taken {
