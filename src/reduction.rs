@@ -1,6 +1,6 @@
 //! What is left of an input: which Gaussians stay, which of them stand for several, and what was changed of them.
 
-use crate::model::Gaussians;
+use crate::model::{Columns, Gaussians};
 use crate::recipe::Merge;
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
@@ -36,6 +36,46 @@ pub struct Proxies {
     pub notes: Vec<String>,
 }
 
+/// What is added to the parameters of the output's Gaussians as they are stored, the same at all times.
+///
+/// A row for every Gaussian of the output, in columns that change; columns that do not are empty. Harmonics may be of
+/// a lower degree than the output's: those above stay.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Change(pub Gaussians);
+
+impl Change {
+    /// The columns that change.
+    pub fn columns(&self) -> Columns {
+        let changes = |&column: &Columns| !self.0.column(column).is_empty();
+        Columns::all().iter().filter(changes).collect()
+    }
+
+    /// Whether nothing changes.
+    pub fn is_empty(&self) -> bool {
+        self.columns().is_empty()
+    }
+
+    /// The change of the Gaussians at `places`, in that order.
+    pub fn pick(&self, places: &[u32]) -> Change {
+        let mut picked = Change::default();
+        for column in self.columns().iter() {
+            *picked.0.column_mut(column) = self.0.column(column).pick(places);
+        }
+        picked
+    }
+
+    /// Changes the columns `of` of `state`, row by row. A zero leaves the value its bits.
+    pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
+        for column in (self.columns() & of).iter() {
+            let (by, values) = (self.0.column(column), state.column_mut(column));
+            for c in 0..by.width().min(values.width()) {
+                let changed = values.plane_mut(c).iter_mut().zip(by.plane(c)).filter(|(_, by)| **by != 0.0);
+                changed.for_each(|(value, by)| *value += by);
+            }
+        }
+    }
+}
+
 /// The Gaussians of the output in terms of those of the input.
 #[derive(Debug, Clone)]
 pub struct Reduction {
@@ -47,15 +87,15 @@ pub struct Reduction {
     pub rule: Merge,
     /// The proxies, solved.
     pub proxies: Proxies,
-    /// What is added to the base colours (`f_dc`), by place in the output; empty: nothing.
-    pub recolor: Vec<[f32; 3]>,
+    /// What is added to their parameters.
+    pub change: Change,
 }
 
 impl Reduction {
     /// The Gaussians `kept` (increasing) as they are. Nothing is merged, so that nothing goes by `rule`.
     pub fn pruned(kept: Vec<u32>, rule: &Merge) -> Self {
-        let (clusters, proxies, recolor) = (Vec::new(), Proxies::default(), Vec::new());
-        Reduction { kept, clusters, rule: rule.clone(), proxies, recolor }
+        let (clusters, proxies, change) = (Vec::new(), Proxies::default(), Change::default());
+        Reduction { kept, clusters, rule: rule.clone(), proxies, change }
     }
 
     /// Number of Gaussians in the output.
@@ -87,6 +127,27 @@ impl Reduction {
 mod tests {
     use super::*;
     use crate::recipe::Recipe;
+
+    #[test]
+    fn a_change_adds_to_its_own_columns_and_zeros_keep_even_the_sign_of_zero() {
+        let mut state = Gaussians::zeros(2, 1);
+        state.opacity_logit.set_row(0, [-0.0]);
+        let mut by = Gaussians::zeros(2, 0);
+        by.rotation = Default::default();
+        by.position.set_row(1, [1.0, 0.0, -2.0]);
+        by.sh.set_row(0, [0.5, 0.0, 0.25]);
+        let change = Change(by);
+        assert_eq!(change.columns(), Columns::all().difference(Columns::ROTATION));
+        let mut changed = state.clone();
+        change.add_to(&mut changed, change.columns().difference(Columns::LOG_SCALE));
+        assert_eq!(changed.opacity_logit.row::<1>(0)[0].to_bits(), (-0.0f32).to_bits());
+        assert_eq!(changed.position.row(1), [1.0, 0.0, -2.0]);
+        assert_eq!(changed.sh.row(0), [0.5, 0.0, 0.25, 0.0, 0.0]);
+        assert_eq!((&changed.rotation, &changed.log_scale), (&state.rotation, &state.log_scale));
+        change.pick(&[1, 0]).add_to(&mut state, Columns::all());
+        assert_eq!((state.position.row(0), state.sh.row(1)), ([1.0, 0.0, -2.0], [0.5, 0.0, 0.25]));
+        assert!(Change::default().is_empty() && !change.is_empty());
+    }
 
     #[test]
     fn members_of_a_cluster_share_its_place() {

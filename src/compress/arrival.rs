@@ -1,7 +1,7 @@
 //! Opening a scene that is to be measured; a stream is measured as it arrives, so that it is read once.
 //!
 //! Memory of a stream: what packing it takes ([`crate::families::stream`]) and, when measuring, the accumulators of all
-//! Gaussians ([`crate::stats::BYTES_PER_GAUSSIAN`] each) and what [`Looking`] needs.
+//! Gaussians ([`crate::stats::BYTES_PER_GAUSSIAN`] each) and what [`RunningContribution`] needs.
 //!
 //! What only the end of the stream tells (time span, number of frames) is assumed meanwhile: even frames, and
 //! pictures taken at exactly the times that arrive. Where that proves wrong the packed frames are
@@ -19,12 +19,12 @@ use crate::error::Result;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
 use crate::ingest::cameras;
-use crate::model::{Camera, Rig, Split};
+use crate::model::{Camera, Picture, Rig, Split};
 use crate::pass::{FrameSource, Reads};
 use crate::recipe;
 use crate::scene::{InputOptions, Opened, Scene, load_cameras, open_scene, open_stream, receiving, scene_of};
 use crate::stats::{RobustBox, ScanPlan};
-use crate::stream::{HeldFrames, Looking, RunningScan, Sampler};
+use crate::stream::{HeldFrames, RunningContribution, RunningScan, Sampler};
 
 /// Opens a scene to be measured, with the limits of its budget; `plan` says what is to be done with such a scene. A
 /// stream is measured as it arrives, see [`receive_measured`]; the statistics come back then.
@@ -86,8 +86,9 @@ fn receive_measured<S: Stages>(
             none if measures => {
                 let rig: &Rig = rig.get_or_init(|| rig_around(held));
                 let plan = plan_of_scan.get_or_init(|| ScanPlan::arriving(&scan.recipe, &rig.cameras));
-                let looking = visible.as_ref().map(|_| Looking::new(count, scan.recipe.pixel_stride, memory.limits));
-                none.insert(Measuring::new(count, rig, options.split, plan, &scan.recipe, looking))
+                let seen =
+                    visible.as_ref().map(|_| RunningContribution::new(count, scan.recipe.pixel_stride, memory.limits));
+                none.insert(Measuring::new(count, rig, options.split, plan, &scan.recipe, seen))
             }
             _ => return Ok(()),
         };
@@ -128,7 +129,7 @@ struct Measuring<'a> {
     /// For every frame its (view number, camera index) pairs, as assumed.
     frames: Vec<Vec<(u32, u32)>>,
     scan: RunningScan<'a>,
-    looking: Option<(Sampler, Looking)>,
+    seen: Option<(Sampler, RunningContribution)>,
 }
 
 impl<'a> Measuring<'a> {
@@ -138,7 +139,7 @@ impl<'a> Measuring<'a> {
         split: Option<Split>,
         plan: &'a ScanPlan,
         scan: &recipe::Scan,
-        looking: Option<Looking>,
+        seen: Option<RunningContribution>,
     ) -> Self {
         Measuring {
             plan,
@@ -146,7 +147,7 @@ impl<'a> Measuring<'a> {
             assumed: AssumedTimes::new(rig, split),
             frames: Vec::new(),
             scan: RunningScan::new(count, plan),
-            looking: looking.map(|looking| (Sampler::new(scan), looking)),
+            seen: seen.map(|seen| (Sampler::new(scan), seen)),
         }
     }
 
@@ -157,10 +158,10 @@ impl<'a> Measuring<'a> {
         let cameras: Vec<Vec<&Camera>> =
             new.iter().map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect()).collect();
         self.scan.add(held, &cameras)?;
-        if let Some((sampler, looking)) = &mut self.looking {
-            let taken = new.iter().map(|views| sampler.next(views, self.cameras)).enumerate();
-            let pictures: Vec<(usize, Vec<&Camera>)> = taken.filter(|(_, cameras)| !cameras.is_empty()).collect();
-            looking.add(held, &pictures, |_| ())?;
+        if let Some((sampler, seen)) = &mut self.seen {
+            let new = new.iter().enumerate();
+            let pictures: Vec<Picture> = new.flat_map(|(frame, views)| sampler.next(frame, views)).collect();
+            seen.add(held, self.cameras, &pictures, || ())?;
         }
         Ok(())
     }
@@ -174,7 +175,7 @@ impl<'a> Measuring<'a> {
     }
 
     fn finish(self, complete: &ScanPlan) -> Measured {
-        Measured { scanned: self.scan.finish(complete), seen: self.looking.map(|(_, looking)| looking.finish()) }
+        Measured { scanned: self.scan.finish(complete), seen: self.seen.map(|(_, seen)| seen.finish()) }
     }
 }
 

@@ -10,15 +10,13 @@ use super::score::{Order, Ranked, Scored, scored};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
-use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Wanted};
+use crate::model::{Camera, Columns, Gaussians, Picture};
 use crate::plan::Limits;
 use crate::recipe::{self, StaticTerm};
 use crate::reduction::Reduction;
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
-use crate::scene::pictures::spread;
-use crate::stream::States;
+use crate::stream::{Batch, Subject, View, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -106,7 +104,7 @@ impl Choose {
         if alternatives.is_empty() {
             return Ok(merged);
         }
-        let pictures = spread(&scene.schedule, PICTURES);
+        let pictures = spread(&scene.schedule, PICTURES, 1);
         let found =
             journal.stage(NAME, count, scene.source(), |_| Ok((mean_psnr(scene, &alternatives, &pictures)?, count)))?;
         // Strictly greater: of equals the first.
@@ -167,45 +165,46 @@ impl Choose {
     }
 }
 
-/// Mean PSNR of every alternative against the original over `pictures`, dB.
-fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[(usize, u32)]) -> Result<Vec<f64>> {
-    let background = scene.background;
-    let results: Vec<Option<Box<dyn FrameSource + '_>>> = alternatives
-        .iter()
-        .map(|other| match other.reduction.clusters.is_empty() {
-            true => Ok(None),
-            false => scene.input.reduced(&other.reduction).map(Some),
-        })
-        .collect::<Result<_>>()?;
-    let wanted = Wanted::of(pictures.iter().map(|&(frame, _)| frame)).holding(scene.limits.frames_held);
-    let open = |source| States::open(source, &wanted);
-    let mut of_source = open(scene.source())?;
-    let mut of_results: Vec<Option<States<'_>>> =
-        results.iter().map(|result| result.as_deref().map(open).transpose()).collect::<Result<_>>()?;
+/// Mean PSNR of every alternative against the original over `pictures`, dB. At most one has clusters.
+fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[Picture]) -> Result<Vec<f64>> {
+    let merged = alternatives.iter().position(|other| !other.reduction.clusters.is_empty());
+    let result = merged.map(|at| scene.input.reduced(&alternatives[at].reduction)).transpose()?;
     let mut sums = vec![0.0; alternatives.len()];
-    for of_frame in pictures.chunk_by(|a, b| a.0 == b.0).flat_map(|of_frame| of_frame.chunks(AT_ONCE)) {
-        let frame = of_frame[0].0;
-        let camera = |index: u32| &scene.schedule.cameras[index as usize];
-        let original = of_source.at(frame)?;
-        let expected: Vec<Image> =
-            of_frame.iter().map(|&(_, index)| render(original, camera(index), background)).collect();
-        let compare = |state: &Gaussians| -> f64 {
-            let of_picture = |(&(_, index), expected): (&(usize, u32), &Image)| {
-                psnr(&render(state, camera(index), background), expected)
+    let mut add = |original: &Gaussians, merged: Option<&Gaussians>, cameras: &[&Camera]| {
+        let picture = |state: &Gaussians, camera: &Camera| render(state, camera, scene.background);
+        let expected: Vec<Image> = cameras.iter().map(|camera| picture(original, camera)).collect();
+        for (other, sum) in alternatives.iter().zip(&mut sums) {
+            let pruned;
+            let state = match merged.filter(|_| !other.reduction.clusters.is_empty()) {
+                Some(merged) => merged,
+                None => {
+                    pruned = original.pick(&other.reduction.kept);
+                    &pruned
+                }
             };
-            of_frame.iter().zip(&expected).map(of_picture).sum()
-        };
-        let pruned = alternatives.iter().zip(&mut sums).filter(|(other, _)| other.reduction.clusters.is_empty());
-        for (other, sum) in pruned {
-            *sum += compare(&original.pick(&other.reduction.kept));
+            let quality = |(camera, expected): (&&Camera, &Image)| psnr(&picture(state, camera), expected);
+            *sum += cameras.iter().zip(&expected).map(quality).sum::<f64>();
         }
-        for (result, sum) in of_results.iter_mut().zip(&mut sums) {
-            if let Some(states) = result {
-                *sum += compare(states.at(frame)?);
-            }
-        }
-    }
+    };
+    let batch = Batch { pictures: AT_ONCE, ..Batch::of_frame(&scene.limits) };
+    let (original, cameras) = (Subject::all(scene.source()), &scene.schedule.cameras);
+    match &result {
+        None => show([original], cameras, pictures, batch, |views| {
+            add(views[0].states[0], None, &cameras_of(views));
+            Ok(())
+        }),
+        Some(result) => show([original, Subject::all(&**result)], cameras, pictures, batch, |views| {
+            let [original, merged] = views[0].states;
+            add(original, Some(merged), &cameras_of(views));
+            Ok(())
+        }),
+    }?;
     Ok(sums.into_iter().map(|sum| sum / pictures.len().max(1) as f64).collect())
+}
+
+/// The cameras of views of one frame.
+fn cameras_of<'a, const S: usize>(views: &[View<'a, S>]) -> Vec<&'a Camera> {
+    views.iter().map(|view| view.camera).collect()
 }
 
 #[cfg(test)]
@@ -219,7 +218,7 @@ mod tests {
     /// Mean PSNR over the pictures that decide.
     fn quality(scene: &Scene, reduction: &Reduction) -> f64 {
         let alone = [Alternative { by: Order::Rounds, reduction: reduction.clone() }];
-        mean_psnr(scene, &alone, &spread(&scene.schedule, PICTURES)).unwrap()[0]
+        mean_psnr(scene, &alone, &spread(&scene.schedule, PICTURES, 1)).unwrap()[0]
     }
 
     /// What merging leaves of a scene, and what is chosen then.
@@ -269,15 +268,5 @@ mod tests {
         let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, None);
         assert!(merged.len() < survivors, "nothing merged");
         assert_eq!((chosen.reduction.len(), journal.left_out.len()), (survivors, 1));
-    }
-
-    #[test]
-    fn pictures_that_decide_are_spread_over_all_and_none_counts_twice() {
-        let folder = tempfile::tempdir().unwrap();
-        let scene = scene(folder.path());
-        let pictures = spread(&scene.schedule, PICTURES);
-        assert_eq!(pictures.len(), PICTURES);
-        assert!(pictures.is_sorted() && pictures.windows(2).all(|pair| pair[0] != pair[1]));
-        assert_eq!((pictures[0].0, pictures[PICTURES - 1].0), (0, 5));
     }
 }

@@ -6,18 +6,17 @@
 use super::journal::Journal;
 use super::score::{Scored, scored};
 use crate::budget::{Need, Workload};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::metrics::psnr;
-use crate::model::{Camera, Columns, SH_C0};
-use crate::pass::{FrameSource, Wanted};
+use crate::model::{Camera, Column, Columns, Gaussians, Picture, SH_C0};
+use crate::pass::FrameSource;
 use crate::plan::Limits;
 use crate::recipe;
-use crate::reduction::Reduction;
+use crate::reduction::{Change, Reduction};
 use crate::refit::{self, Refit as Equations};
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
-use crate::scene::pictures::spread;
-use crate::stream::{States, recolor};
+use crate::stream::{Batch, Subject, View, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "refit";
@@ -38,8 +37,7 @@ pub struct Refit {
 
 /// A picture that the colours are not fitted to.
 struct Test {
-    frame: usize,
-    camera: u32,
+    picture: Picture,
     original: Image,
 }
 
@@ -57,6 +55,7 @@ impl Refit {
         let fitted = (self.pictures as u64).min(most);
         let tests = fitted.div_ceil(3);
         let sights = fitted.min(limits.sights_together as u64);
+        let at_once = work.threads.min(limits.pictures_together as u64);
         // Those whose footprints are not kept are looked at in every iteration.
         let again = if sights < fitted { ITERATIONS as f64 + 1.0 } else { 0.0 };
         let per_gaussian = vec![
@@ -78,7 +77,7 @@ impl Refit {
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![
                 work.arriving(),
-                ("pictures", (tests + work.views + 1) * 12 * work.pixels),
+                ("pictures", (tests + at_once + 1) * 12 * work.pixels),
                 ("pairs", (sights + work.threads) * render::STRIP_BYTES as u64 / 3),
             ],
         }
@@ -97,29 +96,33 @@ impl Refit {
         journal: &mut Journal,
     ) -> Result<Reduction> {
         let count = reduction.len();
-        let pictures = spread(&scene.schedule, self.pictures + self.pictures.div_ceil(TEST_EVERY - 1));
+        let pictures = spread(&scene.schedule, self.pictures + self.pictures.div_ceil(TEST_EVERY - 1), 1);
         // A single picture cannot be fitted to and tested on.
         if pictures.len() < 2 || count == 0 {
             return Ok(reduction);
         }
-        let change = journal.stage(NAME, count, scene.source(), |journal| {
+        reduction.change = journal.stage(NAME, count, scene.source(), |journal| {
             let result = scene.input.reduced(&reduction)?;
             let fixed = reduction.kept.iter().map(|id| scored.protected.binary_search(id).is_ok()).collect();
             let kept = scene.limits.sights_together;
             let mut equations = Equations::new(fixed, kept);
-            let tests = look(scene, &*result, &pictures, &mut equations)?;
-            let unkept: Vec<(usize, u32)> = fitted(&pictures).skip(kept).collect();
+            let (fitted, tested) = divided(&pictures);
+            let tests = look(scene, &*result, (&fitted, &tested), &mut equations)?;
+            let unkept = fitted.get(kept..).unwrap_or_default();
+            let (cameras, batch) = (&scene.schedule.cameras, Batch::of_frame(&scene.limits));
             let colors = equations.solve(self.ridge, ITERATIONS, |see| {
-                let mut states = open(scene, &*result, unkept.iter().map(|&(frame, _)| frame))?;
-                for of_frame in unkept.chunk_by(|a, b| a.0 == b.0) {
-                    let cameras: Vec<&Camera> =
-                        of_frame.iter().map(|&(_, camera)| &scene.schedule.cameras[camera as usize]).collect();
-                    see(states.at(of_frame[0].0)?, &cameras);
-                }
-                Ok::<_, Error>(())
+                show([Subject::all(&*result)], cameras, unkept, batch, |views| {
+                    let cameras: Vec<&Camera> = views.iter().map(|view| view.camera).collect();
+                    see(views[0].states[0], &cameras);
+                    Ok(())
+                })
             })?;
             drop(equations);
-            let change: Vec<[f32; 3]> = colors.iter().map(|rgb| rgb.map(|x| (f64::from(x) / SH_C0) as f32)).collect();
+            let mut base = Column::zeros(3, count);
+            for (i, rgb) in colors.into_iter().enumerate() {
+                base.set_row(i, rgb.map(|x| (f64::from(x) / SH_C0) as f32));
+            }
+            let change = Change(Gaussians { sh: base, ..Gaussians::default() });
             let [before, after] = quality(scene, &*result, &tests, &change)?;
             if after > before {
                 journal.notes.push(format!(
@@ -129,77 +132,70 @@ impl Refit {
             }
             let why = format!("pictures not fitted to keep {before:.2} dB without it, {after:.2} with it");
             journal.leave_out("refitting colours", why);
-            Ok((Vec::new(), count))
+            Ok((Change::default(), count))
         })?;
-        reduction.recolor = change;
         Ok(reduction)
     }
 }
 
-/// The states of `source`, which is the scene's or made of it, at `frames`.
-fn open<'a>(scene: &Scene, source: &'a dyn FrameSource, frames: impl IntoIterator<Item = usize>) -> Result<States<'a>> {
-    States::open(source, &Wanted::of(frames).holding(scene.limits.frames_held))
+/// `pictures` to fit to and, every fourth, to test on; a few pictures spare one too.
+fn divided(pictures: &[Picture]) -> (Vec<Picture>, Vec<Picture>) {
+    let is_test = |k: usize| k % TEST_EVERY == TEST_EVERY - 1 || k + 1 == pictures.len().min(TEST_EVERY);
+    let (mut fitted, mut tested) = (Vec::new(), Vec::new());
+    for (k, &picture) in pictures.iter().enumerate() {
+        if is_test(k) { tested.push(picture) } else { fitted.push(picture) }
+    }
+    (fitted, tested)
 }
 
-/// Whether picture `k` of `count` is for the test; a few pictures spare one too.
-fn is_test(k: usize, count: usize) -> bool {
-    k % TEST_EVERY == TEST_EVERY - 1 || k + 1 == count.min(TEST_EVERY)
-}
-
-/// The pictures that are not for the test.
-fn fitted(pictures: &[(usize, u32)]) -> impl Iterator<Item = (usize, u32)> {
-    let of = pictures.iter().enumerate().filter(|&(k, _)| !is_test(k, pictures.len()));
-    of.map(|(_, &picture)| picture)
-}
-
-/// Adds what all but every fourth of `pictures` lack to `equations`; gives the others.
+/// Adds what the pictures `fitted` lack to `equations`; gives the original's pictures `tested`.
 fn look(
     scene: &Scene,
     result: &dyn FrameSource,
-    pictures: &[(usize, u32)],
+    (fitted, tested): (&[Picture], &[Picture]),
     equations: &mut Equations,
 ) -> Result<Vec<Test>> {
     let background = scene.background;
-    let camera = |index: u32| &scene.schedule.cameras[index as usize];
-    let mut tests = Vec::new();
-    let frames = || pictures.iter().map(|&(frame, _)| frame);
-    let (mut of_result, mut of_source) = (open(scene, result, frames())?, open(scene, scene.source(), frames())?);
-    let numbered: Vec<(usize, usize, u32)> =
-        pictures.iter().enumerate().map(|(k, &(frame, camera))| (k, frame, camera)).collect();
-    for of_frame in numbered.chunk_by(|a, b| a.1 == b.1) {
-        let frame = of_frame[0].1;
-        let (state, original) = (of_result.at(frame)?, of_source.at(frame)?);
+    let (cameras, batch) = (&scene.schedule.cameras, Batch::of_frame(&scene.limits));
+    let (result, original) = (Subject::all(result), Subject::all(scene.source()));
+    let mut tests = Vec::with_capacity(tested.len());
+    let mut pictures = [fitted, tested].concat();
+    pictures.sort_unstable_by_key(|picture| (picture.frame, picture.view));
+    show([result, original], cameras, &pictures, batch, |views| {
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
-        for &(k, _, index) in of_frame {
-            let mut picture = render(original, camera(index), background);
-            if is_test(k, pictures.len()) {
-                tests.push(Test { frame, camera: index, original: picture });
+        let state = views[0].states[0];
+        for &View { picture, camera, states: [_, original] } in views {
+            let mut lack = render(original, camera, background);
+            if tested.contains(&picture) {
+                tests.push(Test { picture, original: lack });
                 continue;
             }
-            let now = render(state, camera(index), background);
-            picture.data.iter_mut().zip(&now.data).for_each(|(lack, now)| *lack -= now);
-            lacks.push((camera(index), picture));
+            let now = render(state, camera, background);
+            lack.data.iter_mut().zip(&now.data).for_each(|(lack, now)| *lack -= now);
+            lacks.push((camera, lack));
         }
         equations.add(state, &lacks);
-    }
+        Ok(())
+    })?;
     Ok(tests)
 }
 
 /// Mean PSNR over `tests` without `change` and with it, dB.
-fn quality(scene: &Scene, result: &dyn FrameSource, tests: &[Test], change: &[[f32; 3]]) -> Result<[f64; 2]> {
-    let background = scene.background;
+fn quality(scene: &Scene, result: &dyn FrameSource, tests: &[Test], change: &Change) -> Result<[f64; 2]> {
     let mut sums = [0.0; 2];
-    let mut states = open(scene, result, tests.iter().map(|test| test.frame))?;
-    for of_frame in tests.chunk_by(|a, b| a.frame == b.frame) {
-        let before = states.at(of_frame[0].frame)?;
+    let pictures: Vec<Picture> = tests.iter().map(|test| test.picture).collect();
+    let mut originals = tests.iter().map(|test| &test.original);
+    let (cameras, batch) = (&scene.schedule.cameras, Batch::of_frame(&scene.limits));
+    show([Subject::all(result)], cameras, &pictures, batch, |views| {
+        let before = views[0].states[0];
         let mut after = before.clone();
-        recolor(&mut after, change);
-        for test in of_frame {
-            let camera = &scene.schedule.cameras[test.camera as usize];
+        change.add_to(&mut after, Columns::all());
+        for (view, original) in views.iter().zip(&mut originals) {
             for (sum, state) in sums.iter_mut().zip([before, &after]) {
-                *sum += psnr(&render(state, camera, background), &test.original);
+                *sum += psnr(&render(state, view.camera, scene.background), original);
             }
         }
-    }
+        Ok(())
+    })?;
     Ok(sums.map(|sum| sum / tests.len().max(1) as f64))
 }

@@ -15,7 +15,7 @@ use crate::plan::Limits;
 use crate::recipe;
 use crate::scene::Scene;
 use crate::select::Ranking;
-use crate::stream::{Sample, removal_error};
+use crate::stream::{VIEWS_AT_ONCE, removal_error, spread};
 
 /// What the stage is called.
 const NAME: &str = "rounds";
@@ -69,7 +69,8 @@ impl Rounds {
         fewest: usize,
         journal: &mut Journal,
     ) -> Result<Ranked> {
-        let sample = Sample::at_most(&scene.schedule, PICTURES);
+        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
+        let pictures = (&scene.schedule.cameras[..], &pictures[..]);
         let floor = self.contrast_floor as f32;
         let source = scene.source();
         let protected = &scored.protected;
@@ -84,7 +85,7 @@ impl Rounds {
             journal.stage(NAME, seen, source, |_| {
                 let mut ids: Vec<u32> = free.iter().chain(protected).copied().collect();
                 ids.sort_unstable();
-                let errors = removal_error(source, &ids, &sample, scene.background, floor, scene.limits)?.sum;
+                let errors = removal_error(source, &ids, pictures, scene.background, floor, scene.limits)?.sum;
                 let error = |id: &u32| ids.binary_search(id).map_or(0, |row| errors[row]);
                 // Stable: ties keep the order there was.
                 free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
@@ -109,9 +110,9 @@ mod tests {
     use crate::compress::score::UserOverrides;
     use crate::compress::tests::{scene, score_scene};
     use crate::metrics::psnr;
+    use crate::model::Picture;
     use crate::recipe::Recipe;
     use crate::render::render;
-    use crate::scene::pictures::spread;
     use crate::stream::gather;
 
     /// The order of scoring, and that of the rounds.
@@ -143,12 +144,12 @@ mod tests {
         let all: Vec<u32> = (0..1500).collect();
         for target in [150, 500] {
             let quality = |kept: &[u32]| -> f64 {
-                let of_picture = |&(frame, camera): &(usize, u32)| {
-                    let original = gather(scene.source(), &all, frame, Columns::all()).unwrap();
-                    let camera = &scene.schedule.cameras[camera as usize];
+                let of_picture = |picture: &Picture| {
+                    let original = gather(scene.source(), &all, picture.frame, Columns::all()).unwrap();
+                    let camera = &scene.schedule.cameras[picture.camera as usize];
                     psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
                 };
-                spread(&scene.schedule, 12).iter().map(of_picture).sum::<f64>() / 12.0
+                spread(&scene.schedule, 12, 1).iter().map(of_picture).sum::<f64>() / 12.0
             };
             let got = quality(&rounds.ranking.take(target));
             let at_once = quality(&once.ranking.take(target));

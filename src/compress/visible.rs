@@ -7,7 +7,7 @@ use crate::model::{Columns, Rows};
 use crate::plan::Limits;
 use crate::recipe::{self, Coverage};
 use crate::scene::Scene;
-use crate::stream::{Sample, Seen, visible_contribution};
+use crate::stream::{Seen, strided, visible_contribution};
 
 /// What the stage is called.
 const NAME: &str = "visible";
@@ -45,9 +45,17 @@ impl Visible {
     pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Seen> {
         let source = scene.source();
         let count = source.info().count;
-        let sample = Sample::new(&scene.schedule, &self.recipe);
+        let pictures = strided(&scene.schedule, &self.recipe);
         journal.stage(NAME, count, source, |_| {
-            Ok((visible_contribution(source, &sample, self.recipe.pixel_stride, scene.limits)?, count))
+            Ok((
+                visible_contribution(
+                    source,
+                    (&scene.schedule.cameras, &pictures),
+                    self.recipe.pixel_stride,
+                    scene.limits,
+                )?,
+                count,
+            ))
         })
     }
 }

@@ -10,7 +10,7 @@ use std::path::Path;
 use crate::error::{Error, Result};
 use crate::ingest::ply::{Encoding, Plane, Ply, Property, Scalar, read_plane};
 use crate::model::{Columns, Gaussians, sh_coefficients};
-use crate::reduction::Reduction;
+use crate::reduction::{Change, Reduction};
 
 /// One row of a smaller PLY.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,15 +19,11 @@ pub struct OutRow {
     pub source: u32,
     /// The proxy whose columns replace those of the row, if any.
     pub proxy: Option<u32>,
-    /// What is added to its `f_dc_0..2`; zeros leave them their bytes.
-    pub recolor: [f32; 3],
 }
 
 /// The rows of what `reduction` leaves.
 pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
-    let row = |&source: &u32| OutRow { source, proxy: None, recolor: [0.0; 3] };
-    let mut rows: Vec<OutRow> = reduction.kept.iter().map(row).collect();
-    rows.iter_mut().zip(&reduction.recolor).for_each(|(row, &recolor)| row.recolor = recolor);
+    let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
         rows[cluster.output as usize].proxy = Some(proxy as u32);
     }
@@ -35,8 +31,8 @@ pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
 }
 
 /// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):
-/// only the count changes. A row without a proxy is the template's, byte for byte but for a change of its
-/// base colour. A row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of its
+/// only the count changes. A row without a proxy is the template's, byte for byte but for what
+/// `change`, by row, adds to it (zeros leave the bytes). A row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of its
 /// property (integers: nearest, saturated); normals and further properties stay the leader's. A
 /// template without `scale_2` has no place for a proxy's third scale: order axes largest first.
 ///
@@ -44,23 +40,23 @@ pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
 /// binary; otherwise all rows in order without proxies give the template's own bytes.
 ///
 /// # Errors
-/// A source or proxy that does not exist; proxies of another SH degree; a template cut short since
+/// A source or proxy that does not exist; proxies of another SH degree; changes of other rows; a template cut short since
 /// it was opened; a failed write.
-pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, path: &Path) -> Result<()> {
-    check_rows(template, rows, proxies)?;
+pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change, path: &Path) -> Result<()> {
+    check_rows(template, rows, proxies, change)?;
     template.check_unshrunk()?;
     create(path, |out| {
         out.write_all(&template.header().text_for(rows.len()))?;
         out.write_all(template.lead())?;
         let mut changed = Vec::new();
-        for row in rows {
+        for (place, row) in rows.iter().enumerate() {
             let source = template.row(row.source as usize);
             changed.clear();
             changed.extend_from_slice(source);
             if let Some(proxy) = row.proxy {
                 replace(&mut changed, template, proxies, proxy as usize);
             }
-            recolor(&mut changed, template, row.recolor);
+            add(&mut changed, template, change, place);
             out.write_all(&changed)?;
         }
         out.write_all(template.tail())
@@ -120,7 +116,14 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
     fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians) -> Result<()> {
+fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change) -> Result<()> {
+    for column in change.columns().iter() {
+        let changes = change.0.column(column).len();
+        if changes != rows.len() {
+            let message = format!("{}: {changes} changes of {} rows", column.name(), rows.len());
+            return Err(Error::usage(message));
+        }
+    }
     let planes = template.layout().planes(Columns::SH).len();
     if !proxies.is_empty() && proxies.sh.width() != planes {
         let width = proxies.sh.width();
@@ -153,14 +156,18 @@ fn replace(row: &mut [u8], template: &Ply, proxies: &Gaussians, proxy: usize) {
     }
 }
 
-/// Adds to the base colour in the bytes of a row.
-fn recolor(row: &mut [u8], template: &Ply, by: [f32; 3]) {
+/// Adds the change of the Gaussian at `place` of the output to the bytes of its row.
+fn add(row: &mut [u8], template: &Ply, change: &Change, place: usize) {
     let big_endian = template.header().encoding == Encoding::BigEndian;
-    for (plane, by) in template.layout().planes(Columns::SH).iter().zip(by) {
-        if let (Plane::Property(property), true) = (plane, by != 0.0) {
-            let mut value = [0.0];
-            read_plane(row, &[0], property, big_endian, &mut value);
-            put(row, property, big_endian, value[0] + by);
+    for column in change.columns().iter() {
+        let by = change.0.column(column);
+        for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
+            let by = by.plane(c)[place];
+            if let (Plane::Property(property), true) = (plane, by != 0.0) {
+                let mut value = [0.0];
+                read_plane(row, &[0], property, big_endian, &mut value);
+                put(row, property, big_endian, value[0] + by);
+            }
         }
     }
 }

@@ -103,7 +103,7 @@ fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, 
             (OutputKind::PlySequence, Some(name)) => path.join(name),
             _ => path.to_owned(),
         };
-        write_like(&template, &rows, &proxies, &target)?;
+        write_like(&template, &rows, &proxies, &reduction.change, &target)?;
         progress.advance(1);
         Ok(())
     };

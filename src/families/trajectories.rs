@@ -15,7 +15,7 @@ use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::pass::{FrameSource, Wanted};
 use crate::plan::Limits;
 use crate::reduction::Reduction;
-use crate::stream::{HeldFrames, MergedSequence, Progress, Recolored, States};
+use crate::stream::{Changed, HeldFrames, MergedSequence, Progress, States};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -34,12 +34,12 @@ pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a Reduction) 
     MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
 }
 
-/// What is left of `source`, merged and recoloured.
+/// What is left of `source`, merged and changed.
 pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a Reduction,
 ) -> Box<dyn FrameSource + 'a> {
-    Box::new(Recolored::new(Box::new(merged(source, reduction)), &reduction.recolor))
+    Box::new(Changed::new(Box::new(merged(source, reduction)), &reduction.change))
 }
 
 /// Confirms that a sequence of so many frames can be written as `kind`.
@@ -95,8 +95,9 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
                 held.push(times[frame], state);
             }
             drop(frames);
-            let change = reduction.recolor.get(part.clone()).unwrap_or(&[]);
-            let held = Recolored::new(Box::new(held), change);
+            let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
+            let change = reduction.change.pick(&places);
+            let held = Changed::new(Box::new(held), &change);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }

@@ -1,6 +1,6 @@
 //! Cameras, the pictures they took, and which camera sees which frame.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
@@ -67,7 +67,7 @@ pub enum Split {
     Test,
 }
 
-/// One picture: a (time, view) pair.
+/// A picture that cameras took, or may have taken: a (time, view) pair.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shot {
     /// View number.
@@ -149,6 +149,16 @@ impl Rig {
             .ok_or_else(|| self.no_such_frame(shot.view, time, frame_times))
     }
 
+    /// The file of `picture`, if the cameras name one; `frame_times` as for [`Rig::schedule`].
+    pub fn image(&self, picture: Picture, frame_times: &[f64]) -> Option<&Path> {
+        let shows = |shot: &&Shot| {
+            let frame = || self.frame_of(shot, frame_times).ok();
+            (shot.view, shot.camera) == (picture.view, picture.camera)
+                && frame().is_some_and(|frame| frame.is_none_or(|frame| frame == picture.frame))
+        };
+        self.shots.iter().find(shows)?.image.as_deref()
+    }
+
     fn no_such_frame(&self, view: u32, time: f64, frame_times: &[f64]) -> Error {
         let frames = match frame_times {
             [] => "has none".to_owned(),
@@ -187,6 +197,24 @@ pub struct Schedule {
     pub cameras: Vec<Camera>,
     /// For every frame its (view number, camera index) pairs.
     pub frames: Vec<Vec<(u32, u32)>>,
+}
+
+/// A picture to make: what a camera sees at a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Picture {
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// View number.
+    pub view: u32,
+    /// Index of its camera.
+    pub camera: u32,
+}
+
+impl Picture {
+    /// `tNNN_vNN`: frame and view, with more digits where they need them.
+    pub fn name(&self) -> String {
+        format!("t{:03}_v{:02}", self.frame, self.view)
+    }
 }
 
 impl Schedule {

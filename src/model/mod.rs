@@ -4,7 +4,7 @@ mod camera;
 mod gaussians;
 mod rows;
 
-pub use camera::{Camera, Rig, Schedule, Shot, Split};
+pub use camera::{Camera, Picture, Rig, Schedule, Shot, Split};
 pub use gaussians::{Column, Columns, Gaussians};
 pub use rows::{Flags, Rows};
 

@@ -3,11 +3,9 @@
 use super::Scene;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
 use crate::error::{Error, Result};
-use crate::model::{Columns, Gaussians, Rig, Schedule, Split};
-use crate::pass::{FrameSource, Wanted};
+use crate::model::{Columns, Picture, Rig, Split};
 use crate::plan::Limits;
 use crate::render;
-use crate::stream::States;
 
 /// The part of a rig's pictures that is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -21,48 +19,19 @@ pub enum Part {
     All,
 }
 
-/// A picture to make.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Picture {
-    /// Frame of the sequence.
-    pub frame: usize,
-    /// View number.
-    pub view: u32,
-    /// Index into [`Rig::cameras`].
-    pub camera: usize,
-    /// Index into [`Rig::shots`].
-    pub shot: usize,
-}
-
-impl Picture {
-    /// `tNNN_vNN`: frame and view, with more digits where they need them.
-    pub fn name(&self) -> String {
-        format!("t{:03}_v{:02}", self.frame, self.view)
-    }
-}
-
 /// The pictures of `part`, by frame, then view.
 ///
 /// # Errors
 /// A picture at no frame's time; a split without pictures; two cameras that share frame and view, which
 /// only splits of one numbering can.
 pub fn pictures(rig: &Rig, frame_times: &[f64], part: Part) -> Result<Vec<Picture>> {
-    let split = part.split(rig);
     let mut found = Vec::new();
-    for (index, shot) in rig.shots.iter().enumerate() {
-        if split.is_some_and(|split| split != shot.split) {
-            continue;
-        }
-        let frames = match rig.frame_of(shot, frame_times)? {
-            Some(frame) => frame..frame + 1,
-            None => 0..frame_times.len(),
-        };
-        let camera = shot.camera as usize;
-        found.extend(frames.map(|frame| Picture { frame, view: shot.view, camera, shot: index }));
+    for (frame, mut views) in rig.schedule(frame_times, part.split(rig))?.frames.into_iter().enumerate() {
+        views.sort_by_key(|&(view, _)| view);
+        // Train and test files may both list a picture.
+        views.dedup();
+        found.extend(views.into_iter().map(|(view, camera)| Picture { frame, view, camera }));
     }
-    found.sort_unstable_by_key(|picture| (picture.frame, picture.view, picture.shot));
-    // Train and test files may both list a picture.
-    found.dedup_by_key(|picture| (picture.frame, picture.view, picture.camera));
     if let Some(pair) = found.windows(2).find(|pair| (pair[0].frame, pair[0].view) == (pair[1].frame, pair[1].view)) {
         return Err(Error::usage(format!(
             "{}: two cameras are view {} at frame {}\n  choose one part with --split train or --split test",
@@ -106,41 +75,6 @@ pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
     // Fewer than there are frames: steps above 1 never take one twice.
     let kept: Vec<usize> = (0..count).map(|i| frames[(i as f64 * step).round_ties_even() as usize]).collect();
     pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
-}
-
-/// At most `count` (frame, camera) pairs, spread evenly over all of `schedule`; its cameras by index.
-pub fn spread(schedule: &Schedule, count: usize) -> Vec<(usize, u32)> {
-    let frames = schedule.frames.iter().enumerate();
-    let all: Vec<(usize, u32)> =
-        frames.flat_map(|(frame, views)| views.iter().map(move |&(_, camera)| (frame, camera))).collect();
-    let count = all.len().min(count);
-    (0..count).map(|k| all[(2 * k + 1) * all.len() / (2 * count)]).collect()
-}
-
-/// Hands every frame's state and its pictures to `visit`, in order, no more pictures at once than there
-/// are threads and `limits` allow; each state is read once.
-///
-/// Memory: of each source its readers, the frames that they hold, and the state of one frame.
-pub fn for_each_batch<const S: usize>(
-    sources: [&dyn FrameSource; S],
-    pictures: &[Picture],
-    limits: Limits,
-    mut visit: impl FnMut([&Gaussians; S], &[Picture]) -> Result<()>,
-) -> Result<()> {
-    let wanted = Wanted::of(pictures.iter().map(|picture| picture.frame)).holding(limits.frames_held);
-    let mut all = Vec::with_capacity(S);
-    for source in sources {
-        all.push(States::open(source, &wanted)?);
-    }
-    for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
-        for states in &mut all {
-            states.at(frame[0].frame)?;
-        }
-        for batch in frame.chunks(rayon::current_num_threads().min(limits.pictures_together)) {
-            visit(std::array::from_fn(|k| all[k].now()), batch)?;
-        }
-    }
-    Ok(())
 }
 
 /// Colour behind a scene: the one asked for, else the scene's own.
@@ -241,7 +175,7 @@ mod tests {
     #[test]
     fn thinned_frames_are_those_of_numpys_linspace() {
         let every = |frames: usize| -> Vec<Picture> {
-            (0..frames).map(|frame| Picture { frame: 3 * frame, view: 0, camera: 0, shot: 0 }).collect()
+            (0..frames).map(|frame| Picture { frame: 3 * frame, view: 0, camera: 0 }).collect()
         };
         let kept = |frames, count| pairs(&thin(every(frames), count)).iter().map(|p| p.0 / 3).collect::<Vec<_>>();
         // np.round(np.linspace(0, 59, 15)), np.round(np.linspace(0, 9, 3)) with 4.5 going to 4.

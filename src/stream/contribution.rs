@@ -6,9 +6,9 @@
 use std::num::NonZeroU32;
 
 use super::Progress;
-use super::look::{Looks, Sample};
+use super::pictures::{Subject, Workers};
 use crate::error::Result;
-use crate::model::{Camera, Columns};
+use crate::model::{Camera, Columns, Picture};
 use crate::pass::{FrameSource, Ids};
 use crate::plan::Limits;
 use crate::render::{Contribution, Renderer};
@@ -25,60 +25,60 @@ pub struct Seen {
     pub peak: Vec<f64>,
 }
 
-/// Looks at every `pixel_stride`-th pixel each way of the pictures of `sample`.
+/// Looks at every `pixel_stride`-th pixel each way of `pictures`.
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
 /// pictures at all give zeros.
 ///
-/// Memory per Gaussian: its reader, and that of [`Looking`]. Nothing grows with frames or views.
+/// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with frames or views.
 pub fn visible_contribution(
     source: &dyn FrameSource,
-    sample: &Sample<'_>,
+    (cameras, pictures): (&[Camera], &[Picture]),
     pixel_stride: NonZeroU32,
     limits: Limits,
 ) -> Result<Seen> {
-    let progress = Progress::new("visible", "pictures", sample.pictures() as u64);
-    let mut looking = Looking::new(source.info().count, pixel_stride, limits);
-    looking.add(source, &sample.0, |pictures| progress.advance(pictures))?;
-    Ok(looking.finish())
+    let progress = Progress::new("visible", "pictures", pictures.len() as u64);
+    let mut running = RunningContribution::new(source.info().count, pixel_stride, limits);
+    running.add(source, cameras, pictures, || progress.advance(1))?;
+    Ok(running.finish())
 }
 
 /// Contributions to the pictures so far.
 ///
-/// Memory per Gaussian: 44 bytes for each frame of a batch (frames with 4 × threads pictures between them, within
-/// `limits`) and for a block's state; for each picture at a time 12 bytes of sums and the picture's buffers
+/// Memory per Gaussian: 44 bytes for each frame of a batch (of 4 × threads pictures, within `limits`) and for a
+/// block's state; for each picture at a time 12 bytes of sums and the picture's buffers
 /// ([`crate::render`]).
-pub struct Looking {
+pub struct RunningContribution {
     count: usize,
     pixel_stride: NonZeroU32,
     pictures: usize,
-    looks: Looks<(Renderer, Contribution)>,
+    workers: Workers<(Renderer, Contribution)>,
 }
 
-impl Looking {
+impl RunningContribution {
     /// No pictures yet of `count` Gaussians.
     pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
-        Looking { count, pixel_stride, pictures: 0, looks: Looks::new(GEOMETRY, limits) }
+        RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
     }
 
-    /// Looks at pictures of `source`: frames, each with the cameras of its pictures. Every source that is
-    /// added must have the same Gaussians, and the same values in columns that do not vary.
+    /// Looks at `pictures` of `source`, by frame. Every source that is added must have the same Gaussians.
     pub fn add(
         &mut self,
         source: &dyn FrameSource,
-        frames: &[(usize, Vec<&Camera>)],
-        advance: impl Fn(u64) + Sync,
+        cameras: &[Camera],
+        pictures: &[Picture],
+        advance: impl Fn() + Sync,
     ) -> Result<()> {
         let (count, pixel_stride) = (self.count, self.pixel_stride);
-        self.pictures += frames.iter().map(|(_, cameras)| cameras.len()).sum::<usize>();
-        self.looks.add(
-            source,
-            Ids::Range(0..count),
-            frames,
+        self.pictures += pictures.len();
+        self.workers.show(
+            Subject { source, ids: Some(Ids::Range(0..count)), columns: GEOMETRY },
+            cameras,
+            pictures,
             || (Renderer::new(), Contribution::new(count)),
             |(renderer, seen), state, camera| {
                 renderer.contribution(state, camera, pixel_stride, seen);
-                advance(1);
+                advance();
             },
         )
     }
@@ -86,7 +86,7 @@ impl Looking {
     /// What was seen in all pictures.
     pub fn finish(self) -> Seen {
         let mut sum = Contribution::new(self.count);
-        self.looks.into_workers().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+        self.workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
         let per_pixel = f64::from(self.pixel_stride.get()).powi(2);
         let coverage = (0..self.count).map(|i| sum.pixels(i) * per_pixel / self.pictures.max(1) as f64).collect();
         Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() }
@@ -101,6 +101,7 @@ mod tests {
     use crate::pass::BlockReader;
     use crate::recipe::{self, Recipe};
     use crate::select::{Overrides, select};
+    use crate::stream::strided;
     use crate::{render, score};
 
     fn strides(pixel: u32, view: u32, frame: u32) -> recipe::Scan {
@@ -129,11 +130,13 @@ mod tests {
                     pictures += 1;
                 }
             }
-            let sample = Sample::new(&schedule, &scan);
-            assert_eq!((sample.pictures(), sample.frames()), (pictures, 7usize.div_ceil(frame as usize)));
+            let sample = strided(&schedule, &scan);
+            let frames = sample.chunk_by(|a, b| a.frame == b.frame).count();
+            assert_eq!((sample.len(), frames), (pictures, 7usize.div_ceil(frame as usize)));
             let one = Limits { frames_held: 1, frames_together: 1, pictures_together: 1, ..Limits::NONE };
             for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
-                let look = || visible_contribution(&scene, &sample, scan.pixel_stride, limits).unwrap();
+                let look =
+                    || visible_contribution(&scene, (&schedule.cameras, &sample), scan.pixel_stride, limits).unwrap();
                 let seen = on_threads(threads, look);
                 for i in 0..2500 {
                     let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
@@ -150,8 +153,8 @@ mod tests {
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let total = |pixel| {
             let scan = strides(pixel, 1, 1);
-            let seen =
-                visible_contribution(&scene, &Sample::new(&schedule, &scan), scan.pixel_stride, Limits::NONE).unwrap();
+            let sample = (&schedule.cameras[..], &strided(&schedule, &scan)[..]);
+            let seen = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
             seen.coverage.iter().sum::<f64>()
         };
         let (all, third) = (total(1), total(3));
@@ -165,14 +168,13 @@ mod tests {
         // The first frame has no picture in this split.
         let frames = vec![vec![], views(0, 3), views(0, 3), vec![], views(0, 3), views(0, 3)];
         let schedule = Schedule { cameras: (0..3).map(|_| camera.clone()).collect(), frames };
-        let index = |camera: &&Camera| schedule.cameras.iter().position(|c| std::ptr::eq(c, *camera)).unwrap();
-        let taken = |view, frame| -> Vec<(usize, Vec<usize>)> {
-            let sample = Sample::new(&schedule, &strides(1, view, frame));
-            sample.0.iter().map(|(t, cameras)| (*t, cameras.iter().map(index).collect())).collect()
+        let taken = |view, frame| -> Vec<(usize, u32)> {
+            let sample = strided(&schedule, &strides(1, view, frame));
+            sample.iter().map(|picture| (picture.frame, picture.camera)).collect()
         };
-        assert_eq!(taken(3, 1), [(1, vec![0]), (2, vec![1]), (4, vec![2]), (5, vec![0])]);
-        assert_eq!(taken(2, 2), [(1, vec![0, 2]), (4, vec![1])]);
-        assert_eq!(taken(100, 100), [(1, vec![0])]);
+        assert_eq!(taken(3, 1), [(1, 0), (2, 1), (4, 2), (5, 0)]);
+        assert_eq!(taken(2, 2), [(1, 0), (1, 2), (4, 1)]);
+        assert_eq!(taken(100, 100), [(1, 0)]);
     }
 
     /// One state for ever.
@@ -224,8 +226,14 @@ mod tests {
         };
         let schedule = rig.schedule(&info.times, None).unwrap();
         let recipe = Recipe::preset("default").unwrap();
-        let sample = Sample::new(&schedule, &recipe.scan);
-        let seen = visible_contribution(&Still(state, info), &sample, recipe.scan.pixel_stride, Limits::NONE).unwrap();
+        let sample = strided(&schedule, &recipe.scan);
+        let seen = visible_contribution(
+            &Still(state, info),
+            (&schedule.cameras, &sample),
+            recipe.scan.pixel_stride,
+            Limits::NONE,
+        )
+        .unwrap();
         assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
@@ -252,8 +260,8 @@ mod tests {
         let scene = Scene::new(300, 2);
         let schedule = Schedule { cameras: Vec::new(), frames: vec![Vec::new(); 2] };
         let look = |source: &dyn FrameSource, schedule: &Schedule| {
-            let sample = Sample::new(schedule, &strides(1, 1, 1));
-            visible_contribution(source, &sample, NonZeroU32::MIN, Limits::NONE).unwrap()
+            let sample = strided(schedule, &strides(1, 1, 1));
+            visible_contribution(source, (&schedule.cameras, &sample), NonZeroU32::MIN, Limits::NONE).unwrap()
         };
         let seen = look(&scene, &schedule);
         assert_eq!(seen, Seen { coverage: vec![0.0; 300], peak: vec![0.0; 300] });

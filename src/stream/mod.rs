@@ -1,31 +1,33 @@
 //! Driving a pass over the frames of a source on all threads, with progress.
 
 mod blocks;
+mod changed;
 mod contribution;
 mod frames;
 mod gather;
 mod held;
-mod look;
 mod merged;
 pub mod motion;
 mod parts;
+mod pictures;
 mod progress;
-mod recolored;
 mod removal;
+mod sample;
 mod scan;
 mod stages;
 mod states;
 mod trajectories;
 
-pub use contribution::{Looking, Seen, visible_contribution};
+pub use changed::Changed;
+pub use contribution::{RunningContribution, Seen, visible_contribution};
 pub use frames::Frames;
 pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
-pub use look::{PICTURES_PER_THREAD, Sample, Sampler, VIEWS_AT_ONCE};
 pub use merged::MergedSequence;
+pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, View, show};
 pub use progress::{Mode, Progress, begin_run};
-pub use recolored::{Recolored, recolor};
 pub use removal::removal_error;
+pub use sample::{Sampler, VIEWS_AT_ONCE, spread, strided};
 pub use scan::{RunningScan, Scanned, scan};
 pub use states::States;
 

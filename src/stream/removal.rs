@@ -1,14 +1,15 @@
 //! What the scored pictures would lose with each Gaussian of a part of the input.
 
-use super::look::{Sample, look};
+use super::Progress;
+use super::pictures::{Subject, Workers};
 use crate::error::Result;
-use crate::model::Columns;
+use crate::model::{Camera, Columns, Picture};
 use crate::pass::{FrameSource, Ids};
 use crate::plan::Limits;
 use crate::render::{RemovalError, Renderer};
 
-/// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over the pictures of `sample`: the same
-/// bits whatever the threads.
+/// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over `pictures`: the same bits whatever
+/// the threads.
 ///
 /// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for each frame of a batch (frames with
 /// 4 × threads pictures between them, within `limits`) and for a block's state; for each picture at a time 8 bytes
@@ -16,22 +17,25 @@ use crate::render::{RemovalError, Renderer};
 pub fn removal_error(
     source: &dyn FrameSource,
     ids: &[u32],
-    sample: &Sample<'_>,
+    (cameras, pictures): (&[Camera], &[Picture]),
     background: [f32; 3],
     contrast_floor: f32,
     limits: Limits,
 ) -> Result<RemovalError> {
-    let found = look(
-        source,
-        Ids::List(ids),
-        Columns::all(),
-        sample,
-        ("rounds", limits),
+    let progress = Progress::new("rounds", "pictures", pictures.len() as u64);
+    let mut workers = Workers::new(limits);
+    workers.show(
+        Subject { source, ids: Some(Ids::List(ids)), columns: Columns::all() },
+        cameras,
+        pictures,
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
-        |(renderer, errors), state, camera| renderer.removal_error(state, camera, background, errors),
+        |(renderer, errors), state, camera| {
+            renderer.removal_error(state, camera, background, errors);
+            progress.advance(1);
+        },
     )?;
     let mut sum = RemovalError::new(ids.len(), contrast_floor);
-    found.iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+    workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
     Ok(sum)
 }
 
@@ -40,7 +44,7 @@ mod tests {
     use super::*;
     use crate::demo::Scene;
     use crate::model::Split;
-    use crate::stream::gather;
+    use crate::stream::{VIEWS_AT_ONCE, gather, spread};
 
     #[test]
     fn errors_are_the_bits_of_a_plain_loop_over_pictures_of_those_ids_alone_whatever_the_threads() {
@@ -56,12 +60,14 @@ mod tests {
             }
         }
         assert!(plain.sum.iter().filter(|&&sum| sum > 0).count() > 1000);
-        let sample = Sample::at_most(&schedule, usize::MAX);
-        assert_eq!(sample.pictures(), schedule.pairs());
+        let sample = spread(&schedule, usize::MAX, VIEWS_AT_ONCE);
+        assert_eq!(sample.len(), schedule.pairs());
         let two = Limits { frames_held: 2, frames_together: 2, pictures_together: 2, ..Limits::NONE };
         for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let found = pool.install(|| removal_error(&scene, &ids, &sample, background, 0.1, limits)).unwrap();
+            let found = pool
+                .install(|| removal_error(&scene, &ids, (&schedule.cameras, &sample), background, 0.1, limits))
+                .unwrap();
             assert!(found == plain, "{threads} threads");
         }
     }

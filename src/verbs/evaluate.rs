@@ -19,13 +19,12 @@ use crate::error::{Error, Result};
 use crate::families::{self, Family, OpenOptions, Timing};
 use crate::ingest::image::read_png;
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
-use crate::model::{Camera, Gaussians, Rig};
-use crate::pass::FrameSource;
+use crate::model::{Camera, Gaussians, Picture, Rig};
 use crate::plan::Limits;
 use crate::render::{Image, render};
-use crate::scene::pictures::{self, Part, Picture, background, for_each_batch, pictures, thin};
+use crate::scene::pictures::{self, Part, background, pictures, thin};
 use crate::scene::{InputOptions, Scene, open_scene};
-use crate::stream::Progress;
+use crate::stream::{Batch, Progress, Subject, View, show};
 
 /// What to compare.
 #[derive(Debug, Clone)]
@@ -116,7 +115,7 @@ impl SideBySide {
         if let Some(frames) = options.max_frames {
             chosen = thin(chosen, frames);
         }
-        let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, &chosen));
+        let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, times, &chosen));
         Ok(SideBySide {
             truth: truth.transpose()?,
             truth_folder: options.ground_truth.clone(),
@@ -196,10 +195,9 @@ impl SideBySide {
         places.dedup();
         let chosen: Vec<Picture> = places.iter().map(|&place| self.pictures[place]).collect();
         let mut found = Vec::with_capacity(chosen.len());
-        for_each_batch(self.sources(), &chosen, self.scene.limits, |states, batch| {
-            for picture in batch {
-                let taken = self.take(picture, states)?;
-                found.push(see(places[found.len()], states[0], &self.scene.rig.cameras[picture.camera], taken));
+        self.show(&chosen, |views| {
+            for view in views {
+                found.push(see(places[found.len()], view.states[0], view.camera, self.take(view)?));
             }
             Ok(())
         })?;
@@ -211,8 +209,10 @@ impl SideBySide {
         self.compressed.source().info().count
     }
 
-    fn sources(&self) -> [&dyn FrameSource; 2] {
-        [self.scene.source(), self.compressed.source()]
+    /// Shows the original and the compressed model.
+    fn show(&self, pictures: &[Picture], visit: impl FnMut(&[View<'_, 2>]) -> Result<()>) -> Result<()> {
+        let subjects = [self.scene.source(), self.compressed.source()].map(Subject::all);
+        show(subjects, &self.scene.rig.cameras, pictures, Batch::of_frame(&self.scene.limits), visit)
     }
 
     fn scores<O: Send>(
@@ -229,18 +229,19 @@ impl SideBySide {
         let mut all = Vec::with_capacity(pictures.len());
         let mut observed = Vec::with_capacity(pictures.len());
         let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
-        for_each_batch(self.sources(), pictures, self.scene.limits, |states, batch| {
-            let taken: Vec<_> = batch
+        self.show(pictures, |views| {
+            let taken: Vec<_> = views
                 .par_iter()
-                .map(|picture| {
-                    let taken = self.take(picture, states)?;
-                    let scores = taken.scores(before.get(&picture.view), self.flip);
-                    let seen = observe(states[0], &self.scene.rig.cameras[picture.camera], &taken);
+                .map(|view| {
+                    let taken = self.take(view)?;
+                    let scores = taken.scores(before.get(&view.picture.view), self.flip);
+                    let seen = observe(view.states[0], view.camera, &taken);
                     progress.advance(1);
                     Ok((taken, scores, seen))
                 })
                 .collect::<Result<_>>()?;
-            for (&Picture { frame, view, .. }, (taken, (loss, truth), seen)) in batch.iter().zip(taken) {
+            for (shown, (taken, (loss, truth), seen)) in views.iter().zip(taken) {
+                let Picture { frame, view, .. } = shown.picture;
                 all.push(PictureScores { frame, time: times[frame], view, loss, truth });
                 observed.push(seen);
                 if last_frame.get(&view).is_some_and(|&last| last > frame) {
@@ -254,8 +255,7 @@ impl SideBySide {
         Ok((all, observed))
     }
 
-    fn take(&self, picture: &Picture, [original, compressed]: [&Gaussians; 2]) -> Result<Taken> {
-        let camera = &self.scene.rig.cameras[picture.camera];
+    fn take(&self, &View { picture, camera, states: [original, compressed] }: &View<'_, 2>) -> Result<Taken> {
         let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
         let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
         Ok(Taken {
@@ -306,7 +306,7 @@ struct GroundTruth {
 impl GroundTruth {
     /// Finds the photograph of every picture: `tNNN_vNN.png`, else the file its camera names, by as
     /// much of its path as leads to one inside `folder`.
-    fn find(folder: &Path, rig: &Rig, pictures: &[Picture]) -> Result<GroundTruth> {
+    fn find(folder: &Path, rig: &Rig, times: &[f64], pictures: &[Picture]) -> Result<GroundTruth> {
         if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
             return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.display())));
         }
@@ -314,7 +314,7 @@ impl GroundTruth {
         let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
         for &picture in pictures {
             let place = || format!("frame {}, view {}", picture.frame, picture.view);
-            let named = rig.shots[picture.shot].image.as_deref();
+            let named = rig.image(picture, times);
             let numbered = folder.join(format!("{}.png", picture.name()));
             let file = if numbered.is_file() {
                 numbered

@@ -11,13 +11,13 @@ use crate::compress::summary::{CameraSummary, InputSummary};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::image::{ImageFormat, write_image};
 use crate::error::{Error, Result};
-use crate::model::Camera;
+use crate::model::{Camera, Picture};
 use crate::pass::FrameSource;
 use crate::plan::Limits;
 use crate::render;
-use crate::scene::pictures::{self, Part, Picture, background, for_each_batch, picture, pictures};
+use crate::scene::pictures::{self, Part, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
-use crate::stream::Progress;
+use crate::stream::{Batch, Progress, Subject, View, show};
 
 /// Which pictures to render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -135,10 +135,10 @@ struct Job<'a> {
 impl Job<'_> {
     fn write(&self, pictures: &[Picture], path: impl Fn(&Picture) -> PathBuf + Sync) -> Result<()> {
         let progress = Progress::new("render", "pictures", pictures.len() as u64);
-        for_each_batch([self.source], pictures, self.limits, |[state], batch| {
+        show([Subject::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
-            batch.par_iter().try_for_each(|picture| {
-                let image = render::render(state, &self.cameras[picture.camera], self.background);
+            views.par_iter().try_for_each(|View { picture, camera, states: [state] }| {
+                let image = render::render(state, camera, self.background);
                 write_image(&image, self.format, &path(picture))?;
                 progress.advance(1);
                 Ok(())

@@ -22,13 +22,17 @@ impl Scratch {
     }
 
     fn write(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians) -> Vec<u8> {
-        write_like(template, rows, proxies, &self.path("out.ply")).unwrap();
+        self.write_changed(template, rows, proxies, &Change::default())
+    }
+
+    fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change) -> Vec<u8> {
+        write_like(template, rows, proxies, change, &self.path("out.ply")).unwrap();
         fs::read(self.path("out.ply")).unwrap()
     }
 }
 
 fn kept(ids: impl IntoIterator<Item = u32>) -> Vec<OutRow> {
-    ids.into_iter().map(|source| OutRow { source, proxy: None, recolor: [0.0; 3] }).collect()
+    ids.into_iter().map(|source| OutRow { source, proxy: None }).collect()
 }
 
 fn all(ply: &Ply) -> Gaussians {
@@ -121,9 +125,9 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
             let ply = scratch.open(&file(format, kind, &names, 6, "\n"));
             let proxies = proxies(2, 1);
             let rows = [
-                OutRow { source: 4, proxy: Some(1), recolor: [0.0; 3] },
-                OutRow { source: 2, proxy: None, recolor: [0.0; 3] },
-                OutRow { source: 4, proxy: Some(0), recolor: [0.0; 3] },
+                OutRow { source: 4, proxy: Some(1) },
+                OutRow { source: 2, proxy: None },
+                OutRow { source: 4, proxy: Some(0) },
             ];
             let written = scratch.write(&ply, &rows, &proxies);
             let folder = Scratch::new();
@@ -145,12 +149,34 @@ fn a_proxy_replaces_its_columns_and_keeps_the_rest_of_its_leader() {
 }
 
 #[test]
+fn a_change_adds_to_any_column_of_rows_and_proxies_and_zeros_leave_the_bytes() {
+    let scratch = Scratch::new();
+    for (format, kind) in [("binary_little_endian", "float"), ("binary_big_endian", "double"), ("ascii", "short")] {
+        let ply = scratch.open(&file(format, kind, &names(), 3, "\n"));
+        let proxies = proxies(1, 1);
+        let rows = [OutRow { source: 2, proxy: None }, OutRow { source: 0, proxy: Some(0) }];
+        let plain = scratch.write(&ply, &rows, &proxies);
+        let mut by = Gaussians::zeros(2, 0);
+        for column in Columns::all().difference(Columns::LOG_SCALE).iter() {
+            by.column_mut(column).plane_mut(0).copy_from_slice(&[3.0, -2.0]);
+        }
+        let written = scratch.write_changed(&ply, &rows, &proxies, &Change(by.clone()));
+        let (folder, other) = (Scratch::new(), Scratch::new());
+        let mut expected = all(&folder.open(&plain));
+        Change(by).add_to(&mut expected, Columns::all());
+        assert!(all(&other.open(&written)) == expected, "{format} {kind}");
+        let zeros = scratch.write_changed(&ply, &rows, &proxies, &Change(Gaussians::zeros(2, 1)));
+        assert!(zeros == plain, "{format} {kind}");
+    }
+}
+
+#[test]
 fn a_surfel_has_no_place_for_a_third_scale() {
     let scratch = Scratch::new();
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
     let ply = scratch.open(&file("binary_little_endian", "float", &names, 1, "\n"));
     let proxies = proxies(1, 1);
-    let written = scratch.write(&ply, &[OutRow { source: 0, proxy: Some(0), recolor: [0.0; 3] }], &proxies);
+    let written = scratch.write(&ply, &[OutRow { source: 0, proxy: Some(0) }], &proxies);
     let out = Scratch::new();
     let out = all(&out.open(&written));
     assert_eq!(out.log_scale.row::<2>(0), proxies.log_scale.row::<2>(0));
@@ -162,13 +188,14 @@ fn rows_and_proxies_that_do_not_exist_are_refused() {
     let scratch = Scratch::new();
     let ply = scratch.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &scratch.path("none.ply")).unwrap_err().to_string()
+        write_like(&ply, rows, proxies, &Change::default(), &scratch.path("none.ply")).unwrap_err().to_string()
     };
     assert!(refusal(&kept([2]), &Gaussians::default()).contains("Gaussian 2 "));
-    assert!(refusal(&[OutRow { source: 0, proxy: Some(1), recolor: [0.0; 3] }], &proxies(1, 1)).contains("proxy 1 "));
-    assert!(
-        refusal(&[OutRow { source: 0, proxy: Some(0), recolor: [0.0; 3] }], &proxies(1, 3)).contains("48 SH planes")
-    );
+    assert!(refusal(&[OutRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
+    assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
+    let short = Change(Gaussians::zeros(1, 1));
+    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, &scratch.path("none.ply"));
+    assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));
     assert!(!scratch.path("none.ply").exists());
 }
 

@@ -22,7 +22,6 @@ use crate::pass::FrameSource;
 use crate::plan::Limits;
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
-use crate::stream::recolor;
 
 /// A model folder.
 pub(super) const ENTRY: Entry = Entry {
@@ -140,11 +139,11 @@ impl ModelFolder {
     fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().unwrap_or(&none);
-        write_like(&Ply::open(&self.paths().point_cloud)?, &out_rows(reduction), proxies, path)
+        write_like(&Ply::open(&self.paths().point_cloud)?, &out_rows(reduction), proxies, &reduction.change, path)
     }
 }
 
-/// The canonical cloud of what is left, recoloured: the field's changes of colour add to the base.
+/// The canonical cloud of what is left, changed: what the field adds to it stays as it is.
 fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
     let mut cloud = ModelFolder::canonical(model).pick(&reduction.kept);
     if let Some(raw) = &reduction.proxies.raw {
@@ -156,7 +155,7 @@ fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
             }
         }
     }
-    recolor(&mut cloud, &reduction.recolor);
+    reduction.change.add_to(&mut cloud, Columns::all());
     cloud
 }
 
