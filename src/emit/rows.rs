@@ -48,6 +48,14 @@ impl Values<'_> {
             Values::Bool(values) => values.len(),
         }
     }
+
+    fn text(&self, id: usize) -> String {
+        match self {
+            Values::F64(values) => format!("{:?}", values[id]),
+            Values::U32(values) => values[id].to_string(),
+            Values::Bool(values) => values[id].to_string(),
+        }
+    }
 }
 
 impl RowTable<'_> {
@@ -68,8 +76,8 @@ impl RowTable<'_> {
     /// Slices of different lengths; a failed write.
     pub fn write_csv(&self, path: &Path) -> Result<()> {
         self.check_lengths()?;
-        let mut out = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
-        self.csv_into(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
+        let file = File::create(path).map_err(Error::io("create", path))?;
+        self.csv_into(file).map_err(Error::io("write", path))
     }
 
     /// The columns in order, as both formats name them.
@@ -122,25 +130,18 @@ impl RowTable<'_> {
         archive.zip_writer().finish()?.flush()
     }
 
-    fn csv_into(&self, out: &mut impl Write) -> io::Result<()> {
+    fn csv_into(&self, out: impl Write) -> io::Result<()> {
         let columns = self.columns();
-        write!(out, "id")?;
-        for (name, _) in &columns {
-            write!(out, ",{name}")?;
-        }
-        writeln!(out)?;
+        let mut out = csv::Writer::from_writer(out);
+        out.write_record(std::iter::once("id").chain(columns.iter().map(|(name, _)| *name)))?;
         for id in 0..self.rows.len() {
-            write!(out, "{id}")?;
-            for (_, column) in &columns {
-                match column {
-                    Values::F64(values) => write!(out, ",{:?}", values[id])?,
-                    Values::U32(values) => write!(out, ",{}", values[id])?,
-                    Values::Bool(values) => write!(out, ",{}", values[id])?,
-                }
+            out.write_field(id.to_string())?;
+            for (_, values) in &columns {
+                out.write_field(values.text(id))?;
             }
-            writeln!(out)?;
+            out.write_record(None::<&[u8]>)?;
         }
-        Ok(())
+        out.flush()
     }
 }
 
@@ -235,6 +236,18 @@ mod tests {
             }
             assert_eq!(text.lines().count(), N + 1);
         });
+    }
+
+    #[test]
+    fn csv_is_these_bytes() {
+        let mut text = Vec::new();
+        with_table(|table| table.csv_into(&mut text).unwrap());
+        let expected = "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W\n\
+            0,0.1,0.2,0.03333333333333333,0,0.4,1.0,0.03,-0.0,-0.0,-0.0,true,0.020000000000000004\n\
+            1,NaN,2.2,0.3666666666666667,7,4.4,1000000000000.0,0.33,\
+            0.30000000000000004,0.30000000000000004,0.30000000000000004,false,0.22000000000000003\n\
+            2,1e-300,4.2,0.7,4294967295,8.4,inf,0.63,5e-324,5e-324,5e-324,true,0.42000000000000004\n";
+        assert_eq!(String::from_utf8(text).unwrap(), expected);
     }
 
     #[test]

@@ -3,13 +3,12 @@
 //! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins are equal in ratio
 //! over the positive values, for scores span many powers of ten; what is 0 is counted apart.
 
-use std::fmt::Write as _;
-
 use serde::Serialize;
 
 use super::run::Fate;
 use crate::model::Rows;
 use crate::score::Scores;
+use crate::verbs::csv::table;
 
 /// Bins of a histogram.
 const BINS: usize = 40;
@@ -122,17 +121,18 @@ impl Histogram {
 
 /// One line per bin, and one for the zeros of each score.
 pub fn csv(histograms: &[Histogram]) -> String {
-    let mut out = String::from("score,from,to,kept,merged,dropped\n");
-    for of in histograms {
-        // Writing to a String cannot fail.
-        let _ = writeln!(out, "{},0,0,{},{},{}", of.name, of.zero.kept, of.zero.merged, of.zero.dropped);
-        for (bin, edges) in of.edges.windows(2).enumerate() {
-            let ByFate { kept, merged, dropped } = &of.bins;
-            let _ =
-                writeln!(out, "{},{},{},{},{},{}", of.name, edges[0], edges[1], kept[bin], merged[bin], dropped[bin]);
+    let mut rows = Vec::new();
+    for Histogram { name, edges, bins, zero, .. } in histograms {
+        let mut add = |from: f64, to: f64, counts: [usize; 3]| {
+            let edges = [name.to_string(), from.to_string(), to.to_string()];
+            rows.push(edges.into_iter().chain(counts.map(|count| count.to_string())).collect());
+        };
+        add(0.0, 0.0, [zero.kept, zero.merged, zero.dropped]);
+        for (bin, edges) in edges.windows(2).enumerate() {
+            add(edges[0], edges[1], [bins.kept[bin], bins.merged[bin], bins.dropped[bin]]);
         }
     }
-    out
+    table(&["score", "from", "to", "kept", "merged", "dropped"], rows)
 }
 
 #[cfg(test)]
@@ -169,5 +169,16 @@ mod tests {
         let far = Histogram::of("D", "", &[1e-300, 1.0], &[Fate::Kept; 2]);
         assert_eq!(far.bins.kept.iter().sum::<usize>(), 2);
         assert_eq!(far.bins.kept[0], 1, "what is far below is in the first bin");
+    }
+
+    #[test]
+    fn csv_is_these_bytes() {
+        let bins = ByFate { kept: vec![1, 0], merged: vec![2, 3], dropped: vec![0, 4] };
+        let zero = ByFate { kept: 5, merged: 0, dropped: 6 };
+        let of = Histogram { name: "C", meaning: "", edges: vec![1e-7, 0.5, 2.0], bins, zero };
+        assert_eq!(
+            csv(&[of]),
+            "score,from,to,kept,merged,dropped\nC,0,0,5,0,6\nC,0.0000001,0.5,1,2,0\nC,0.5,2,0,3,4\n"
+        );
     }
 }

@@ -250,7 +250,7 @@ fn write(options: &ReportOptions, report: &Report, page: &str, run: &Run) -> Res
         (MARKER, format!("{marker:#}\n")),
     ];
     files.extend(report.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
-    files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(of))));
+    files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(&of.stages))));
     files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", of.csv())));
     for (name, text) in files {
         let path = staged.path().join(name);

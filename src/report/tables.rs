@@ -1,55 +1,122 @@
-//! The page's tables as CSV: a line of names, then one line per row; what does not exist is empty.
-
-use std::fmt::Write as _;
+//! The page's tables as CSV.
 
 use super::failure::FailureMode;
-use crate::compress::summary::Summary;
-use crate::verbs::csv::{known, quoted};
+use crate::compress::summary::Stage;
+use crate::verbs::csv::{known, table};
 
 /// One line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
-    let mut out = String::from(
-        "failure_mode,verdict,gaussians,dropped,merged,coverage,coverage_lost,shown,psnr_there,psnr_elsewhere,\
-         detail_lost,worst_frame,worst_view,worst_psnr\n",
-    );
-    for of in modes {
-        let worst = of.worst;
-        // Writing to a String cannot fail.
-        let _ = writeln!(
-            out,
-            "{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
-            quoted(of.name),
+    let names = [
+        "failure_mode",
+        "verdict",
+        "gaussians",
+        "dropped",
+        "merged",
+        "coverage",
+        "coverage_lost",
+        "shown",
+        "psnr_there",
+        "psnr_elsewhere",
+        "detail_lost",
+        "worst_frame",
+        "worst_view",
+        "worst_psnr",
+    ];
+    let row = |of: &FailureMode| {
+        vec![
+            of.name.to_owned(),
             serde_json::to_value(of.verdict).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default(),
-            of.gaussians,
+            of.gaussians.to_string(),
             known(of.dropped),
             known(of.merged),
-            of.coverage,
+            of.coverage.to_string(),
             known(of.coverage_lost),
-            of.shown,
+            of.shown.to_string(),
             known(of.psnr_there),
             known(of.psnr_elsewhere),
             known(of.detail_lost),
-            known(worst.map(|worst| worst.frame)),
-            known(worst.map(|worst| worst.view)),
-            known(worst.map(|worst| worst.psnr)),
-        );
-    }
-    out
+            known(of.worst.map(|worst| worst.frame)),
+            known(of.worst.map(|worst| worst.view)),
+            known(of.worst.map(|worst| worst.psnr)),
+        ]
+    };
+    table(&names, modes.iter().map(row))
 }
 
 /// One line per stage of the run.
-pub(super) fn stages(summary: &Summary) -> String {
-    let mut out = String::from("stage,gaussians_in,gaussians_out,seconds,peak_memory_bytes\n");
-    for of in &summary.stages {
-        let _ = writeln!(
-            out,
-            "{},{},{},{},{}",
-            quoted(&of.name),
-            of.gaussians_in,
-            of.gaussians_out,
-            of.seconds,
-            known(of.peak_memory_bytes)
+pub(super) fn stages(stages: &[Stage]) -> String {
+    let row = |of: &Stage| {
+        vec![
+            of.name.clone(),
+            of.gaussians_in.to_string(),
+            of.gaussians_out.to_string(),
+            of.seconds.to_string(),
+            known(of.peak_memory_bytes),
+        ]
+    };
+    table(&["stage", "gaussians_in", "gaussians_out", "seconds", "peak_memory_bytes"], stages.iter().map(row))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pass::Reads;
+    use crate::report::failure::{Verdict, Worst};
+
+    #[test]
+    fn failure_modes_are_these_bytes() {
+        let seen = FailureMode {
+            name: "fast, and small",
+            happens_to: String::new(),
+            verdict: Verdict::Flagged,
+            gaussians: 9,
+            dropped: Some(2),
+            merged: Some(3),
+            coverage: 0.25,
+            coverage_lost: Some(1e-7),
+            shown: 1.0,
+            psnr_there: Some(30.5),
+            psnr_elsewhere: Some(40.0),
+            detail_lost: Some(-0.5),
+            worst: Some(Worst { place: 0, frame: 4, view: 7, psnr: 12.0 }),
+        };
+        let unknown = FailureMode {
+            name: "slow",
+            verdict: Verdict::Absent,
+            dropped: None,
+            merged: None,
+            coverage_lost: None,
+            psnr_there: None,
+            psnr_elsewhere: None,
+            detail_lost: None,
+            worst: None,
+            ..seen.clone()
+        };
+        assert_eq!(
+            failure_modes(&[seen, unknown]),
+            "failure_mode,verdict,gaussians,dropped,merged,coverage,coverage_lost,shown,psnr_there,psnr_elsewhere,\
+             detail_lost,worst_frame,worst_view,worst_psnr\n\
+             \"fast, and small\",flagged,9,2,3,0.25,0.0000001,1,30.5,40,-0.5,4,7,12\n\
+             slow,absent,9,,,0.25,,1,,,,,,\n"
         );
     }
-    out
+
+    #[test]
+    fn stages_are_these_bytes() {
+        let stage = Stage {
+            name: "scan".to_owned(),
+            gaussians_in: 10,
+            gaussians_out: 7,
+            reads: Reads::default(),
+            full_reads: 0.0,
+            seconds: 0.125,
+            peak_memory_bytes: Some(4096),
+        };
+        let merge = Stage { name: "\"merge\"".to_owned(), seconds: 3.0, peak_memory_bytes: None, ..stage.clone() };
+        assert_eq!(
+            stages(&[stage, merge]),
+            "stage,gaussians_in,gaussians_out,seconds,peak_memory_bytes\nscan,10,7,0.125,4096\n\
+             \"\"\"merge\"\"\",10,7,3,\n"
+        );
+    }
 }

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use super::csv::known;
+use super::csv::{known, table};
 use crate::compress::summary::CameraSummary;
 
 /// One value for the model before compression and one for the model after it.
@@ -223,27 +223,23 @@ impl Evaluation {
 
     /// One line per picture under a line of names; a value that does not exist is empty.
     pub fn csv(&self) -> String {
-        let mut out = String::from("frame,view,time");
         let with_flip = self.loss.overall.flip.is_some();
         let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };
+        let mut names = ["frame", "view", "time"].map(str::to_owned).to_vec();
         for with in compared {
-            let _ = write!(out, ",psnr{with},ssim{with},temporal{with}");
-            if with_flip {
-                let _ = write!(out, ",flip{with}");
-            }
+            names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{with}")));
+            names.extend(with_flip.then(|| format!("flip{with}")));
         }
-        for picture in &self.pictures {
-            let _ = write!(out, "\n{},{},{}", picture.frame, picture.view, picture.time);
+        let row = |picture: &PictureScores| {
+            let mut row = vec![picture.frame.to_string(), picture.view.to_string(), picture.time.to_string()];
             let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
             for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
-                let _ = write!(out, ",{},{},{}", score.psnr, score.ssim, known(score.temporal));
-                if with_flip {
-                    let _ = write!(out, ",{}", known(score.flip));
-                }
+                row.extend([score.psnr.to_string(), score.ssim.to_string(), known(score.temporal)]);
+                row.extend(with_flip.then(|| known(score.flip)));
             }
-        }
-        out.push('\n');
-        out
+            row
+        };
+        table(&names, self.pictures.iter().map(row))
     }
 }
 
@@ -272,5 +268,45 @@ mod tests {
         let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
         assert_eq!(frames, [(0, 35.0, None), (2, 35.0, Some(0.25)), (3, 10.0, Some(0.75))]);
         assert!(Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
+    }
+
+    fn evaluation(pictures: Vec<PictureScores>) -> Evaluation {
+        let truth = Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
+        Evaluation {
+            tool: String::new(),
+            path: Both { original: String::new(), compressed: String::new() },
+            count: Both { original: 0, compressed: 0 },
+            bytes: Both { original: 0, compressed: 0 },
+            cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
+            background: [0.0; 3],
+            loss: Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap(),
+            ground_truth: truth.map(|of| TruthComparison {
+                folder: String::new(),
+                compressed: of.clone(),
+                original: of,
+            }),
+            notes: Vec::new(),
+            pictures,
+        }
+    }
+
+    #[test]
+    fn csv_is_these_bytes() {
+        let mut pictures = vec![picture(0, 1, 30.0, None), picture(3, 2, 3e-5, Some(0.25))];
+        assert_eq!(
+            evaluation(pictures.clone()).csv(),
+            "frame,view,time,psnr,ssim,temporal\n0,1,0,30,0.3,\n3,2,0.75,0.00003,0.0000003,0.25\n"
+        );
+        for picture in &mut pictures {
+            picture.loss.flip = Some(0.5);
+            picture.truth = Some(Both { original: Score { flip: None, ..picture.loss }, compressed: picture.loss });
+        }
+        assert_eq!(
+            evaluation(pictures).csv(),
+            "frame,view,time,psnr,ssim,temporal,flip,psnr_gt,ssim_gt,temporal_gt,flip_gt,\
+             psnr_gt_original,ssim_gt_original,temporal_gt_original,flip_gt_original\n\
+             0,1,0,30,0.3,,0.5,30,0.3,,0.5,30,0.3,,\n\
+             3,2,0.75,0.00003,0.0000003,0.25,0.5,0.00003,0.0000003,0.25,0.5,0.00003,0.0000003,0.25,\n"
+        );
     }
 }

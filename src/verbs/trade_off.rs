@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
 
-use super::csv::{known, quoted};
+use super::csv::{known, table};
 
 /// Every point of a sweep, and what they share.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -65,20 +65,33 @@ impl TradeOff {
 
     /// One line per point under a line of names; a value that does not exist is empty.
     pub fn csv(&self) -> String {
-        let mut out = String::from("method,asked,count,fraction,bytes,psnr,ssim,temporal,seconds,peak_memory_bytes\n");
-        for point in &self.points {
-            let Point { count, bytes, psnr, ssim, seconds, .. } = point;
-            // Quoted: a file may name methods that this program does not know.
-            let (method, fraction) = (quoted(&point.method), self.fraction(point));
-            let (asked, temporal) = (known(point.asked), known(point.temporal));
-            let memory = known(point.peak_memory_bytes);
-            // Writing to a String cannot fail.
-            let _ = writeln!(
-                out,
-                "{method},{asked},{count},{fraction},{bytes},{psnr},{ssim},{temporal},{seconds},{memory}"
-            );
-        }
-        out
+        let names = [
+            "method",
+            "asked",
+            "count",
+            "fraction",
+            "bytes",
+            "psnr",
+            "ssim",
+            "temporal",
+            "seconds",
+            "peak_memory_bytes",
+        ];
+        let row = |point: &Point| {
+            vec![
+                point.method.clone(),
+                known(point.asked),
+                point.count.to_string(),
+                self.fraction(point).to_string(),
+                point.bytes.to_string(),
+                point.psnr.to_string(),
+                point.ssim.to_string(),
+                known(point.temporal),
+                point.seconds.to_string(),
+                known(point.peak_memory_bytes),
+            ]
+        };
+        table(&names, self.points.iter().map(row))
     }
 
     /// A table for a person.
@@ -119,5 +132,50 @@ impl TradeOff {
     /// Part of the Gaussians that a point keeps; 1 of none.
     pub fn fraction(&self, point: &Point) -> f64 {
         if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn csv_is_these_bytes() {
+        let point = Point {
+            method: "paper".to_owned(),
+            asked: Some(0.5),
+            count: 6,
+            bytes: 1 << 40,
+            psnr: f64::INFINITY,
+            ssim: 1.0,
+            temporal: Some(1e-7),
+            seconds: 2.5,
+            peak_memory_bytes: Some(4096),
+        };
+        let own = Point {
+            method: "of \"others\", unknown".to_owned(),
+            asked: None,
+            temporal: None,
+            peak_memory_bytes: None,
+            ..point.clone()
+        };
+        let found = TradeOff {
+            tool: String::new(),
+            path: String::new(),
+            digest: String::new(),
+            gaussians: 8,
+            bytes: 0,
+            threads: 1,
+            pictures: 1,
+            cameras: String::new(),
+            points: vec![point, own],
+            notes: Vec::new(),
+        };
+        assert_eq!(
+            found.csv(),
+            "method,asked,count,fraction,bytes,psnr,ssim,temporal,seconds,peak_memory_bytes\n\
+             paper,0.5,6,0.75,1099511627776,inf,1,0.0000001,2.5,4096\n\
+             \"of \"\"others\"\", unknown\",,6,0.75,1099511627776,inf,1,,2.5,\n"
+        );
     }
 }
