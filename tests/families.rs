@@ -1,0 +1,90 @@
+//! What every family promises: the frames of a reduction are those of what is written of it, whatever a refinement
+//! changed.
+
+mod scene;
+
+use std::path::Path;
+
+use scene::{Workplace, state, tiny};
+use splatsieve::emit::kind::OutputKind;
+use splatsieve::families::{self, Family, OpenOptions};
+use splatsieve::model::{Columns, Gaussians};
+use splatsieve::plan::Limits;
+use splatsieve::recipe::Recipe;
+use splatsieve::reduction::{Change, Cluster, Reduction, Reference};
+
+/// Opens `path`, at three times where it leaves them open.
+fn open(path: &Path) -> Box<dyn Family> {
+    let input = families::open(path, &OpenOptions::default()).unwrap();
+    if input.source().info().times.is_empty() { input.with_times(vec![0.0, 0.25, 1.0]).unwrap() } else { input }
+}
+
+/// Every third Gaussian of `input`, two of them merged with a neighbour.
+fn reduction(input: &dyn Family) -> Reduction {
+    let rule = Recipe::preset("default").unwrap().merge;
+    let kept: Vec<u32> = (0..input.source().info().count as u32).step_by(3).collect();
+    let mut reduction = Reduction::pruned(kept, &rule);
+    for output in [1, 4] {
+        let leader = reduction.kept[output as usize];
+        reduction.clusters.push(Cluster { output, leader, members: vec![(leader, 0.625), (leader + 1, 0.375)] });
+    }
+    let reference = Reference { frame: 0, extent: 1.0 };
+    reduction.proxies = input.solve(&reduction.clusters, reference, &rule).unwrap();
+    reduction
+}
+
+/// Something else for every third Gaussian, in the columns `of`.
+fn change(count: usize, of: Columns) -> Change {
+    let mut by = Gaussians::default();
+    for column in of.iter() {
+        *by.column_mut(column) = Gaussians::zeros(count, 0).column(column).clone();
+        for c in 0..by.column(column).width() {
+            let plane = by.column_mut(column).plane_mut(c);
+            (0..count).step_by(3).for_each(|i| plane[i] = 0.01 * (c + 1) as f32 * (i as f32 - 7.0));
+        }
+    }
+    Change(by)
+}
+
+/// States of what `reduction` leaves of `input`, and of what is written of it as `kind` and read again.
+fn both(workplace: &Workplace, input: &dyn Family, reduction: &Reduction, kind: OutputKind) -> [Vec<Gaussians>; 2] {
+    let path = workplace.path(if kind.is_folder() { "written" } else { "written.gseq" });
+    if kind.is_folder() {
+        std::fs::create_dir(&path).unwrap();
+    }
+    input.write(reduction, kind, &path, &Limits::NONE).unwrap();
+    let frames = input.source().info().times.len();
+    let reduced = input.reduced(reduction).unwrap();
+    let written = open(&path);
+    let found = [&*reduced, written.source()].map(|source| (0..frames).map(|frame| state(source, frame)).collect());
+    if kind.is_folder() { std::fs::remove_dir_all(&path).unwrap() } else { std::fs::remove_file(&path).unwrap() }
+    found
+}
+
+#[test]
+fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_changed() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 300 --frames 3 -o demo");
+    workplace.done("unpack demo/scene.gseq -o frames");
+    for (path, kinds) in [
+        (tiny(), [OutputKind::Model, OutputKind::Gseq]),
+        (workplace.path("frames"), [OutputKind::PlySequence, OutputKind::Gseq]),
+        (workplace.path("demo/scene.gseq"), [OutputKind::PlySequence, OutputKind::Gseq]),
+    ] {
+        let input = open(&path);
+        let mut reduction = reduction(&*input);
+        for kind in kinds {
+            reduction.change = Change::default();
+            let [plain, _] = both(&workplace, &*input, &reduction, kind);
+            for column in Columns::all().iter().chain([Columns::all()]) {
+                reduction.change = change(reduction.len(), column);
+                let [reduced, written] = both(&workplace, &*input, &reduction, kind);
+                let of = format!("{}, {}, {kind:?}", path.display(), column.name());
+                assert!(reduced == written, "{of}: what is written differs from what was promised");
+                assert!(reduced != plain, "{of}: nothing changed");
+                let moved = |k: &usize| plain[0].position.row::<3>(*k) != reduced[0].position.row(*k);
+                assert_eq!((0..reduction.len()).find(|k| k % 3 != 0 && moved(k)), None, "{of}: a zero moved it");
+            }
+        }
+    }
+}
