@@ -1,4 +1,5 @@
-//! What a run needs of memory, and how it keeps to a budget. Names no stage: each states its own [`Need`].
+//! What a run needs of memory and about how long it takes, and how it keeps to a budget. Names no stage: each states its
+//! own [`Need`].
 //!
 //! A need is a number of bytes per Gaussian and a fixed one, both as sums of named parts; the largest stage counts.
 //! [`Plan::fit`] begins with limits that cost no time and halves the one that frees most, until all stages fit.
@@ -19,15 +20,27 @@ use crate::machine::memory_limit;
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
 use crate::plan::Limits;
 use crate::render;
-use crate::stream::{BLOCK, PICTURES_PER_THREAD};
+use crate::stream::{BLOCK, PICTURES_PER_THREAD, duration};
+
+/// What a run says of itself before it begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Tell {
+    /// Nothing.
+    #[default]
+    Nothing,
+    /// About how long it will take.
+    Time,
+    /// What takes how much memory, how often frames are read, and about how long it will take.
+    Plan,
+}
 
 /// Memory that a run may take, and whether it is to say beforehand what it will take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Budget {
     /// Bytes; none: a quarter of what this process may take, see [`memory_limit`].
     pub bytes: Option<u64>,
-    /// Print the plan on standard error before any work.
-    pub explain: bool,
+    /// What to print on standard error before any work.
+    pub tell: Tell,
 }
 
 /// Resident before any Gaussian is: the program, its libraries, its threads' stacks and heaps, messages.
@@ -199,6 +212,21 @@ impl Workload {
         shared * self.reads(frames, limits)
     }
 
+    /// Seconds that `pictures` pictures of `gaussians` Gaussians take, by what each and a pixel take.
+    pub fn picturing(&self, pictures: f64, gaussians: f64, (gaussian, pixel): (f64, f64)) -> f64 {
+        pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
+    }
+
+    /// Seconds that the states of `gaussians` Gaussians at `frames` frames take to read.
+    pub fn reading(&self, gaussians: f64, frames: f64) -> f64 {
+        gaussians * frames * self.input.seconds_per_state
+    }
+
+    /// N, as a part of which later stages are timed.
+    pub fn count(&self) -> f64 {
+        self.gaussians as f64
+    }
+
     /// The whole input as it is known and seen, whatever its Gaussians hold.
     fn known(&self) -> u64 {
         let index = match self.input.frame_block {
@@ -219,6 +247,15 @@ impl Workload {
     }
 }
 
+/// Seconds of one processor that a Gaussian and a pixel of a picture take to be looked at, to find what pictures lose
+/// without it, and to be rendered and compared: fitted to runs on three trained models (`scripts/estimate.py` shows how
+/// well they tell the time of a run).
+pub const LOOK: (f64, f64) = (3e-7, 1e-8);
+/// See [`LOOK`].
+pub const REMOVE: (f64, f64) = (6.5e-7, 3e-8);
+/// See [`LOOK`].
+pub const RENDER: (f64, f64) = (9e-7, 8e-8);
+
 /// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
 pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 
@@ -232,6 +269,8 @@ pub struct Need {
     pub stage: &'static str,
     /// Full reads of the frames, at most.
     pub reads: f64,
+    /// Seconds of one processor, about: what is done so many times, by what doing it once took where it was timed.
+    pub seconds: f64,
     /// Bytes per Gaussian.
     pub per_gaussian: Vec<Part>,
     /// Bytes, however many Gaussians there are.
@@ -276,10 +315,13 @@ impl Plan {
     /// A budget that no limits fit; the error names the least that works.
     pub fn fit(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<Plan> {
         let plan = Self::closest(work, budget.limit(), needs);
-        if budget.explain {
-            eprint!("{}{}", budget.text(), plan.text());
+        let fits = plan.excess() == 0;
+        match budget.tell {
+            Tell::Plan => eprint!("{}{}", budget.text(), plan.text()),
+            Tell::Time if fits => eprint!("{}", plan.time()),
+            _ => (),
         }
-        if plan.excess() > 0 { Err(plan.refusal(budget)) } else { Ok(plan) }
+        if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
     }
 
     /// The fastest plan that fits into `budget`, else the one that takes least.
@@ -296,7 +338,7 @@ impl Plan {
         };
         // A model is read whole before anything else.
         let opening = vec![("file", work.input.opening)];
-        let read = Need { stage: "read", reads: 0.0, per_gaussian: opening, fixed: Vec::new() };
+        let read = Need { stage: "read", reads: 0.0, seconds: 0.0, per_gaussian: opening, fixed: Vec::new() };
         let all = |limits: &Limits| {
             let first = Some(read.clone()).filter(|_| work.input.opening > 0);
             first.into_iter().chain(needs(&work, limits)).collect::<Vec<Need>>()
@@ -336,6 +378,11 @@ impl Plan {
     pub fn reads(&self) -> f64 {
         let sum: f64 = self.needs.iter().map(|need| need.reads).sum();
         if self.limits.tiles_held { sum.min(1.0) } else { sum }
+    }
+
+    /// Stages and the seconds that each takes, about; none where nobody knows how many frames there will be.
+    pub fn stages(&self) -> Vec<(&'static str, f64)> {
+        seconds(&self.work, &self.needs)
     }
 
     /// Bytes resident at most.
@@ -420,7 +467,19 @@ impl Plan {
         let held = if limits.tiles_held { "every tile stays in memory once it is decoded; else " } else { "" };
         let named = named.join(" + ");
         let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.reads());
-        out
+        out + &self.time()
+    }
+
+    /// How long it will take, for a person.
+    fn time(&self) -> String {
+        let stages = self.stages();
+        let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
+        if self.work.frames == 0 {
+            return "time: nobody knows how many frames will arrive\n".to_owned();
+        }
+        let named: Vec<String> =
+            stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds))).collect();
+        format!("time: about {} ({})\n", duration(whole), named.join(" + "))
     }
 }
 
@@ -446,6 +505,11 @@ impl Budget {
             }
         }
     }
+}
+
+/// Names of stages and the seconds that each takes on all threads, about.
+pub fn seconds(work: &Workload, needs: &[Need]) -> Vec<(&'static str, f64)> {
+    needs.iter().map(|need| (need.stage, need.seconds / work.threads as f64)).collect()
 }
 
 /// What this process has taken so far, for a person; none where the system does not say.

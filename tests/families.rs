@@ -57,7 +57,11 @@ fn both(workplace: &Workplace, input: &dyn Family, reduction: &Reduction, kind: 
     let reduced = input.reduced(reduction).unwrap();
     let written = open(&path);
     let found = [&*reduced, written.source()].map(|source| (0..frames).map(|frame| state(source, frame)).collect());
-    if kind.is_folder() { std::fs::remove_dir_all(&path).unwrap() } else { std::fs::remove_file(&path).unwrap() }
+    if kind.is_folder() {
+        std::fs::remove_dir_all(&path).unwrap()
+    } else {
+        std::fs::remove_file(&path).unwrap()
+    }
     found
 }
 

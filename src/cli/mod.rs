@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
-use crate::budget::{self, Budget};
+use crate::budget::{self, Budget, Tell};
 use crate::compress::{Only, Request, Run, Target, compress};
 use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
@@ -70,7 +70,7 @@ fn run(cli: Cli) -> Result<()> {
     match cli.verb {
         Verb::Compress(args) => {
             let json = args.json;
-            let summary = compress(&compress_options(args)?)?;
+            let summary = compress(&compress_options(args, cli.quiet)?)?;
             print(&if json { summary.json() } else { summary.text() })
         }
         Verb::Score(args) => {
@@ -189,7 +189,7 @@ fn run(cli: Cli) -> Result<()> {
     }
 }
 
-fn compress_options(args: Compress) -> Result<Request> {
+fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     let recipe = args.recipe.recipe()?;
     let kind = args.kind.map(|kind| match kind {
         args::OutputKind::Model => OutputKind::Model,
@@ -200,6 +200,9 @@ fn compress_options(args: Compress) -> Result<Request> {
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
+    if args.dry_run && input.memory.tell == Tell::Nothing && !quiet {
+        input.memory.tell = Tell::Time;
+    }
     // What the command line leaves open is as it was in the run that the recipe was written beside.
     let run = match record.run {
         Some(run) => {
@@ -300,7 +303,7 @@ fn part_of(split: SplitArg) -> Part {
 }
 
 fn budget_of(memory: Memory) -> Budget {
-    Budget { bytes: memory.memory, explain: memory.explain }
+    Budget { bytes: memory.memory, tell: if memory.explain { Tell::Plan } else { Tell::Nothing } }
 }
 
 fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {

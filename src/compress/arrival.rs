@@ -14,7 +14,7 @@ use glam::DVec3;
 
 use super::journal::Journal;
 use super::measure::{Measure, Measured, Outlook, Stages};
-use crate::budget::{Budget, Plan, Workload};
+use crate::budget::{Budget, Plan, Tell, Workload};
 use crate::error::Result;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
@@ -65,15 +65,15 @@ fn receive_measured<S: Stages>(
     let block = frame_block(stream.header());
     let work = Workload::of_stream(stream.header(), block, &of_rig);
     let held = (block + AHEAD) as u64;
-    let fit = |explain: bool, measuring: Option<bool>| {
-        Plan::fit(work, Budget { explain, ..options.memory }, |work, limits| {
+    let fit = |tell: Tell, measuring: Option<bool>| {
+        Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
             let mut all = vec![receiving(work, limits, held, measuring)];
             all.extend(stages.needs(work, limits));
             all
         })
     };
-    let measures = fit(false, Some(visible.is_some())).is_ok();
-    let memory = fit(options.memory.explain, measures.then_some(visible.is_some()))?;
+    let measures = fit(Tell::Nothing, Some(visible.is_some())).is_ok();
+    let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
     // Without cameras the rig stands around the first frame, and everything else around the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
@@ -98,7 +98,7 @@ fn receive_measured<S: Stages>(
     let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = scene_of(opened, options)?;
     // Now that the frames are counted; what they add is small, and no reason to throw away what has arrived.
-    let counted = Budget { explain: false, ..options.memory };
+    let counted = Budget { tell: Tell::Nothing, ..options.memory };
     let counted = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits));
     scene.follow(counted.as_ref().unwrap_or(&memory));
     let mut arrived = None;

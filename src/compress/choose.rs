@@ -7,7 +7,7 @@
 use super::journal::Journal;
 use super::merge::Outcome;
 use super::score::{Order, Ranked, Scored, scored};
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
 use crate::model::{Camera, Columns, Gaussians, Picture};
@@ -27,6 +27,9 @@ const PICTURES: usize = 24;
 
 /// Pictures of a frame that are compared at a time.
 const AT_ONCE: usize = 4;
+
+/// Most alternatives: the run's own order, those by C and by the mean, and what merging leaves.
+const ALTERNATIVES: f64 = 4.0;
 
 /// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
 pub(super) const CLUSTERED: u64 = 125;
@@ -63,8 +66,12 @@ impl Choose {
         ];
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + AT_ONCE as u64);
         let frames = (PICTURES as u64).min(work.pictures);
+        // The original, and as many alternatives of about half as many Gaussians as there are orders and merging.
+        let made = work.picturing(frames as f64, (1.0 + 0.5 * ALTERNATIVES) * work.count(), (RENDER.0, 0.0))
+            + work.picturing((1.0 + ALTERNATIVES) * frames as f64, 0.0, RENDER);
         Need {
             stage: NAME,
+            seconds: work.reading(work.count(), frames as f64) + made,
             reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![work.arriving(), ("pictures", pictures)],

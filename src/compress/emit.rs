@@ -23,6 +23,11 @@ use crate::scene::Scene;
 /// What the stage is called.
 const NAME: &str = "emit";
 
+/// Part of the Gaussians that is usually left.
+const LEFT: f64 = 0.5;
+/// Seconds that a state takes to be encoded and written (`benches/pack.rs`).
+pub const ENCODING: f64 = 3.5e-7;
+
 /// File beside every result: all parameters it was made with.
 pub const RECIPE: &str = "recipe.toml";
 /// File beside every result: where each Gaussian of the input went.
@@ -105,7 +110,10 @@ impl Emit {
             true => 0.0,
             false => parts as f64 * work.scattered_reads(work.frames, limits),
         };
-        Need { stage: NAME, reads, per_gaussian, fixed }
+        let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
+        let left = LEFT * work.count();
+        let seconds = work.reading(left, frames) + left * frames * ENCODING;
+        Need { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
     /// Writes the result and what goes beside it; everything appears under its name at the end, a file

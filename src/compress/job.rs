@@ -69,11 +69,6 @@ impl Job {
         })
     }
 
-    /// Names of its stages that go over frames or pictures, in their order.
-    pub fn names(&self) -> Vec<&'static str> {
-        self.needs(&Workload::nothing(), &Limits::NONE).iter().map(|need| need.stage).collect()
-    }
-
     /// Writes down the stages that the request leaves out.
     pub fn write_down(&self, request: &Request, journal: &mut Journal) {
         if !self.prune.prunes {
@@ -122,7 +117,7 @@ mod tests {
     }
 
     fn budget(bytes: u64) -> Budget {
-        Budget { bytes: Some(bytes), explain: false }
+        Budget { bytes: Some(bytes), ..Budget::default() }
     }
 
     /// Everything compressing does under `preset`, colours fitted too.

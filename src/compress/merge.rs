@@ -38,6 +38,11 @@ const TRIALS: f64 = 16.0;
 /// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
 const GATHERED: usize = 16 * BLOCK;
 
+/// Seconds that a Gaussian takes: neighbours, tests and what comes of them (`benches/merge.rs`).
+const MERGING: f64 = 1e-5;
+/// Part of the Gaussians whose pairs are followed along the frames, about.
+const FOLLOWED: f64 = 0.3;
+
 /// The merging of a run.
 #[derive(Debug, Clone)]
 pub struct Merge {
@@ -82,6 +87,7 @@ impl Merge {
         Need {
             stage: NAME,
             reads: work.scattered_reads(1, limits) + followed,
+            seconds: MERGING * work.count() + FOLLOWED * work.reading(work.count(), work.frames as f64),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
         }

@@ -26,6 +26,7 @@ pub use record::{Record, Run};
 pub use request::{Only, Request, Target};
 
 use crate::TOOL;
+use crate::budget::seconds;
 use crate::error::Result;
 use crate::recipe::Recipe;
 use crate::reduction::Reduction;
@@ -90,7 +91,11 @@ fn reduce(
     scene.input.check_output(job.emit.kind, &request.output)?;
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.whole()?;
-    let _numbered = begin_run(&job.names());
+    let work = scene.workload();
+    let stages = seconds(&work, &job.needs(&work, &scene.limits));
+    // What was measured on arrival is not done again.
+    let measured = usize::from(arrived.is_some()) + arrived.iter().filter(|measured| measured.seen.is_some()).count();
+    let _numbered = begin_run(stages[measured..].to_vec());
     let input = InputSummary::of(&*scene.input, &scene.path)?;
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;

@@ -5,7 +5,7 @@
 
 use super::journal::Journal;
 use super::score::{Scored, scored};
-use crate::budget::{Need, Workload};
+use crate::budget::{LOOK, Need, RENDER, Workload};
 use crate::error::Result;
 use crate::metrics::psnr;
 use crate::model::{Camera, Column, Columns, Gaussians, Picture, SH_C0};
@@ -69,8 +69,12 @@ impl Refit {
             // Made at a time, with what they pull at: twice three f64.
             ("pictures", work.threads * (render::BYTES_PER_VISIBLE as u64 + 48)),
         ];
+        let (rendered, solved) = (2 * fitted + 3 * tests, fitted * (ITERATIONS as u64 + 1));
         Need {
             stage: NAME,
+            seconds: work.reading(work.count(), (fitted + tests) as f64)
+                + work.picturing(rendered as f64, 0.5 * work.count(), RENDER)
+                + work.picturing(solved as f64, 0.5 * work.count(), LOOK),
             reads: 2.0 * work.scattered_reads(fitted + tests, limits)
                 + again * work.scattered_reads(fitted - sights, limits)
                 + work.scattered_reads(tests, limits),

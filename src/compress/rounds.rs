@@ -8,7 +8,7 @@
 
 use super::journal::Journal;
 use super::score::{Order, Ranked, Scored, scored};
-use crate::budget::{Need, Workload};
+use crate::budget::{Need, REMOVE, Workload};
 use crate::error::Result;
 use crate::model::Columns;
 use crate::plan::Limits;
@@ -32,27 +32,38 @@ pub struct Rounds {
     pub contrast_floor: f64,
     /// Part of the Gaussians that the last round is taken to leave at least, to say how many rounds there are at most.
     pub fewest: f64,
+    /// Part of them that it usually leaves, to say about how long rounds take.
+    pub usual: f64,
 }
 
 /// Where no size is asked for, rounds are taken to leave this part of the Gaussians at least.
 const FEWEST: f64 = 0.05;
+/// And usually this one.
+const USUAL: f64 = 0.5;
 
 impl Rounds {
     /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
     /// contributions.
     pub fn of(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
         let recipe::Select { round_fraction: fraction, contrast_floor, .. } = *recipe;
-        let fewest = target.unwrap_or(FEWEST);
-        (fraction < 1.0).then_some(Rounds { fraction, contrast_floor, fewest })
+        let (fewest, usual) = (target.unwrap_or(FEWEST), target.unwrap_or(USUAL));
+        (fraction < 1.0).then_some(Rounds { fraction, contrast_floor, fewest, usual })
     }
 
     /// The ranking, and pictures of all that is left.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let per_gaussian = [scored(limits), vec![("ranking", 32)], looking].concat();
-        let rounds = (self.fewest.ln() / self.fraction.ln()).ceil().max(0.0);
-        let reads = rounds * work.scattered_reads((PICTURES as u64).min(work.pictures), limits);
-        Need { stage: NAME, reads, per_gaussian, fixed }
+        let rounds = |fewest: f64| (fewest.ln() / self.fraction.ln()).ceil().max(0.0);
+        let pictures = (PICTURES as u64).min(work.pictures);
+        let views = work.pictures.div_ceil(work.frames.max(1)).clamp(1, VIEWS_AT_ONCE as u64);
+        let frames = pictures.div_ceil(views);
+        let seconds = (0..rounds(self.usual) as i32).map(|round| {
+            let left = work.count() * self.fraction.powi(round);
+            work.reading(left, frames as f64) + work.picturing(pictures as f64, left, REMOVE)
+        });
+        let reads = rounds(self.fewest) * work.scattered_reads(frames, limits);
+        Need { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
     /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one

@@ -13,6 +13,12 @@ use crate::stream::{self, BLOCK, Scanned};
 /// What the stage is called.
 const NAME: &str = "scan";
 
+/// Seconds that a state takes to be added to an accumulator, and to be projected to a picture (`benches/scan.rs`,
+/// `benches/projection.rs`).
+const ACCUMULATING: f64 = 2e-8;
+/// See [`ACCUMULATING`].
+const PROJECTING: f64 = 8e-9;
+
 /// The scan of a run.
 #[derive(Debug, Clone)]
 pub struct Scan {
@@ -28,6 +34,8 @@ impl Scan {
         Need {
             stage: NAME,
             reads: 1.0,
+            seconds: work.count() * work.frames as f64 * (ACCUMULATING + work.views as f64 * PROJECTING)
+                + work.reading(work.count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving()],
         }

@@ -115,6 +115,7 @@ impl Score {
         Need {
             stage: NAME,
             reads: work.reads(1, limits),
+            seconds: 2e-6 * work.count(),
             per_gaussian: vec![
                 ("rows", SCORED),
                 ("sorting", select::WORKING_BYTES_PER_GAUSSIAN as u64),

@@ -1,7 +1,7 @@
 //! Stage `visible`: what every Gaussian adds to the pictures, occlusion included.
 
 use super::journal::Journal;
-use crate::budget::{Need, Workload};
+use crate::budget::{LOOK, Need, Workload};
 use crate::error::Result;
 use crate::model::{Columns, Rows};
 use crate::plan::Limits;
@@ -35,7 +35,10 @@ impl Visible {
         let (mut per_gaussian, fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
         per_gaussian.insert(0, ("rows", Rows::BYTES_PER_GAUSSIAN as u64 + 16));
-        Need { stage: NAME, reads: work.reads(frames, limits), per_gaussian, fixed }
+        let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
+        let seconds = work.reading(work.count(), frames as f64)
+            + work.picturing(work.pictures as f64 / every, work.count(), LOOK);
+        Need { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
     /// C and W of every Gaussian of `scene`.

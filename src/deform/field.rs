@@ -161,6 +161,12 @@ impl Field {
         input + if matches!(self.mask, Mask::Voxel(_)) { 4 } else { 0 }
     }
 
+    /// Multiplications by weights that a Gaussian takes at one time.
+    pub fn multiplications(&self) -> usize {
+        let heads = self.heads.iter().flat_map(|head| [&head.hidden, &head.output]);
+        self.trunk.iter().chain(heads).map(Linear::multiplications).sum()
+    }
+
     /// Computes what does not depend on time for Gaussians at canonical `position` `[N, 3]`.
     pub fn prepare(&self, position: &Column) -> Prepared {
         Prepared {

@@ -55,6 +55,11 @@ impl Linear {
         Ok(layer)
     }
 
+    /// Multiplications by weights that a Gaussian takes.
+    pub(super) fn multiplications(&self) -> usize {
+        self.weight.len() * PANEL
+    }
+
     /// ReLU(y) of `input` `[inputs, LANES]` into `out` `[outputs, LANES]`. NaN stays NaN, as it would not through
     /// `f32::max`.
     #[inline(always)]

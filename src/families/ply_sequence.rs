@@ -68,6 +68,7 @@ impl Family for PlySequence {
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
+            seconds_per_state: 1e-7,
             decoded: 0,
         }
     }

@@ -62,7 +62,8 @@ pub fn need(work: &Workload) -> Need {
         ("neighbours", 190),
     ];
     let reads = SAMPLES.min(work.frames as usize) as f64 / work.frames.max(1) as f64;
-    Need { stage: "traits", reads: 2.0 * reads, per_gaussian, fixed: vec![work.arriving()] }
+    let seconds = 2e-5 * work.count() + work.reading(work.count(), 2.0 * reads * work.frames as f64);
+    Need { stage: "traits", reads: 2.0 * reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
 }
 
 /// The kinds one Gaussian is of, by [`Kind::ALL`].

@@ -1,7 +1,7 @@
 //! Which pictures of a rig to make: at which frame, by which camera, over what background.
 
 use super::Scene;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Picture, Rig, Split};
 use crate::plan::Limits;
@@ -96,6 +96,9 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
     Need {
         stage,
         reads: models as f64,
+        seconds: models as f64
+            * (work.reading(work.count(), work.frames as f64)
+                + work.picturing(work.pictures as f64, work.count(), RENDER)),
         per_gaussian: vec![
             ("states", models * work.state(Columns::all())),
             ("readers", models * work.input.reader),

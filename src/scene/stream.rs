@@ -74,5 +74,5 @@ pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<
             fixed.extend(pictures);
         }
     }
-    Need { stage: "receive", reads: 0.0, per_gaussian, fixed }
+    Need { stage: "receive", reads: 0.0, seconds: 0.0, per_gaussian, fixed }
 }

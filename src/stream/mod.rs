@@ -25,7 +25,7 @@ pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use merged::MergedSequence;
 pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, View, show};
-pub use progress::{Mode, Progress, begin_run};
+pub use progress::{Mode, Progress, begin_run, duration};
 pub use removal::removal_error;
 pub use sample::{Sampler, VIEWS_AT_ONCE, spread, strided};
 pub use scan::{RunningScan, Scanned, scan};

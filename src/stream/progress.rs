@@ -4,7 +4,7 @@
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write as _};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanCount, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
@@ -14,7 +14,7 @@ const LINE_EVERY: u64 = 60;
 
 /// A library says nothing unasked.
 static QUIET: AtomicBool = AtomicBool::new(true);
-static STAGES: Mutex<Vec<&'static str>> = Mutex::new(Vec::new());
+static RUN: Mutex<Option<Run>> = Mutex::new(None);
 
 /// What this process shows of its progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,11 +25,51 @@ pub enum Mode {
     Quiet,
 }
 
-/// Names the stages that a run is made of, in order: as long as what it gives lives, a bar or line of one of them says
-/// `[k/n]`.
-pub fn begin_run(stages: &[&'static str]) -> RunOfStages {
-    *STAGES.lock().unwrap_or_else(PoisonError::into_inner) = stages.to_vec();
+/// Names the stages that a run is made of, in order, with the seconds that each takes, about: as long as what it gives
+/// lives, a bar or line of one of them says `[k/n]`, and a bar how long the whole run will take yet.
+pub fn begin_run(stages: Vec<(&'static str, f64)>) -> RunOfStages {
+    *run() = Some(Run { stages, start: Instant::now(), at: None });
     RunOfStages(())
+}
+
+fn run() -> MutexGuard<'static, Option<Run>> {
+    RUN.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Where a run is.
+#[derive(Debug)]
+struct Run {
+    /// Names, and about how many seconds they take.
+    stages: Vec<(&'static str, f64)>,
+    start: Instant,
+    /// The stage that runs, and since when.
+    at: Option<(usize, Instant)>,
+}
+
+impl Run {
+    /// A stage's name with its place among the stages, if it is one of them: the one that runs now.
+    fn enter(&mut self, what: &str, now: Instant) -> String {
+        let Some(place) = self.stages.iter().position(|(stage, _)| *stage == what) else { return what.to_owned() };
+        if self.at.is_none_or(|(stage, _)| stage != place) {
+            self.at = Some((place, now));
+        }
+        format!("[{}/{}] {what}", place + 1, self.stages.len())
+    }
+
+    /// Seconds until its end, about, when the step that runs takes `step` more: what is expected of the stages to come,
+    /// corrected by how long those before took.
+    fn left(&self, step: f64, now: Instant) -> f64 {
+        let Some((place, since)) = self.at else { return step };
+        let expected = |stages: &[(&str, f64)]| stages.iter().map(|(_, seconds)| seconds).sum::<f64>();
+        let before = expected(&self.stages[..place]);
+        // What hardly takes time tells little.
+        let correction = match before >= 0.5 {
+            true => ((since - self.start).as_secs_f64() / before).clamp(0.1, 10.0),
+            false => 1.0,
+        };
+        let of_stage = correction * self.stages[place].1 - (now - since).as_secs_f64();
+        of_stage.max(step) + correction * expected(&self.stages[place + 1..])
+    }
 }
 
 /// A run whose stages are numbered.
@@ -39,7 +79,7 @@ pub struct RunOfStages(());
 
 impl Drop for RunOfStages {
     fn drop(&mut self) {
-        STAGES.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        *run() = None;
     }
 }
 
@@ -74,20 +114,25 @@ impl Progress {
         if QUIET.load(Ordering::Relaxed) {
             return Progress(Shown::Nothing);
         }
-        let name = numbered(what, &STAGES.lock().unwrap_or_else(PoisonError::into_inner));
+        let name = run().as_mut().map_or_else(|| what.to_owned(), |run| run.enter(what, Instant::now()));
         if !io::stderr().is_terminal() {
             return Progress(Shown::Lines(Log::new(name, unit, total)));
         }
         let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(10));
         let template = match total {
             Some(_) => format!(
-                "{{prefix:>10}} [{{wide_bar}}] {{percent:>3}}% {{human_pos}}/{{human_len}} {unit}, {{rate}}, {{eta}} left"
+                "{{prefix:>10}} [{{wide_bar}}] {{percent:>3}}% {{human_pos}}/{{human_len}} {unit}, {{rate}}, {{eta}} \
+                 left{{run}}"
             ),
             None => format!("{{prefix:>10}} {{spinner}} {{human_pos}} {unit}, {{rate}}"),
         };
         if let Ok(style) = ProgressStyle::with_template(&template) {
             let rate = |state: &ProgressState, out: &mut dyn std::fmt::Write| _ = out.write_str(&rate(state.per_sec()));
-            bar.set_style(style.with_key("rate", rate).progress_chars("=> "));
+            let of_run = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+                let left = run().as_ref().map(|run| run.left(state.eta().as_secs_f64(), Instant::now()));
+                let _ = left.map(|left| write!(out, " (about {} in all)", duration(left)));
+            };
+            bar.set_style(style.with_key("rate", rate).with_key("run", of_run).progress_chars("=> "));
         }
         bar.set_prefix(name);
         bar.enable_steady_tick(Duration::from_millis(200));
@@ -172,14 +217,6 @@ fn tell(line: &str) {
     let _ = writeln!(io::stderr(), "{line}");
 }
 
-/// A stage's name with its place among the stages of the run, if it is one of them.
-fn numbered(what: &str, stages: &[&str]) -> String {
-    match stages.iter().position(|&stage| stage == what) {
-        Some(place) => format!("[{}/{}] {what}", place + 1, stages.len()),
-        None => what.to_owned(),
-    }
-}
-
 /// A rate as a person reads it: two digits or three.
 fn rate(per_second: f64) -> String {
     let (value, unit) = match per_second {
@@ -192,7 +229,8 @@ fn rate(per_second: f64) -> String {
     format!("{value:.digits$}{unit}/s")
 }
 
-fn duration(seconds: f64) -> String {
+/// A time as a person reads it.
+pub fn duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;
     match whole {
         0..60 => format!("{seconds:.1} s"),
@@ -234,9 +272,20 @@ mod tests {
     }
 
     #[test]
-    fn stages_of_a_run_are_numbered_and_others_are_not() {
-        let stages = ["scan", "score", "emit"];
-        assert_eq!(numbered("score", &stages), "[2/3] score");
-        assert_eq!(numbered("motion", &stages), "motion");
+    fn stages_of_a_run_are_numbered_and_what_is_left_of_it_follows_how_long_the_first_ones_took() {
+        let start = Instant::now();
+        let after = |seconds| start + Duration::from_secs(seconds);
+        let stages = vec![("scan", 10.0), ("score", 0.0), ("rounds", 30.0), ("emit", 5.0)];
+        let mut run = Run { stages, start, at: None };
+        assert_eq!(run.enter("motion", start), "motion");
+        assert_eq!(run.left(2.0, start), 2.0);
+        assert_eq!(run.enter("scan", start), "[1/4] scan");
+        assert_eq!(run.left(8.0, after(4)), 8.0 + 35.0);
+        // Twice as slow as was thought: so will be what follows.
+        assert_eq!(run.enter("rounds", after(20)), "[3/4] rounds");
+        assert_eq!(run.left(1.0, after(30)), 50.0 + 10.0);
+        // A second round does not begin the stage anew.
+        assert_eq!(run.enter("rounds", after(60)), "[3/4] rounds");
+        assert_eq!(run.left(7.0, after(90)), 7.0 + 10.0);
     }
 }

@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use crate::TOOL;
 use crate::budget::{Need, Plan, Workload};
+use crate::compress::emit::ENCODING;
 use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::container::write_container;
@@ -164,14 +165,16 @@ fn workload(input: &dyn Family) -> Workload {
 
 /// What it takes to write every frame as a container.
 fn packing(work: &Workload, _: &Limits) -> Vec<Need> {
-    vec![Need { stage: "pack", reads: 1.0, per_gaussian: Vec::new(), fixed: work.writing() }]
+    let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
+    vec![Need { stage: "pack", reads: 1.0, seconds, per_gaussian: Vec::new(), fixed: work.writing() }]
 }
 
 /// What it takes to write every frame by itself.
 fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
     let states = ("states", work.state(Columns::all()));
     let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
-    vec![Need { stage: "unpack", reads: 1.0, per_gaussian, fixed: vec![work.arriving()] }]
+    let seconds = 2.0 * work.reading(work.count(), work.frames as f64);
+    vec![Need { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.arriving()] }]
 }
 
 impl Info {
