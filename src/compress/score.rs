@@ -12,7 +12,7 @@ use crate::plan::Limits;
 use crate::recipe::{self, NonFinite, StaticTerm};
 use crate::reduction::Reference;
 use crate::scene::Scene;
-use crate::score::{Scores, Term, score};
+use crate::score::{Graded, Scores, Term, score};
 use crate::select::{self, Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, fill_anisotropy, snap, ulp};
 use crate::stream::{Scanned, Seen, gather};
@@ -101,9 +101,7 @@ impl Order {
     /// As people know it.
     pub fn name(self) -> &'static str {
         match self {
-            Order::Term(StaticTerm::Mean) => "C",
-            Order::Term(StaticTerm::Peak) => "W",
-            Order::Term(StaticTerm::Geometric) => "sqrt(C*W)",
+            Order::Term(term) => Graded::from(term).name(),
             Order::Rounds => "removal in rounds",
         }
     }
@@ -138,7 +136,7 @@ impl Score {
             (rows.c, rows.w) = (seen.coverage, seen.peak);
             let odd: Vec<u32> = non_finite(&rows).collect();
             for id in odd {
-                (rows.c[id as usize], rows.w[id as usize]) = (0.0, 0.0);
+                rows.clear(id as usize);
             }
         }
         let reference_frame = first_of_largest(&scanned.alive_per_frame);
@@ -299,7 +297,7 @@ impl Scored {
     /// Percentiles of every term.
     pub fn term_summaries(&self) -> Vec<TermSummary> {
         let summarise = |term: &Term| TermSummary {
-            name: term.name.to_owned(),
+            name: term.of.name().to_owned(),
             p1: term.norm.p1,
             p99: term.norm.p99,
             active: term.norm.is_active(),
@@ -323,7 +321,7 @@ impl Scored {
         }
         for term in self.terms.iter().filter(|term| !term.norm.is_active()) {
             let why = format!("1st and 99th percentile are both {}", term.norm.p1);
-            journal.leave_out(inactive(term.name), why);
+            journal.leave_out(format!("grading by {}", term.of.property()), why);
         }
         for (count, what) in [
             (self.flags.non_finite, "with NaN or infinity"),
@@ -346,18 +344,5 @@ fn constant(column: Columns) -> &'static str {
         Columns::LOG_SCALE => "re-reading scales per frame",
         Columns::OPACITY => "re-reading opacities per frame",
         _ => "re-reading colours per frame",
-    }
-}
-
-fn inactive(term: &str) -> &'static str {
-    match term {
-        "C" | "W" | "sqrt(C*W)" => "grading by coverage",
-        "E" => "grading by anisotropy",
-        "D" => "grading by motion",
-        "kappa" => "grading by curvature",
-        "V" => "grading by opacity variance",
-        "Life" => "grading by life span",
-        "S_static" => "grading by the static score",
-        _ => "grading by the dynamic score",
     }
 }

@@ -1,7 +1,7 @@
 //! Statistics that nothing needs until later: in memory, or set aside in a scratch file.
 //!
-//! The file: of every Gaussian D, κ, V, C, E, Vis and, where there is one, W, one column of f64 after the other, then
-//! its life (u32), then its flags; all as this machine has them. Memory: nothing, until something is asked for.
+//! The file: the values of one statistic after the other, then the flags; all as this machine has them. Memory: nothing,
+//! until something is asked for.
 
 use std::borrow::Cow;
 use std::fs::File;
@@ -13,7 +13,7 @@ use bytemuck::{AnyBitPattern, NoUninit};
 
 use crate::emit::atomic::nameless;
 use crate::error::{Error, Result};
-use crate::model::{Flags, Rows};
+use crate::model::{Flags, Rows, Statistic, Values};
 
 /// The rows of N Gaussians.
 pub(super) enum Statistics {
@@ -28,28 +28,27 @@ pub(super) struct Aside {
     /// Where the file is.
     folder: PathBuf,
     count: usize,
-    has_peak: bool,
+    /// What is in it.
+    columns: Vec<Statistic>,
 }
-
-/// Places of the columns in the file.
-const COVERAGE: usize = 3;
-const VISIBILITY: usize = 5;
-const PEAK: usize = 6;
 
 impl Statistics {
     /// Writes `rows` to a file in `folder`.
     pub(super) fn aside(rows: Rows, folder: &Path) -> Result<Statistics> {
         let io = |what| Error::io(what, folder);
         let mut out = BufWriter::new(nameless(folder)?);
-        let Rows { d, kappa, v, life, c, w, e, vis, flags } = &rows;
-        let columns = [d, kappa, v, c, e, vis, w].map(|column| bytemuck::cast_slice::<f64, u8>(column));
-        let written = columns.iter().try_for_each(|column| out.write_all(column));
-        let written = written.and_then(|()| out.write_all(bytemuck::cast_slice(life)));
-        let written = written.and_then(|()| flags.iter().try_for_each(|flags| out.write_all(&[flags.bits()])));
+        let bytes = |of: &Statistic| -> &[u8] {
+            match of.values() {
+                Values::F64(of, _) => bytemuck::cast_slice(of(&rows)),
+                Values::U32(of, _) => bytemuck::cast_slice(of(&rows)),
+            }
+        };
+        let columns: Vec<_> = Statistic::ALL.into_iter().filter(|of| !bytes(of).is_empty()).collect();
+        let written = columns.iter().try_for_each(|of| out.write_all(bytes(of)));
+        let written = written.and_then(|()| rows.flags.iter().try_for_each(|flags| out.write_all(&[flags.bits()])));
         written.map_err(io("write a scratch file in"))?;
         let file = out.into_inner().map_err(|error| io("write a scratch file in")(error.into_error()))?;
-        let (count, has_peak) = (rows.len(), !w.is_empty());
-        Ok(Statistics::Aside(Aside { file: Mutex::new(file), folder: folder.to_owned(), count, has_peak }))
+        Ok(Statistics::Aside(Aside { file: Mutex::new(file), folder: folder.to_owned(), count: rows.len(), columns }))
     }
 
     /// All rows.
@@ -64,7 +63,9 @@ impl Statistics {
     pub(super) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         Ok(match self {
             Statistics::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
-            Statistics::Aside(aside) => [Cow::Owned(aside.column(COVERAGE)?), Cow::Owned(aside.column(VISIBILITY)?)],
+            Statistics::Aside(aside) => {
+                [Cow::Owned(aside.column(Statistic::C)?), Cow::Owned(aside.column(Statistic::Vis)?)]
+            }
         })
     }
 
@@ -79,28 +80,27 @@ impl Statistics {
 
 impl Aside {
     fn rows(&self) -> Result<Rows> {
-        let lives = if self.has_peak { PEAK + 1 } else { PEAK };
-        let first = 8 * self.count as u64 * lives as u64;
-        let flags: Vec<u8> = self.values(first + 4 * self.count as u64)?;
-        Ok(Rows {
-            d: self.column(0)?,
-            kappa: self.column(1)?,
-            v: self.column(2)?,
-            life: self.values(first)?,
-            c: self.column(COVERAGE)?,
-            w: if self.has_peak { self.column(PEAK)? } else { Vec::new() },
-            e: self.column(4)?,
-            vis: self.column(VISIBILITY)?,
-            flags: flags.into_iter().map(Flags::from_bits_retain).collect(),
-        })
+        let mut rows = Rows::default();
+        for &column in &self.columns {
+            match column.values() {
+                Values::F64(_, of) => *of(&mut rows) = self.column(column)?,
+                Values::U32(_, of) => *of(&mut rows) = self.column(column)?,
+            }
+        }
+        let flags: Vec<u8> = self.values(&self.columns)?;
+        rows.flags = flags.into_iter().map(Flags::from_bits_retain).collect();
+        Ok(rows)
     }
 
-    fn column(&self, place: usize) -> Result<Vec<f64>> {
-        self.values(8 * self.count as u64 * place as u64)
+    /// Of no Gaussians nothing is in the file, and nothing is read of it.
+    fn column<T: AnyBitPattern + NoUninit>(&self, of: Statistic) -> Result<Vec<T>> {
+        let place = self.columns.iter().position(|&column| column == of).unwrap_or(self.columns.len());
+        self.values(&self.columns[..place])
     }
 
-    /// A value for every Gaussian from byte `start` on.
-    fn values<T: AnyBitPattern + NoUninit>(&self, start: u64) -> Result<Vec<T>> {
+    /// A value for every Gaussian, from behind the columns `before` on.
+    fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
+        let start = before.iter().map(|of| of.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let read = file.seek(SeekFrom::Start(start));
@@ -132,6 +132,10 @@ mod tests {
             };
             let statistics = Statistics::aside(rows.clone(), folder.path()).unwrap();
             assert_eq!(statistics.len(), count);
+            let Statistics::Aside(aside) = &statistics else { panic!("it is aside") };
+            let without = if peak { 0 } else { Statistic::W.bytes() };
+            let bytes = aside.file.lock().unwrap().metadata().unwrap().len();
+            assert_eq!(bytes, ((Rows::BYTES_PER_GAUSSIAN - without) * count) as u64);
             assert_eq!(format!("{:?}", statistics.rows().unwrap()), format!("{rows:?}"));
             assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);

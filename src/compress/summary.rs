@@ -111,7 +111,7 @@ impl CameraSummary {
 /// A term of the scores.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TermSummary {
-    /// C, W, sqrt(C*W), E, D, kappa, V, Life, S_static or S_dynamic.
+    /// [`Graded::name`](crate::score::Graded::name).
     pub name: String,
     /// 1st percentile.
     #[serde(deserialize_with = "number")]

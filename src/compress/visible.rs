@@ -3,7 +3,7 @@
 use super::journal::Journal;
 use crate::budget::{LOOK, Need, Workload};
 use crate::error::Result;
-use crate::model::{Columns, Rows};
+use crate::model::{Columns, Rows, Statistic};
 use crate::plan::Limits;
 use crate::recipe::{self, Coverage};
 use crate::scene::Scene;
@@ -34,7 +34,8 @@ impl Visible {
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let (mut per_gaussian, fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
-        per_gaussian.insert(0, ("rows", Rows::BYTES_PER_GAUSSIAN as u64 + 16));
+        let rows = Rows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
+        per_gaussian.insert(0, ("rows", rows as u64));
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
         let seconds = work.reading(work.count(), frames as f64)
             + work.picturing(work.pictures as f64 / every, work.count(), LOOK);

@@ -14,13 +14,12 @@ use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime};
 
 use crate::error::{Error, Result};
-use crate::model::Rows;
+use crate::model::{self, Rows, Statistic};
 
 /// Everything known of N Gaussians after selection; every slice has N entries.
 #[derive(Debug, Clone, Copy)]
 pub struct RowTable<'a> {
-    /// Statistics: `D`, `kappa`, `V`, `C`, `E`, `vis` (f64), `life` in frames (u32); last of all columns `W`
-    /// (f64), where there is one.
+    /// Statistics, each a column ([`Statistic::column`]); last of all columns W, where there is one.
     pub rows: &'a Rows,
     /// S_static.
     pub static_score: &'a [f64],
@@ -82,23 +81,18 @@ impl RowTable<'_> {
 
     /// The columns in order, as both formats name them.
     fn columns(&self) -> Vec<(&'static str, Values<'_>)> {
-        let Rows { d, kappa, v, life, c, w, e, vis, flags: _ } = self.rows;
-        let mut columns = vec![
-            ("D", Values::F64(d)),
-            ("kappa", Values::F64(kappa)),
-            ("V", Values::F64(v)),
-            ("life", Values::U32(life)),
-            ("C", Values::F64(c)),
-            ("E", Values::F64(e)),
-            ("vis", Values::F64(vis)),
+        let column = |of: Statistic| match of.values() {
+            model::Values::F64(values, _) => (of.column(), Values::F64(values(self.rows))),
+            model::Values::U32(values, _) => (of.column(), Values::U32(values(self.rows))),
+        };
+        let mut columns: Vec<_> = Statistic::ALL.into_iter().filter(|&of| of != Statistic::W).map(column).collect();
+        columns.extend([
             ("static_score", Values::F64(self.static_score)),
             ("dynamic_score", Values::F64(self.dynamic_score)),
             ("score", Values::F64(self.score)),
             ("keep", Values::Bool(self.keep)),
-        ];
-        if !w.is_empty() {
-            columns.push(("W", Values::F64(w)));
-        }
+        ]);
+        columns.extend((!self.rows.w.is_empty()).then(|| column(Statistic::W)));
         columns
     }
 

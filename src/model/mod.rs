@@ -6,7 +6,7 @@ mod rows;
 
 pub use camera::{Camera, Picture, Rig, Schedule, Shot, Split};
 pub use gaussians::{Column, Columns, Gaussians};
-pub use rows::{Flags, Rows};
+pub use rows::{Flags, Rows, Statistic, Values};
 
 /// Zeroth spherical-harmonic basis constant: colour = 0.5 + SH_C0 · f_dc.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;

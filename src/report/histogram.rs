@@ -3,11 +3,13 @@
 //! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins are equal in ratio
 //! over the positive values, for scores span many powers of ten; what is 0 is counted apart.
 
+use std::borrow::Cow;
+
 use serde::Serialize;
 
 use super::run::Fate;
-use crate::model::Rows;
-use crate::score::Scores;
+use crate::model::{Rows, Statistic, Values};
+use crate::score::{Graded, Scores};
 use crate::verbs::csv::table;
 
 /// Bins of a histogram.
@@ -40,7 +42,7 @@ impl<T> ByFate<T> {
 /// One score over all Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Histogram {
-    /// S, S_static, S_dynamic, C, W, D, kappa, V, Life or Vis.
+    /// As scores call it.
     pub name: &'static str,
     /// What it measures, with the unit.
     pub meaning: &'static str,
@@ -55,23 +57,25 @@ pub struct Histogram {
 
 /// The histograms of everything that was scored.
 pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -> Vec<Histogram> {
-    let life: Vec<f64> = rows.life.iter().map(|&life| f64::from(life) / frames.max(1) as f64).collect();
-    let all: [(&'static str, &'static str, &[f64]); 10] = [
+    use Statistic::{C, D, Kappa, Life, V, Vis, W};
+    let scores = [
         ("S", "the whole score", &scores.score),
-        ("S_static", "the static score", &scores.static_score),
-        ("S_dynamic", "the dynamic score", &scores.dynamic_score),
-        ("C", "mean coverage, pixels", &rows.c),
-        ("W", "largest share of a pixel", &rows.w),
-        ("D", "root mean square step, scene units per frame", &rows.d),
-        ("kappa", "mean curvature of the path, scene units per frame²", &rows.kappa),
-        ("V", "variance of the opacity", &rows.v),
-        ("Life", "part of the frames it lives in", &life),
-        ("Vis", "part of the pictures it touches", &rows.vis),
+        (Graded::Static.name(), Graded::Static.property(), &scores.static_score),
+        (Graded::Dynamic.name(), Graded::Dynamic.property(), &scores.dynamic_score),
     ];
+    let part = |&count: &u32| f64::from(count) / frames.max(1) as f64;
+    let statistic = |of: Statistic| {
+        let values = match of.values() {
+            Values::F64(values, _) => Cow::Borrowed(&values(rows)[..]),
+            Values::U32(values, _) => values(rows).iter().map(part).collect(),
+        };
+        (of.name(), of.meaning(), values)
+    };
+    let scores = scores.map(|(name, meaning, values)| (name, meaning, Cow::Borrowed(&values[..])));
+    let all = scores.into_iter().chain([C, W, D, Kappa, V, Life, Vis].map(statistic));
     // Without visible coverage there is no W.
-    all.into_iter()
-        .filter(|(_, _, values)| values.len() == fates.len() && !fates.is_empty())
-        .map(|(name, meaning, values)| Histogram::of(name, meaning, values, fates))
+    all.filter(|(_, _, values)| values.len() == fates.len() && !fates.is_empty())
+        .map(|(name, meaning, values)| Histogram::of(name, meaning, &values, fates))
         .collect()
 }
 

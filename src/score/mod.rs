@@ -10,7 +10,7 @@ pub mod sketch;
 pub use norm::Norm;
 pub use sketch::FloatSketch;
 
-use crate::model::{Flags, Rows};
+use crate::model::{Flags, Rows, Statistic};
 use crate::recipe::{self, StaticTerm};
 
 /// Scores of N Gaussians; every array has N entries, all finite.
@@ -26,8 +26,8 @@ pub struct Scores {
     pub static_norm: Vec<f64>,
     /// norm(S_dynamic), for stage 2.
     pub dynamic_norm: Vec<f64>,
-    /// What every term was normalised by, in the order C (or W, sqrt(C*W)), E, D, kappa, V, Life, S_static, S_dynamic;
-    /// terms of weight 0 were not computed and are missing.
+    /// What every term was normalised by, those of S_static, then those of S_dynamic, then these two; terms of weight 0
+    /// were not computed and are missing.
     pub terms: Vec<Term>,
 }
 
@@ -39,10 +39,55 @@ impl Scores {
 /// How a term was normalised.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Term {
-    /// C, W, sqrt(C*W), E, D, kappa, V, Life, S_static or S_dynamic.
-    pub name: &'static str,
+    /// What is normalised.
+    pub of: Graded,
     /// Its percentiles.
     pub norm: Norm,
+}
+
+/// What grades Gaussians: a statistic, or what is made of several.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Graded {
+    /// One statistic.
+    By(Statistic),
+    /// √(C·W).
+    Geometric,
+    /// S_static.
+    Static,
+    /// S_dynamic.
+    Dynamic,
+}
+
+impl From<StaticTerm> for Graded {
+    fn from(term: StaticTerm) -> Graded {
+        match term {
+            StaticTerm::Mean => Graded::By(Statistic::C),
+            StaticTerm::Peak => Graded::By(Statistic::W),
+            StaticTerm::Geometric => Graded::Geometric,
+        }
+    }
+}
+
+impl Graded {
+    /// As summaries and reports call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Graded::By(statistic) => statistic.name(),
+            Graded::Geometric => "sqrt(C*W)",
+            Graded::Static => "S_static",
+            Graded::Dynamic => "S_dynamic",
+        }
+    }
+
+    /// The property that it grades by.
+    pub fn property(self) -> &'static str {
+        match self {
+            Graded::By(statistic) => statistic.property(),
+            Graded::Geometric => Statistic::C.property(),
+            Graded::Static => "the static score",
+            Graded::Dynamic => "the dynamic score",
+        }
+    }
 }
 
 /// Scores of `rows` from a sequence of `frames` frames.
@@ -50,6 +95,8 @@ pub struct Term {
 /// Rows with [`Flags::NON_FINITE`] count in no percentile and score 0 throughout. `rows.e` is used
 /// only when λ > 0. No rows give empty scores.
 pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
+    use Graded::By;
+    use Statistic::{C, D, E, Kappa, Life, V, W};
     let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
     let motion_weight = |i: usize| if recipe.weigh_motion_by_life { life(i) } else { 1.0 };
@@ -57,25 +104,25 @@ pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
     let mut sum = Summation { counts: &counts, recipe, terms: Vec::new() };
     let mut static_score = vec![0.0; rows.len()];
     match recipe.static_term {
-        StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, "W", 1.0, |i| rows.w[i]),
+        StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
         StaticTerm::Geometric if !rows.w.is_empty() => {
-            sum.add(&mut static_score, "sqrt(C*W)", 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
+            sum.add(&mut static_score, Graded::Geometric, 1.0, |i| (rows.c[i] * rows.w[i]).sqrt());
         }
-        _ => sum.add(&mut static_score, "C", 1.0, |i| rows.c[i]),
+        _ => sum.add(&mut static_score, By(C), 1.0, |i| rows.c[i]),
     }
-    sum.add(&mut static_score, "E", recipe.lambda, |i| rows.e[i]);
+    sum.add(&mut static_score, By(E), recipe.lambda, |i| rows.e[i]);
     let mut dynamic_score = vec![0.0; rows.len()];
-    sum.add(&mut dynamic_score, "D", 1.0, |i| rows.d[i] * motion_weight(i));
-    sum.add(&mut dynamic_score, "kappa", recipe.mu, |i| rows.kappa[i] * motion_weight(i));
-    sum.add(&mut dynamic_score, "V", recipe.eta, |i| rows.v[i]);
-    sum.add(&mut dynamic_score, "Life", recipe.xi, life);
+    sum.add(&mut dynamic_score, By(D), 1.0, |i| rows.d[i] * motion_weight(i));
+    sum.add(&mut dynamic_score, By(Kappa), recipe.mu, |i| rows.kappa[i] * motion_weight(i));
+    sum.add(&mut dynamic_score, By(V), recipe.eta, |i| rows.v[i]);
+    sum.add(&mut dynamic_score, By(Life), recipe.xi, life);
 
     let score =
         static_score.iter().zip(&dynamic_score).map(|(s, d)| recipe.w_static * s + recipe.w_dynamic * d).collect();
     let mut static_norm = vec![0.0; rows.len()];
-    sum.add(&mut static_norm, "S_static", 1.0, |i| static_score[i]);
+    sum.add(&mut static_norm, Graded::Static, 1.0, |i| static_score[i]);
     let mut dynamic_norm = vec![0.0; rows.len()];
-    sum.add(&mut dynamic_norm, "S_dynamic", 1.0, |i| dynamic_score[i]);
+    sum.add(&mut dynamic_norm, Graded::Dynamic, 1.0, |i| dynamic_score[i]);
     let terms = sum.terms;
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
@@ -89,7 +136,7 @@ struct Summation<'a> {
 
 impl Summation<'_> {
     /// total += weight · norm(value), over the rows that count; nothing when the weight is 0.
-    fn add(&mut self, total: &mut [f64], name: &'static str, weight: f64, value: impl Fn(usize) -> f64) {
+    fn add(&mut self, total: &mut [f64], of: Graded, weight: f64, value: impl Fn(usize) -> f64) {
         if weight == 0.0 {
             return;
         }
@@ -100,7 +147,7 @@ impl Summation<'_> {
                 *total += weight * norm.apply(value(i));
             }
         }
-        self.terms.push(Term { name, norm });
+        self.terms.push(Term { of, norm });
     }
 }
 
@@ -143,7 +190,7 @@ mod tests {
             assert!((scores.score[i] - expected).abs() < 1e-12, "{i}: got {}, expected {expected}", scores.score[i]);
             assert!((scores.static_norm[i] - norm(i, 1.0)).abs() < 1e-7);
         }
-        let names: Vec<&str> = scores.terms.iter().map(|term| term.name).collect();
+        let names: Vec<&str> = scores.terms.iter().map(|term| term.of.name()).collect();
         assert_eq!(names, ["C", "E", "D", "kappa", "V", "Life", "S_static", "S_dynamic"]);
     }
 
@@ -152,7 +199,7 @@ mod tests {
         let mut rows = rows(100);
         rows.e = vec![f64::NAN; 100];
         let scores = score(&rows, 100, &preset("default"));
-        assert!(scores.terms.iter().all(|term| term.name != "E" && term.name != "Life"));
+        assert!(scores.terms.iter().all(|term| ![Statistic::E, Statistic::Life].map(Graded::By).contains(&term.of)));
         assert!(scores.score.iter().all(|s| s.is_finite()));
     }
 
@@ -189,7 +236,7 @@ mod tests {
         for name in ["paper", "default"] {
             let scores = score(&rows, 300, &preset(name));
             assert!(scores.dynamic_score.iter().chain(&scores.dynamic_norm).all(|&s| s == 0.0));
-            let inactive: Vec<_> = scores.terms.iter().filter(|t| !t.norm.is_active()).map(|t| t.name).collect();
+            let inactive: Vec<_> = scores.terms.iter().filter(|t| !t.norm.is_active()).map(|t| t.of.name()).collect();
             assert_eq!(inactive, ["D", "kappa", "V", "S_dynamic"]);
         }
     }
@@ -221,7 +268,7 @@ mod tests {
         rows.life = vec![50; 200];
         let plain = score(&rows, 100, &preset("paper"));
         let weighed = score(&rows, 100, &recipe::Score { weigh_motion_by_life: true, ..preset("paper") });
-        let d = |scores: &Scores| scores.terms.iter().find(|t| t.name == "D").unwrap().norm.p99;
+        let d = |scores: &Scores| scores.terms.iter().find(|t| t.of == Graded::By(Statistic::D)).unwrap().norm.p99;
         assert_eq!(d(&weighed), 0.5 * d(&plain));
     }
 }

@@ -212,11 +212,10 @@ impl<'a> BlockScan<'a> {
 }
 
 fn clear_non_finite(rows: &mut Rows) {
-    for (i, _) in rows.flags.iter().enumerate().filter(|(_, flags)| flags.contains(Flags::NON_FINITE)) {
-        for values in [&mut rows.d, &mut rows.kappa, &mut rows.v, &mut rows.c, &mut rows.vis] {
-            values[i] = 0.0;
+    for i in 0..rows.len() {
+        if rows.flags[i].contains(Flags::NON_FINITE) {
+            rows.clear(i);
         }
-        rows.life[i] = 0;
     }
 }
 
