@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use super::summary::{LeftOut, Stage};
 use crate::budget::peak_memory_bytes;
+use crate::emit::atomic::Spill;
 use crate::error::Result;
 use crate::pass::{FrameSource, Reads};
 
@@ -33,16 +34,16 @@ impl Journal {
         source: &dyn FrameSource,
         work: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
-        let (start, before) = (Instant::now(), source.reads());
+        let (start, before, scratch) = (Instant::now(), source.reads(), Spill::read_back());
         let (value, gaussians_out) = work(self)?;
-        let reads = source.reads() - before;
-        self.add(name, gaussians_in, gaussians_out, start, reads);
+        let (reads, scratch) = (source.reads() - before, Spill::read_back() - scratch);
+        self.add(name, [gaussians_in, gaussians_out], start, reads, scratch);
         Ok(value)
     }
 
     /// Writes down that opening the input, begun at `start`, gave `gaussians` Gaussians and read so much.
     pub fn opened(&mut self, name: &'static str, start: Instant, gaussians: usize, reads: Reads) {
-        self.add(name, 0, gaussians, start, reads);
+        self.add(name, [0, gaussians], start, reads, 0);
     }
 
     /// Writes down what was not done, and why not.
@@ -50,7 +51,14 @@ impl Journal {
         self.left_out.push(LeftOut { what: what.into(), why: why.into() });
     }
 
-    fn add(&mut self, name: &str, gaussians_in: usize, gaussians_out: usize, start: Instant, reads: Reads) {
+    fn add(
+        &mut self,
+        name: &str,
+        [gaussians_in, gaussians_out]: [usize; 2],
+        start: Instant,
+        reads: Reads,
+        scratch_bytes: u64,
+    ) {
         let Reads { bytes, states, .. } = self.whole;
         let (read, whole) = if bytes > 0 { (reads.bytes, bytes) } else { (reads.states, states) };
         self.stages.push(Stage {
@@ -59,6 +67,7 @@ impl Journal {
             gaussians_out,
             reads,
             full_reads: read as f64 / whole.max(1) as f64,
+            scratch_bytes,
             seconds: start.elapsed().as_secs_f64(),
             peak_memory_bytes: peak_memory_bytes(),
         });

@@ -4,15 +4,12 @@
 //! until something is asked for.
 
 use std::borrow::Cow;
-use std::fs::File;
-use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::path::Path;
 
 use bytemuck::{AnyBitPattern, NoUninit};
 
-use crate::emit::atomic::nameless;
-use crate::error::{Error, Result};
+use crate::emit::atomic::Spill;
+use crate::error::Result;
 use crate::model::{Flags, Rows, Statistic, Values};
 
 /// The rows of N Gaussians.
@@ -23,10 +20,7 @@ pub(super) enum Statistics {
 
 /// Rows in a nameless file that lasts as long as this.
 pub(super) struct Aside {
-    /// Locked from finding a place to having read it.
-    file: Mutex<File>,
-    /// Where the file is.
-    folder: PathBuf,
+    file: Spill,
     count: usize,
     /// What is in it.
     columns: Vec<Statistic>,
@@ -35,8 +29,7 @@ pub(super) struct Aside {
 impl Statistics {
     /// Writes `rows` to a file in `folder`.
     pub(super) fn aside(rows: Rows, folder: &Path) -> Result<Statistics> {
-        let io = |what| Error::io(what, folder);
-        let mut out = BufWriter::new(nameless(folder)?);
+        let mut file = Spill::new(folder)?;
         let bytes = |of: &Statistic| -> &[u8] {
             match of.values() {
                 Values::F64(of, _) => bytemuck::cast_slice(of(&rows)),
@@ -44,11 +37,10 @@ impl Statistics {
             }
         };
         let columns: Vec<_> = Statistic::ALL.into_iter().filter(|of| !bytes(of).is_empty()).collect();
-        let written = columns.iter().try_for_each(|of| out.write_all(bytes(of)));
-        let written = written.and_then(|()| rows.flags.iter().try_for_each(|flags| out.write_all(&[flags.bits()])));
-        written.map_err(io("write a scratch file in"))?;
-        let file = out.into_inner().map_err(|error| io("write a scratch file in")(error.into_error()))?;
-        Ok(Statistics::Aside(Aside { file: Mutex::new(file), folder: folder.to_owned(), count: rows.len(), columns }))
+        columns.iter().try_for_each(|of| file.write(bytes(of)))?;
+        rows.flags.iter().try_for_each(|flags| file.write(&[flags.bits()]))?;
+        file.finish()?;
+        Ok(Statistics::Aside(Aside { file, count: rows.len(), columns }))
     }
 
     /// All rows.
@@ -102,10 +94,7 @@ impl Aside {
     fn values<T: AnyBitPattern + NoUninit>(&self, before: &[Statistic]) -> Result<Vec<T>> {
         let start = before.iter().map(|of| of.bytes() as u64).sum::<u64>() * self.count as u64;
         let mut values = vec![T::zeroed(); self.count];
-        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-        let read = file.seek(SeekFrom::Start(start));
-        let read = read.and_then(|_| file.read_exact(bytemuck::cast_slice_mut(&mut values)));
-        read.map_err(Error::io("read back a scratch file in", &self.folder))?;
+        self.file.read(start, bytemuck::cast_slice_mut(&mut values))?;
         Ok(values)
     }
 }
@@ -134,8 +123,9 @@ mod tests {
             assert_eq!(statistics.len(), count);
             let Statistics::Aside(aside) = &statistics else { panic!("it is aside") };
             let without = if peak { 0 } else { Statistic::W.bytes() };
-            let bytes = aside.file.lock().unwrap().metadata().unwrap().len();
-            assert_eq!(bytes, ((Rows::BYTES_PER_GAUSSIAN - without) * count) as u64);
+            let bytes = ((Rows::BYTES_PER_GAUSSIAN - without) * count) as u64;
+            let ends_before = |byte: u64| aside.file.read(byte, &mut [0]).is_err();
+            assert!(ends_before(bytes) && (bytes == 0 || !ends_before(bytes - 1)), "{bytes} bytes were declared");
             assert_eq!(format!("{:?}", statistics.rows().unwrap()), format!("{rows:?}"));
             assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);

@@ -30,6 +30,9 @@ pub struct Stage {
     pub reads: Reads,
     /// The same as full reads of the input: by bytes where it is stored in tiles, else by states.
     pub full_reads: f64,
+    /// Bytes that it read back of scratch files, which are no part of the input.
+    #[serde(default)]
+    pub scratch_bytes: u64,
     /// Wall-clock time.
     pub seconds: f64,
     /// Largest resident memory of the process up to the end of this stage, where the system tells.
@@ -235,10 +238,14 @@ impl Summary {
             self.cameras.origin, self.cameras.cameras, self.cameras.pairs
         );
         for stage in &self.stages {
+            let scratch = match stage.scratch_bytes {
+                0 => String::new(),
+                bytes => format!(", {:.1} MiB of scratch", bytes as f64 / f64::from(1 << 20)),
+            };
             let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
             let _ = writeln!(
                 out,
-                "  {:<7} {:>9} -> {:>9}  {:8.2} s, {:.2} reads{memory}",
+                "  {:<7} {:>9} -> {:>9}  {:8.2} s, {:.2} reads{scratch}{memory}",
                 stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds, stage.full_reads
             );
         }

@@ -109,6 +109,7 @@ mod tests {
             gaussians_out: 7,
             reads: Reads::default(),
             full_reads: 0.0,
+            scratch_bytes: 0,
             seconds: 0.125,
             peak_memory_bytes: Some(4096),
         };

@@ -13,17 +13,15 @@
 //! Memory while gathering, per Gaussian: 8 bytes, and what varies of 16 for each of F frames; for every thread two
 //! blocks of as many frames.
 
-use std::fs::File;
-use std::io::{Read, Seek, SeekFrom, Write};
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
 
 use super::{BLOCK, Progress};
-use crate::emit::atomic::nameless;
+use crate::emit::atomic::Spill;
 use crate::emit::container::FRAME_BLOCK;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::pass::{FrameSource, Ids, Wanted};
 
@@ -40,9 +38,7 @@ const RUN: u32 = 2048;
 
 /// Trajectories in a nameless file that lasts as long as this.
 pub(super) struct Trajectories {
-    file: File,
-    /// Where the file is.
-    folder: PathBuf,
+    file: Spill,
     count: usize,
     frames: usize,
     /// Frames of a block.
@@ -66,23 +62,23 @@ impl Trajectories {
         let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
         let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
         places.par_sort_unstable();
-        let io = |what| Error::io(what, folder);
-        let mut file = nameless(folder)?;
+        let mut file = Spill::new(folder)?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
         let progress = Progress::new("merge", "frames", frames as u64);
         let mut values = Vec::new();
         if frames > 0 {
             take(source, &places, 0..1, NEEDED, &mut values)?;
-            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write a scratch file in"))?;
+            file.write(bytemuck::cast_slice(&values))?;
         }
         for start in (0..frames).step_by(block).take_while(|_| !columns.is_empty()) {
             let of_block = start..frames.min(start + block);
             take(source, &places, of_block.clone(), columns, &mut values)?;
-            file.write_all(bytemuck::cast_slice(&values)).map_err(io("write a scratch file in"))?;
+            file.write(bytemuck::cast_slice(&values))?;
             progress.advance(of_block.len() as u64);
         }
+        file.finish()?;
         let varying = numbers(columns);
-        Ok(Trajectories { file, folder: folder.to_owned(), count: ids.len(), frames, block, varying })
+        Ok(Trajectories { file, count: ids.len(), frames, block, varying })
     }
 
     /// Shows the moments of the Gaussians at `places` (increasing) frame after frame; only once if none varies.
@@ -91,7 +87,7 @@ impl Trajectories {
     ///
     /// # Errors
     /// Those of reading the file.
-    pub(super) fn play(&mut self, places: &[u32], mut show: impl FnMut(&[Moment])) -> Result<()> {
+    pub(super) fn play(&self, places: &[u32], mut show: impl FnMut(&[Moment])) -> Result<()> {
         if self.frames == 0 {
             return Ok(());
         }
@@ -118,18 +114,13 @@ impl Trajectories {
     }
 
     /// Reads rows of `width` numbers at `places` of a table that begins with number `first` of the file.
-    fn read(&mut self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
+    fn read(&self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
         let mut values: Vec<f32> = Vec::new();
         for near in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
             let low = near[0] as usize;
             let rows = near[near.len() - 1] as usize + 1 - low;
             values.resize(rows * width, 0.0);
-            let at = SeekFrom::Start(4 * (first + low * width) as u64);
-            let bytes = bytemuck::cast_slice_mut(&mut values);
-            self.file
-                .seek(at)
-                .and_then(|_| self.file.read_exact(bytes))
-                .map_err(Error::io("read back a scratch file in", &self.folder))?;
+            self.file.read(4 * (first + low * width) as u64, bytemuck::cast_slice_mut(&mut values))?;
             let (of_run, rest) = out.split_at_mut(near.len() * width);
             for (to, &place) in of_run.chunks_exact_mut(width).zip(near) {
                 to.copy_from_slice(&values[(place as usize - low) * width..][..width]);
@@ -245,7 +236,7 @@ mod tests {
         for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {
             let source = Still::new(varying);
             for frames_together in [1, 3, usize::MAX] {
-                let mut gathered = Trajectories::gather(&source, &ids, frames_together, folder.path()).unwrap();
+                let gathered = Trajectories::gather(&source, &ids, frames_together, folder.path()).unwrap();
                 let mut shown = Vec::new();
                 gathered.play(&places, |moments| shown.push(moments.to_vec())).unwrap();
                 let frames = if varying.is_empty() { 1 } else { 7 };
