@@ -4,16 +4,21 @@
 //! what is allowed and no more; [`HeldTiles::BYTES_PER_SLOT`] for every tile, held or not. What is held is never given
 //! up: passes go over all frames, so that the tile that was not used for longest is the next to be asked for.
 
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use crate::error::Result;
 
 type Slot = OnceLock<Box<[f32]>>;
 
-/// The tiles held, each with a place of its own, so that no reader waits for another.
+/// Locks that tiles share while they are decoded: more than there are threads, so that hardly two wait for one another.
+const TURNS: usize = 256;
+
+/// The tiles held, each with a place of its own, so that nobody who reads one waits for another.
 pub(super) struct HeldTiles {
     slots: Vec<Slot>,
+    /// Held by whoever decodes the tile of a slot, by its number modulo theirs.
+    turns: Vec<Mutex<()>>,
     /// Bytes allowed.
     capacity: AtomicU64,
     /// Bytes of these that are free.
@@ -29,7 +34,8 @@ impl HeldTiles {
     /// Room for no tile yet.
     pub(super) fn new(slots: usize) -> HeldTiles {
         let slots = (0..slots).map(|_| Slot::new()).collect();
-        HeldTiles { slots, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
+        let turns = (0..TURNS).map(|_| Mutex::default()).collect();
+        HeldTiles { slots, turns, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
     }
 
     /// Allows values of `bytes` altogether, if that is more than before.
@@ -41,20 +47,24 @@ impl HeldTiles {
         }
     }
 
-    /// The values of the tile of `slot`, which `decode` writes the first time to room for as many as `count` says; none
-    /// if they do not fit. Threads that come first at the same time decode each for itself, and one outcome stays.
+    /// The values of the tile of slot `at`, which `decode` writes the first time to room for as many as `count` says; none
+    /// if they do not fit. Of threads that come at the same time one decodes and the others wait for it.
     pub(super) fn get_or_decode(
         &self,
-        slot: usize,
+        at: usize,
         count: impl FnOnce() -> Result<usize>,
         decode: impl FnOnce(&mut [f32]) -> Result<()>,
     ) -> Result<Option<&[f32]>> {
-        let slot = &self.slots[slot];
+        let slot = &self.slots[at];
         if let Some(values) = slot.get() {
             return Ok(Some(values));
         }
         if self.full.load(Ordering::Relaxed) {
             return Ok(None);
+        }
+        let _turn = self.turns[at % TURNS].lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(values) = slot.get() {
+            return Ok(Some(values));
         }
         let count = count()?;
         let bytes = 4 * count as u64;
@@ -65,11 +75,11 @@ impl HeldTiles {
             return Ok(None);
         }
         let mut values = vec![0.0; count].into_boxed_slice();
-        let stays = decode(&mut values).map(|()| slot.set(values).is_ok());
-        if !matches!(stays, Ok(true)) {
+        if let Err(error) = decode(&mut values) {
             self.left.fetch_add(bytes, Ordering::Relaxed);
+            return Err(error);
         }
-        stays.map(|_| slot.get().map(|values| &**values))
+        Ok(Some(slot.get_or_init(|| values)))
     }
 
     /// Whether the tile of `slot` is held.
@@ -105,6 +115,27 @@ mod tests {
         assert_eq!(decode(&held, 1, 3), Some(&[1.0; 3][..]));
         let unasked = held.get_or_decode(0, || Err(Error::usage("counted")), |_| Err(Error::usage("decoded"))).unwrap();
         assert_eq!(unasked, Some(&[0.0; 3][..]));
+    }
+
+    #[test]
+    fn threads_that_come_at_once_decode_a_tile_once() {
+        let held = HeldTiles::new(1);
+        held.allow(1000);
+        let decoded = AtomicU64::new(0);
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    let decode = |values: &mut [f32]| {
+                        decoded.fetch_add(1, Ordering::Relaxed);
+                        std::thread::sleep(std::time::Duration::from_millis(20));
+                        values.fill(3.0);
+                        Ok(())
+                    };
+                    assert_eq!(held.get_or_decode(0, || Ok(2), decode).unwrap(), Some(&[3.0; 2][..]));
+                });
+            }
+        });
+        assert_eq!((decoded.into_inner(), held.left.load(Ordering::Relaxed)), (1, 992));
     }
 
     #[test]
