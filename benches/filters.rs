@@ -13,7 +13,7 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::model::Columns;
-use splatsieve::pass::FrameSource;
+use splatsieve::source::FrameSource;
 
 struct Filter {
     order: usize,

@@ -31,9 +31,9 @@ use splatsieve::merge::tree::{Nearest, Point, Tree};
 use splatsieve::merge::voxels::voxel_order;
 use splatsieve::merge::{self, Asked, Survivors};
 use splatsieve::model::{Column, Columns, Gaussians};
-use splatsieve::pass::FrameSource;
 use splatsieve::recipe::{Motion, Recipe};
 use splatsieve::select::hash_id;
+use splatsieve::source::FrameSource;
 use splatsieve::stream::gather;
 use splatsieve::stream::motion::PairMeter;
 

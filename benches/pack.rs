@@ -18,7 +18,7 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
 use splatsieve::emit::container::{GAUSSIAN_BLOCK, write_container};
 use splatsieve::model::Columns;
-use splatsieve::pass::FrameSource;
+use splatsieve::source::FrameSource;
 use splatsieve::stream::HeldFrames;
 
 const LEVEL: i32 = 1;

@@ -34,9 +34,9 @@ use splatsieve::emit::container::write_container;
 use splatsieve::error::Result;
 use splatsieve::ingest::container::Container;
 use splatsieve::model::{Columns, Gaussians, Schedule, SequenceInfo};
-use splatsieve::pass::{Ahead, BlockReader, FrameSource, Ids};
 use splatsieve::recipe::Recipe;
 use splatsieve::select::hash_id;
+use splatsieve::source::{Ahead, BlockReader, FrameSource, Ids};
 use splatsieve::stats::ScanPlan;
 use splatsieve::stream::scan;
 

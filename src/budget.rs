@@ -16,9 +16,9 @@ use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::trajectories::state_bytes;
 use crate::ingest::frame_stream::StreamHeader;
+use crate::limits::Limits;
 use crate::machine::memory_limit;
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
-use crate::plan::Limits;
 use crate::render;
 use crate::stream::{BLOCK, PICTURES_PER_THREAD, duration};
 
@@ -291,7 +291,7 @@ impl Need {
 /// Every limit halved, first those that cost most time.
 const HALVINGS: [fn(&Limits) -> Limits; 6] = [
     |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
-    |limits| Limits { sights_together: limits.sights_together / 2, ..*limits },
+    |limits| Limits { operators_together: limits.operators_together / 2, ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
     |limits| Limits { gaussians_together: (limits.gaussians_together / 2).max(GAUSSIAN_BLOCK), ..*limits },
     |limits| Limits { frames_together: limits.frames_together.div_ceil(2), ..*limits },
@@ -330,7 +330,7 @@ impl Plan {
             frames_held: FRAME_BLOCK,
             frames_together: PICTURES_PER_THREAD * work.threads as usize,
             pictures_together: work.threads as usize,
-            sights_together: usize::MAX,
+            operators_together: usize::MAX,
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1) as usize,
             rows_aside: false,

@@ -30,10 +30,9 @@ pub mod merge;
 /// How what is computed follows from what is wanted; comments elsewhere cite its sections.
 #[doc = include_str!("method.md")]
 pub mod method {}
+pub mod limits;
 pub mod metrics;
 pub mod model;
-pub mod pass;
-pub mod plan;
 pub mod recipe;
 pub mod reduction;
 pub mod refit;
@@ -42,6 +41,7 @@ pub mod report;
 pub mod scene;
 pub mod score;
 pub mod select;
+pub mod source;
 pub mod stats;
 pub mod stream;
 pub mod verbs;

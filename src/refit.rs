@@ -1,19 +1,19 @@
 //! Colours that make a smaller model's pictures as like the original's as colours can.
 //!
-//! In: what cameras see of the smaller model ([`Sight`]) and what their pictures lack. Out: a change of
+//! In: what cameras see of the smaller model ([`ColorOperator`]) and what their pictures lack. Out: a change of
 //! every Gaussian's base colour, the same at all times. A picture is linear in colour, so this is linear
 //! least squares: minimise (1/P) Σ ‖A_p·δ − lack_p‖² + ridge·‖δ‖² over P pictures by conjugate gradients
 //! with the diagonal as preconditioner (Hestenes and Stiefel, 1952; Saad, "Iterative Methods for Sparse
-//! Linear Systems", section 9.2). Memory: [`BYTES_PER_GAUSSIAN`], the sights that are to be kept, and one for each
+//! Linear Systems", section 9.2). Memory: [`BYTES_PER_GAUSSIAN`], the operators that are to be kept, and one for each
 //! thread; every iteration makes those that are not kept again. Sums go by picture, so the bits depend neither on
 //! the threads nor on what is kept.
 
 use rayon::prelude::*;
 
 use crate::model::{Camera, Gaussians};
-use crate::render::{Image, Sight};
+use crate::render::{ColorOperator, Image};
 
-/// Memory per Gaussian beside the sights: right-hand side, diagonal, five vectors of the iteration, one of them in f32
+/// Memory per Gaussian beside the operators: right-hand side, diagonal, five vectors of the iteration, one of them in f32
 /// too, and whether its colour stays.
 pub const BYTES_PER_GAUSSIAN: usize = 7 * size_of::<Rgb>() + size_of::<[f32; 3]>() + size_of::<bool>();
 
@@ -24,8 +24,8 @@ type Rgb = [f64; 3];
 #[derive(Debug)]
 pub struct Refit {
     /// Of the first pictures.
-    sights: Vec<Sight>,
-    most_sights: usize,
+    operators: Vec<ColorOperator>,
+    most_operators: usize,
     pictures: usize,
     /// Σ Aᵀ·lack, `[N]`.
     wanted: Vec<Rgb>,
@@ -37,10 +37,10 @@ pub struct Refit {
 
 impl Refit {
     /// Of as many Gaussians as `fixed` has entries; those set keep their colours. What the cameras of the first
-    /// `most_sights` pictures see is kept.
-    pub fn new(fixed: Vec<bool>, most_sights: usize) -> Self {
+    /// `most_operators` pictures see is kept.
+    pub fn new(fixed: Vec<bool>, most_operators: usize) -> Self {
         let zeros = vec![[0.0; 3]; fixed.len()];
-        Refit { sights: Vec::new(), most_sights, pictures: 0, wanted: zeros.clone(), power: zeros, fixed }
+        Refit { operators: Vec::new(), most_operators, pictures: 0, wanted: zeros.clone(), power: zeros, fixed }
     }
 
     /// Adds pictures of `state`, the smaller model at one frame: each a camera, and the original's picture
@@ -50,21 +50,21 @@ impl Refit {
     /// If `state` has not N Gaussians, or a picture not its camera's size.
     pub fn add(&mut self, state: &Gaussians, lacks: &[(&Camera, Image)]) {
         assert_eq!(state.len(), self.fixed.len(), "pictures of another model");
-        // By batches, so that no more sights and pulls wait for their turn than threads make at a time.
+        // By batches, so that no more operators and sums wait for their turn than threads make at a time.
         for batch in lacks.chunks(rayon::current_num_threads()) {
             let seen: Vec<_> = batch
                 .par_iter()
                 .map(|(camera, lack)| {
-                    let sight = Sight::new(state, camera);
-                    let (pull, power) = (sight.pull(lack), sight.power());
-                    (sight, pull, power)
+                    let operator = ColorOperator::new(state, camera);
+                    let (sums, power) = (operator.transposed(lack), operator.diagonal());
+                    (operator, sums, power)
                 })
                 .collect();
-            for (sight, pull, power) in seen {
-                sight.add(&pull, &mut self.wanted);
-                sight.add(&power, &mut self.power);
-                if self.sights.len() < self.most_sights {
-                    self.sights.push(sight);
+            for (operator, sums, power) in seen {
+                operator.add(&sums, &mut self.wanted);
+                operator.add(&power, &mut self.power);
+                if self.operators.len() < self.most_operators {
+                    self.operators.push(operator);
                 }
             }
         }
@@ -76,7 +76,7 @@ impl Refit {
     /// `ridge` is in pixels per picture: a Gaussian that covers less hardly changes. What no picture
     /// shows, and what is fixed, does not change at all.
     ///
-    /// `again` is asked once per iteration, if not every sight was kept: it hands on the states and cameras of the
+    /// `again` is asked once per iteration, if not every operator was kept: it hands on the states and cameras of the
     /// pictures beyond those kept, as they were added. Fails only if `again` does.
     pub fn solve<E>(
         &self,
@@ -135,21 +135,21 @@ impl Refit {
     ) -> Result<Vec<Rgb>, E> {
         let narrow: Vec<[f32; 3]> = change.iter().map(|change| change.map(|x| x as f32)).collect();
         let mut total: Vec<Rgb> = change.iter().map(|change| change.map(|x| ridge * x)).collect();
-        // By batches, so that no more pulls wait for their turn than threads make at a time.
-        for batch in self.sights.chunks(rayon::current_num_threads()) {
-            let pulls: Vec<_> = batch.par_iter().map(|sight| sight.pull_of_change(&narrow)).collect();
-            batch.iter().zip(&pulls).for_each(|(sight, pull)| sight.add(pull, &mut total));
+        // By batches, so that no more sums wait for their turn than threads make at a time.
+        for batch in self.operators.chunks(rayon::current_num_threads()) {
+            let sums: Vec<_> = batch.par_iter().map(|operator| operator.normal(&narrow)).collect();
+            batch.iter().zip(&sums).for_each(|(operator, sums)| operator.add(sums, &mut total));
         }
-        if self.sights.len() < self.pictures {
+        if self.operators.len() < self.pictures {
             again(&mut |state, cameras| {
                 for batch in cameras.chunks(rayon::current_num_threads()) {
                     let look = |camera: &&Camera| {
-                        let sight = Sight::new(state, camera);
-                        let pull = sight.pull_of_change(&narrow);
-                        (sight, pull)
+                        let operator = ColorOperator::new(state, camera);
+                        let sums = operator.normal(&narrow);
+                        (operator, sums)
                     };
                     let seen: Vec<_> = batch.par_iter().map(look).collect();
-                    seen.iter().for_each(|(sight, pull)| sight.add(pull, &mut total));
+                    seen.iter().for_each(|(operator, sums)| operator.add(sums, &mut total));
                 }
             })?;
         }
@@ -210,13 +210,13 @@ mod tests {
     }
 
     fn refit_with(
-        most_sights: usize,
+        most_operators: usize,
         now: &Gaussians,
         wanted: &Gaussians,
         cameras: &[Camera],
         fixed: Vec<bool>,
     ) -> Refit {
-        let mut refit = Refit::new(fixed, most_sights);
+        let mut refit = Refit::new(fixed, most_operators);
         for camera in cameras {
             let lack = minus(&render(wanted, camera, BLACK), &render(now, camera, BLACK));
             refit.add(now, &[(camera, lack)]);
@@ -224,9 +224,9 @@ mod tests {
         refit
     }
 
-    /// [`Refit::solve`] with every sight kept.
+    /// [`Refit::solve`] with every operator kept.
     fn solve(refit: &Refit, ridge: f64, iterations: usize) -> Vec<[f32; 3]> {
-        refit.solve(ridge, iterations, |_| Err("every sight is kept")).unwrap()
+        refit.solve(ridge, iterations, |_| Err("every operator is kept")).unwrap()
     }
 
     /// Σ AᵀA + ridge and Σ Aᵀ·lack of one channel, A from pictures in which one Gaussian is 1 and all

@@ -368,7 +368,7 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
         ("recipe --preset paper", "[merge]"),
         ("completions bash", "splatsieve"),
         ("completions zsh", "splatsieve"),
-        ("demo --gaussians 400 --frames 4", "family"),
+        ("demo --gaussians 400 --frames 4", "body"),
     ] {
         let run = workplace.run(&format!("{arguments} --quiet"));
         assert_eq!(run.code, 0, "{arguments}: {}", run.stderr);

@@ -11,7 +11,7 @@ use scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, shared, s
 use splatsieve::ingest::ModelFolder;
 use splatsieve::ingest::container::Container;
 use splatsieve::ingest::ply_sequence::PlySequence;
-use splatsieve::pass::FrameSource;
+use splatsieve::source::FrameSource;
 
 const N: usize = 300;
 /// Rows of the input by place in the output, from the index map.

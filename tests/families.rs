@@ -8,8 +8,8 @@ use std::path::Path;
 use scene::{Workplace, state, tiny};
 use splatsieve::emit::kind::OutputKind;
 use splatsieve::families::{self, Family, OpenOptions};
+use splatsieve::limits::Limits;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::plan::Limits;
 use splatsieve::recipe::Recipe;
 use splatsieve::reduction::{Change, Cluster, Reduction, Reference};
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// Modules of each layer, from the vocabulary up.
 const LAYERS: [&[&str]; 5] = [
-    &["error", "machine", "model", "pass", "plan", "recipe", "reduction"],
+    &["error", "machine", "model", "limits", "recipe", "reduction", "source"],
     &["deform", "stats", "score", "select", "merge", "render", "refit", "metrics"],
     &["ingest", "stream", "emit", "families", "demo"],
     &["budget", "scene", "compress", "verbs", "report"],

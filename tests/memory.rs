@@ -11,8 +11,8 @@ use scene::{Workplace, files, lasting_files};
 use splatsieve::emit::container::write_container;
 use splatsieve::error::Result;
 use splatsieve::model::{Columns, Gaussians, SequenceInfo};
-use splatsieve::pass::{BlockReader, FrameSource, Ids};
 use splatsieve::select::hash_id;
+use splatsieve::source::{BlockReader, FrameSource, Ids};
 
 const GAUSSIANS: usize = 30_000;
 const FRAMES: usize = 48;

@@ -9,9 +9,9 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::{PlyRows, by_formula, lasting_files, state, tiny};
 use splatsieve::compress::score::{Scored, UserOverrides};
 use splatsieve::compress::{Only, Request, Target, compress_scene, score_scene};
+use splatsieve::limits::Limits;
 use splatsieve::merge::proxy::merge_state;
 use splatsieve::model::{Columns, Gaussians, SH_C0};
-use splatsieve::plan::Limits;
 use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
 use splatsieve::scene::{InputOptions, Scene};
 

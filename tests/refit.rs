@@ -9,7 +9,7 @@ use splatsieve::ingest::ModelFolder;
 use splatsieve::ingest::container::Container;
 use splatsieve::ingest::ply_sequence::PlySequence;
 use splatsieve::model::Columns;
-use splatsieve::pass::FrameSource;
+use splatsieve::source::FrameSource;
 
 /// A dynamic scene, and what pruning and refitting leave of it, to be given a name.
 fn request(workplace: &Workplace) -> &'static str {

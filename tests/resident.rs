@@ -11,7 +11,7 @@ use splatsieve::demo::Scene;
 use splatsieve::emit::container::{FRAME_BLOCK, write_container};
 use splatsieve::ingest::container::Container;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::pass::{BlockReader, FrameSource, Ids, Wanted};
+use splatsieve::source::{BlockReader, FrameSource, Ids, Wanted};
 use splatsieve::stream::Frames;
 
 const COUNT: usize = 20_000;

@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 use scene::{Workplace, state, tiny};
 use splatsieve::ingest::container::Container;
 use splatsieve::model::Columns;
-use splatsieve::pass::FrameSource;
+use splatsieve::source::FrameSource;
 
 /// A Python with `modules`, or none with a note where this machine has none. `PYTHON` names another than python3.
 fn python(modules: &str) -> Option<PathBuf> {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use scene::{Workplace, files, lasting_files, state, tiny};
 use splatsieve::ingest::container::Container;
-use splatsieve::pass::FrameSource;
+use splatsieve::source::FrameSource;
 
 fn splatsieve(workplace: &Workplace, arguments: &str) -> Command {
     let mut command = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));

@@ -4,8 +4,8 @@ use std::path::Path;
 
 use splatsieve::ingest::ModelFolder;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::pass::{FrameSource, Ids};
 use splatsieve::select::hash_id;
+use splatsieve::source::{FrameSource, Ids};
 use splatsieve::stream::HeldFrames;
 
 #[path = "../../tests/models/mod.rs"]

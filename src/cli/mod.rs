@@ -251,7 +251,7 @@ fn render_options(args: Render) -> RenderOptions {
         None => (Wanted::All(format), Part::HeldOut),
     };
     let mut input = input_options(args.input, None, Some(&args.output));
-    input.look_from(args.cameras);
+    input.use_cameras(args.cameras);
     RenderOptions {
         input,
         wanted,
@@ -264,7 +264,7 @@ fn render_options(args: Render) -> RenderOptions {
 
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
-    original.look_from(args.cameras);
+    original.use_cameras(args.cameras);
     original.memory = budget_of(args.memory);
     EvaluateOptions {
         original,
@@ -281,7 +281,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
 
 fn sweep_options(args: Sweep) -> SweepOptions {
     let mut input = input_options(args.input, None, Some(&args.output));
-    input.look_from(args.cameras);
+    input.use_cameras(args.cameras);
     let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
     SweepOptions {
         input,
@@ -311,7 +311,7 @@ fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) 
     options.memory = budget_of(input.memory);
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
-        options.look_from(cameras.file);
+        options.use_cameras(cameras.file);
         options.split = match cameras.split {
             Some(SplitArg::Train) | None => Some(Split::Train),
             Some(SplitArg::Test) => Some(Split::Test),
@@ -322,7 +322,7 @@ fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) 
 }
 
 impl InputOptions {
-    fn look_from(&mut self, file: CameraFile) {
+    fn use_cameras(&mut self, file: CameraFile) {
         self.cameras = file.cameras;
         self.size = file.size;
         self.frames = file.frames.map(|frames| frames as usize);

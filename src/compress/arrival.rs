@@ -20,9 +20,9 @@ use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
 use crate::ingest::cameras;
 use crate::model::{Camera, Picture, Rig, Split};
-use crate::pass::{FrameSource, Reads};
 use crate::recipe;
 use crate::scene::{InputOptions, Opened, Scene, load_cameras, open_scene, open_stream, receiving, scene_of};
+use crate::source::{FrameSource, Reads};
 use crate::stats::{RobustBox, ScanPlan};
 use crate::stream::{HeldFrames, RunningContribution, RunningScan, Sampler};
 

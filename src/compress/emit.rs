@@ -15,8 +15,8 @@ use crate::emit::index_map::write_index_map;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::families::Family;
+use crate::limits::Limits;
 use crate::model::Columns;
-use crate::plan::Limits;
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 

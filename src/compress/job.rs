@@ -13,7 +13,7 @@ use super::rounds::Rounds;
 use super::score::UserOverrides;
 use crate::budget::{Need, Workload};
 use crate::error::{Error, Result};
-use crate::plan::Limits;
+use crate::limits::Limits;
 use crate::recipe::Coverage;
 
 /// The stages of a run, in their order.

@@ -7,7 +7,7 @@ use super::summary::{LeftOut, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::emit::atomic::Spill;
 use crate::error::Result;
-use crate::pass::{FrameSource, Reads};
+use crate::source::{FrameSource, Reads};
 
 /// The record of a run so far.
 #[derive(Debug, Default)]

@@ -7,7 +7,7 @@ use super::visible::Visible;
 use crate::budget::{Need, Workload};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
-use crate::plan::Limits;
+use crate::limits::Limits;
 use crate::recipe::Recipe;
 use crate::scene::Scene;
 use crate::stream::{Scanned, Seen};

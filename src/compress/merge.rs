@@ -11,16 +11,16 @@ use super::summary::MergeSummary;
 use crate::budget::{Need, Workload};
 use crate::error::{Error, Result};
 use crate::families::trajectories::state_bytes;
+use crate::limits::Limits;
 use crate::merge::known::KnownPairs;
 use crate::merge::motion::MotionGate;
 use crate::merge::proxy::{Importance, weights};
 use crate::merge::{self, Merged, Survivors};
 use crate::model::{Columns, Gaussians};
-use crate::pass::FrameSource;
-use crate::plan::Limits;
 use crate::recipe;
 use crate::reduction::{Cluster, Reduction};
 use crate::scene::Scene;
+use crate::source::FrameSource;
 use crate::stream::motion::{self, PairMeter};
 use crate::stream::{BLOCK, gather};
 

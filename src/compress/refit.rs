@@ -7,15 +7,15 @@ use super::journal::Journal;
 use super::score::{Scored, scored};
 use crate::budget::{LOOK, Need, RENDER, Workload};
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::metrics::psnr;
 use crate::model::{Camera, Column, Columns, Gaussians, Picture, SH_C0};
-use crate::pass::FrameSource;
-use crate::plan::Limits;
 use crate::recipe;
 use crate::reduction::{Change, Reduction};
 use crate::refit::{self, Refit as Equations};
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
+use crate::source::FrameSource;
 use crate::stream::{Batch, Subject, View, show, spread};
 
 /// What the stage is called.
@@ -54,10 +54,10 @@ impl Refit {
         let most = if work.frames == 0 { 1 << 16 } else { work.pictures };
         let fitted = (self.pictures as u64).min(most);
         let tests = fitted.div_ceil(3);
-        let sights = fitted.min(limits.sights_together as u64);
+        let operators = fitted.min(limits.operators_together as u64);
         let at_once = work.threads.min(limits.pictures_together as u64);
         // Those whose footprints are not kept are looked at in every iteration.
-        let again = if sights < fitted { ITERATIONS as f64 + 1.0 } else { 0.0 };
+        let again = if operators < fitted { ITERATIONS as f64 + 1.0 } else { 0.0 };
         let per_gaussian = vec![
             ("kept", 24),
             ("states", 2 * work.state(Columns::all())),
@@ -65,7 +65,7 @@ impl Refit {
             ("readers", 2 * work.input.reader),
             ("held", 2 * work.held(limits, Columns::all())),
             ("equations", refit::BYTES_PER_GAUSSIAN as u64),
-            ("sights", sights * render::BYTES_PER_VISIBLE as u64),
+            ("operators", operators * render::BYTES_PER_VISIBLE as u64),
             // Made at a time, with what they pull at: twice three f64.
             ("pictures", work.threads * (render::BYTES_PER_VISIBLE as u64 + 48)),
         ];
@@ -76,13 +76,13 @@ impl Refit {
                 + work.picturing(rendered as f64, 0.5 * work.count(), RENDER)
                 + work.picturing(solved as f64, 0.5 * work.count(), LOOK),
             reads: 2.0 * work.scattered_reads(fitted + tests, limits)
-                + again * work.scattered_reads(fitted - sights, limits)
+                + again * work.scattered_reads(fitted - operators, limits)
                 + work.scattered_reads(tests, limits),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![
                 work.arriving(),
                 ("pictures", (tests + at_once + 1) * 12 * work.pixels),
-                ("pairs", (sights + work.threads) * render::STRIP_BYTES as u64 / 3),
+                ("pairs", (operators + work.threads) * render::STRIP_BYTES as u64 / 3),
             ],
         }
     }
@@ -108,7 +108,7 @@ impl Refit {
         reduction.change = journal.stage(NAME, count, scene.source(), |journal| {
             let result = scene.input.reduced(&reduction)?;
             let fixed = reduction.kept.iter().map(|id| scored.protected.binary_search(id).is_ok()).collect();
-            let kept = scene.limits.sights_together;
+            let kept = scene.limits.operators_together;
             let mut equations = Equations::new(fixed, kept);
             let (fitted, tested) = divided(&pictures);
             let tests = look(scene, &*result, (&fitted, &tested), &mut equations)?;

@@ -3,8 +3,8 @@
 use super::journal::Journal;
 use crate::budget::{Need, Workload};
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::model::{Columns, Rows};
-use crate::plan::Limits;
 use crate::recipe;
 use crate::scene::Scene;
 use crate::stats::{self, ScanPlan};

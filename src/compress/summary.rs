@@ -12,10 +12,10 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::error::Result;
 use crate::families::Family;
 use crate::merge::PassCounts;
-use crate::pass::Reads;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 use crate::select::Counts;
+use crate::source::Reads;
 
 /// One stage of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

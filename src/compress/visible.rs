@@ -3,8 +3,8 @@
 use super::journal::Journal;
 use crate::budget::{LOOK, Need, Workload};
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::model::{Columns, Rows, Statistic};
-use crate::plan::Limits;
 use crate::recipe::{self, Coverage};
 use crate::scene::Scene;
 use crate::stream::{Seen, strided, visible_contribution};

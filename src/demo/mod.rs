@@ -1,13 +1,13 @@
 //! A small dynamic scene made from nothing: for trying the program without files, and for tests.
 //!
-//! It holds what trained scenes hold and this program is about, each in a [`Family`] whose motion is
+//! It holds what trained scenes hold and this program is about, each in a [`Body`] whose motion is
 //! known in closed form: a room with needless Gaussians in it, things that move rigidly and not,
 //! things that fade and flash, thin things. Every value is a function of the Gaussian's number, the
 //! scene's size and the time, so nothing is stored and any block can be read on its own.
 //!
 //! Memory: at most 192 bytes per Gaussian of an open block.
 
-mod families;
+mod bodies;
 
 #[cfg(test)]
 mod tests;
@@ -18,10 +18,10 @@ use glam::DVec3;
 
 use crate::error::{Error, Result};
 use crate::model::{Camera, Columns, Gaussians, Rig, SequenceInfo, Shot, Split};
-use crate::pass::{BlockReader, FrameSource, Ids};
-use families::{Layout, Part};
+use crate::source::{BlockReader, FrameSource, Ids};
+use bodies::{Layout, Part};
 
-pub use families::Family;
+pub use bodies::Body;
 
 /// Degree of the scene's spherical harmonics: view-dependent enough to exercise the code, small
 /// enough to keep the scene so.
@@ -38,12 +38,12 @@ const HELD_OUT: u32 = 2;
 /// sampled more finely. A Gaussian's values depend on the scene's count.
 ///
 /// ```
-/// use splatsieve::demo::{Family, Scene};
-/// use splatsieve::pass::FrameSource;
+/// use splatsieve::demo::{Body, Scene};
+/// use splatsieve::source::FrameSource;
 ///
 /// let scene = Scene::new(Scene::COUNT, Scene::FRAMES);
 /// assert_eq!(scene.info().times.len(), 48);
-/// assert!(scene.members(Family::Cloth).len() > 400);
+/// assert!(scene.members(Body::Cloth).len() > 400);
 /// ```
 #[derive(Debug, Clone)]
 pub struct Scene {
@@ -69,10 +69,10 @@ impl Scene {
         Scene { layout: Layout::new(count), info }
     }
 
-    /// The Gaussians of a family, which are consecutive; families follow one another in the order of
-    /// [`Family::ALL`].
-    pub fn members(&self, family: Family) -> Range<usize> {
-        self.layout.members(family)
+    /// The Gaussians of a body, which are consecutive; bodies follow one another in the order of
+    /// [`Body::ALL`].
+    pub fn members(&self, body: Body) -> Range<usize> {
+        self.layout.members(body)
     }
 
     /// Six cameras before the open side of the room, 256×192 pixels, each at every frame; the third

@@ -1,4 +1,4 @@
-//! The demo scene is what its families claim.
+//! The demo scene is what its bodies claim.
 
 use super::*;
 use crate::model::Column;
@@ -11,9 +11,9 @@ fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
     out
 }
 
-/// A family at every frame.
-fn film(scene: &Scene, family: Family) -> Vec<Gaussians> {
-    let members = scene.members(family);
+/// A body at every frame.
+fn film(scene: &Scene, body: Body) -> Vec<Gaussians> {
+    let members = scene.members(body);
     (0..scene.info().times.len()).map(|t| frame(scene, Ids::Range(members.clone()), t)).collect()
 }
 
@@ -67,7 +67,7 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
         let scene = Scene::new(count, frames);
         assert_eq!((scene.info().count, scene.info().times.len()), (count, frames));
         assert!(scene.info().times.is_sorted_by(|a, b| a < b));
-        assert_eq!(Family::ALL.iter().map(|&family| scene.members(family).len()).sum::<usize>(), count);
+        assert_eq!(Body::ALL.iter().map(|&body| scene.members(body).len()).sum::<usize>(), count);
         for t in 0..frames {
             let state = frame(&scene, Ids::Range(0..count), t);
             for column in Columns::all().iter() {
@@ -82,24 +82,24 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
 }
 
 #[test]
-fn still_families_do_not_change_by_a_bit_and_constant_columns_never_do() {
+fn still_bodies_do_not_change_by_a_bit_and_constant_columns_never_do() {
     let scene = usual();
-    for family in Family::ALL {
-        let film = film(&scene, family);
-        let still = matches!(family, Family::Wall | Family::Double | Family::Buried | Family::Dust | Family::Wire);
+    for body in Body::ALL {
+        let film = film(&scene, body);
+        let still = matches!(body, Body::Wall | Body::Double | Body::Buried | Body::Dust | Body::Wire);
         for column in Columns::all().iter() {
             let constant = film.iter().all(|state| bits(state.column(column)) == bits(film[0].column(column)));
             let must = still || !scene.info().varying.contains(column);
-            assert!(constant || !must, "{family:?} {}", column.name());
+            assert!(constant || !must, "{body:?} {}", column.name());
         }
         let moves = film.iter().any(|state| state.position != film[0].position);
-        assert_eq!(moves, matches!(family, Family::Egg | Family::Cloth | Family::Spark), "{family:?}");
+        assert_eq!(moves, matches!(body, Body::Egg | Body::Cloth | Body::Spark), "{body:?}");
     }
 }
 
 #[test]
 fn egg_moves_as_one_body() {
-    let film = film(&usual(), Family::Egg);
+    let film = film(&usual(), Body::Egg);
     let n = film[0].len();
     let quaternion = |state: &Gaussians, i: usize| {
         let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
@@ -122,7 +122,7 @@ fn egg_moves_as_one_body() {
 
 #[test]
 fn cloth_is_held_at_one_edge_and_bends_at_the_other() {
-    let film = film(&usual(), Family::Cloth);
+    let film = film(&usual(), Body::Cloth);
     let n = film[0].len();
     let sway = |i: usize| {
         let y = || film.iter().map(|state| f64::from(state.position.plane(1)[i]));
@@ -155,7 +155,7 @@ fn cloth_is_held_at_one_edge_and_bends_at_the_other() {
 
 #[test]
 fn fading_cloud_is_monotone_and_crosses_the_threshold_of_life() {
-    let film = film(&usual(), Family::Fading);
+    let film = film(&usual(), Body::Fading);
     let mut both = [0, 0];
     for i in 0..film[0].len() {
         let series: Vec<f64> = film.iter().map(|state| opacity(state, i)).collect();
@@ -170,7 +170,7 @@ fn fading_cloud_is_monotone_and_crosses_the_threshold_of_life() {
 
 #[test]
 fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
-    let film = film(&usual(), Family::Spark);
+    let film = film(&usual(), Body::Spark);
     let mut first = Vec::new();
     for i in 0..film[0].len() {
         let life: Vec<usize> = (0..film.len()).filter(|&t| opacity(&film[t], i) >= ALPHA_MIN).collect();
@@ -190,8 +190,8 @@ fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
 #[test]
 fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_colour() {
     let scene = usual();
-    let walls = frame(&scene, Ids::Range(scene.members(Family::Wall)), 0);
-    let doubles = frame(&scene, Ids::Range(scene.members(Family::Double)), 0);
+    let walls = frame(&scene, Ids::Range(scene.members(Body::Wall)), 0);
+    let doubles = frame(&scene, Ids::Range(scene.members(Body::Double)), 0);
     for i in 0..doubles.len() {
         let at = point(&doubles.position, i);
         let apart = |j: usize| (point(&walls.position, j) - at).length();
@@ -205,8 +205,8 @@ fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_colour() {
 #[test]
 fn wires_are_needles_and_dust_is_tiny() {
     let scene = usual();
-    let wires = frame(&scene, Ids::Range(scene.members(Family::Wire)), 0);
-    let dust = frame(&scene, Ids::Range(scene.members(Family::Dust)), 0);
+    let wires = frame(&scene, Ids::Range(scene.members(Body::Wire)), 0);
+    let dust = frame(&scene, Ids::Range(scene.members(Body::Dust)), 0);
     for i in 0..wires.len() {
         let [long, a, b] = wires.log_scale.row::<3>(i);
         assert!(((long - a).exp() - 25.0).abs() < 1e-3 && a == b);
@@ -220,17 +220,17 @@ fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
     let rig = scene.rig();
     assert_eq!((rig.cameras.len(), rig.schedule(&scene.info().times, None).unwrap().pairs()), (6, 6 * 48));
     assert_eq!(rig.schedule(&scene.info().times, Some(Split::Test)).unwrap().pairs(), 48);
-    for family in [Family::Egg, Family::Cloth, Family::Fading] {
-        let state = frame(&scene, Ids::Range(scene.members(family)), 24);
+    for body in [Body::Egg, Body::Cloth, Body::Fading] {
+        let state = frame(&scene, Ids::Range(scene.members(body)), 24);
         for camera in &rig.cameras {
             for i in 0..state.len() {
                 let p = camera.rotation * point(&state.position, i) + camera.translation;
                 let (u, v) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
-                assert!(p.z > 0.0 && (0.0..256.0).contains(&u) && (0.0..192.0).contains(&v), "{family:?} {u} {v}");
+                assert!(p.z > 0.0 && (0.0..256.0).contains(&u) && (0.0..192.0).contains(&v), "{body:?} {u} {v}");
             }
         }
     }
-    let buried = frame(&scene, Ids::Range(scene.members(Family::Buried)), 0);
+    let buried = frame(&scene, Ids::Range(scene.members(Body::Buried)), 0);
     for camera in &rig.cameras {
         for i in 0..buried.len() {
             let (eye, at) = (camera.center(), point(&buried.position, i));

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Ids};
+use crate::source::{FrameSource, Ids};
 
 /// Gaussians per tile: what one task of a scan reads. Fixed, so that the bytes depend on nothing but
 /// the content.

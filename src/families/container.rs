@@ -5,7 +5,7 @@ use gseq::{Encoding, Reader, TileId};
 use super::family::{ColumnInfo, Entry, Family, Residence, Timing, bytes_of};
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
-use crate::pass::FrameSource;
+use crate::source::FrameSource;
 
 /// A container.
 pub(super) const ENTRY: Entry = Entry {

@@ -9,11 +9,11 @@ use super::trajectories::{OWN_OUTPUT, check_output, reduced_trajectories, write_
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
+use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
-use crate::pass::FrameSource;
-use crate::plan::Limits;
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::FrameSource;
 
 /// An open input of some kind.
 ///

@@ -13,10 +13,10 @@ use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
 use crate::error::Result;
 use crate::ingest::ply_sequence::PlySequence;
+use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Ids};
-use crate::plan::Limits;
 use crate::reduction::Reduction;
+use crate::source::{FrameSource, Ids};
 use crate::stream::Progress;
 
 /// A folder with one PLY per frame.

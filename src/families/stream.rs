@@ -18,7 +18,7 @@ use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
-use crate::pass::FrameSource;
+use crate::source::FrameSource;
 use crate::stream::{HeldFrames, Progress};
 
 /// Most bytes of frames that are held together, if that is one frame at least.

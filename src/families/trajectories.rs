@@ -11,10 +11,10 @@ use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
+use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{FrameSource, Wanted};
-use crate::plan::Limits;
 use crate::reduction::Reduction;
+use crate::source::{FrameSource, Wanted};
 use crate::stream::{Changed, HeldFrames, MergedSequence, Progress, States};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.

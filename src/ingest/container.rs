@@ -26,7 +26,7 @@ pub use self::store::Container;
 use self::tiles::TileReader;
 use crate::error::Result;
 use crate::model::{Columns, SequenceInfo};
-use crate::pass::{Ahead, BlockReader, FrameSource, Ids, Reads};
+use crate::source::{Ahead, BlockReader, FrameSource, Ids, Reads};
 
 /// Places of the file that are asked about to know whether the system holds it in memory.
 const SAMPLES: u64 = 64;

@@ -17,7 +17,7 @@ use super::digest::hash_file;
 use super::ply::{Ply, Property, check_ids};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, Count, FrameSource, Ids, Reads};
+use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
 /// A sequence of PLY files.
 #[derive(Debug)]

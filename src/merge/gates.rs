@@ -37,7 +37,7 @@ impl Gates {
     }
 
     /// Whether `a` and `b` pass both tests; symmetric. The cheap tests come first.
-    pub fn pass(&self, a: &Look, b: &Look) -> bool {
+    pub fn pass(&self, a: &Appearance, b: &Appearance) -> bool {
         (a.color - b.color).length() <= self.max_color_difference
             && cosine(a.dc, b.dc) > self.rho
             && alike_in_size(a.log_scale, b.log_scale, self.max_log_scale_ratio)
@@ -47,7 +47,7 @@ impl Gates {
 
 /// What the tests read of a Gaussian.
 #[derive(Debug, Clone, Copy)]
-pub struct Look {
+pub struct Appearance {
     position: DVec3,
     rotation: DQuat,
     /// Descending, the smallest no flatter than [`FLAT`] for the comparison of sizes.
@@ -57,7 +57,7 @@ pub struct Look {
     color: DVec3,
 }
 
-impl Look {
+impl Appearance {
     /// Row `i` of `states`.
     pub fn new(states: &Gaussians, i: usize) -> Self {
         let log_scale = states.log_scale.row::<3>(i).map(f64::from);
@@ -68,7 +68,7 @@ impl Look {
             sorted[2] = sorted[2].max(sorted[1] + FLAT.ln());
         }
         let dc = DVec3::from(states.sh.row::<3>(i).map(f64::from));
-        Look {
+        Appearance {
             position: DVec3::from(states.position.row::<3>(i).map(f64::from)),
             rotation: unit_rotation(states.rotation.row(i)),
             log_scale: sorted,
@@ -137,14 +137,14 @@ mod tests {
         Gates::new(&merge, &merge.passes[0])
     }
 
-    fn two(edit: impl Fn(&mut Gaussians)) -> [Look; 2] {
+    fn two(edit: impl Fn(&mut Gaussians)) -> [Appearance; 2] {
         let mut states = Gaussians::zeros(2, 0);
         for i in 0..2 {
             states.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
             states.sh.set_row(i, [0.4, 0.2, -0.3]);
         }
         edit(&mut states);
-        [0, 1].map(|i| Look::new(&states, i))
+        [0, 1].map(|i| Appearance::new(&states, i))
     }
 
     fn passes(edit: impl Fn(&mut Gaussians)) -> bool {

@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 use crate::model::{Columns, Gaussians};
 use crate::recipe;
 use crate::select::hash_id;
-use gates::{Gates, Look};
+use gates::{Appearance, Gates};
 pub use groups::Groups;
 use known::KNOWN_BYTES;
 use neighbors::{PointIndex, Search};
@@ -215,9 +215,9 @@ impl<'a> Nodes<'a> {
         states.position.row(row)
     }
 
-    fn look(&self, node: usize) -> Look {
+    fn look(&self, node: usize) -> Appearance {
         let (states, row) = self.state(node);
-        Look::new(states, row)
+        Appearance::new(states, row)
     }
 }
 

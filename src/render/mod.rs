@@ -2,7 +2,7 @@
 //!
 //! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend`
 //! (pixels). Data in: [`Gaussians`] in stored encoding and a [`Camera`]. Data out: an [`Image`], or the
-//! [`Contribution`] or [`RemovalError`] of every Gaussian, or a [`Sight`], the picture as a linear map from
+//! [`Contribution`] or [`RemovalError`] of every Gaussian, or a [`ColorOperator`], the picture as a linear map from
 //! colours. Memory: [`BYTES_PER_VISIBLE`], and up to [`STRIP_BYTES`] for pairs of a Gaussian and a 16×16 tile
 //! it can change, which are made for as many tiles at a time as that takes; a tile that more Gaussians than
 //! that reach takes 12 bytes for each.
@@ -14,6 +14,7 @@
 
 mod bin;
 mod blend;
+mod color_operator;
 mod colour;
 mod contribution;
 mod convention;
@@ -21,9 +22,8 @@ mod lanes;
 mod project;
 mod removal;
 mod renderer;
-mod sight;
 
+pub use color_operator::{ColorOperator, PerVisible};
 pub use contribution::Contribution;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
-pub use sight::{Pull, Sight};

@@ -246,7 +246,7 @@ fn paint(blend: Blend, splats: &[Splat], pairs: &[u32], lattice: &Lattice, backg
 mod tests {
     use glam::{DMat3, DVec3};
 
-    use super::super::Sight;
+    use super::super::ColorOperator;
     use super::*;
 
     /// 3000 Gaussians of all sizes, and a camera among them whose picture does not end at a tile's edge.
@@ -304,9 +304,12 @@ mod tests {
             for parallel in [false, true] {
                 assert!(made(Renderer { strip_pairs, ..Renderer::with(parallel) }) == whole, "{strip_pairs} at a time");
             }
-            let sight = |strip_pairs| Sight::with(Renderer { strip_pairs, ..Renderer::new() }, &scene, &camera);
-            let (kept, in_strips) = (sight(pairs), sight(strip_pairs));
-            assert!(in_strips.power() == kept.power() && in_strips.pull(&whole.0) == kept.pull(&whole.0));
+            let operator =
+                |strip_pairs| ColorOperator::with(Renderer { strip_pairs, ..Renderer::new() }, &scene, &camera);
+            let (kept, in_strips) = (operator(pairs), operator(strip_pairs));
+            assert!(
+                in_strips.diagonal() == kept.diagonal() && in_strips.transposed(&whole.0) == kept.transposed(&whole.0)
+            );
             renderer.bins.begin(&renderer.splats, [7, 5], false);
             let mut at = 0;
             while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {

@@ -75,7 +75,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let run = Run::beside(&options.evaluate.compressed, count, side.compressed_count());
     let mut notes = notes_on(&run, &side.scene)?;
 
-    let recipe = recipe_to_look_with(&run)?;
+    let recipe = recipe_to_score_with(&run)?;
     let measure = Measure::new(&recipe, side.scene.has_cameras, UserOverrides::default());
     side.keep_to(options.evaluate.original.memory, |work, limits| {
         let mut needs = measure.needs(work, limits);
@@ -97,7 +97,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let failure_modes: Vec<FailureMode> =
         Kind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
     let choices = choices(&evaluation);
-    let (shown, close) = look_again(&side, &choices, &failure_modes, &traits)?;
+    let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
 
     notes.extend(evaluation.notes.iter().cloned());
     let histograms = match &run.fates {
@@ -144,7 +144,7 @@ fn notes_on(run: &Run, scene: &Scene) -> Result<Vec<String>> {
 
 /// The recipe of the result, else the usual one. The report looks at what is there: values that are not
 /// finite do not stop it.
-fn recipe_to_look_with(run: &Run) -> Result<Recipe> {
+fn recipe_to_score_with(run: &Run) -> Result<Recipe> {
     let mut recipe = match &run.recipe {
         Some(recipe) => recipe.clone(),
         None => Recipe::preset("default")?,
@@ -204,7 +204,7 @@ fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [Members; 
 }
 
 /// Makes the pictures of the page, and of the failure modes' worst ones the worst part.
-fn look_again(
+fn show_again(
     side: &SideBySide,
     choices: &[Choice],
     modes: &[FailureMode],

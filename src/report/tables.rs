@@ -60,8 +60,8 @@ pub(super) fn stages(stages: &[Stage]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pass::Reads;
     use crate::report::failure::{Verdict, Worst};
+    use crate::source::Reads;
 
     #[test]
     fn failure_modes_are_these_bytes() {

@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::merge::neighbors::PointIndex;
 use crate::merge::tree::Point;
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
-use crate::pass::FrameSource;
+use crate::source::FrameSource;
 use crate::stream::gather;
 
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
@@ -214,7 +214,7 @@ fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_
 mod tests {
     use super::*;
     use crate::model::SequenceInfo;
-    use crate::pass::{BlockReader, Ids};
+    use crate::source::{BlockReader, Ids};
 
     /// Gaussians that a function of (Gaussian, frame) sets.
     struct Made<F>(SequenceInfo, F);

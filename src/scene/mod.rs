@@ -10,9 +10,9 @@ use std::path::PathBuf;
 use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::Result;
 use crate::families::Family;
+use crate::limits::Limits;
 use crate::model::{Rig, Schedule, Split};
-use crate::pass::{FrameSource, Reads};
-use crate::plan::Limits;
+use crate::source::{FrameSource, Reads};
 
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{open_input, open_scene, scene_of, scratch_beside};

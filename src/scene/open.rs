@@ -11,7 +11,7 @@ use crate::error::{Error, Result};
 use crate::families::{self, Family, OpenOptions, Timing};
 use crate::ingest::cameras;
 use crate::model::{Columns, Rig};
-use crate::pass::FrameSource;
+use crate::source::FrameSource;
 use crate::stats::RobustBox;
 use crate::stream::gather_all;
 

@@ -3,8 +3,8 @@
 use super::Scene;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
 use crate::error::{Error, Result};
+use crate::limits::Limits;
 use crate::model::{Columns, Picture, Rig, Split};
-use crate::plan::Limits;
 use crate::render;
 
 /// The part of a rig's pictures that is asked for.

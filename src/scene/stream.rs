@@ -9,8 +9,8 @@ use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
+use crate::limits::Limits;
 use crate::model::{Columns, Rig};
-use crate::plan::Limits;
 use crate::stats;
 use crate::stream::BLOCK;
 

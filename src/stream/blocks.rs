@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use super::{BLOCK, Progress};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Rows};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::source::{BlockReader, FrameSource, Ids};
 use crate::stats::{BlockScan, ScanPlan};
 
 /// What the scans of all blocks share.

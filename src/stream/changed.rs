@@ -2,8 +2,8 @@
 
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids, Reads, Wanted};
 use crate::reduction::Change;
+use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
 
 /// A source whose parameters are changed, the same at every frame.
 pub struct Changed<'a> {

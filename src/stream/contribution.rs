@@ -8,10 +8,10 @@ use std::num::NonZeroU32;
 use super::Progress;
 use super::pictures::{Subject, Workers};
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::model::{Camera, Columns, Picture};
-use crate::pass::{FrameSource, Ids};
-use crate::plan::Limits;
 use crate::render::{Contribution, Renderer};
+use crate::source::{FrameSource, Ids};
 
 /// What contributions depend on: all but colour.
 const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
@@ -98,9 +98,9 @@ mod tests {
     use super::*;
     use crate::demo::Scene;
     use crate::model::{Flags, Gaussians, Rig, Rows, Schedule, SequenceInfo, Split};
-    use crate::pass::BlockReader;
     use crate::recipe::{self, Recipe};
     use crate::select::{Overrides, select};
+    use crate::source::BlockReader;
     use crate::stream::strided;
     use crate::{render, score};
 

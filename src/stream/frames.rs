@@ -6,7 +6,7 @@ use super::BLOCK;
 use super::parts::Parts;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 
 /// Readers over Gaussians of a source, open for all the frames that are wanted of it.
 ///

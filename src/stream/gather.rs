@@ -8,7 +8,7 @@ use super::frames::open_all;
 use super::parts::Parts;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Ids, Wanted};
+use crate::source::{FrameSource, Ids, Wanted};
 
 /// Columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
 ///

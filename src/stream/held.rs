@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids};
+use crate::source::{BlockReader, FrameSource, Ids};
 
 /// Frames with all columns, as a source; its frame 0 is the first that is held.
 pub struct HeldFrames {

@@ -13,8 +13,8 @@ use super::Frames;
 use crate::error::Result;
 use crate::merge::proxy::{ProxyState, merge_state};
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, FrameSource, Ids, Reads, Wanted};
 use crate::recipe::{Merge, Placement};
+use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
 
 /// Columns that follow from one another: moments mix position, rotation and scale, and opacity follows from areas.
 const MIXED: Columns = Columns::all().difference(Columns::SH);

@@ -18,8 +18,8 @@ use crate::merge::known::Likeness;
 use crate::merge::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merge::voxels::voxel_order;
 use crate::model::{Column, opacity};
-use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
 use crate::recipe;
+use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 
 /// Memory of one pair while it is measured: its sums, its two Gaussians while they are counted, its result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
@@ -163,8 +163,8 @@ mod tests {
     use crate::demo::Scene;
     use crate::error::Error;
     use crate::model::{Columns, Gaussians, SequenceInfo};
-    use crate::pass::BlockReader;
     use crate::recipe::Recipe;
+    use crate::source::BlockReader;
     use crate::stream::gather;
 
     /// The reference frame of all tests.

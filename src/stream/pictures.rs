@@ -11,9 +11,9 @@ use rayon::prelude::*;
 use super::Frames;
 use super::frames::open_all;
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::model::{Camera, Columns, Gaussians, Picture};
-use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
-use crate::plan::Limits;
+use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 
 /// Pictures of a batch for each thread: enough that the last ones to finish cost little.
 pub const PICTURES_PER_THREAD: usize = 4;

@@ -3,10 +3,10 @@
 use super::Progress;
 use super::pictures::{Subject, Workers};
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::model::{Camera, Columns, Picture};
-use crate::pass::{FrameSource, Ids};
-use crate::plan::Limits;
 use crate::render::{RemovalError, Renderer};
+use crate::source::{FrameSource, Ids};
 
 /// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over `pictures`: the same bits whatever
 /// the threads.

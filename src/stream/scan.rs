@@ -8,7 +8,7 @@ use super::blocks::BlockScans;
 use super::{BLOCK, Progress, stages};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
-use crate::pass::{FrameSource, Ids};
+use crate::source::{FrameSource, Ids};
 use crate::stats::{BlockScan, NEEDED, ScanPlan};
 
 /// What a scan gives.

@@ -19,7 +19,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use super::blocks::BlockScans;
 use crate::error::{Error, Result};
 use crate::model::Rows;
-use crate::pass::{Ahead, BlockReader, Ids};
+use crate::source::{Ahead, BlockReader, Ids};
 
 /// Units that have been fetched and wait for a lane's decoder, at most.
 const FETCHED: usize = 4;
@@ -137,8 +137,8 @@ mod tests {
     use super::*;
     use crate::demo::Scene;
     use crate::model::{Columns, Gaussians, Schedule, SequenceInfo};
-    use crate::pass::FrameSource;
     use crate::recipe::Recipe;
+    use crate::source::FrameSource;
     use crate::stats::ScanPlan;
     use crate::stream::{BLOCK, Scanned, scan};
 

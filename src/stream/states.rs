@@ -3,7 +3,7 @@
 use super::frames::open_all;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
-use crate::pass::{BlockReader, FrameSource, Wanted};
+use crate::source::{BlockReader, FrameSource, Wanted};
 
 /// All columns of all Gaussians at one frame after the other; what does not vary is read once.
 ///

@@ -23,7 +23,7 @@ use crate::emit::atomic::Spill;
 use crate::emit::container::FRAME_BLOCK;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
-use crate::pass::{FrameSource, Ids, Wanted};
+use crate::source::{FrameSource, Ids, Wanted};
 
 /// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
 pub(super) type Moment = [f32; 4];
@@ -181,7 +181,7 @@ mod tests {
     use super::*;
     use crate::demo::Scene;
     use crate::model::SequenceInfo;
-    use crate::pass::BlockReader;
+    use crate::source::BlockReader;
 
     /// A scene that says of fewer columns that they vary, and keeps the others as they are at frame 0.
     struct Still(Scene, SequenceInfo);

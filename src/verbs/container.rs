@@ -22,10 +22,10 @@ use crate::families::trajectories::write_sequence;
 use crate::families::{self, ColumnInfo, Family, OpenOptions, Timing};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
+use crate::limits::Limits;
 use crate::model::Columns;
-use crate::pass::{BlockReader, FrameSource, Ids, Wanted};
-use crate::plan::Limits;
 use crate::scene::{InputOptions, Opened, check_memory, open_input, open_stream};
+use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
 
 /// What `pack` wrote.

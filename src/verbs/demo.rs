@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::budget::Budget;
 use crate::compress::summary::Summary;
 use crate::compress::{Request, compress_scene, keep_to_budget};
-use crate::demo::{self, Family};
+use crate::demo::{self, Body};
 use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -22,8 +22,8 @@ use crate::scene::{InputOptions, Scene};
 pub struct DemoReport {
     /// The compression.
     pub summary: Summary,
-    /// For every family its Gaussians: all, kept as they were or as leaders, merged away.
-    pub families: Vec<(Family, usize, usize, usize)>,
+    /// For every body its Gaussians: all, kept as they were or as leaders, merged away.
+    pub bodies: Vec<(Body, usize, usize, usize)>,
 }
 
 /// Generates the scene, packs it, compresses it. With `output` the folder keeps `scene.gseq`,
@@ -65,20 +65,20 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory
     fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
 
     let mut leaders = vec![false; summary.gaussians];
-    let families = Family::ALL
+    let bodies = Body::ALL
         .iter()
-        .map(|&family| {
-            let members = made.members(family);
+        .map(|&body| {
+            let members = made.members(body);
             // The first Gaussian to reach a place of the output stands for it here.
             let kept = members
                 .clone()
                 .filter(|&id| map[id].is_some_and(|new| !std::mem::replace(&mut leaders[new as usize], true)));
             let kept = kept.count();
             let merged = members.clone().filter(|&id| map[id].is_some()).count() - kept;
-            (family, members.len(), kept, merged)
+            (body, members.len(), kept, merged)
         })
         .collect();
-    Ok(DemoReport { summary, families })
+    Ok(DemoReport { summary, bodies })
 }
 
 /// The cameras as 3DGS writes them: camera-to-world rotations, every camera at every frame.
@@ -106,9 +106,9 @@ impl DemoReport {
     pub fn text(&self) -> String {
         let mut out = self.summary.text();
         // Writing to a String cannot fail.
-        let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "family", "Gaussians", "kept", "merged", "pruned");
-        for &(family, all, kept, merged) in &self.families {
-            let _ = writeln!(out, "  {:<12} {all:>9} {kept:>9} {merged:>9} {:>9}", family.name(), all - kept - merged);
+        let _ = writeln!(out, "\n  {:<12} {:>9} {:>9} {:>9} {:>9}", "body", "Gaussians", "kept", "merged", "pruned");
+        for &(body, all, kept, merged) in &self.bodies {
+            let _ = writeln!(out, "  {:<12} {all:>9} {kept:>9} {merged:>9} {:>9}", body.name(), all - kept - merged);
         }
         out
     }

@@ -11,12 +11,12 @@ use crate::compress::summary::{CameraSummary, InputSummary};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::image::{ImageFormat, write_image};
 use crate::error::{Error, Result};
+use crate::limits::Limits;
 use crate::model::{Camera, Picture};
-use crate::pass::FrameSource;
-use crate::plan::Limits;
 use crate::render;
 use crate::scene::pictures::{self, Part, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
+use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, View, show};
 
 /// Which pictures to render.

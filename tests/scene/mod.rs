@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::pass::FrameSource;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
+use splatsieve::source::FrameSource;
 use splatsieve::stream::gather;
 use tempfile::TempDir;
 

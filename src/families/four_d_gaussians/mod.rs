@@ -17,11 +17,11 @@ use crate::emit::ply::{out_rows, write_like};
 use crate::error::{Error, Result};
 use crate::ingest::ModelFolder;
 use crate::ingest::ply::Ply;
+use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
-use crate::pass::FrameSource;
-use crate::plan::Limits;
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::FrameSource;
 
 /// A model folder.
 pub(super) const ENTRY: Entry = Entry {

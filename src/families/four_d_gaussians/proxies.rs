@@ -6,9 +6,9 @@ use crate::error::Result;
 use crate::ingest::ModelFolder;
 use crate::merge::proxy::merge_state;
 use crate::model::{Columns, Gaussians};
-use crate::pass::FrameSource;
 use crate::recipe::{Merge, Placement};
 use crate::reduction::{Cluster, Proxies, Reference};
+use crate::source::FrameSource;
 use crate::stream::{BLOCK, gather};
 
 /// Frames at which proxies are compared with their members.

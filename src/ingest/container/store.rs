@@ -9,7 +9,7 @@ use gseq::{Reader, TileBuffer, TileFrames, TileId, Touched};
 use super::held::HeldTiles;
 use crate::error::{Error, Result};
 use crate::model::{Columns, SequenceInfo, sh_coefficients};
-use crate::pass::Count;
+use crate::source::Count;
 
 /// An open container with all columns of a Gaussian model.
 pub struct Container {

@@ -7,8 +7,8 @@ use super::tiles::Kept;
 use super::*;
 use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::model::Gaussians;
-use crate::pass::Wanted;
 use crate::select::hash_id;
+use crate::source::Wanted;
 
 const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;
 const FRAMES: usize = 2 * FRAME_BLOCK + 5;

@@ -7,7 +7,7 @@ use gseq::{Encoding, TileFrames, TileId, Touched};
 use super::store::{Container, Scratch};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
-use crate::pass::{BlockReader, Ids, Wanted};
+use crate::source::{BlockReader, Ids, Wanted};
 
 /// Bytes of the map that a reader touches, at most, before it releases what it no longer needs.
 const TOUCHED: u64 = 1 << 20;

@@ -1,7 +1,7 @@
 use super::*;
 use crate::demo::Scene;
 use crate::emit::frame_stream::StreamWriter;
-use crate::pass::{FrameSource, Ids};
+use crate::source::{FrameSource, Ids};
 
 const N: usize = 150;
 const T: usize = 4;

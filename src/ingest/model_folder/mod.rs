@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::pass::{BlockReader, Count, FrameSource, Ids, Reads, Wanted};
+use crate::source::{BlockReader, Count, FrameSource, Ids, Reads, Wanted};
 use crate::stream::gather;
 
 use super::cfg_args::ModelConfig;

@@ -25,7 +25,7 @@ pub(crate) use layout::{Layout, Plane};
 use super::map::FileMap;
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians};
-use crate::pass::Ids;
+use crate::source::Ids;
 
 /// Rows handled together, so that all planes of them are taken from cache: 32 KiB at degree 3.
 const BLOCK_ROWS: usize = 128;

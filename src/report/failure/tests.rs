@@ -5,13 +5,13 @@ use glam::DVec3;
 use super::*;
 use crate::compress::score::{Scored, UserOverrides};
 use crate::compress::score_scene;
-use crate::demo::{Family, Scene};
+use crate::demo::{Body, Scene};
 use crate::emit::container::write_container;
 use crate::ingest::container::Container;
 use crate::model::Split;
-use crate::pass::FrameSource;
 use crate::recipe::Recipe;
 use crate::report::traits::{shares, traits};
+use crate::source::FrameSource;
 use crate::stream::gather;
 use crate::verbs::evaluate::Taken;
 
@@ -38,10 +38,10 @@ fn looked() -> Looked {
 }
 
 impl Looked {
-    /// Part of the visible members of a family that have a trait.
-    fn part(&self, family: Family, kind: Kind) -> f64 {
+    /// Part of the visible members of a body that have a trait.
+    fn part(&self, body: Body, kind: Kind) -> f64 {
         let rows = self.scored.rows().unwrap();
-        let members: Vec<usize> = self.made.members(family).filter(|&i| rows.c[i] > 0.0).collect();
+        let members: Vec<usize> = self.made.members(body).filter(|&i| rows.c[i] > 0.0).collect();
         let with = members.iter().filter(|&&i| self.traits[i][kind as usize]).count();
         with as f64 / members.len().max(1) as f64
     }
@@ -79,16 +79,16 @@ impl Looked {
 #[test]
 fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
     let scene = looked();
-    assert!(scene.part(Family::Cloth, Kind::Motion) > 0.3, "got {}", scene.part(Family::Cloth, Kind::Motion));
-    assert!(scene.part(Family::Egg, Kind::Motion) < 0.15, "a rigid motion: {}", scene.part(Family::Egg, Kind::Motion));
-    assert_eq!(scene.part(Family::Wire, Kind::Thin), 1.0);
-    assert!(scene.part(Family::Fading, Kind::Appearance) > 0.9);
-    for family in [Family::Wall, Family::Double] {
+    assert!(scene.part(Body::Cloth, Kind::Motion) > 0.3, "got {}", scene.part(Body::Cloth, Kind::Motion));
+    assert!(scene.part(Body::Egg, Kind::Motion) < 0.15, "a rigid motion: {}", scene.part(Body::Egg, Kind::Motion));
+    assert_eq!(scene.part(Body::Wire, Kind::Thin), 1.0);
+    assert!(scene.part(Body::Fading, Kind::Appearance) > 0.9);
+    for body in [Body::Wall, Body::Double] {
         for kind in Kind::ALL {
-            assert_eq!(scene.part(family, kind), 0.0, "{} {kind:?}", family.name());
+            assert_eq!(scene.part(body, kind), 0.0, "{} {kind:?}", body.name());
         }
     }
-    let buried = scene.made.members(Family::Buried);
+    let buried = scene.made.members(Body::Buried);
     assert!(scene.traits[buried].iter().all(|of| *of == [false; 3]), "what is never seen is of no kind");
 }
 

@@ -5,7 +5,7 @@
 //! A·δ, and least squares over colours needs A·δ and Aᵀ·picture only, both of which the blend gives; A is
 //! never formed. Data in: one frame's Gaussians and a camera. Data out: sums per visible Gaussian.
 //! Memory: [`BYTES_PER_VISIBLE`](super::BYTES_PER_VISIBLE) and 4 bytes per (Gaussian, tile) pair of a strip, as
-//! long as the sight is kept.
+//! long as the operator is kept.
 
 use super::bin::Bins;
 use super::blend::{Blend, GROUPS, Ink, Lattice, Plane, lane_sum};
@@ -20,7 +20,7 @@ use crate::model::{Camera, Gaussians};
 /// A channel that is cut off at 0 here, because its spherical harmonics go below, counts as one that no
 /// change moves: the map is that of small changes.
 #[derive(Debug)]
-pub struct Sight {
+pub struct ColorOperator {
     blend: Blend,
     splats: Splats,
     /// All pairs ready if one strip holds them.
@@ -29,11 +29,11 @@ pub struct Sight {
     strip_pairs: usize,
 }
 
-/// Red, green and blue of every visible Gaussian of a [`Sight`].
+/// Red, green and blue of every visible Gaussian of a [`ColorOperator`].
 #[derive(Debug, Clone, PartialEq)]
-pub struct Pull(Vec<[f64; 3]>);
+pub struct PerVisible(Vec<[f64; 3]>);
 
-impl Sight {
+impl ColorOperator {
     /// What `camera` sees of `gaussians`.
     ///
     /// # Panics
@@ -47,7 +47,7 @@ impl Sight {
         renderer.prepare(gaussians, &view, true);
         renderer.bins.next_strip(&renderer.splats, renderer.strip_pairs);
         let Renderer { blend, splats, bins, strip_pairs, .. } = renderer;
-        Sight { blend, splats, bins, size: view.size, strip_pairs }
+        ColorOperator { blend, splats, bins, size: view.size, strip_pairs }
     }
 
     /// Aᵀ·`picture`: of every visible Gaussian Σ over pixels of w · pixel, per channel; f32 within a tile,
@@ -55,7 +55,7 @@ impl Sight {
     ///
     /// # Panics
     /// If `picture` has not the camera's size.
-    pub fn pull(&self, picture: &Image) -> Pull {
+    pub fn transposed(&self, picture: &Image) -> PerVisible {
         assert_eq!([picture.width, picture.height], self.size, "a picture of another size");
         self.per_splat(|tile, lattice, pairs, sums| {
             let planes = self.planes(picture, tile);
@@ -67,7 +67,7 @@ impl Sight {
     ///
     /// # Panics
     /// If `change` is shorter than the Gaussians that were seen.
-    pub fn pull_of_change(&self, change: &[[f32; 3]]) -> Pull {
+    pub fn normal(&self, change: &[[f32; 3]]) -> PerVisible {
         self.per_splat(|_, lattice, pairs, sums| {
             let mut made = Change { change, planes: [[[0.0; LANES]; GROUPS]; 3] };
             self.blend.tile(&self.splats.splats, pairs, lattice, &mut made);
@@ -76,25 +76,25 @@ impl Sight {
     }
 
     /// The diagonal of AᵀA: of every visible Gaussian Σ over pixels of w².
-    pub fn power(&self) -> Pull {
+    pub fn diagonal(&self) -> PerVisible {
         self.per_splat(|_, lattice, pairs, sums| {
             self.blend.tile(&self.splats.splats, pairs, lattice, &mut Power { pairs: sums });
         })
     }
 
-    /// Adds `pull`, which this sight made, to `[N]` totals.
+    /// Adds `sums`, which this operator made, to `[N]` totals.
     ///
     /// # Panics
     /// If `total` is shorter than the Gaussians that were seen.
-    pub fn add(&self, pull: &Pull, total: &mut [[f64; 3]]) {
-        for (splat, pull) in self.splats.splats.iter().zip(&pull.0) {
+    pub fn add(&self, sums: &PerVisible, total: &mut [[f64; 3]]) {
+        for (splat, sums) in self.splats.splats.iter().zip(&sums.0) {
             let total = &mut total[splat.id as usize];
-            (0..3).for_each(|c| total[c] += pull[c]);
+            (0..3).for_each(|c| total[c] += sums[c]);
         }
     }
 
     /// Sums over tiles of what `of_tile` writes for every pair of a tile, zero for channels cut off at 0.
-    fn per_splat(&self, mut of_tile: impl FnMut([u32; 2], &Lattice, &[u32], &mut [[f32; 3]])) -> Pull {
+    fn per_splat(&self, mut of_tile: impl FnMut([u32; 2], &Lattice, &[u32], &mut [[f32; 3]])) -> PerVisible {
         let mut total = vec![[0.0; 3]; self.splats.splats.len()];
         let mut sums = Vec::new();
         let mut of_strip = |bins: &Bins| {
@@ -120,7 +120,7 @@ impl Sight {
         for (total, splat) in total.iter_mut().zip(&self.splats.splats) {
             (0..3).filter(|&c| splat.colour[c] == 0.0).for_each(|c| total[c] = 0.0);
         }
-        Pull(total)
+        PerVisible(total)
     }
 
     /// The pixels of one tile, 0 beyond the picture's edge.

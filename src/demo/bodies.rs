@@ -1,4 +1,4 @@
-//! The families of the demo scene: where each Gaussian is at rest, and how it moves.
+//! The bodies of the demo scene: where each Gaussian is at rest, and how it moves.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::ops::Range;
@@ -10,7 +10,7 @@ use crate::model::SH_C0;
 
 /// A kind of thing in the demo scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Family {
+pub enum Body {
     /// Floor and three walls with a chequered texture. Still; inside a tile all of one colour, so
     /// neighbours can merge.
     Wall,
@@ -37,44 +37,44 @@ pub enum Family {
     Wire,
 }
 
-impl Family {
-    /// Every family, in the order of their Gaussians.
-    pub const ALL: [Family; 9] = [
-        Family::Wall,
-        Family::Double,
-        Family::Buried,
-        Family::Dust,
-        Family::Egg,
-        Family::Cloth,
-        Family::Fading,
-        Family::Spark,
-        Family::Wire,
+impl Body {
+    /// Every body, in the order of their Gaussians.
+    pub const ALL: [Body; 9] = [
+        Body::Wall,
+        Body::Double,
+        Body::Buried,
+        Body::Dust,
+        Body::Egg,
+        Body::Cloth,
+        Body::Fading,
+        Body::Spark,
+        Body::Wire,
     ];
 
     /// Its name, for tables.
     pub const fn name(self) -> &'static str {
         match self {
-            Family::Wall => "wall",
-            Family::Double => "double",
-            Family::Buried => "buried",
-            Family::Dust => "dust",
-            Family::Egg => "egg",
-            Family::Cloth => "cloth",
-            Family::Fading => "fading",
-            Family::Spark => "spark",
-            Family::Wire => "wire",
+            Body::Wall => "wall",
+            Body::Double => "double",
+            Body::Buried => "buried",
+            Body::Dust => "dust",
+            Body::Egg => "egg",
+            Body::Cloth => "cloth",
+            Body::Fading => "fading",
+            Body::Spark => "spark",
+            Body::Wire => "wire",
         }
     }
 
     /// Parts of a thousand Gaussians.
     const fn share(self) -> usize {
         match self {
-            Family::Wall => 400,
-            Family::Double => 150,
-            Family::Egg => 100,
-            Family::Buried | Family::Dust | Family::Cloth => 80,
-            Family::Fading | Family::Wire => 40,
-            Family::Spark => 30,
+            Body::Wall => 400,
+            Body::Double => 150,
+            Body::Egg => 100,
+            Body::Buried | Body::Dust | Body::Cloth => 80,
+            Body::Fading | Body::Wire => 40,
+            Body::Spark => 30,
         }
     }
 }
@@ -164,50 +164,50 @@ impl Part {
     }
 }
 
-/// Which Gaussian belongs to which family.
+/// Which Gaussian belongs to which body.
 #[derive(Debug, Clone)]
 pub(super) struct Layout {
-    /// Where each family starts, and where the last ends.
-    starts: [usize; Family::ALL.len() + 1],
+    /// Where each body starts, and where the last ends.
+    starts: [usize; Body::ALL.len() + 1],
 }
 
 impl Layout {
     pub(super) fn new(count: usize) -> Layout {
-        let mut starts = [0; Family::ALL.len() + 1];
+        let mut starts = [0; Body::ALL.len() + 1];
         let mut share = 0;
-        for (start, family) in starts[1..].iter_mut().zip(Family::ALL) {
-            share += family.share();
+        for (start, body) in starts[1..].iter_mut().zip(Body::ALL) {
+            share += body.share();
             *start = (count as u128 * share as u128 / 1000) as usize;
         }
         Layout { starts }
     }
 
-    pub(super) fn members(&self, family: Family) -> Range<usize> {
-        let at = family as usize;
+    pub(super) fn members(&self, body: Body) -> Range<usize> {
+        let at = body as usize;
         self.starts[at]..self.starts[at + 1]
     }
 
     /// Gaussian `id`, less than the count.
     pub(super) fn part(&self, id: usize) -> Part {
-        let family = Family::ALL[self.starts.partition_point(|&start| start <= id) - 1];
-        let members = self.members(family);
+        let body = Body::ALL[self.starts.partition_point(|&start| start <= id) - 1];
+        let members = self.members(body);
         let dice = Dice(id as u64);
         let (k, n) = (id - members.start, members.len());
-        match family {
-            Family::Wall => wall(k, n, dice),
-            Family::Double => self.double(k, n, dice),
-            Family::Buried => buried(dice),
-            Family::Dust => dust(dice),
-            Family::Egg => egg(k, n, dice),
-            Family::Cloth => cloth(k, n, dice),
-            Family::Fading => fading(dice),
-            Family::Spark => spark(dice),
-            Family::Wire => wire(k, n, dice),
+        match body {
+            Body::Wall => wall(k, n, dice),
+            Body::Double => self.double(k, n, dice),
+            Body::Buried => buried(dice),
+            Body::Dust => dust(dice),
+            Body::Egg => egg(k, n, dice),
+            Body::Cloth => cloth(k, n, dice),
+            Body::Fading => fading(dice),
+            Body::Spark => spark(dice),
+            Body::Wire => wire(k, n, dice),
         }
     }
 
     fn double(&self, k: usize, n: usize, dice: Dice) -> Part {
-        let walls = self.members(Family::Wall);
+        let walls = self.members(Body::Wall);
         // A scene of two Gaussians has a double and no wall.
         let original = (k as u128 * walls.len() as u128 / n as u128) as usize;
         let mut part = wall(original, walls.len().max(1), Dice((walls.start + original) as u64));
@@ -241,7 +241,7 @@ impl Dice {
     }
 }
 
-/// Channels of [`Dice`] that several families use: the families' own start at 0.
+/// Channels of [`Dice`] that several bodies use: the bodies' own start at 0.
 const TINT: u64 = 100;
 const SHEEN: u64 = 200;
 
