@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, shared, state, tiny};
-use splatsieve::ingest::ModelFolder;
+use splatsieve::families::ModelFolder;
 use splatsieve::ingest::container::Container;
 use splatsieve::ingest::ply_sequence::PlySequence;
 use splatsieve::source::FrameSource;

@@ -230,7 +230,7 @@ fn proxies_are_solved_at_their_leaders(
 ) {
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
-    let result = splatsieve::ingest::ModelFolder::open(output, None).unwrap();
+    let result = splatsieve::families::ModelFolder::open(output, None).unwrap();
     let result = result.with_times(scene.source().info().times.clone()).unwrap();
     let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
     let at_reference = &whole.frames[whole.reference];

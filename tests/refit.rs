@@ -5,7 +5,7 @@ mod scene;
 use std::path::Path;
 
 use scene::{Workplace, lasting_files, state, tiny};
-use splatsieve::ingest::ModelFolder;
+use splatsieve::families::ModelFolder;
 use splatsieve::ingest::container::Container;
 use splatsieve::ingest::ply_sequence::PlySequence;
 use splatsieve::model::Columns;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use splatsieve::ingest::ModelFolder;
+use splatsieve::families::ModelFolder;
 use splatsieve::model::{Columns, Gaussians};
 use splatsieve::select::hash_id;
 use splatsieve::source::{FrameSource, Ids};

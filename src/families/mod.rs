@@ -14,6 +14,7 @@ use std::io::Read;
 use std::path::Path;
 
 pub use family::{ColumnInfo, Family, OpenOptions, Residence, Timing};
+pub use four_d_gaussians::ModelFolder;
 
 use crate::error::{Error, Result};
 use family::{Entry, Found};

@@ -12,7 +12,7 @@ use crate::error::{Error, Result};
 const PIECE: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.
-pub(super) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
+pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
     let mut file = File::open(path).map_err(Error::io("open", path))?;
     let mut piece = vec![0; PIECE];
     loop {

@@ -3,7 +3,11 @@
 //! The result is a folder of the same layout with a smaller point cloud; the field and the configuration stay byte
 //! for byte as they were.
 
+mod cfg_args;
+mod model_folder;
 mod proxies;
+mod pth;
+mod python_literal;
 
 use std::fs::{self, File};
 use std::io;
@@ -15,13 +19,13 @@ use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
 use crate::error::{Error, Result};
-use crate::ingest::ModelFolder;
 use crate::ingest::ply::Ply;
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
+pub use model_folder::ModelFolder;
 
 /// A model folder.
 pub(super) const ENTRY: Entry = Entry {

@@ -1,9 +1,9 @@
 //! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is
 //! the merged one (method.md, section 5.6).
 
+use super::ModelFolder;
 use crate::deform::Deltas;
 use crate::error::Result;
-use crate::ingest::ModelFolder;
 use crate::merge::proxy::merge_state;
 use crate::model::{Columns, Gaussians};
 use crate::recipe::{Merge, Placement};

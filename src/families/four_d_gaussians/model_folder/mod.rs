@@ -18,9 +18,9 @@ use crate::source::{BlockReader, Count, FrameSource, Ids, Reads, Wanted};
 use crate::stream::gather;
 
 use super::cfg_args::ModelConfig;
-use super::digest::hash_file;
-use super::ply::Ply;
 use super::pth::read_state_dict;
+use crate::ingest::digest::hash_file;
+use crate::ingest::ply::Ply;
 
 /// The files of a model folder.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -21,7 +21,7 @@ const MAX_EXPANSION: u64 = 4;
 ///
 /// # Errors
 /// A file that is no state dict, is cut short or damaged, or declares more values than it can hold.
-pub fn read_state_dict(path: &Path) -> Result<Tensors> {
+pub(super) fn read_state_dict(path: &Path) -> Result<Tensors> {
     let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
     let reader = PytorchReader::new(path).map_err(|error| match error {
         PytorchError::Io(source) if is_system(&source) => Error::io("read", path)(source),
