@@ -21,7 +21,7 @@ use crate::error::{Error, Result};
 use crate::model::Split;
 use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions};
-use crate::scene::pictures::Part;
+use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, scratch_beside};
 use crate::stream::{Mode, Progress};
 use crate::verbs::evaluate::EvaluateOptions;
@@ -247,8 +247,8 @@ fn render_options(args: Render) -> RenderOptions {
         Some(ImageKind::Png) | None => ImageFormat::Png,
     };
     let (wanted, part) = match args.frame.zip(args.view) {
-        Some((frame, view)) => (Wanted::One { frame: frame as usize, view }, Part::All),
-        None => (Wanted::All(format), Part::HeldOut),
+        Some((frame, view)) => (Wanted::One { frame: frame as usize, view }, PictureSet::All),
+        None => (Wanted::All(format), PictureSet::HeldOut),
     };
     let mut input = input_options(args.input, None, Some(&args.output));
     input.use_cameras(args.cameras);
@@ -270,7 +270,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
         original,
         compressed: args.compressed,
         ground_truth: args.ground_truth,
-        part: args.split.map_or(Part::HeldOut, part_of),
+        part: args.split.map_or(PictureSet::HeldOut, part_of),
         max_frames: args.max_frames.map(|frames| frames as usize),
         background: args.background.background,
         flip: args.flip,
@@ -294,11 +294,11 @@ fn sweep_options(args: Sweep) -> SweepOptions {
     }
 }
 
-fn part_of(split: SplitArg) -> Part {
+fn part_of(split: SplitArg) -> PictureSet {
     match split {
-        SplitArg::Train => Part::Split(Split::Train),
-        SplitArg::Test => Part::Split(Split::Test),
-        SplitArg::All => Part::All,
+        SplitArg::Train => PictureSet::Split(Split::Train),
+        SplitArg::Test => PictureSet::Split(Split::Test),
+        SplitArg::All => PictureSet::All,
     }
 }
 

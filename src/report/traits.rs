@@ -10,11 +10,12 @@ use rayon::prelude::*;
 use crate::budget::{Need, Workload};
 use crate::compress::score::{SCORED, Scored};
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::merge::neighbors::PointIndex;
 use crate::merge::tree::Point;
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
-use crate::source::FrameSource;
-use crate::stream::gather;
+use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::stream::{Frames, gather};
 
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
 /// scene and 500 pixels across, a pixel per frame.
@@ -60,10 +61,13 @@ pub fn need(work: &Workload) -> Need {
         ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
         ("colours", 88 + work.state(Columns::SH | Columns::OPACITY)),
         ("neighbours", 190),
+        ("readers", work.input.reader),
+        ("held", work.held(&Limits::NONE, Columns::SH | Columns::OPACITY)),
     ];
-    let reads = SAMPLES.min(work.frames as usize) as f64 / work.frames.max(1) as f64;
-    let seconds = 2e-5 * work.count() + work.reading(work.count(), 2.0 * reads * work.frames as f64);
-    Need { stage: "traits", reads: 2.0 * reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
+    let frames = SAMPLES.min(work.frames as usize) as u64;
+    let reads = work.scattered_reads(1, &Limits::NONE) + 2.0 * work.scattered_reads(frames, &Limits::NONE);
+    let seconds = 2e-5 * work.count() + work.reading(work.count(), 2.0 * frames as f64);
+    Need { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
 }
 
 /// The kinds one Gaussian is of, by [`Kind::ALL`].
@@ -158,12 +162,15 @@ fn bending(
         let (a, b) = (p.row::<3>(i), p.row::<3>(j));
         (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum::<f64>().sqrt()
     };
+    let mut reader = Frames::open(source, Ids::List(&followed), Columns::POSITION, &Wanted::of(frames.to_vec()))?;
+    let mut state = reader.state();
     for &frame in frames {
-        let now = gather(source, &followed, frame, Columns::POSITION)?.position;
+        reader.read(frame, Columns::POSITION, &mut state)?;
+        let now = &state.position;
         sums.par_iter_mut().zip(&pairs).for_each(|(sums, (i, near))| {
             for (sum, &j) in sums.iter_mut().zip(near) {
                 let before = distance(&start, *i, j);
-                *sum += ((distance(&now, *i, j) - before) / before.max(nearest)).powi(2);
+                *sum += ((distance(now, *i, j) - before) / before.max(nearest)).powi(2);
             }
         });
     }
@@ -186,8 +193,11 @@ fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_
     // From the first living frame's colour: sums of small differences lose no digits.
     let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
+    let columns = Columns::SH | Columns::OPACITY;
+    let mut reader = Frames::open(source, Ids::List(all), columns, &Wanted::of(frames.to_vec()))?;
+    let mut now = reader.state();
     for &frame in frames {
-        let now = gather(source, all, frame, Columns::SH | Columns::OPACITY)?;
+        reader.read(frame, columns, &mut now)?;
         for (i, (n, sum, squares)) in sums.iter_mut().enumerate() {
             if opacity(now.opacity_logit.row::<1>(i)[0]) < alpha_min {
                 continue;

@@ -9,7 +9,7 @@ use crate::render;
 
 /// The part of a rig's pictures that is asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Part {
+pub enum PictureSet {
     /// The held-out pictures; of cameras that hold none out, every one.
     #[default]
     HeldOut,
@@ -24,7 +24,7 @@ pub enum Part {
 /// # Errors
 /// A picture at no frame's time; a split without pictures; two cameras that share frame and view, which
 /// only splits of one numbering can.
-pub fn pictures(rig: &Rig, frame_times: &[f64], part: Part) -> Result<Vec<Picture>> {
+pub fn pictures(rig: &Rig, frame_times: &[f64], part: PictureSet) -> Result<Vec<Picture>> {
     let mut found = Vec::new();
     for (frame, mut views) in rig.schedule(frame_times, part.split(rig))?.frames.into_iter().enumerate() {
         views.sort_by_key(|&(view, _)| view);
@@ -48,7 +48,7 @@ pub fn pictures(rig: &Rig, frame_times: &[f64], part: Part) -> Result<Vec<Pictur
 ///
 /// # Errors
 /// As [`pictures`]; a frame that the sequence does not have, a view that does not see it.
-pub fn picture(rig: &Rig, frame_times: &[f64], part: Part, frame: usize, view: u32) -> Result<Picture> {
+pub fn picture(rig: &Rig, frame_times: &[f64], part: PictureSet, frame: usize, view: u32) -> Result<Picture> {
     if frame >= frame_times.len() {
         let last = frame_times.len().saturating_sub(1);
         return Err(Error::usage(format!("--frame {frame}: expected 0 to {last}, the frames of this sequence")));
@@ -109,13 +109,13 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
     }
 }
 
-impl Part {
+impl PictureSet {
     /// The split it comes to with these cameras; none: every picture.
     fn split(self, rig: &Rig) -> Option<Split> {
         match self {
-            Part::HeldOut => Some(Split::Test).filter(|_| rig.shots.iter().any(|shot| shot.split == Split::Test)),
-            Part::Split(split) => Some(split),
-            Part::All => None,
+            PictureSet::HeldOut => Some(Split::Test).filter(|_| rig.shots.iter().any(|shot| shot.split == Split::Test)),
+            PictureSet::Split(split) => Some(split),
+            PictureSet::All => None,
         }
     }
 }
@@ -152,26 +152,29 @@ mod tests {
             (5, 3, Some(0.5), Split::Train),
         ]);
         let times = [0.0, 0.5, 1.0];
-        assert_eq!(pairs(&pictures(&rig, &times, Part::HeldOut).unwrap()), [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]);
-        assert_eq!(pairs(&pictures(&rig, &times, Part::Split(Split::Train)).unwrap()), [(1, 5)]);
-        assert_eq!(pictures(&rig, &times, Part::All).unwrap().len(), 6);
-        assert_eq!(pairs(&[picture(&rig, &times, Part::All, 1, 5).unwrap()]), [(1, 5)]);
+        assert_eq!(
+            pairs(&pictures(&rig, &times, PictureSet::HeldOut).unwrap()),
+            [(0, 1), (0, 7), (1, 7), (2, 2), (2, 7)]
+        );
+        assert_eq!(pairs(&pictures(&rig, &times, PictureSet::Split(Split::Train)).unwrap()), [(1, 5)]);
+        assert_eq!(pictures(&rig, &times, PictureSet::All).unwrap().len(), 6);
+        assert_eq!(pairs(&[picture(&rig, &times, PictureSet::All, 1, 5).unwrap()]), [(1, 5)]);
     }
 
     #[test]
     fn cameras_that_hold_nothing_out_are_all_looked_at_unless_asked_not_to() {
         let rig = rig(&[(0, 0, None, Split::Train)]);
-        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], Part::HeldOut).unwrap()), [(0, 0), (1, 0)]);
-        let message = pictures(&rig, &[0.0], Part::Split(Split::Test)).unwrap_err().to_string();
+        assert_eq!(pairs(&pictures(&rig, &[0.0, 1.0], PictureSet::HeldOut).unwrap()), [(0, 0), (1, 0)]);
+        let message = pictures(&rig, &[0.0], PictureSet::Split(Split::Test)).unwrap_err().to_string();
         assert!(message.contains("--split"), "{message}");
     }
 
     #[test]
     fn one_picture_in_two_files_is_one_and_two_of_one_name_are_refused() {
         let same = rig(&[(3, 1, Some(0.0), Split::Train), (3, 1, Some(0.0), Split::Test)]);
-        assert_eq!(pairs(&pictures(&same, &[0.0], Part::All).unwrap()), [(0, 3)]);
+        assert_eq!(pairs(&pictures(&same, &[0.0], PictureSet::All).unwrap()), [(0, 3)]);
         let two = rig(&[(3, 1, Some(0.0), Split::Train), (3, 2, Some(0.0), Split::Test)]);
-        let message = pictures(&two, &[0.0], Part::All).unwrap_err().to_string();
+        let message = pictures(&two, &[0.0], PictureSet::All).unwrap_err().to_string();
         assert!(message.contains("view 3 at frame 0") && message.contains("--split"), "{message}");
     }
 

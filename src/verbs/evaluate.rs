@@ -22,7 +22,7 @@ use crate::limits::Limits;
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Picture, Rig};
 use crate::render::{Image, render};
-use crate::scene::pictures::{self, Part, background, pictures, thin};
+use crate::scene::pictures::{self, PictureSet, background, pictures, thin};
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::stream::{Batch, Progress, Subject, View, show};
 
@@ -36,7 +36,7 @@ pub struct EvaluateOptions {
     /// Folder of photographs.
     pub ground_truth: Option<PathBuf>,
     /// Part of the cameras' pictures to compare.
-    pub part: Part,
+    pub part: PictureSet,
     /// Compare at most this many frames, evenly; none: all.
     pub max_frames: Option<usize>,
     /// Red, green, blue in [0, 1]; none: see [`background`].

@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture};
 use crate::render;
-use crate::scene::pictures::{self, Part, background, picture, pictures};
+use crate::scene::pictures::{self, PictureSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, View, show};
@@ -41,7 +41,7 @@ pub struct RenderOptions {
     /// Which pictures.
     pub wanted: Wanted,
     /// Part of the cameras' pictures they are among.
-    pub part: Part,
+    pub part: PictureSet,
     /// Red, green, blue in [0, 1]; none: see [`background`].
     pub background: Option<[f32; 3]>,
     /// File or folder to write.

@@ -19,7 +19,7 @@ use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::model::Split;
 use crate::recipe::{Coverage, Recipe, StaticTerm};
-use crate::scene::pictures::Part;
+use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, open_scene};
 use crate::stream::Progress;
 
@@ -250,7 +250,7 @@ fn measure(
         original: input,
         compressed: output,
         ground_truth: None,
-        part: Part::HeldOut,
+        part: PictureSet::HeldOut,
         max_frames: options.max_frames,
         background: options.background,
         flip: false,
