@@ -269,14 +269,27 @@ fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
 #[test]
 fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
     let workplace = Workplace::new();
-    let run = workplace.run("compress {tiny} -o out.gseq");
+    let run = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq");
     assert_eq!(run.code, 0, "{}", run.stderr);
-    for stage in ["scan", "emit"] {
+    for stage in ["scan", "visible", "score", "choose", "emit"] {
         let lines: Vec<&str> = run.stderr.lines().filter(|line| line.contains(&format!("] {stage}  "))).collect();
         assert_eq!(lines.len(), 1, "{stage}: {}", run.stderr);
         assert!(lines[0].starts_with('[') && lines[0].contains("/s, ") && lines[0].ends_with(" s"), "{}", lines[0]);
     }
     assert!(!run.stderr.contains('\r') && !run.stderr.contains('\x1b'), "{:?}", run.stderr);
     let quiet = workplace.run("compress {tiny} -o quiet.gseq --quiet");
+    assert_eq!((quiet.code, quiet.stderr.as_str()), (0, ""));
+}
+
+#[test]
+fn a_dry_run_and_an_explained_one_say_how_long_it_will_take_before_anything_else_is_done() {
+    let workplace = Workplace::new();
+    let run = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq --dry-run");
+    let first = run.stderr.lines().next().unwrap_or_default();
+    assert!(first.starts_with("time: about ") && first.contains(" s scan + "), "{}", run.stderr);
+    let explained = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq --explain");
+    let place = |what: &str| explained.stderr.find(what).unwrap_or_else(|| panic!("{what}: {}", explained.stderr));
+    assert!(place("\ntime: about ") < place("] scan  "), "{}", explained.stderr);
+    let quiet = workplace.run("compress {tiny} -o other.gseq --dry-run --quiet");
     assert_eq!((quiet.code, quiet.stderr.as_str()), (0, ""));
 }

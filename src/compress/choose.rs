@@ -16,7 +16,7 @@ use crate::recipe::{self, StaticTerm};
 use crate::reduction::Reduction;
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
-use crate::stream::{Batch, Subject, View, show, spread};
+use crate::stream::{Batch, Progress, Subject, View, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -176,6 +176,7 @@ impl Choose {
 fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[Picture]) -> Result<Vec<f64>> {
     let merged = alternatives.iter().position(|other| !other.reduction.clusters.is_empty());
     let result = merged.map(|at| scene.input.reduced(&alternatives[at].reduction)).transpose()?;
+    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
     let mut sums = vec![0.0; alternatives.len()];
     let mut add = |original: &Gaussians, merged: Option<&Gaussians>, cameras: &[&Camera]| {
         let picture = |state: &Gaussians, camera: &Camera| render(state, camera, scene.background);
@@ -192,6 +193,7 @@ fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[Picture]) 
             let quality = |(camera, expected): (&&Camera, &Image)| psnr(&picture(state, camera), expected);
             *sum += cameras.iter().zip(&expected).map(quality).sum::<f64>();
         }
+        progress.advance(cameras.len() as u64);
     };
     let batch = Batch { pictures: AT_ONCE, ..Batch::of_frame(&scene.limits) };
     let (original, cameras) = (Subject::all(scene.source()), &scene.schedule.cameras);

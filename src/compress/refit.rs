@@ -16,7 +16,7 @@ use crate::refit::{self, Refit as Equations};
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
-use crate::stream::{Batch, Subject, View, show, spread};
+use crate::stream::{Batch, Progress, Subject, View, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "refit";
@@ -165,6 +165,7 @@ fn look(
     let mut tests = Vec::with_capacity(tested.len());
     let mut pictures = [fitted, tested].concat();
     pictures.sort_unstable_by_key(|picture| (picture.frame, picture.view));
+    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
     show([result, original], cameras, &pictures, batch, |views| {
         let mut lacks: Vec<(&Camera, Image)> = Vec::new();
         let state = views[0].states[0];
@@ -179,6 +180,7 @@ fn look(
             lacks.push((camera, lack));
         }
         equations.add(state, &lacks);
+        progress.advance(views.len() as u64);
         Ok(())
     })?;
     Ok(tests)

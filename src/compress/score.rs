@@ -15,7 +15,7 @@ use crate::scene::Scene;
 use crate::score::{Graded, Scores, Term, score};
 use crate::select::{self, Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, fill_anisotropy, snap, ulp};
-use crate::stream::{Scanned, Seen, gather};
+use crate::stream::{Progress, Scanned, Seen, gather};
 
 /// What the stage is called.
 const NAME: &str = "score";
@@ -141,6 +141,7 @@ impl Score {
         }
         let reference_frame = first_of_largest(&scanned.alive_per_frame);
         journal.stage(NAME, info.count, source, |journal| {
+            let progress = Progress::new(NAME, "Gaussians", info.count as u64);
             if self.snap_noise {
                 snap(&mut rows, scanned.largest_coordinate);
             }
@@ -188,6 +189,7 @@ impl Score {
                 position_ulp,
             };
             scored.write_down(scene, journal);
+            progress.advance(info.count as u64);
             Ok((scored, info.count))
         })
     }
