@@ -4,83 +4,10 @@ mod oracle;
 
 use std::num::NonZeroU32;
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::DVec3;
+use oracle::scenes::{camera, plain_camera, scene, single};
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Contribution, Image, Renderer, contribution, render};
-
-/// A camera at the origin that looks along +z, turned a little so that no axis is special.
-fn camera(width: u32, height: u32) -> Camera {
-    Camera {
-        width,
-        height,
-        fx: 0.9 * f64::from(width),
-        fy: 0.95 * f64::from(width),
-        cx: 0.5 * f64::from(width) + 1.3,
-        cy: 0.5 * f64::from(height) - 0.7,
-        rotation: DMat3::from_quat(DQuat::from_xyzw(0.05, -0.03, 0.02, 1.0).normalize()),
-        translation: DVec3::new(0.1, -0.2, 0.3),
-    }
-}
-
-/// A camera at the origin whose axes are the world's.
-fn plain_camera(size: u32) -> Camera {
-    Camera {
-        width: size,
-        height: size,
-        fx: 50.0,
-        fy: 50.0,
-        cx: 0.5 * f64::from(size),
-        cy: 0.5 * f64::from(size),
-        rotation: DMat3::IDENTITY,
-        translation: DVec3::ZERO,
-    }
-}
-
-/// Pseudo-random numbers in [0, 1) (splitmix64).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f32 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
-    }
-
-    fn within(&mut self, low: f32, high: f32) -> f32 {
-        low + (high - low) * self.next()
-    }
-}
-
-/// A cloud with needles, pancakes, giants, specks, quaternions of any length and Gaussians off-screen.
-fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
-    let mut random = Random(seed);
-    let mut scene = Gaussians::zeros(count, degree);
-    for i in 0..count {
-        let depth = random.within(-0.5, 6.0);
-        let reach = depth.abs() + 0.3;
-        scene.position.set_row(i, [random.within(-reach, reach), random.within(-reach, reach), depth]);
-        scene.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.within(-2.0, 2.0)));
-        scene.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.within(-6.5, -1.0)));
-        scene.opacity_logit.set_row(i, [random.within(-6.0, 6.0)]);
-        for c in 0..scene.sh.width() {
-            scene.sh.plane_mut(c)[i] = random.within(-0.5, 0.5) * if c < 3 { 3.0 } else { 1.0 };
-        }
-    }
-    scene
-}
-
-/// One Gaussian on the axis of [`plain_camera`], `depth` away, of the colour 1, ½, 0.
-fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
-    let mut one = Gaussians::zeros(1, 0);
-    one.position.set_row(0, [0.0, 0.0, depth]);
-    one.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
-    one.log_scale.set_row(0, [scale.ln(); 3]);
-    one.opacity_logit.set_row(0, [(opacity / (1.0 - opacity)).ln()]);
-    one.sh.set_row(0, [0.5 / 0.282_094_8, 0.0, -9.0]);
-    one
-}
 
 fn stride(s: u32) -> NonZeroU32 {
     NonZeroU32::new(s).unwrap()

@@ -3,6 +3,8 @@
 
 #![allow(dead_code, reason = "each test and bench uses its part")]
 
+pub(crate) mod scenes;
+
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use splatsieve::model::{Camera, Gaussians};
 
@@ -28,6 +30,13 @@ struct Footprint {
     rgb: DVec3,
     /// First and one-past-last tile, x then y.
     tiles: [[i64; 2]; 2],
+}
+
+impl Footprint {
+    fn alpha(&self, pixel: DVec2) -> f64 {
+        let offset = pixel - self.center;
+        (self.opacity * (-0.5 * offset.dot(self.inverse * offset)).exp()).min(0.99)
+    }
 }
 
 /// Real spherical harmonics of degree up to 3 as products of x, y and z.
@@ -109,6 +118,44 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
 
 /// Renders, and weighs the pixels of every `stride`-th column and row.
 pub(crate) fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> Picture {
+    picture_of(gaussians, camera, background, stride, |_, _| ())
+}
+
+/// What each pixel blends, by id, nearest first: every decision that a small change of a Gaussian may turn over.
+pub(crate) fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
+    let mut ids = vec![Vec::new(); camera.width as usize * camera.height as usize];
+    picture_of(gaussians, camera, [0.0; 3], 1, |pixel, id| ids[pixel].push(id));
+    ids
+}
+
+/// The pixels with `blended` decided: a function without steps of everything that is stored.
+pub(crate) fn decided(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    background: [f32; 3],
+    blended: &[Vec<usize>],
+) -> Vec<[f64; 3]> {
+    let footprints: Vec<Option<Footprint>> = (0..gaussians.len()).map(|id| footprint(gaussians, id, camera)).collect();
+    let pixel = |(at, ids): (usize, &Vec<usize>)| {
+        let place = DVec2::new((at % camera.width as usize) as f64, (at / camera.width as usize) as f64);
+        let (mut rgb, mut transmittance) = (DVec3::ZERO, 1.0f64);
+        for footprint in ids.iter().map(|&id| footprints[id].as_ref().expect("what is blended is seen")) {
+            let alpha = footprint.alpha(place);
+            rgb += alpha * transmittance * footprint.rgb;
+            transmittance *= 1.0 - alpha;
+        }
+        (rgb + transmittance * DVec3::from_array(background.map(f64::from))).to_array()
+    };
+    blended.iter().enumerate().map(pixel).collect()
+}
+
+fn picture_of(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    background: [f32; 3],
+    stride: u32,
+    mut blended: impl FnMut(usize, usize),
+) -> Picture {
     let mut footprints: Vec<Footprint> =
         (0..gaussians.len()).filter_map(|id| footprint(gaussians, id, camera)).collect();
     footprints.sort_by(|a, b| a.depth.total_cmp(&b.depth).then(a.id.cmp(&b.id)));
@@ -136,8 +183,7 @@ pub(crate) fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 
             let sampled = [x, y].iter().all(|&at| at as u32 % stride == stride / 2);
             let (mut rgb, mut transmittance, mut doubtful) = (DVec3::ZERO, 1.0f64, false);
             for footprint in tiles[y / 16 * across + x / 16].iter().map(|&at| &footprints[at]) {
-                let offset = DVec2::new(x as f64, y as f64) - footprint.center;
-                let alpha = (footprint.opacity * (-0.5 * offset.dot(footprint.inverse * offset)).exp()).min(0.99);
+                let alpha = footprint.alpha(DVec2::new(x as f64, y as f64));
                 doubtful |= near(alpha, 1.0 / 255.0);
                 if alpha < 1.0 / 255.0 {
                     continue;
@@ -149,6 +195,7 @@ pub(crate) fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 
                 }
                 let weight = alpha * transmittance;
                 rgb += weight * footprint.rgb;
+                blended(y * width + x, footprint.id);
                 if sampled {
                     seen.sum[footprint.id] += weight;
                     seen.max[footprint.id] = seen.max[footprint.id].max(weight);
