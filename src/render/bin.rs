@@ -22,6 +22,8 @@ pub(super) struct Bins {
     across: usize,
     /// End of each tile's pairs among those of the whole picture; tile t begins where t − 1 ends.
     ends: Vec<usize>,
+    /// Tiles before this one were handed out.
+    after: usize,
     /// Tiles whose pairs lie ready.
     strip: Range<usize>,
     pairs: Vec<u32>,
@@ -60,6 +62,12 @@ impl Bins {
             *end = total;
         }
         self.strip = 0..0;
+        self.after = 0;
+    }
+
+    /// Lets [`Bins::next_strip`] begin again with the first tiles; if one strip held all, its pairs are kept.
+    pub(super) fn rewind(&mut self) {
+        self.after = 0;
     }
 
     /// Makes the pairs of the next strip of tiles ready: whole rows of tiles with at most `most` pairs, else part
@@ -68,12 +76,17 @@ impl Bins {
         if self.is_last_strip() {
             return None;
         }
-        let first = self.strip.end;
+        let first = self.after;
         let before = self.start(first);
         let fitting = self.ends[first..].partition_point(|&end| end - before <= most);
         let end = first + fitting.max(1);
         let whole_rows = end - end % self.across;
-        self.strip = first..if whole_rows > first { whole_rows } else { end };
+        let strip = first..if whole_rows > first { whole_rows } else { end };
+        self.after = strip.end;
+        if strip == self.strip {
+            return Some(strip);
+        }
+        self.strip = strip;
 
         self.next.clear();
         self.next.push(0);
@@ -98,9 +111,9 @@ impl Bins {
         Some(self.strip.clone())
     }
 
-    /// Whether no tiles come after the strip.
+    /// Whether no tiles come after those handed out.
     pub(super) fn is_last_strip(&self) -> bool {
-        self.strip.end == self.ends.len()
+        self.after == self.ends.len()
     }
 
     /// The splats of every (splat, tile) pair of the strip, tile after tile.

@@ -74,15 +74,29 @@ fn samples(start: u32, size: u32, stride: u32) -> ([f32; SIDE], usize) {
     (offsets, count)
 }
 
+/// One splat in one group of pixels.
+#[derive(Clone, Copy)]
+pub(super) struct Stroke<V> {
+    /// Cut at 0.99.
+    pub(super) alpha: V,
+    /// alpha · transmittance; 0 where it is not blended.
+    pub(super) weight: V,
+    /// Transmittance behind it, never 0; where the weight is 0, it may be negative.
+    pub(super) left: V,
+    /// Offset from the splat's middle of this row, pixels: dx − slope·dy of [`Splat`].
+    pub(super) across: V,
+    /// Offset of the row from the splat's centre, pixels: dy of [`Splat`].
+    pub(super) down: f32,
+}
+
 /// What becomes of the weights alpha · transmittance.
 pub(super) trait Ink {
     /// What it holds of one splat while that is drawn.
     type Drop<V: Lanes>: Copy;
     /// The next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Drop<V>;
-    /// Its weights in one group of pixels, and the transmittance left behind it, never 0; where the weight
-    /// is 0, that may be negative.
-    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, weight: V, left: V) -> Self::Drop<V>;
+    /// What it does to one group of pixels.
+    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, stroke: Stroke<V>) -> Self::Drop<V>;
     /// The splat, `pair` of the tile, is done.
     fn end<V: Lanes>(&mut self, drop: Self::Drop<V>, pair: usize);
 }
@@ -99,7 +113,7 @@ impl Ink for Colour {
         [V::splat(splat.colour[0]), V::splat(splat.colour[1]), V::splat(splat.colour[2])]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 3] {
         for (plane, colour) in self.planes.iter_mut().zip(colour) {
             V::load(&plane[group]).add(colour.mul(weight)).store(&mut plane[group]);
         }
@@ -130,7 +144,7 @@ impl Ink for Weights<'_> {
         [V::splat(0.0); 2]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, weight: V, _: V) -> [V; 2] {
+    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 2] {
         [sum.add(weight), max.max(weight)]
     }
     #[inline(always)]
@@ -207,13 +221,15 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
         // monotone, so evaluating its pixels one by one would give alpha < 1/255 for each.
         let mut middles = [0.0f32; SIDE];
         let mut levels = [0.0f32; SIDE];
+        let mut downs = [0.0f32; SIDE];
         let mut reached = 0;
         for half in 0..SIDE / LANES {
             let dy = ys[half].sub(v);
             let middle = u.add(V::splat(splat.slope).mul(dy));
             let level = zero.sub(V::splat(splat.fall).mul(dy.mul(dy)));
-            middle.store((&mut middles[half * LANES..][..LANES]).try_into().unwrap());
-            level.store((&mut levels[half * LANES..][..LANES]).try_into().unwrap());
+            for (row, rows) in [(middle, &mut middles), (level, &mut levels), (dy, &mut downs)] {
+                row.store((&mut rows[half * LANES..][..LANES]).try_into().unwrap());
+            }
             for (column, [first, last]) in lattice.spans.iter().enumerate() {
                 let gap = V::splat(*first).sub(middle).max(middle.sub(V::splat(*last))).max(zero);
                 let nearest = level.sub(narrow.mul(gap.mul(gap)));
@@ -244,7 +260,8 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
             if left.signs() == (1 << LANES) - 1 {
                 live &= !(1 << group);
             }
-            drop = ink.add::<V>(drop, group, weight, left);
+            let stroke = Stroke { alpha, weight, left, across: dx, down: downs[group % SIDE] };
+            drop = ink.add::<V>(drop, group, stroke);
         }
         ink.end::<V>(drop, pair);
         if live == 0 {

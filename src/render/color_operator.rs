@@ -8,8 +8,7 @@
 //! long as the operator is kept.
 
 use super::bin::Bins;
-use super::blend::{Blend, GROUPS, Ink, Lattice, Plane, lane_sum};
-use super::convention::TILE;
+use super::blend::{Blend, GROUPS, Ink, Lattice, Plane, Stroke, lane_sum};
 use super::lanes::{LANES, Lanes};
 use super::project::{Splat, Splats, View};
 use super::renderer::{Image, Renderer};
@@ -58,7 +57,7 @@ impl ColorOperator {
     pub fn transposed(&self, picture: &Image) -> PerVisible {
         assert_eq!([picture.width, picture.height], self.size, "a picture of another size");
         self.per_splat(|tile, lattice, pairs, sums| {
-            let planes = self.planes(picture, tile);
+            let planes = picture.planes(tile);
             self.blend.tile(&self.splats.splats, pairs, lattice, &mut Weighed { planes: &planes, pairs: sums });
         })
     }
@@ -122,22 +121,6 @@ impl ColorOperator {
         }
         PerVisible(total)
     }
-
-    /// The pixels of one tile, 0 beyond the picture's edge.
-    fn planes(&self, picture: &Image, tile: [u32; 2]) -> [Plane; 3] {
-        let mut planes = [[[0.0; LANES]; GROUPS]; 3];
-        let [x0, y0] = tile.map(|t| t * TILE);
-        for v in 0..TILE.min(self.size[1] - y0) {
-            for u in 0..TILE.min(self.size[0] - x0) {
-                let pixel = ((y0 + v) as usize * self.size[0] as usize + (x0 + u) as usize) * 3;
-                let (group, lane) = (v as usize + u as usize / LANES * TILE as usize, u as usize % LANES);
-                for (c, plane) in planes.iter_mut().enumerate() {
-                    plane[group][lane] = picture.data[pixel + c];
-                }
-            }
-        }
-        planes
-    }
 }
 
 /// Paints changes of colour, without what is cut off at 0.
@@ -154,7 +137,7 @@ impl Ink for Change<'_> {
         std::array::from_fn(|c| V::splat(if splat.colour[c] > 0.0 { change[c] } else { 0.0 }))
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, change: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, change: [V; 3], group: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 3] {
         for (plane, change) in self.planes.iter_mut().zip(change) {
             V::load(&plane[group]).add(change.mul(weight)).store(&mut plane[group]);
         }
@@ -177,7 +160,7 @@ impl Ink for Weighed<'_> {
         [V::splat(0.0); 3]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, sums: [V; 3], group: usize, weight: V, _: V) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, sums: [V; 3], group: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 3] {
         std::array::from_fn(|c| sums[c].add(weight.mul(V::load(&self.planes[c][group]))))
     }
     #[inline(always)]
@@ -198,7 +181,7 @@ impl Ink for Power<'_> {
         V::splat(0.0)
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, sum: V, _: usize, weight: V, _: V) -> V {
+    fn add<V: Lanes>(&mut self, sum: V, _: usize, Stroke { weight, .. }: Stroke<V>) -> V {
         sum.add(weight.mul(weight))
     }
     #[inline(always)]

@@ -12,6 +12,7 @@
 //! changes no pixel. Pixels are the same bits for any number of threads and any instruction set.
 //! Gaussians with a NaN or infinite value among position, rotation, scale or opacity are not drawn.
 
+mod backward;
 mod bin;
 mod blend;
 mod color_operator;
@@ -23,6 +24,7 @@ mod project;
 mod removal;
 mod renderer;
 
+pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 pub use color_operator::{ColorOperator, PerVisible};
 pub use contribution::Contribution;
 pub use removal::RemovalError;

@@ -20,18 +20,19 @@ const DILATION: f64 = 0.3;
 /// The Jacobian is taken at directions no further out than this many half fields of view.
 const FIELD_MARGIN: f64 = 1.3;
 /// Logarithms of scales and logits are cut to ± this: squares of squares of scales stay finite in f64.
-const LOGARITHM_LIMIT: f64 = 80.0;
+pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
 /// Slack of the alpha bound in powers of two: thousands of times the rounding of the blend's exponent.
 const REACH_SLACK: f64 = 1e-3;
 
 /// What of a camera the projection needs.
 pub(super) struct View {
-    rotation: [[f64; 3]; 3],
+    /// Rows of the rotation from world to camera.
+    pub(super) rotation: [[f64; 3]; 3],
     translation: [f64; 3],
-    focal: [f64; 2],
+    pub(super) focal: [f64; 2],
     /// Where the optical axis lands when pixel centres are integers.
     principal: [f64; 2],
-    slope_limit: [f64; 2],
+    pub(super) slope_limit: [f64; 2],
     pub(super) center: [f64; 3],
     pub(super) size: [u32; 2],
     /// Tiles across and down.
@@ -201,50 +202,28 @@ impl Footprints {
         let rotation: [&[f32]; 4] = std::array::from_fn(|c| &gaussians.rotation.plane(c)[block.clone()][..n]);
         let log_scale: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.log_scale.plane(c)[block.clone()][..n]);
         let logit = &gaussians.opacity_logit.plane(0)[block.clone()][..n];
-        let [r0, r1, r2] = view.rotation;
-        let [t0, t1, t2] = view.translation;
-        let w = [r2[0] as f32, r2[1] as f32, r2[2] as f32, t2 as f32];
-        let [fx, fy] = view.focal;
-        let [lx, ly] = view.slope_limit;
-        let [px, py] = view.principal;
+        let [w0, w1, w2] = view.rotation[2].map(|x| x as f32);
+        let w3 = view.translation[2] as f32;
         for i in 0..n {
             let p: [f64; 3] = [position[0][i].into(), position[1][i].into(), position[2][i].into()];
-            let z = dot(r2, p) + t2;
-            let slope_x = (dot(r0, p) + t0) / z;
-            let slope_y = (dot(r1, p) + t1) / z;
             let q: [f64; 4] =
                 [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()];
-            let axes = rotation_matrix(q);
-            let s = [
-                exp(limit(log_scale[0][i].into(), LOGARITHM_LIMIT)),
-                exp(limit(log_scale[1][i].into(), LOGARITHM_LIMIT)),
-                exp(limit(log_scale[2][i].into(), LOGARITHM_LIMIT)),
-            ];
-            // Rows of the Jacobian times the camera's rotation: world directions that move u and v.
-            let (jx, jy) = (fx / z, fy / z);
-            let (kx, ky) = (limit(slope_x, lx), limit(slope_y, ly));
-            let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
-            let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
-            let a = [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]];
-            let b = [dot(to_v, axes[0]) * s[0], dot(to_v, axes[1]) * s[1], dot(to_v, axes[2]) * s[2]];
-            let (aa, bb) = (dot(a, a), dot(b, b));
-            let cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-            let (xx, xy, yy) = (aa + DILATION, dot(a, b), bb + DILATION);
+            let shape = Shape::new(p, q, [log_scale[0][i], log_scale[1][i], log_scale[2][i]], view);
+            let Covariance { xx, xy, yy, det } = shape.covariance();
             // m² − det of the dilated covariance, written as a sum of squares.
-            let spread = 0.25 * (aa - bb) * (aa - bb) + xy * xy;
+            let spread = 0.25 * (xx - yy) * (xx - yy) + xy * xy;
             let largest = 0.5 * (xx + yy) + (if spread < 0.1 { 0.1 } else { spread }).sqrt();
-            self.depth[i] = z;
-            self.order[i] = (w[0] * position[0][i] + w[1] * position[1][i]) + (w[2] * position[2][i] + w[3]);
-            self.u[i] = fx * slope_x + px;
-            self.v[i] = fy * slope_y + py;
-            let det = dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION;
+            self.depth[i] = shape.depth;
+            self.order[i] = (w0 * position[0][i] + w1 * position[1][i]) + (w2 * position[2][i] + w3);
+            self.u[i] = view.focal[0] * shape.slopes[0] + view.principal[0];
+            self.v[i] = view.focal[1] * shape.slopes[1] + view.principal[1];
             self.narrow[i] = 0.5 * LOG2_E * yy / det;
             self.slope[i] = xy / yy;
             self.fall[i] = 0.5 * LOG2_E / yy;
             self.half_u[i] = (2.0 * LN_2 * xx).sqrt();
             self.half_v[i] = (2.0 * LN_2 * yy).sqrt();
             self.radius[i] = (3.0 * largest.sqrt()).ceil();
-            self.opacity[i] = 1.0 / (1.0 + exp(limit(-f64::from(logit[i]), LOGARITHM_LIMIT)));
+            self.opacity[i] = opacity(logit[i]);
         }
     }
 
@@ -280,6 +259,71 @@ impl Footprints {
     }
 }
 
+/// How a camera sees the axes of one Gaussian.
+pub(super) struct Shape {
+    /// View depth, scene units.
+    pub(super) depth: f64,
+    /// x / depth and y / depth in camera axes.
+    pub(super) slopes: [f64; 2],
+    /// World directions that move u and v, pixels per scene unit: rows of the Jacobian times the camera's rotation.
+    pub(super) to: [[f64; 3]; 2],
+    /// Columns of the Gaussian's rotation.
+    pub(super) axes: [[f64; 3]; 3],
+    pub(super) scale: [f64; 3],
+    /// Standard deviations along the axes as seen in u and v, pixels: `to` · axes · scale.
+    pub(super) spread: [[f64; 3]; 2],
+}
+
+/// The widened 2-D covariance, pixels², and its determinant.
+pub(super) struct Covariance {
+    pub(super) xx: f64,
+    pub(super) xy: f64,
+    pub(super) yy: f64,
+    pub(super) det: f64,
+}
+
+impl Shape {
+    /// Of a Gaussian at `p` with wxyz quaternion `q`.
+    #[inline(always)]
+    pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &View) -> Self {
+        let [r0, r1, r2] = view.rotation;
+        let [t0, t1, t2] = view.translation;
+        let z = dot(r2, p) + t2;
+        let slopes = [(dot(r0, p) + t0) / z, (dot(r1, p) + t1) / z];
+        let axes = rotation_matrix(q);
+        let s = [
+            exp(limit(log_scale[0].into(), LOGARITHM_LIMIT)),
+            exp(limit(log_scale[1].into(), LOGARITHM_LIMIT)),
+            exp(limit(log_scale[2].into(), LOGARITHM_LIMIT)),
+        ];
+        let (jx, jy) = (view.focal[0] / z, view.focal[1] / z);
+        let (kx, ky) = (limit(slopes[0], view.slope_limit[0]), limit(slopes[1], view.slope_limit[1]));
+        let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
+        let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
+        let spread = [to_u, to_v].map(|to| [dot(to, axes[0]) * s[0], dot(to, axes[1]) * s[1], dot(to, axes[2]) * s[2]]);
+        Shape { depth: z, slopes, to: [to_u, to_v], axes, scale: s, spread }
+    }
+
+    #[inline(always)]
+    pub(super) fn covariance(&self) -> Covariance {
+        let [a, b] = self.spread;
+        let (aa, bb) = (dot(a, a), dot(b, b));
+        let cross = cross(a, b);
+        Covariance {
+            xx: aa + DILATION,
+            xy: dot(a, b),
+            yy: bb + DILATION,
+            det: dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION,
+        }
+    }
+}
+
+/// Opacity in [0, 1] of a stored logit.
+#[inline(always)]
+pub(super) fn opacity(logit: f32) -> f64 {
+    1.0 / (1.0 + exp(limit(-f64::from(logit), LOGARITHM_LIMIT)))
+}
+
 /// Tiles along one axis: those touched by `at ± radius` as the reference kernel counts them, without
 /// those whose pixels all lie further than `half` from `at`.
 #[inline(always)]
@@ -307,8 +351,13 @@ fn limit(x: f64, bound: f64) -> f64 {
 }
 
 #[inline(always)]
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 /// Columns of the rotation of a wxyz quaternion of any length; the identity for a zero one.

@@ -5,7 +5,7 @@
 //! nothing however much it covers. Of N removals at once the changes add up, with b changing too; hence
 //! the floor under c − b, and ranking in rounds.
 
-use super::blend::{Ink, Plane, lane_sum};
+use super::blend::{Ink, Plane, Stroke, lane_sum};
 use super::lanes::Lanes;
 use super::project::Splat;
 
@@ -75,7 +75,8 @@ impl Ink for Removal<'_> {
         (splat.colour.map(V::splat), V::splat(0.0))
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, (colour, sum): ([V; 3], V), group: usize, weight: V, left: V) -> ([V; 3], V) {
+    fn add<V: Lanes>(&mut self, (colour, sum): ([V; 3], V), group: usize, stroke: Stroke<V>) -> ([V; 3], V) {
+        let Stroke { weight, left, .. } = stroke;
         // What lies behind shows with transmittance `left`, and `weight` more without this splat.
         let gain = weight.div(left);
         let floor = weight.mul(V::splat(self.contrast_floor));

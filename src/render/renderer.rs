@@ -9,6 +9,7 @@ use super::bin::{Bins, STRIP_PAIRS};
 use super::blend::{Blend, Colour, GROUPS, Lattice, Plane, Weight, Weights};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
+use super::lanes::LANES;
 use super::project::{Splat, Splats, TileRect, View, project};
 use super::removal::{Removal, RemovalError};
 use crate::model::{Camera, Gaussians};
@@ -32,6 +33,24 @@ pub struct Image {
     pub data: Vec<f32>,
 }
 
+impl Image {
+    /// The pixels of one tile, 0 beyond the picture's edge.
+    pub(super) fn planes(&self, tile: [u32; 2]) -> [Plane; 3] {
+        let mut planes = [[[0.0; LANES]; GROUPS]; 3];
+        let [x0, y0] = tile.map(|t| t * TILE);
+        for v in 0..TILE.min(self.height - y0) {
+            for u in 0..TILE.min(self.width - x0) {
+                let pixel = ((y0 + v) as usize * self.width as usize + (x0 + u) as usize) * 3;
+                let (group, lane) = (v as usize + u as usize / LANES * TILE as usize, u as usize % LANES);
+                for (c, plane) in planes.iter_mut().enumerate() {
+                    plane[group][lane] = self.data[pixel + c];
+                }
+            }
+        }
+        planes
+    }
+}
+
 /// Renders `gaussians` before `background` as `camera` sees them, on all threads of the pool.
 ///
 /// A camera without pixels gives an empty image; no Gaussians give the background. Scales are taken
@@ -40,7 +59,7 @@ pub struct Image {
 /// # Panics
 /// If the columns of `gaussians` differ in length.
 pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
-    Renderer::with(true).render(gaussians, camera, background)
+    Renderer::on_all_threads().render(gaussians, camera, background)
 }
 
 /// Adds what `camera` sees of each Gaussian to `seen`, on all threads of the pool; reads no colour.
@@ -52,15 +71,15 @@ pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> I
 /// # Panics
 /// If `seen` is not of as many Gaussians, or the columns of `gaussians` differ in length.
 pub fn contribution(gaussians: &Gaussians, camera: &Camera, stride: NonZeroU32, seen: &mut Contribution) {
-    Renderer::with(true).contribution(gaussians, camera, stride, seen);
+    Renderer::on_all_threads().contribution(gaussians, camera, stride, seen);
 }
 
-/// Renders on the calling thread alone and keeps its buffers: for loops that run pictures in parallel.
+/// Renders and keeps its buffers: one picture after the other.
 ///
 /// Gives the same bits as [`render`] and [`contribution`].
 #[derive(Debug)]
 pub struct Renderer {
-    parallel: bool,
+    pub(super) parallel: bool,
     pub(super) blend: Blend,
     pub(super) splats: Splats,
     pub(super) bins: Bins,
@@ -76,9 +95,14 @@ impl Default for Renderer {
 }
 
 impl Renderer {
-    /// A renderer with empty buffers.
+    /// A renderer on the calling thread alone: for loops that run pictures in parallel.
     pub fn new() -> Self {
         Renderer::with(false)
+    }
+
+    /// A renderer on all threads of the pool: for pictures that must follow one another.
+    pub fn on_all_threads() -> Self {
+        Renderer::with(true)
     }
 
     fn with(parallel: bool) -> Self {
@@ -92,12 +116,18 @@ impl Renderer {
         }
     }
 
-    /// As [`render`], on this thread.
+    /// As the function [`render`].
     pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
         let view = View::new(camera);
         self.prepare(gaussians, &view, true);
-        let row_len = camera.width as usize * 3;
-        let mut data = vec![0.0; row_len * camera.height as usize];
+        self.picture(&view, background)
+    }
+
+    /// The picture of what is prepared.
+    pub(super) fn picture(&mut self, view: &View, background: [f32; 3]) -> Image {
+        let [width, height] = view.size;
+        let row_len = width as usize * 3;
+        let mut data = vec![0.0; row_len * height as usize];
         // Without pixels there are no rows, and chunks must not be empty.
         let tile_row_len = (row_len * TILE as usize).max(1);
         while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
@@ -112,7 +142,7 @@ impl Renderer {
                         let start = x * TILE as usize;
                         let pixels = row[start * 3..].chunks_exact_mut(3).take(TILE as usize);
                         for (u, pixel) in pixels.enumerate() {
-                            let (group, lane) = (v + u / 8 * TILE as usize, u % 8);
+                            let (group, lane) = (v + u / LANES * TILE as usize, u % LANES);
                             for c in 0..3 {
                                 pixel[c] = planes[c][group][lane];
                             }
@@ -127,10 +157,10 @@ impl Renderer {
                 rows.for_each(paint_row);
             }
         }
-        Image { width: camera.width, height: camera.height, data }
+        Image { width, height, data }
     }
 
-    /// As [`contribution`], on this thread.
+    /// As the function [`contribution`].
     ///
     /// # Panics
     /// If `seen` is not of as many Gaussians, or the columns of `gaussians` differ in length.
@@ -146,29 +176,10 @@ impl Renderer {
         self.prepare(gaussians, &view, false);
         while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            self.weights.clear();
-            self.weights.resize(bins.pairs().len(), Weight::default());
-            let mut rest = &mut self.weights[..];
-            let mut rows = Vec::new();
-            for (y, tiles) in bins.rows() {
-                let (row, after) = rest.split_at_mut(bins.range(y, tiles.clone()).len());
-                rows.push((y, tiles, row));
-                rest = after;
-            }
-            let weigh_row = |(y, tiles, mut weights): (usize, Range<usize>, &mut [Weight])| {
-                for x in tiles {
-                    let lattice = Lattice::new([x as u32, y as u32], view.size, stride.get());
-                    let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
-                    let (tile, after) = weights.split_at_mut(pairs.len());
-                    blend.tile(splats, pairs, &lattice, &mut Weights { pairs: tile });
-                    weights = after;
-                }
-            };
-            if self.parallel {
-                rows.into_par_iter().for_each(weigh_row);
-            } else {
-                rows.into_iter().for_each(weigh_row);
-            }
+            fill_pairs(bins, self.parallel, &mut self.weights, |tile, pairs, weights| {
+                let lattice = Lattice::new(tile, view.size, stride.get());
+                blend.tile(splats, pairs, &lattice, &mut Weights { pairs: weights });
+            });
             for (&splat, weight) in bins.pairs().iter().zip(&self.weights) {
                 if weight.max > 0.0 {
                     seen.add(splats[splat as usize].id as usize, weight.sum, weight.max);
@@ -230,9 +241,41 @@ impl Renderer {
     }
 }
 
+/// Makes `sums` one default value for every pair of the strip, and has `of_tile` change those of each tile, given its
+/// place and its pairs; tiles at once if `parallel`.
+pub(super) fn fill_pairs<T: Copy + Default + Send>(
+    bins: &Bins,
+    parallel: bool,
+    sums: &mut Vec<T>,
+    of_tile: impl Fn([u32; 2], &[u32], &mut [T]) + Sync,
+) {
+    sums.clear();
+    sums.resize(bins.pairs().len(), T::default());
+    let mut rest = &mut sums[..];
+    let mut rows = Vec::new();
+    for (y, tiles) in bins.rows() {
+        let (row, after) = rest.split_at_mut(bins.range(y, tiles.clone()).len());
+        rows.push((y, tiles, row));
+        rest = after;
+    }
+    let fill_row = |(y, tiles, mut sums): (usize, Range<usize>, &mut [T])| {
+        for x in tiles {
+            let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+            let (of_pairs, after) = sums.split_at_mut(pairs.len());
+            of_tile([x as u32, y as u32], pairs, of_pairs);
+            sums = after;
+        }
+    };
+    if parallel {
+        rows.into_par_iter().for_each(fill_row);
+    } else {
+        rows.into_iter().for_each(fill_row);
+    }
+}
+
 /// The colours of one tile's sampled pixels.
 fn paint(blend: Blend, splats: &[Splat], pairs: &[u32], lattice: &Lattice, background: [f32; 3]) -> [Plane; 3] {
-    let mut colour = Colour { planes: [[[0.0; 8]; GROUPS]; 3] };
+    let mut colour = Colour { planes: [[[0.0; LANES]; GROUPS]; 3] };
     let left = blend.tile(splats, pairs, lattice, &mut colour);
     for (plane, background) in colour.planes.iter_mut().zip(background) {
         for (pixel, left) in plane.as_flattened_mut().iter_mut().zip(left.as_flattened()) {
@@ -248,6 +291,7 @@ mod tests {
 
     use super::super::ColorOperator;
     use super::*;
+    use crate::model::{Columns, Gradients};
 
     /// 3000 Gaussians of all sizes, and a camera among them whose picture does not end at a tile's edge.
     fn scene() -> (Gaussians, Camera) {
@@ -275,13 +319,16 @@ mod tests {
     }
 
     /// Everything a renderer can make of the scene.
-    fn made(mut renderer: Renderer) -> (Image, Contribution, RemovalError) {
+    fn made(mut renderer: Renderer) -> (Image, Contribution, RemovalError, Gradients) {
         let (scene, camera) = scene();
         let mut seen = Contribution::new(scene.len());
         renderer.contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
         let mut errors = RemovalError::new(scene.len(), 0.1);
         renderer.removal_error(&scene, &camera, [0.3; 3], &mut errors);
-        (renderer.render(&scene, &camera, [0.3; 3]), seen, errors)
+        let mut gradients = Gradients::new(scene.len(), Columns::all(), 0);
+        let loss = |picture: &Image| (0.0, picture.clone());
+        renderer.gradient(&scene, &camera, [0.3; 3], loss, &mut gradients);
+        (renderer.render(&scene, &camera, [0.3; 3]), seen, errors, gradients)
     }
 
     #[test]

@@ -1,0 +1,141 @@
+//! The second walk over a tile: from what pixels take to what splats take.
+//!
+//! Front to back again, so that no list of what was blended has to be kept: of a pixel's rest of colour each splat
+//! takes its own part away, and what is left is what lies behind it (method.md, section 8.1). Data in: the tile's
+//! splats, ∂L/∂ pixel, and the pixels. Data out: nine sums per pair of a splat and the tile.
+
+use std::f64::consts::LN_2;
+
+use super::super::blend::{GROUPS, Ink, Plane, Stroke, lane_sum};
+use super::super::convention::MAX_ALPHA;
+use super::super::lanes::{LANES, Lanes};
+use super::super::project::Splat;
+use super::super::renderer::Image;
+
+/// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
+///
+/// With p = alpha · ∂L/∂alpha and a pixel's offset (s, t) from the splat's centre in its standard deviations: t along
+/// v, s along u where the row's alpha is largest. s² + t² is at most 2·ln 255, so no size of a splat makes a sum large.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Sums<T> {
+    /// Σ p.
+    pub(super) p: T,
+    /// Σ p·s and Σ p·t.
+    pub(super) first: [T; 2],
+    /// Σ p·s², Σ p·s·t and Σ p·t².
+    pub(super) second: [T; 3],
+    /// Σ weight · ∂L/∂ pixel, by channel.
+    pub(super) colour: [T; 3],
+}
+
+impl Sums<f64> {
+    pub(super) fn add(&mut self, tile: &Sums<f32>) {
+        self.p += f64::from(tile.p);
+        (0..2).for_each(|k| self.first[k] += f64::from(tile.first[k]));
+        (0..3).for_each(|k| self.second[k] += f64::from(tile.second[k]));
+        (0..3).for_each(|k| self.colour[k] += f64::from(tile.colour[k]));
+    }
+}
+
+/// What the pixels of a tile take, before the walk.
+pub(super) struct Pull {
+    /// ∂L/∂ pixel, by channel.
+    pixel: [Plane; 3],
+    /// Inner product of that with the pixel's colour.
+    rest: Plane,
+}
+
+impl Pull {
+    /// Of tile `tile` of `picture`. A pixel that is not finite, itself or in `pull`, takes nothing.
+    pub(super) fn new(picture: &Image, pull: &Image, tile: [u32; 2]) -> Self {
+        let (colour, mut pixel) = (picture.planes(tile), pull.planes(tile));
+        let mut rest = [[0.0; LANES]; GROUPS];
+        for group in 0..GROUPS {
+            for lane in 0..LANES {
+                let product: f32 = (0..3).map(|c| pixel[c][group][lane] * colour[c][group][lane]).sum();
+                if product.is_finite() {
+                    rest[group][lane] = product;
+                } else {
+                    (0..3).for_each(|c| pixel[c][group][lane] = 0.0);
+                }
+            }
+        }
+        Pull { pixel, rest }
+    }
+}
+
+/// Sums what splats take; of their colours alone unless `SHAPE`.
+pub(super) struct Pulled<'a, const SHAPE: bool> {
+    pub(super) pull: Pull,
+    /// One per pair of the tile.
+    pub(super) pairs: &'a mut [Sums<f32>],
+}
+
+/// A splat that is walked over.
+#[derive(Clone, Copy)]
+pub(super) struct Walked<V> {
+    colour: [V; 3],
+    /// Standard deviations per pixel, along u and along v.
+    per_pixel: [f32; 2],
+    p: V,
+    first: [V; 2],
+    second: [V; 3],
+    taken: [V; 3],
+}
+
+impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
+    type Drop<V: Lanes> = Walked<V>;
+    #[inline(always)]
+    fn begin<V: Lanes>(&self, splat: &Splat) -> Walked<V> {
+        let zero = V::splat(0.0);
+        // Exponents are in powers of two: half the square of an offset is ln 2 times one.
+        let per_pixel = |exponent: f32| (exponent * 2.0 * LN_2 as f32).sqrt();
+        Walked {
+            colour: splat.colour.map(V::splat),
+            per_pixel: [per_pixel(splat.narrow), per_pixel(splat.fall)],
+            p: zero,
+            first: [zero; 2],
+            second: [zero; 3],
+            taken: [zero; 3],
+        }
+    }
+    #[inline(always)]
+    fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Stroke<V>) -> Walked<V> {
+        let Stroke { alpha, weight, left, across, down } = stroke;
+        let pixel: [V; 3] = std::array::from_fn(|c| V::load(&self.pull.pixel[c][group]));
+        for (taken, pixel) in walked.taken.iter_mut().zip(pixel) {
+            *taken = taken.add(weight.mul(pixel));
+        }
+        if !SHAPE {
+            return walked;
+        }
+        let [red, green, blue] = walked.colour;
+        let own = red.mul(pixel[0]).add(green.mul(pixel[1])).add(blue.mul(pixel[2]));
+        let rest = V::load(&self.pull.rest[group]).sub(weight.mul(own));
+        rest.store(&mut self.pull.rest[group]);
+        // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing.
+        let p = weight.mul(own.sub(rest.div(left)));
+        let p = alpha.at_least(V::splat(MAX_ALPHA)).select(V::splat(0.0), p);
+        let s = across.mul(V::splat(walked.per_pixel[0]));
+        let t = V::splat(down * walked.per_pixel[1]);
+        let (ps, pt) = (p.mul(s), p.mul(t));
+        walked.p = walked.p.add(p);
+        walked.first = [walked.first[0].add(ps), walked.first[1].add(pt)];
+        let [ss, st, tt] = walked.second;
+        walked.second = [ss.add(ps.mul(s)), st.add(ps.mul(t)), tt.add(pt.mul(t))];
+        walked
+    }
+    #[inline(always)]
+    fn end<V: Lanes>(&mut self, walked: Walked<V>, pair: usize) {
+        let colour = walked.taken.map(lane_sum);
+        self.pairs[pair] = match SHAPE {
+            true => Sums {
+                p: lane_sum(walked.p),
+                first: walked.first.map(lane_sum),
+                second: walked.second.map(lane_sum),
+                colour,
+            },
+            false => Sums { colour, ..Sums::default() },
+        };
+    }
+}

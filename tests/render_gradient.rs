@@ -1,0 +1,290 @@
+//! The rasteriser's derivative against differences of the f64 oracle, closed forms, and laws.
+
+mod oracle;
+
+use oracle::scenes::{Random, camera, plain_camera, scene, single};
+use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
+use splatsieve::render::{Image, Renderer, render};
+
+const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
+
+/// The gradients of a loss whose derivative by the picture is `pull`.
+fn gradients(gaussians: &Gaussians, camera: &Camera, pull: impl FnOnce(&Image) -> Image) -> Gradients {
+    let degree = (gaussians.sh.width() / 3).isqrt() - 1;
+    let mut gradients = Gradients::new(gaussians.len(), Columns::all(), degree);
+    Renderer::new().gradient(gaussians, camera, BACKGROUND, |picture| (0.0, pull(picture)), &mut gradients);
+    gradients
+}
+
+/// A picture of one value.
+fn plain_image(camera: &Camera, value: [f32; 3]) -> Image {
+    let pixels = camera.width as usize * camera.height as usize;
+    Image { width: camera.width, height: camera.height, data: value.repeat(pixels) }
+}
+
+/// `x` changed by about ± `step`, and how far apart both are.
+fn nudged(x: f32, step: f32) -> ([f32; 2], f64) {
+    let both = [x - step, x + step];
+    (both, f64::from(both[1]) - f64::from(both[0]))
+}
+
+#[test]
+fn derivatives_are_those_of_the_oracle_by_central_differences() {
+    for (seed, count, degree, width, height) in [(1, 300, 3, 67, 45), (2, 900, 1, 64, 64), (3, 40, 2, 33, 100)] {
+        let (gaussians, camera) = (scene(seed, count, degree), camera(width, height));
+        // Half the squared difference from noise, over pixels in which f32 decides as f64 does.
+        let sure: Vec<f64> = oracle::picture(&gaussians, &camera, BACKGROUND, 1)
+            .doubtful
+            .iter()
+            .map(|&doubtful| if doubtful { 0.0 } else { 1.0 })
+            .collect();
+        let mut random = Random(seed + 100);
+        let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next()).collect();
+        let found = gradients(&gaussians, &camera, |picture| Image {
+            data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
+            ..*picture
+        });
+
+        let blended = oracle::blended(&gaussians, &camera);
+        let loss = |changed: &Gaussians| -> f64 {
+            let pixels = oracle::decided(changed, &camera, BACKGROUND, &blended);
+            let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
+            (0..target.len()).map(|at| 0.5 * sure[at / 3] * square(at)).sum()
+        };
+        for column in Columns::all().iter() {
+            let got = found.column(column).planes();
+            let mut largest: Vec<usize> = (0..got.len()).collect();
+            largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
+            for &at in largest.iter().take(60) {
+                let mut changed = gaussians.clone();
+                let (both, apart) = nudged(gaussians.column(column).planes()[at], 3e-5);
+                let losses = both.map(|x| {
+                    changed.column_mut(column).planes_mut()[at] = x;
+                    loss(&changed)
+                });
+                let expected = (losses[1] - losses[0]) / apart;
+                let got = f64::from(got[at]);
+                // What is blended is decided beforehand, so the loss has kinks (an alpha of 0.99, a channel at 0) but
+                // no steps. What is left is f32: sums of terms of both signs, and the picture they start from.
+                let tolerance = 5e-4 * expected.abs();
+                assert!(
+                    (got - expected).abs() <= tolerance,
+                    "seed {seed}, {} {} of Gaussian {}: got {got}, expected {expected} ± {tolerance}",
+                    column.name(),
+                    at / count,
+                    at % count
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn one_gaussian_is_its_closed_form() {
+    // Isotropic, on the axis: a variance of (f·s/z)² + 0.3 about the picture's middle.
+    let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
+    let (gaussians, camera) = (single(depth as f32, scale as f32, opacity as f32), plain_camera(size));
+    let seen = (50.0 * scale / depth).powi(2);
+    let (variance, middle) = (seen + 0.3, f64::from(size) / 2.0 - 0.5);
+    // The loss is the total of a channel; its colour before a background makes the contrast.
+    for (channel, contrast) in [(0, 1.0 - 0.1), (1, 0.5 - 0.9), (2, 0.0 - 0.4)] {
+        let mut weights: [f32; 3] = [0.0; 3];
+        weights[channel] = 1.0;
+        let found = gradients(&gaussians, &camera, |_| plain_image(&camera, weights));
+        let mut alphas = 0.0;
+        let mut squares = [0.0; 2];
+        for y in 0..size {
+            for x in 0..size {
+                let offset = [x, y].map(|at| f64::from(at) - middle);
+                let alpha = opacity * (-0.5 * (offset[0].powi(2) + offset[1].powi(2)) / variance).exp();
+                if alpha >= 1.0 / 255.0 {
+                    alphas += alpha;
+                    (0..2).for_each(|k| squares[k] += alpha * offset[k].powi(2));
+                }
+            }
+        }
+        let close = |what: &str, got: f32, expected: f64| {
+            let tolerance = 1e-5 * alphas;
+            let error = (f64::from(got) - expected).abs();
+            assert!(error <= tolerance, "channel {channel}, {what}: got {got}, expected {expected} ± {tolerance}");
+        };
+        let row = |column| found.column(column);
+        close("logit", row(Columns::OPACITY).plane(0)[0], (1.0 - opacity) * contrast * alphas);
+        // Blue is cut off at 0.
+        let colour = if channel == 2 { 0.0 } else { splatsieve::model::SH_C0 * alphas };
+        (0..3).for_each(|c| close("sh", row(Columns::SH).plane(c)[0], if c == channel { colour } else { 0.0 }));
+        let widths = squares.map(|square| contrast * square * seen / variance.powi(2));
+        close("scale x", row(Columns::LOG_SCALE).plane(0)[0], widths[0]);
+        close("scale y", row(Columns::LOG_SCALE).plane(1)[0], widths[1]);
+        // Along the line of sight it has no extent; a ball looks the same however it is turned; and to either side
+        // of the middle pixels are alike.
+        close("scale z", row(Columns::LOG_SCALE).plane(2)[0], 0.0);
+        (0..4).for_each(|c| close("rotation", row(Columns::ROTATION).plane(c)[0], 0.0));
+        (0..2).for_each(|c| close("position", row(Columns::POSITION).plane(c)[0], 0.0));
+        // Twice the distance is half the size.
+        close("depth", row(Columns::POSITION).plane(2)[0], -(widths[0] + widths[1]) / depth);
+    }
+}
+
+#[test]
+fn moving_a_picture_whole_moves_it_by_focal_over_depth() {
+    // The first moment of the picture along u: its derivative by x is alphas · f/z.
+    let (gaussians, camera) = (single(2.0, 0.05, 0.6), plain_camera(48));
+    let found = gradients(&gaussians, &camera, |picture| {
+        let mut moment = plain_image(&camera, [0.0; 3]);
+        (0..moment.data.len()).step_by(3).for_each(|at| moment.data[at] = ((at / 3) as u32 % picture.width) as f32);
+        moment
+    });
+    let picture = render(&gaussians, &camera, [0.0; 3]);
+    // By parts: what stands above the edge, where alpha drops from 1/255 to 0.
+    let above = |red: f32| (f64::from(red) - 1.0 / 255.0).max(0.0);
+    let red: f64 = picture.data.chunks_exact(3).map(|pixel| above(pixel[0])).sum();
+    let expected = red * (1.0 - 0.1) * 50.0 / 2.0;
+    let got = f64::from(found.column(Columns::POSITION).plane(0)[0]);
+    // The sum over whole pixels is the integral, but for pixels on the edge.
+    assert!((got / expected - 1.0).abs() < 0.005, "got {got}, expected {expected}");
+}
+
+#[test]
+fn threads_kept_buffers_and_frozen_columns_do_not_change_a_bit() {
+    let camera = camera(131, 77);
+    let noise = |picture: &Image| {
+        let mut random = Random(7);
+        Image { data: picture.data.iter().map(|x| x - random.next()).collect(), ..*picture }
+    };
+    let mut kept = Renderer::new();
+    for (seed, count) in [(31, 20_000), (32, 300), (33, 9000)] {
+        let scene = scene(seed, count, 2);
+        let with = |renderer: &mut Renderer, columns, degree| {
+            let mut found = Gradients::new(count, columns, degree);
+            let value = renderer.gradient(&scene, &camera, BACKGROUND, |picture| (1.5, noise(picture)), &mut found);
+            assert_eq!(value, 1.5);
+            found
+        };
+        let expected = with(&mut kept, Columns::all(), 2);
+        for threads in [1, 2, 3] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let got = pool.install(|| with(&mut Renderer::on_all_threads(), Columns::all(), 2));
+            assert!(got == expected, "seed {seed}: {threads} threads differ from the single-thread renderer");
+        }
+        for columns in [Columns::SH, Columns::POSITION | Columns::OPACITY, Columns::all(), Columns::empty()] {
+            let got = with(&mut kept, columns, 0);
+            for column in columns.iter() {
+                let planes = got.column(column).planes();
+                assert!(planes == &expected.column(column).planes()[..planes.len()], "{columns:?}: {}", column.name());
+                assert!(planes.iter().any(|&x| x != 0.0));
+            }
+            assert!(Columns::all().difference(columns).iter().all(|column| got.column(column).is_empty()));
+        }
+    }
+}
+
+#[test]
+fn pictures_add_up() {
+    let (scene, views) = (scene(51, 200, 1), [camera(40, 40), camera(50, 30)]);
+    let mut both = Gradients::new(200, Columns::all(), 1);
+    let mut renderer = Renderer::new();
+    for camera in &views {
+        renderer.gradient(&scene, camera, BACKGROUND, |picture| (0.0, picture.clone()), &mut both);
+    }
+    let apart = views.each_ref().map(|camera| gradients(&scene, camera, Image::clone));
+    for column in Columns::all().iter() {
+        let [first, second] = [0, 1].map(|k: usize| apart[k].column(column).planes());
+        let sums = first.iter().zip(second).map(|(a, b)| a + b);
+        // A position takes two parts of each picture.
+        let close = |(&got, expected): (&f32, f32)| (got - expected).abs() <= 1e-6 * (1.0 + expected.abs());
+        assert!(both.column(column).planes().iter().zip(sums).all(close), "{}", column.name());
+    }
+    both.clear();
+    assert!(both == Gradients::new(200, Columns::all(), 1));
+}
+
+#[test]
+fn extremes_give_finite_gradients_and_what_is_not_drawn_none() {
+    let camera = plain_camera(40);
+    let extremes: [fn(&mut Gaussians); 16] = [
+        |g| g.log_scale.set_row(0, [40.0f32; 3]),
+        |g| g.log_scale.set_row(0, [-40.0f32; 3]),
+        |g| g.log_scale.set_row(0, [40.0f32, -40.0, 1.0]),
+        |g| g.log_scale.set_row(0, [f32::MAX, -f32::MAX, 0.0]),
+        |g| g.opacity_logit.set_row(0, [1e4]),
+        |g| g.opacity_logit.set_row(0, [-1e4]),
+        |g| g.rotation.set_row(0, [0.0f32; 4]),
+        |g| g.rotation.set_row(0, [1e-45f32, 1e-45, 0.0, 0.0]),
+        |g| g.rotation.set_row(0, [f32::MAX; 4]),
+        |g| g.sh.set_row(0, [f32::INFINITY, 0.0, 1.0]),
+        |g| g.sh.set_row(0, [f32::MAX, f32::NEG_INFINITY, f32::NAN]),
+        |g| g.sh.plane_mut(5)[0] = f32::INFINITY,
+        |g| g.position.set_row(0, [0.0, 0.0, 0.200_001]),
+        |g| g.position.set_row(0, [f32::NAN, 0.0, 2.0]),
+        |g| g.log_scale.set_row(0, [f32::NAN, 0.0, 0.0]),
+        |g| g.rotation.set_row(0, [1.0, f32::NAN, 0.0, 0.0]),
+    ];
+    for (k, extreme) in extremes.into_iter().enumerate() {
+        let mut scene = scene(61, 50, 1);
+        // The one that is extreme stands before the camera.
+        scene.position.set_row(0, [0.02, -0.03, 2.0]);
+        scene.rotation.set_row(0, [1.0, 0.3, -0.2, 0.5]);
+        extreme(&mut scene);
+        let found = gradients(&scene, &camera, Image::clone);
+        for column in Columns::all().iter() {
+            let planes = found.column(column).planes();
+            assert!(planes.iter().all(|x| x.is_finite()), "extreme {k}, {}: not finite", column.name());
+            // The last three and what is too faint are not drawn.
+            let of_it = (0..found.column(column).width()).all(|c| found.column(column).plane(c)[0] == 0.0);
+            assert!(of_it || (k < 13 && k != 5), "extreme {k}, {}: {planes:?}", column.name());
+        }
+        assert!(found.column(Columns::SH).planes().iter().any(|&x| x != 0.0), "extreme {k}: nothing is left");
+    }
+}
+
+#[test]
+fn one_gaussian_over_the_whole_picture_is_its_alpha() {
+    let mut wall = single(2.0, 1.0, 0.6);
+    wall.log_scale.set_row(0, [40.0f32; 3]);
+    let camera = plain_camera(40);
+    let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0, 0.0, 0.0]));
+    let expected = 0.6 * 0.4 * (1.0 - 0.1) * 1600.0;
+    let got = found.column(Columns::OPACITY).plane(0)[0];
+    assert!((got / expected - 1.0).abs() < 1e-5, "logit: got {got}, expected {expected}");
+    assert!(found.column(Columns::LOG_SCALE).planes().iter().all(|x| x.abs() < 1e-3), "it has no edge");
+}
+
+#[test]
+fn an_alpha_that_is_cut_moves_nothing_but_colour() {
+    let mut wall = single(2.0, 1.0, 0.999);
+    wall.log_scale.set_row(0, [5.0f32; 3]);
+    let camera = plain_camera(40);
+    let found = gradients(&wall, &camera, |_| plain_image(&camera, [1.0; 3]));
+    for column in Columns::all().difference(Columns::SH).iter() {
+        assert!(found.column(column).planes().iter().all(|&x| x == 0.0), "{} moves", column.name());
+    }
+    let got = f64::from(found.column(Columns::SH).plane(0)[0]);
+    let expected = splatsieve::model::SH_C0 * 0.99 * 1600.0;
+    assert!((got / expected - 1.0).abs() < 1e-5, "colour: got {got}, expected {expected}");
+}
+
+#[test]
+fn pixels_that_are_not_finite_count_as_ones_the_loss_does_not_depend_on() {
+    let (scene, camera) = (scene(71, 300, 1), camera(50, 40));
+    let spoiled = |value: f32| {
+        gradients(&scene, &camera, |picture| {
+            let mut pull = picture.clone();
+            (30..33).for_each(|c| pull.data[3 * 777 + c] = value);
+            pull
+        })
+    };
+    let expected = spoiled(0.0);
+    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        assert!(spoiled(value) == expected, "{value}");
+    }
+    assert!(expected != gradients(&scene, &camera, Image::clone), "the pixel says nothing");
+}
+
+#[test]
+fn empty_scenes_and_empty_pictures_are_valid() {
+    assert!(gradients(&Gaussians::zeros(0, 1), &plain_camera(17), Image::clone).is_empty());
+    let nothing = Camera { width: 0, height: 0, ..plain_camera(16) };
+    let found = gradients(&single(2.0, 0.1, 0.5), &nothing, Image::clone);
+    assert!(found == Gradients::new(1, Columns::all(), 0));
+}
