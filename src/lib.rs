@@ -35,6 +35,7 @@ pub mod metrics;
 pub mod model;
 pub mod recipe;
 pub mod reduction;
+pub mod refine;
 pub mod refit;
 pub mod render;
 pub mod report;

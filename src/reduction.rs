@@ -64,6 +64,19 @@ impl Change {
         picked
     }
 
+    /// This change and then `more`, whose harmonics are of no lower degree where both have some.
+    pub fn and(self, mut more: Change) -> Change {
+        for column in self.columns().iter() {
+            let (of, to) = (self.0.column(column), more.0.column_mut(column));
+            if to.is_empty() {
+                *to = of.clone();
+            } else {
+                to.planes_mut().iter_mut().zip(of.planes()).for_each(|(to, of)| *to += of);
+            }
+        }
+        more
+    }
+
     /// Changes the columns `of` of `state`, row by row. A zero leaves the value its bits.
     pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
         for column in (self.columns() & of).iter() {

@@ -7,6 +7,7 @@ use super::journal::Journal;
 use super::measure::{Measure, Outlook, Stages};
 use super::merge::Merge;
 use super::prune::Prune;
+use super::refine::Refine;
 use super::refit::Refit;
 use super::request::{Only, Request};
 use super::rounds::Rounds;
@@ -31,6 +32,8 @@ pub struct Job {
     pub choose: Option<Choose>,
     /// Recolours what is left.
     pub refit: Option<Refit>,
+    /// Moves what is stored of what is left.
+    pub refine: Option<Refine>,
     /// Writes.
     pub emit: Emit,
     has_cameras: bool,
@@ -63,6 +66,7 @@ impl Job {
             merge: merges.then(merge),
             choose: (looks && prunes && recipe.select.choose_by_views).then(choose),
             refit: Refit::of(&recipe.refit).filter(|_| looks),
+            refine: Refine::of(&recipe.refine).filter(|_| looks),
             emit: Emit::new(request, outlook.own_output, merges),
             measure,
             has_cameras: outlook.has_cameras,
@@ -96,6 +100,7 @@ impl Stages for Job {
         needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.refit.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits));
         needs
     }

@@ -11,6 +11,7 @@ pub mod measure;
 mod merge;
 mod prune;
 mod record;
+mod refine;
 mod refit;
 mod request;
 mod rounds;
@@ -124,6 +125,9 @@ fn reduce(
     journal.notes.extend(reduction.proxies.notes.iter().cloned());
     if let Some(refit) = &job.refit {
         reduction = refit.run(scene, &scored, reduction, &mut journal)?;
+    }
+    if let Some(refine) = &job.refine {
+        reduction = refine.run(scene, &scored, reduction, &mut journal)?;
     }
     job.write_down(request, &mut journal);
 

@@ -150,6 +150,19 @@ impl Field {
         self.config.active
     }
 
+    /// Columns of which the state is the raw value, or that and a delta.
+    pub fn added(&self) -> Columns {
+        let mut multiplied = if matches!(self.mask, Mask::None) {
+            Columns::empty()
+        } else {
+            self.active().difference(Columns::ROTATION)
+        };
+        if self.config.apply_rotation {
+            multiplied |= Columns::ROTATION;
+        }
+        Columns::all().difference(multiplied)
+    }
+
     /// The hyper-parameters the field was built with.
     pub fn config(&self) -> &FieldConfig {
         &self.config

@@ -41,6 +41,8 @@ pub struct Recipe {
     pub merge: Merge,
     /// Colours of what is left.
     pub refit: Refit,
+    /// Everything that is stored of what is left.
+    pub refine: Refine,
 }
 
 /// Parameters of the pass over all frames.
@@ -183,6 +185,14 @@ pub struct Merge {
 pub struct Refit {
     pub refit_pictures: u32,
     pub refit_ridge: f64,
+}
+
+/// Parameters of everything that is stored of what is left.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Refine {
+    pub refine_steps: u32,
 }
 
 /// Thresholds of one merge pass.

@@ -1,5 +1,6 @@
 //! An input with the cameras that look at it: what every verb starts from.
 
+pub mod between;
 mod input;
 mod open;
 pub mod pictures;

@@ -1,0 +1,187 @@
+//! Descending a gradient: how far what is stored of Gaussians moves, given how a number changes with it.
+//!
+//! In: derivatives of one picture's loss after another ([`Gradients`]). Out: a [`Change`] of what is stored. Adam
+//! (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015) with a rate for each group of values and no
+//! correction but its own. Memory: [`bytes_per_gaussian`].
+
+use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
+use crate::reduction::Change;
+
+/// Decay of the means of a derivative and of its square, and what keeps a division from 0.
+const BETAS: [f32; 2] = [0.9, 0.999];
+/// See [`BETAS`].
+const EPSILON: f32 = 1e-15;
+/// Steps over which rates grow to their full size: the first means say little.
+const WARM_UP: usize = 10;
+/// Rates at the last step, as a part of those at the first.
+const LAST: f32 = 0.05;
+/// Root mean square error of pictures from which rates are full: what is nearly right must not be shaken.
+const FULL_ERROR: f64 = 0.045;
+
+/// What is stored of Gaussians on its way down.
+#[derive(Debug)]
+pub struct Descent {
+    change: Gaussians,
+    /// Means of the derivatives, and of their squares.
+    means: [Gaussians; 2],
+    /// Rates of positions, by Gaussian.
+    reach: Vec<f32>,
+    /// Whose values stay, `[N]`.
+    fixed: Vec<bool>,
+    columns: Columns,
+    done: i32,
+    steps: usize,
+    factor: f32,
+}
+
+/// Memory of a [`Descent`] and of the derivatives that it follows, for `columns` with harmonics up to `sh_degree`.
+pub fn bytes_per_gaussian(columns: Columns, sh_degree: usize) -> usize {
+    4 * 4 * columns.width(sh_degree) + size_of::<f32>() + size_of::<bool>()
+}
+
+impl Descent {
+    /// From `start`, of which the columns `columns` may move, in `steps` steps; those `fixed` do not. `error` is the
+    /// root mean square error of the pictures at the start.
+    pub fn new(start: &Gaussians, columns: Columns, fixed: Vec<bool>, steps: usize, error: f64) -> Descent {
+        let mut change = Gaussians::default();
+        for column in columns.iter() {
+            *change.column_mut(column) = Column::zeros(start.column(column).width(), start.len());
+        }
+        // Two hundredths of the mean extent.
+        let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
+        let reach = (0..start.len()).map(|i| 0.02 * extent(i).clamp(-80.0, 80.0).exp()).collect();
+        let factor = (error / FULL_ERROR).min(1.0) as f32;
+        Descent { means: [change.clone(), change.clone()], change, reach, fixed, columns, done: 0, steps, factor }
+    }
+
+    /// What is to be added to the start.
+    pub fn change(&self) -> Change {
+        Change(self.change.clone())
+    }
+
+    /// Adds what is to be added to the start to `state`, in the columns that move.
+    pub fn add_to(&self, state: &mut Gaussians) {
+        for column in self.columns.iter() {
+            let (by, to) = (self.change.column(column), state.column_mut(column));
+            to.planes_mut().iter_mut().zip(by.planes()).for_each(|(to, by)| *to += by);
+        }
+    }
+
+    /// One step against `gradients`.
+    ///
+    /// # Panics
+    /// If they are of other Gaussians or columns.
+    pub fn step(&mut self, gradients: &Gradients) {
+        let [warm, late] = [self.done as f32 + 1.0, self.done as f32 / self.steps.max(1) as f32];
+        let schedule = self.factor * (warm / WARM_UP as f32).min(1.0) * LAST.powf(late);
+        self.done += 1;
+        let [first, second] = BETAS;
+        // Of means that began at 0.
+        let unbiased = [first, second].map(|beta| 1.0 / (1.0 - beta.powi(self.done)));
+        for column in self.columns.iter() {
+            let of = gradients.column(column);
+            for c in 0..of.width() {
+                let rate = schedule * rate(column, c);
+                let [means, squares] = &mut self.means;
+                let planes = [means, squares, &mut self.change].map(|of| of.column_mut(column).plane_mut(c));
+                let [mean, square, value] = planes;
+                for (i, &slope) in of.plane(c).iter().enumerate() {
+                    if self.fixed[i] {
+                        continue;
+                    }
+                    mean[i] += (1.0 - first) * (slope - mean[i]);
+                    square[i] += (1.0 - second) * (slope * slope - square[i]);
+                    let root = (square[i] * unbiased[1]).sqrt() + EPSILON;
+                    let reach = if column == Columns::POSITION { self.reach[i] } else { 1.0 };
+                    let next = value[i] - rate * reach * mean[i] * unbiased[0] / root;
+                    if next.is_finite() {
+                        value[i] = next;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// How far component `c` of `column` moves in a step at first; positions in units of their reach.
+fn rate(column: Columns, c: usize) -> f32 {
+    match column {
+        Columns::POSITION => 1.0,
+        Columns::ROTATION => 0.006,
+        Columns::SH if c < 3 * sh_coefficients(0) => 0.015,
+        Columns::SH => 0.001_25,
+        // Log scale and logit.
+        _ => 0.05,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Slopes of Σ (value − aim)² / 2 in every column.
+    fn slopes(state: &Gaussians, aim: f32) -> Gradients {
+        let mut gradients = Gradients::new(state.len(), Columns::all(), 0);
+        for column in Columns::all().iter() {
+            let values = state.column(column).planes();
+            gradients.column_mut(column).planes_mut().iter_mut().zip(values).for_each(|(slope, x)| *slope = x - aim);
+        }
+        gradients
+    }
+
+    #[test]
+    fn values_come_to_rest_where_the_slope_is_zero_and_fixed_ones_do_not_move() {
+        let start = Gaussians::zeros(3, 0);
+        let mut descent = Descent::new(&start, Columns::all(), vec![false, true, false], 2000, 1.0);
+        for _ in 0..2000 {
+            let mut now = start.clone();
+            descent.add_to(&mut now);
+            descent.step(&slopes(&now, 0.25));
+        }
+        let mut end = start.clone();
+        descent.change().add_to(&mut end, Columns::all());
+        for column in Columns::all().iter() {
+            for c in 0..end.column(column).width() {
+                let plane = end.column(column).plane(c);
+                assert_eq!(plane[1], 0.0);
+                assert!((plane[0] - 0.25).abs() < 1e-3 && plane[0] == plane[2], "{column:?} {c}: {plane:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_step_is_that_of_adam_written_out_in_f64() {
+        let start = Gaussians::zeros(1, 0);
+        let (steps, error) = (50, 0.009);
+        let mut descent = Descent::new(&start, Columns::OPACITY, vec![false], steps, error);
+        let (mut value, mut mean, mut square) = (0.0f64, 0.0f64, 0.0f64);
+        for k in 0..steps {
+            let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
+            let slope = (k as f64 * 0.7).sin() + 0.3;
+            gradients.column_mut(Columns::OPACITY).set_row(0, [slope as f32]);
+            descent.step(&gradients);
+            mean = 0.9 * mean + 0.1 * slope;
+            square = 0.999 * square + 0.001 * slope * slope;
+            let t = k as i32 + 1;
+            let size = (mean / (1.0 - 0.9f64.powi(t))) / (square / (1.0 - 0.999f64.powi(t))).sqrt();
+            let rate = 0.05 * 0.2 * (f64::from(t) / 10.0).min(1.0) * 0.05f64.powf(k as f64 / steps as f64);
+            value -= rate * size;
+            let got = f64::from(descent.change().0.opacity_logit.row::<1>(0)[0]);
+            assert!((got - value).abs() < 1e-5, "step {k}: got {got}, expected {value}");
+        }
+    }
+
+    #[test]
+    fn slopes_of_any_size_leave_every_value_finite() {
+        let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), vec![false; 4], 10, 1.0);
+        for slope in [f32::MAX, 1e-38, -f32::MAX, 0.0, 3e20] {
+            let mut gradients = Gradients::new(4, Columns::all(), 0);
+            for column in Columns::all().iter() {
+                gradients.column_mut(column).planes_mut().fill(slope);
+            }
+            descent.step(&gradients);
+        }
+        let change = descent.change();
+        assert!(Columns::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));
+    }
+}
