@@ -1,5 +1,6 @@
 //! Question: what does one picture cost on one core, and how does that grow from 10,000 to a million
-//! Gaussians? And what does scoring one (Gaussian, frame, view) cost, with and without a pixel stride?
+//! Gaussians? What does scoring one (Gaussian, frame, view) cost, with and without a pixel stride? And what does a
+//! picture cost together with its derivative?
 //!
 //! `picture/*` renders and scores a view of each trained model, its state known (skipped where the models
 //! are absent); the bar is 25 ms for `room2_big`. `size/*` does the same for synthetic clouds in a 640×512
@@ -8,6 +9,9 @@
 //! changed, counted by the tests' oracle) of the picture are printed, and how many of each a second at the
 //! median time of some renders. The rival is the C++ AVX-512 port of the
 //! original rasteriser, measured elsewhere: 26, 14 and 12 ms for `room2_big`, `room2_dynerf`, `deform2`.
+//!
+//! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 2.6 times the
+//! picture alone; before each group the ratio is printed. `picture/demo` is a view of the demo scene.
 //!
 //! Times are wall-clock: on a busy machine they are several times the cost. Criterion arguments filter:
 //! `cargo bench --bench render -- picture`.
@@ -23,8 +27,10 @@ use std::time::Instant;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3};
-use splatsieve::model::{Camera, Gaussians};
-use splatsieve::render::{Contribution, Renderer};
+use splatsieve::demo::Scene;
+use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
+use splatsieve::source::{FrameSource, Ids};
+use splatsieve::render::{Contribution, Image, Renderer};
 
 /// Pictures whose median time gives the rates.
 const PICTURES: usize = 21;
@@ -34,26 +40,34 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     let events = oracle::picture(state, camera, [0.0; 3], 1).events;
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
     let mut renderer = Renderer::new();
-    let mut seconds: Vec<f64> = (0..PICTURES)
-        .map(|_| {
-            let start = Instant::now();
-            black_box(renderer.render(state, camera, [0.0; 3]));
-            start.elapsed().as_secs_f64()
-        })
-        .collect();
-    seconds.sort_by(f64::total_cmp);
-    let rate = |amount: f64| amount / seconds[PICTURES / 2] / 1e6;
+    let target = renderer.render(state, camera, [0.5; 3]);
+    let squared_error = |picture: &Image| {
+        let pull: Vec<f32> = picture.data.iter().zip(&target.data).map(|(a, b)| a - b).collect();
+        let error = pull.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>();
+        (0.5 * error, Image { data: pull, ..*picture })
+    };
+    let degree = (state.sh.width() / 3).isqrt() - 1;
+    let mut gradients = Gradients::new(count, Columns::all(), degree);
+    let seconds = median(|| drop(black_box(renderer.render(state, camera, [0.0; 3]))));
+    let differentiated = median(|| {
+        black_box(renderer.gradient(state, camera, [0.0; 3], squared_error, &mut gradients));
+    });
+    let rate = |amount: f64| amount / seconds / 1e6;
     eprintln!(
-        "{group} {name}: {count} Gaussians, {pixels} pixels, {events} blend events in {:.1} ms: {:.1}, {:.1} and {:.0} million a second",
-        1e3 * seconds[PICTURES / 2],
+        "{group} {name}: {count} Gaussians, {pixels} pixels, {events} blend events in {:.1} ms: {:.1}, {:.1} and {:.0} million a second; with its derivative {:.2} times as long",
+        1e3 * seconds,
         rate(count as f64),
         rate(pixels as f64),
-        rate(events as f64)
+        rate(events as f64),
+        differentiated / seconds
     );
     let mut group = criterion.benchmark_group(group);
     group.sample_size(20).throughput(Throughput::Elements(count as u64));
     group.bench_function(BenchmarkId::new("render", name), |b| {
         b.iter(|| renderer.render(state, camera, [0.0; 3]));
+    });
+    group.bench_function(BenchmarkId::new("gradient", name), |b| {
+        b.iter(|| renderer.gradient(state, camera, [0.0; 3], squared_error, &mut gradients));
     });
     let mut seen = Contribution::new(count);
     for stride in [1, 2, 4].into_iter().filter_map(NonZeroU32::new) {
@@ -64,7 +78,25 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     group.finish();
 }
 
+/// Median time of some runs, seconds.
+fn median(mut run: impl FnMut()) -> f64 {
+    let mut seconds: Vec<f64> = (0..PICTURES)
+        .map(|_| {
+            let start = Instant::now();
+            run();
+            start.elapsed().as_secs_f64()
+        })
+        .collect();
+    seconds.sort_by(f64::total_cmp);
+    seconds[PICTURES / 2]
+}
+
 fn pictures(criterion: &mut Criterion) {
+    let demo = Scene::new(Scene::COUNT, Scene::FRAMES);
+    let mut state = Gaussians::zeros(0, demo.info().sh_degree);
+    let everything = Ids::Range(0..demo.info().count);
+    demo.open(everything).unwrap().read(Scene::FRAMES / 2, Columns::all(), &mut state).unwrap();
+    measure(criterion, "picture", "demo", &state, &demo.rig().cameras[0]);
     let Some(folder) = models::folder() else { return };
     for name in models::NAMES {
         let model = models::Model::open(&folder, name);

@@ -384,7 +384,7 @@ mod tests {
 
     #[test]
     fn sixteen_bits_hold_a_value_to_a_hundred_thousandth() {
-        let picture = Image { width: 1, height: 1, data: vec![0.0, 1.0, 0.123_456], ..Image::default() };
+        let picture = Image { width: 1, height: 1, data: vec![0.0, 1.0, 0.123_456] };
         let back: Vec<f32> = narrow(&picture).into_iter().map(wide).collect();
         assert!(back.iter().zip(&picture.data).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?}");
         let odd = Image { data: vec![-3.0, f32::NAN, 7.0], ..picture };

@@ -98,20 +98,19 @@ impl GradientSpan<'_> {
         self.columns
     }
 
-    /// Adds `parts`, one per component, to the sums of Gaussian `id` in a single column, if that is differentiated. A
-    /// part that is not finite, or that f32 could not hold the sum with, is left out.
+    /// Adds `parts` to the sums of a component of a single column, of Gaussian `first` and those after it, if that
+    /// column and component are differentiated. A part that is not finite, or that f32 could not hold the sum with, is
+    /// left out, and so are parts for Gaussians beyond the span.
     ///
     /// # Panics
-    /// If `id` is not one of the span.
-    #[inline]
-    pub fn add(&mut self, column: Columns, id: usize, parts: impl IntoIterator<Item = f64>) {
+    /// If `first` lies before the span, or more than one beyond it.
+    #[inline(always)]
+    pub fn add(&mut self, column: Columns, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
         let planes = &mut self.planes[column.bits().trailing_zeros() as usize];
-        for (plane, part) in planes.iter_mut().zip(parts) {
-            let sum = &mut plane[id - self.ids.start];
-            let next = *sum + part as f32;
-            if next.is_finite() {
-                *sum = next;
-            }
+        let Some(plane) = planes.get_mut(component) else { return };
+        for (sum, part) in plane[first - self.ids.start..].iter_mut().zip(parts) {
+            let next = *sum + part;
+            *sum = if next.is_finite() { next } else { *sum };
         }
     }
 }
@@ -126,15 +125,16 @@ mod tests {
         for (len, span) in [(0, 3), (1, 3), (7, 3), (6, 3), (5, 100)] {
             let mut gradients = Gradients::new(len, columns, 1);
             for mut span in gradients.spans(span) {
-                for id in span.ids() {
-                    span.add(Columns::POSITION, id, [1.0, 2.0, 3.0]);
-                    span.add(Columns::ROTATION, id, [9.0; 4]);
-                    span.add(Columns::SH, id, (0..48).map(f64::from));
+                let ids = span.ids();
+                for c in 0..48 {
+                    for column in [Columns::POSITION, Columns::ROTATION, Columns::SH] {
+                        span.add(column, c, ids.start, vec![c as f32; ids.len()]);
+                    }
                 }
             }
             assert!(gradients.column(Columns::ROTATION).is_empty());
             for id in 0..len {
-                assert_eq!(gradients.column(Columns::POSITION).row(id), [1.0, 2.0, 3.0]);
+                assert_eq!(gradients.column(Columns::POSITION).row(id), [0.0, 1.0, 2.0]);
                 assert_eq!(gradients.column(Columns::SH).row::<12>(id), std::array::from_fn(|c| c as f32));
             }
         }
@@ -143,8 +143,8 @@ mod tests {
     #[test]
     fn what_f32_cannot_hold_is_left_out() {
         let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
-        for part in [3e38, f64::NAN, 3e38, f64::NEG_INFINITY, 1e300, -1e38] {
-            gradients.spans(1)[0].add(Columns::OPACITY, 0, [part]);
+        for part in [3e38, f32::NAN, 3e38, f32::NEG_INFINITY, -1e38] {
+            gradients.spans(1)[0].add(Columns::OPACITY, 0, 0, [part]);
         }
         assert_eq!(gradients.column(Columns::OPACITY).plane(0), [3e38f32 - 1e38]);
     }

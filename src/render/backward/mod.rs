@@ -16,13 +16,14 @@ use rayon::prelude::*;
 
 use super::bin::STRIP_PAIRS;
 use super::blend::Lattice;
+use super::convention::BLOCK;
 use super::project::View;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
 use crate::model::{Camera, Columns, Gaussians, GradientSpan, Gradients};
 use tile::{Pull, Pulled, Sums};
 
-/// Gaussians whose gradients one task adds to.
-const SPAN: usize = 4096;
+/// Gaussians whose gradients one task adds to: whole blocks.
+const SPAN: usize = 32 * BLOCK;
 
 /// Memory of a picture that is differentiated per Gaussian it shows.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<Sums<f64>>();
@@ -64,9 +65,7 @@ impl Renderer {
         let add = |mut span: GradientSpan<'_>| {
             let [start, end] =
                 [span.ids().start, span.ids().end].map(|id| splats.partition_point(|splat| (splat.id as usize) < id));
-            for (splat, sums) in splats[start..end].iter().zip(&sums[start..end]) {
-                splat::add(gaussians, splat, sums, &view, &mut span);
-            }
+            splat::add(gaussians, &splats[start..end], &sums[start..end], &view, &mut span);
         };
         if self.parallel {
             out.spans(SPAN).into_par_iter().for_each(add);

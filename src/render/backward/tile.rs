@@ -14,8 +14,8 @@ use super::super::renderer::Image;
 
 /// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
 ///
-/// With p = alpha · ∂L/∂alpha and a pixel's offset (s, t) from the splat's centre in its standard deviations: t along
-/// v, s along u where the row's alpha is largest. s² + t² is at most 2·ln 255, so no size of a splat makes a sum large.
+/// With p = alpha · ∂L/∂alpha and a pixel's offset (s, t) in standard deviations: t along v from the splat's centre, s
+/// along u from the middle of the row. s² + t² is at most 2·ln 255, so no size of a splat makes a sum large.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Sums<T> {
     /// Σ p.
@@ -29,6 +29,7 @@ pub(super) struct Sums<T> {
 }
 
 impl Sums<f64> {
+    #[inline(always)]
     pub(super) fn add(&mut self, tile: &Sums<f32>) {
         self.p += f64::from(tile.p);
         (0..2).for_each(|k| self.first[k] += f64::from(tile.first[k]));
@@ -111,31 +112,34 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
         }
         let [red, green, blue] = walked.colour;
         let own = red.mul(pixel[0]).add(green.mul(pixel[1])).add(blue.mul(pixel[2]));
-        let rest = V::load(&self.pull.rest[group]).sub(weight.mul(own));
+        let own = weight.mul(own);
+        let rest = V::load(&self.pull.rest[group]).sub(own);
         rest.store(&mut self.pull.rest[group]);
         // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing.
-        let p = weight.mul(own.sub(rest.div(left)));
+        let p = own.sub(weight.div(left).mul(rest));
         let p = alpha.at_least(V::splat(MAX_ALPHA)).select(V::splat(0.0), p);
-        let s = across.mul(V::splat(walked.per_pixel[0]));
-        let t = V::splat(down * walked.per_pixel[1]);
-        let (ps, pt) = (p.mul(s), p.mul(t));
+        let down = V::splat(down);
+        let (px, py) = (p.mul(across), p.mul(down));
         walked.p = walked.p.add(p);
-        walked.first = [walked.first[0].add(ps), walked.first[1].add(pt)];
-        let [ss, st, tt] = walked.second;
-        walked.second = [ss.add(ps.mul(s)), st.add(ps.mul(t)), tt.add(pt.mul(t))];
+        walked.first = [walked.first[0].add(px), walked.first[1].add(py)];
+        let [xx, xy, yy] = walked.second;
+        walked.second = [xx.add(px.mul(across)), xy.add(px.mul(down)), yy.add(py.mul(down))];
         walked
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, walked: Walked<V>, pair: usize) {
         let colour = walked.taken.map(lane_sum);
-        self.pairs[pair] = match SHAPE {
-            true => Sums {
+        self.pairs[pair] = if SHAPE {
+            let [per_x, per_y] = walked.per_pixel;
+            let ([x, y], [xx, xy, yy]) = (walked.first.map(lane_sum), walked.second.map(lane_sum));
+            Sums {
                 p: lane_sum(walked.p),
-                first: walked.first.map(lane_sum),
-                second: walked.second.map(lane_sum),
+                first: [x * per_x, y * per_y],
+                second: [xx * per_x * per_x, xy * per_x * per_y, yy * per_y * per_y],
                 colour,
-            },
-            false => Sums { colour, ..Sums::default() },
+            }
+        } else {
+            Sums { colour, ..Sums::default() }
         };
     }
 }
