@@ -29,8 +29,8 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use glam::{DMat3, DVec3};
 use splatsieve::demo::Scene;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
-use splatsieve::source::{FrameSource, Ids};
 use splatsieve::render::{Contribution, Image, Renderer};
+use splatsieve::source::{FrameSource, Ids};
 
 /// Pictures whose median time gives the rates.
 const PICTURES: usize = 21;
