@@ -6,21 +6,14 @@
 
 DATA/<name>/ is a model folder with its cameras inside and, if there are any, held-out photographs in test/. Prints a
 Markdown table: mean PSNR of 15 frames of every held-out view against the unpruned model's own pictures and against the
-photographs, plain → refined, the time of each run and of the stage, and the peak. Standard library only.
+photographs, plain → refined, and the peak of both runs. Standard library only.
 """
 
-import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-
-def run(*command):
-    result = subprocess.run([str(part) for part in command], capture_output=True, text=True)
-    if result.returncode != 0:
-        sys.exit(f"{' '.join(map(str, command))}\n{result.stderr}")
-    return json.loads(result.stdout)
+from models_table import run
 
 
 def point(binary, model, ratio, steps, output):
@@ -28,13 +21,10 @@ def point(binary, model, ratio, steps, output):
     summary = run(binary, "compress", model, "--cameras", model, "-o", output, *options)
     truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
     quality = run(binary, "evaluate", model, output, "--cameras", model, *truth, "--max-frames", 15, "--json")
-    seconds = {stage["name"]: stage["seconds"] for stage in summary["stages"]}
     return {
         "psnr": quality["psnr"],
         "photos": quality["ground_truth"]["psnr"] if truth else None,
         "original": quality["ground_truth"]["original"]["psnr"] if truth else None,
-        "seconds": sum(stage["seconds"] for stage in summary["stages"]),
-        "refine": seconds.get("refine", 0.0),
         "peak": max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"]) / 2**20,
     }
 
@@ -46,8 +36,8 @@ def main():
     binary, data = sys.argv[1], Path(sys.argv[2])
     steps = sys.argv[3] if len(sys.argv) > 3 else "500"
     ratios = sys.argv[4:] or ["0.4", "0.2", "0.1", "0.05"]
-    print("| model | kept | PSNR dB to the original | PSNR dB to photographs (unpruned) | s in all | s refining | MiB |")
-    print("|---|---|---|---|---|---|---|")
+    print("| model | kept | PSNR dB to the original | PSNR dB to photographs (unpruned) | MiB |")
+    print("|---|---|---|---|---|")
     for model in sorted(path.parent for path in data.glob("*/cfg_args")):
         for ratio in ratios:
             with tempfile.TemporaryDirectory() as folder:
@@ -58,7 +48,6 @@ def main():
                 photos = f"{plain['photos']:.2f} → {moved['photos']:.2f} ({moved['original']:.2f})"
             print(
                 f"| {model.name} | {100 * float(ratio):.0f}% | {plain['psnr']:.1f} → {moved['psnr']:.1f} | {photos} "
-                f"| {plain['seconds']:.1f} → {moved['seconds']:.1f} | {moved['refine']:.1f} "
                 f"| {plain['peak']:.0f} → {moved['peak']:.0f} |",
                 flush=True,
             )
