@@ -4,13 +4,14 @@
 //! position, scale and rotation) and DyNeRF style (width 128, two levels of 16 channels; all five heads).
 //! The rival is the original PyTorch code, which needs 2.3 to 3.1 µs and 4.6 µs on one core of the machine
 //! these were first run on. Positions alone are measured too: the scan of a model without opacity
-//! deformation asks for no more. Invert the throughput to get the time per Gaussian and frame.
+//! deformation asks for no more; and the derivative of a state by positions, which a refinement asks for in every step.
+//! Invert the throughput to get the time per Gaussian and frame.
 
 use std::path::Path;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Deltas, Field, FieldConfig, Scratch, Tensor, Tensors};
-use splatsieve::model::{Column, Columns};
+use splatsieve::model::{Column, Columns, Gaussians, Gradients};
 
 const BLOCK: usize = 1024;
 
@@ -78,6 +79,20 @@ fn deform(criterion: &mut Criterion) {
             bencher.iter(|| {
                 frame = (frame + 1) % 60;
                 field.deltas(&prepared, frame as f64 / 60.0, want, &mut scratch, &mut out)
+            });
+        });
+    }
+    // The derivative of a step that changes positions: forward to the position's head and back.
+    let mut raw = Gaussians::zeros(BLOCK, 3);
+    raw.position = position;
+    for (name, field) in
+        [("dnerf_pull_back", field(64, 32, three)), ("dynerf_pull_back", field(128, 16, Columns::all()))]
+    {
+        let mut gradients = Gradients::new(BLOCK, Columns::POSITION, 0);
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| {
+                gradients.column_mut(Columns::POSITION).planes_mut().fill(1.0);
+                gradients.spans(BLOCK).iter_mut().try_for_each(|span| field.pull_back(&raw, 0.4, span))
             });
         });
     }

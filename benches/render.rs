@@ -46,8 +46,7 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
         let error = pull.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>();
         (0.5 * error, Image { data: pull, ..*picture })
     };
-    let degree = (state.sh.width() / 3).isqrt() - 1;
-    let mut gradients = Gradients::new(count, Columns::all(), degree);
+    let mut gradients = Gradients::new(count, Columns::all(), state.sh_degree());
     let seconds = median(|| drop(black_box(renderer.render(state, camera, [0.0; 3]))));
     let differentiated = median(|| {
         black_box(renderer.gradient(state, camera, [0.0; 3], squared_error, &mut gradients));

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Columns, Gaussians, Gradients, SequenceInfo};
 
 /// Which Gaussians of a sequence a reader covers.
 #[derive(Debug, Clone)]
@@ -167,6 +167,13 @@ pub trait FrameSource: Send + Sync {
     /// per Gaussian, may be more than theirs.
     fn open_all(&self, _wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
+    }
+
+    /// Turns derivatives by the state at `frame` of all Gaussians into derivatives by what is stored of them once for
+    /// all frames. What has a body here is right for explicit trajectories, of which a change of a state is a change at
+    /// every frame.
+    fn pull_back(&self, _frame: usize, _gradients: &mut Gradients) -> Result<()> {
+        Ok(())
     }
 
     /// What was read so far, by all readers; nothing where nobody counts.

@@ -10,8 +10,7 @@ const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
 /// The gradients of a loss whose derivative by the picture is `pull`.
 fn gradients(gaussians: &Gaussians, camera: &Camera, pull: impl FnOnce(&Image) -> Image) -> Gradients {
-    let degree = (gaussians.sh.width() / 3).isqrt() - 1;
-    let mut gradients = Gradients::new(gaussians.len(), Columns::all(), degree);
+    let mut gradients = Gradients::new(gaussians.len(), Columns::all(), gaussians.sh_degree());
     Renderer::new().gradient(gaussians, camera, BACKGROUND, |picture| (0.0, pull(picture)), &mut gradients);
     gradients
 }

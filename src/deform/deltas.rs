@@ -1,6 +1,6 @@
-//! What the field changes: state = raw·mask + delta, and back.
+//! What the field changes: state = raw·mask + delta, back, and the derivative.
 
-use crate::model::{Columns, Gaussians};
+use crate::model::{Column, Columns, Gaussians, GradientSpan};
 
 /// Changes of a block of Gaussians at one time.
 ///
@@ -59,6 +59,26 @@ impl Deltas {
         }
     }
 
+    /// Turns derivatives by the state into derivatives by the raw parameters, deltas and masks held as they are; 0
+    /// where one would not be finite. `rotation` is raw; it and this are of the Gaussians of `gradients`.
+    pub(super) fn pull_back(&self, rotation: &Column, gradients: &mut GradientSpan<'_>) {
+        for column in self.active.iter() {
+            let planes = gradients.planes(column);
+            if column == Columns::ROTATION && self.multiply_rotation {
+                let [w, x, y, z] = planes else { continue };
+                for i in 0..rotation.len() {
+                    let by_state = [w[i], x[i], y[i], z[i]];
+                    let by_raw = pull_unit_product(rotation.row(i), self.delta.rotation.row(i), by_state);
+                    [w[i], x[i], y[i], z[i]] = by_raw.map(finite);
+                }
+            } else if let Some(mask) = self.mask.as_ref().filter(|_| column != Columns::ROTATION) {
+                for plane in planes {
+                    plane.iter_mut().zip(mask).for_each(|(by, mask)| *by = finite(*by * mask));
+                }
+            }
+        }
+    }
+
     /// The raw parameters whose state is `state`, in the columns `want`: the inverse of [`Deltas::apply`].
     /// Exact to rounding; a rotation is recovered up to its length. Where a mask or a rotation delta is
     /// zero no raw value leads to `state` and the result is not finite.
@@ -103,4 +123,23 @@ fn product(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
 fn unit(q: [f32; 4]) -> [f32; 4] {
     let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
     if length == 0.0 { q } else { q.map(|x| x / length) }
+}
+
+/// `x`, or 0 if it is not finite.
+fn finite(x: f32) -> f32 {
+    if x.is_finite() { x } else { 0.0 }
+}
+
+/// Derivative by `a`, given that by the product of `a` and `b` at unit length; none where that is zero.
+fn pull_unit_product(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
+    let whole = product(a, b);
+    let length = whole.iter().map(|x| x * x).sum::<f32>().sqrt();
+    if length == 0.0 {
+        return [0.0; 4];
+    }
+    let direction = whole.map(|x| x / length);
+    let radial: f32 = direction.iter().zip(by_unit).map(|(x, by)| x * by).sum();
+    let by_product = std::array::from_fn(|c| (by_unit[c] - radial * direction[c]) / length);
+    let [w, x, y, z] = b;
+    product(by_product, [w, -x, -y, -z])
 }

@@ -35,7 +35,7 @@ pub struct FieldConfig {
 }
 
 #[derive(Debug, Clone)]
-enum Mask {
+pub(super) enum Mask {
     None,
     /// The last head, of the hidden features: varies with time.
     Head,
@@ -45,23 +45,23 @@ enum Mask {
 
 /// One head: hidden layer, ReLU, output layer, on top of the trunk's ReLU.
 #[derive(Debug, Clone)]
-struct Head {
+pub(super) struct Head {
     /// The column it deforms; none for the mask of `static_mlp`.
-    column: Option<Columns>,
-    hidden: Linear,
-    output: Linear,
+    pub(super) column: Option<Columns>,
+    pub(super) hidden: Linear,
+    pub(super) output: Linear,
 }
 
 /// A 4DGaussians deformation field. Evaluates any block of Gaussians at any time; the result of a
 /// Gaussian has the same bits whatever block it is evaluated in.
 #[derive(Debug, Clone)]
 pub struct Field {
-    config: FieldConfig,
+    pub(super) config: FieldConfig,
     /// None when the trunk reads positions.
-    planes: Option<Planes>,
-    trunk: Vec<Linear>,
-    heads: Vec<Head>,
-    mask: Mask,
+    pub(super) planes: Option<Planes>,
+    pub(super) trunk: Vec<Linear>,
+    pub(super) heads: Vec<Head>,
+    pub(super) mask: Mask,
 }
 
 /// What does not depend on time for one block of Gaussians.
@@ -273,11 +273,8 @@ impl Field {
                     }
                 }
                 (_, PreparedInput::Position(position)) => {
-                    features.clear();
-                    features.resize(4, Lanes([time; LANES]));
-                    for (axis, out) in features[..3].iter_mut().enumerate() {
-                        out.0[..lanes].copy_from_slice(&position.plane(axis)[start..start + lanes]);
-                    }
+                    let places = [0, 1, 2].map(|axis| &position.plane(axis)[start..start + lanes]);
+                    place_features(places, time, features);
                 }
                 (None, PreparedInput::Planes(_)) => {}
             }
@@ -299,6 +296,16 @@ impl Field {
     }
 }
 
+/// What the trunk reads where it reads `[x, y, z, t]`; `places` are by axis.
+#[inline(always)]
+pub(super) fn place_features(places: [&[f32]; 3], time: f32, features: &mut Vec<Lanes>) {
+    features.clear();
+    features.resize(4, Lanes([time; LANES]));
+    for (out, place) in features.iter_mut().zip(places) {
+        out.0[..place.len()].copy_from_slice(place);
+    }
+}
+
 /// Runs the trunk on `input`; gives its ReLU-ed output, as every head wants it.
 #[inline(always)]
 fn run_trunk<'a, const FMA: bool>(
@@ -314,7 +321,7 @@ fn run_trunk<'a, const FMA: bool>(
 }
 
 /// `[f, sin(p·f), cos(p·f)]` of features f.
-fn add_frequencies(features: &mut Vec<Lanes>, p: f32) {
+pub(super) fn add_frequencies(features: &mut Vec<Lanes>, p: f32) {
     let plain = features.clone();
     for of in [f32::sin, f32::cos] {
         features.extend(plain.iter().map(|f| Lanes(f.0.map(|f| of(p * f)))));

@@ -55,6 +55,11 @@ impl Linear {
         Ok(layer)
     }
 
+    /// Outputs in whole panels.
+    pub(super) fn padded_outputs(&self) -> usize {
+        self.bias.len() * PANEL
+    }
+
     /// Multiplications by weights that a Gaussian takes.
     pub(super) fn multiplications(&self) -> usize {
         self.weight.len() * PANEL
@@ -64,7 +69,7 @@ impl Linear {
     /// `f32::max`.
     #[inline(always)]
     pub(super) fn activate<const FMA: bool>(&self, input: &[Lanes], out: &mut Vec<Lanes>) {
-        out.resize(self.bias.len() * PANEL, Lanes([0.0; LANES]));
+        out.resize(self.padded_outputs(), Lanes([0.0; LANES]));
         let panels = self.weight.chunks_exact(self.inputs).zip(&self.bias);
         for (out, (weight, bias)) in out.chunks_exact_mut(PANEL).zip(panels) {
             let sums = sums::<FMA>(input, weight, bias);
@@ -72,6 +77,31 @@ impl Linear {
                 for (out, &y) in out.0.iter_mut().zip(&y.0) {
                     *out = if y < 0.0 { 0.0 } else { y };
                 }
+            }
+        }
+    }
+
+    /// Derivatives by the inputs into `out`, given those by the outputs, both in whole panels that are 0 beyond the
+    /// last; 0 where `kept`, the inputs as ReLU left them, is not positive.
+    #[inline(always)]
+    pub(super) fn pull<const FMA: bool>(&self, by_output: &[Lanes], kept: Option<&[Lanes]>, out: &mut Vec<Lanes>) {
+        out.resize(self.inputs.next_multiple_of(PANEL), Lanes([0.0; LANES]));
+        for (first, out) in (0..self.inputs).step_by(PANEL).zip(out.chunks_exact_mut(PANEL)) {
+            let mut sums = [Lanes([0.0; LANES]); PANEL];
+            for (weight, by) in self.weight.chunks_exact(self.inputs).zip(by_output.chunks_exact(PANEL)) {
+                for (sum, weight) in sums.iter_mut().zip(&weight[first..]) {
+                    for (&w, by) in weight.iter().zip(by) {
+                        for (sum, &by) in sum.0.iter_mut().zip(&by.0) {
+                            *sum = if FMA { by.mul_add(w, *sum) } else { by * w + *sum };
+                        }
+                    }
+                }
+            }
+            out.copy_from_slice(&sums);
+        }
+        for (out, kept) in out.iter_mut().zip(kept.unwrap_or_default()) {
+            for (out, &kept) in out.0.iter_mut().zip(&kept.0) {
+                *out = if kept > 0.0 { *out } else { 0.0 };
             }
         }
     }

@@ -6,6 +6,8 @@ mod linear;
 #[cfg(test)]
 mod oracle;
 mod planes;
+mod pull;
+mod slopes;
 mod tensors;
 #[cfg(test)]
 mod tests;

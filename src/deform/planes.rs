@@ -18,23 +18,23 @@ const X: usize = 0;
 const Y: usize = 1;
 const Z: usize = 2;
 /// Axis pairs of the planes without time, as (place in the state dict, a, b).
-const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
+pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
 /// Places in the state dict of the planes (x,t), (y,t), (z,t).
 const TEMPORAL: [usize; 3] = [2, 4, 5];
 
 /// A plane over axes (a, b), `[size_b, size_a, channels]`: one sample is contiguous.
 #[derive(Debug, Clone)]
-struct Plane {
-    size_a: usize,
-    size_b: usize,
+pub(super) struct Plane {
+    pub(super) size_a: usize,
+    pub(super) size_b: usize,
     texels: Vec<f32>,
 }
 
 #[derive(Debug, Clone)]
-struct Level {
-    channels: usize,
-    spatial: [Plane; 3],
-    temporal: [Plane; 3],
+pub(super) struct Level {
+    pub(super) channels: usize,
+    pub(super) spatial: [Plane; 3],
+    pub(super) temporal: [Plane; 3],
 }
 
 /// The time planes of a level at one time, by axis: `[size_a, channels]` each.
@@ -44,18 +44,18 @@ pub(super) type Lines = [Vec<f32>; 3];
 #[derive(Debug, Clone)]
 pub(super) struct Planes {
     /// Corner mapped to −1, by axis; the model stores the MAX corner here.
-    origin: [f32; 3],
+    pub(super) origin: [f32; 3],
     /// 2 / (other corner − origin).
-    factor: [f32; 3],
-    levels: Vec<Level>,
+    pub(super) factor: [f32; 3],
+    pub(super) levels: Vec<Level>,
 }
 
 /// Where a coordinate falls between texels `low` and `high`; `fraction` is the weight of `high`.
 #[derive(Debug, Clone, Copy)]
-struct Tap {
-    low: u32,
-    high: u32,
-    fraction: f32,
+pub(super) struct Tap {
+    pub(super) low: u32,
+    pub(super) high: u32,
+    pub(super) fraction: f32,
 }
 
 /// What of the features of a block does not depend on time.
@@ -81,7 +81,7 @@ impl Plane {
         Ok((Plane { size_a, size_b, texels }, channels))
     }
 
-    fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
+    pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
         let start = (b as usize * self.size_a + a as usize) * channels;
         &self.texels[start..start + channels]
     }
@@ -106,7 +106,7 @@ impl Plane {
 
 /// The tap of normalised coordinate `u` on `size` texels: align_corners, border padding.
 /// A NaN coordinate gives a NaN fraction, hence NaN features.
-fn tap(u: f32, size: usize) -> Tap {
+pub(super) fn tap(u: f32, size: usize) -> Tap {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
     let low = x.floor();
@@ -115,7 +115,7 @@ fn tap(u: f32, size: usize) -> Tap {
 
 /// The two texels of a line that a tap lies between, and its fraction.
 #[inline(always)]
-fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
+pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
     let texel = |at: u32| &line[at as usize * channels..][..channels];
     ([texel(tap.low), texel(tap.high)], tap.fraction)
 }

@@ -128,6 +128,11 @@ impl Gaussians {
         self.len() == 0
     }
 
+    /// Degree of the spherical harmonics.
+    pub fn sh_degree(&self) -> usize {
+        (self.sh.width() / 3).isqrt().saturating_sub(1)
+    }
+
     /// Makes room for `len` Gaussians; the values are unspecified until written.
     pub fn resize(&mut self, len: usize) {
         for column in Columns::all().iter() {

@@ -87,7 +87,7 @@ pub struct GradientSpan<'a> {
     planes: [Vec<&'a mut [f32]>; 5],
 }
 
-impl GradientSpan<'_> {
+impl<'a> GradientSpan<'a> {
     /// Whose sums they are.
     pub fn ids(&self) -> Range<usize> {
         self.ids.clone()
@@ -98,6 +98,11 @@ impl GradientSpan<'_> {
         self.columns
     }
 
+    /// The sums of a single column, a plane per component; none if it is not differentiated.
+    pub fn planes(&mut self, column: Columns) -> &mut [&'a mut [f32]] {
+        &mut self.planes[column.bits().trailing_zeros() as usize]
+    }
+
     /// Adds `parts` to the sums of a component of a single column, of Gaussian `first` and those after it, if that
     /// column and component are differentiated. A part that is not finite, or that f32 could not hold the sum with, is
     /// left out, and so are parts for Gaussians beyond the span.
@@ -106,9 +111,9 @@ impl GradientSpan<'_> {
     /// If `first` lies before the span, or more than one beyond it.
     #[inline(always)]
     pub fn add(&mut self, column: Columns, component: usize, first: usize, parts: impl IntoIterator<Item = f32>) {
-        let planes = &mut self.planes[column.bits().trailing_zeros() as usize];
-        let Some(plane) = planes.get_mut(component) else { return };
-        for (sum, part) in plane[first - self.ids.start..].iter_mut().zip(parts) {
+        let start = first - self.ids.start;
+        let Some(plane) = self.planes(column).get_mut(component) else { return };
+        for (sum, part) in plane[start..].iter_mut().zip(parts) {
             let next = *sum + part;
             *sum = if next.is_finite() { next } else { *sum };
         }

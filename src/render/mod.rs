@@ -1,11 +1,12 @@
 //! What a camera sees of one frame's Gaussians: EWA splatting on the CPU.
 //!
-//! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend`
-//! (pixels). Data in: [`Gaussians`] in stored encoding and a [`Camera`]. Data out: an [`Image`], or the
-//! [`Contribution`] or [`RemovalError`] of every Gaussian, or a [`ColorOperator`], the picture as a linear map from
-//! colours. Memory: [`BYTES_PER_VISIBLE`], and up to [`STRIP_BYTES`] for pairs of a Gaussian and a 16×16 tile
-//! it can change, which are made for as many tiles at a time as that takes; a tile that more Gaussians than
-//! that reach takes 12 bytes for each.
+//! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend` (pixels), and
+//! `backward` from there. Data in: [`Gaussians`](crate::model::Gaussians) in stored encoding and a
+//! [`Camera`](crate::model::Camera). Data out: an [`Image`], or the [`Contribution`] or [`RemovalError`] of every
+//! Gaussian, or a [`ColorOperator`], the picture as a linear map from colours, or the
+//! [`Gradients`](crate::model::Gradients) of a loss. Memory: [`BYTES_PER_VISIBLE`], and up to [`STRIP_BYTES`] for pairs
+//! of a Gaussian and a 16×16 tile it can change, which are made for as many tiles at a time as that takes; a tile that
+//! more Gaussians than that reach takes 12 bytes for each.
 //!
 //! Every convention is that of the original CUDA rasteriser (Kerbl et al., "3D Gaussian Splatting", 2023),
 //! decided to the sentence because each costs tens of dB; what the reach of alpha ≥ 1/255 lets us skip

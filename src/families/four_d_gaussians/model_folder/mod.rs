@@ -9,13 +9,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use rayon::prelude::*;
 use xxhash_rust::xxh3::Xxh3;
 
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians, SequenceInfo};
+use crate::model::{Column, Columns, Gaussians, Gradients, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads, Wanted};
-use crate::stream::gather;
+use crate::stream::{BLOCK, gather};
 
 use super::cfg_args::ModelConfig;
 use super::pth::read_state_dict;
@@ -180,6 +181,12 @@ impl ModelFolder {
         &self.field
     }
 
+    fn time_of(&self, frame: usize) -> Result<f64> {
+        let times = &self.info.times;
+        let missing = || Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len()));
+        times.get(frame).copied().ok_or_else(missing)
+    }
+
     /// What the field would change at `time` about Gaussians at canonical `position` `[N, 3]`, which
     /// need not be Gaussians of this model. [`Deltas::solve`] turns a wanted state into raw parameters.
     pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
@@ -222,6 +229,14 @@ impl FrameSource for ModelFolder {
         Some(Ok(Box::new(WholeModel { model: self, ids: (0..self.info.count as u32).collect() })))
     }
 
+    /// Blocks at once.
+    fn pull_back(&self, frame: usize, gradients: &mut Gradients) -> Result<()> {
+        assert_eq!(gradients.len(), self.info.count, "gradients of another model");
+        let time = self.time_of(frame)?;
+        let mut blocks = gradients.spans(BLOCK);
+        blocks.par_iter_mut().try_for_each(|block| self.field.pull_back(&self.canonical, time, block))
+    }
+
     fn reads(&self) -> Reads {
         Reads { states: self.states.get(), ..Reads::default() }
     }
@@ -253,10 +268,7 @@ struct FieldReader<'a> {
 
 impl BlockReader for FieldReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let times = &self.model.info.times;
-        let Some(&time) = times.get(frame) else {
-            return Err(Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len())));
-        };
+        let time = self.model.time_of(frame)?;
         if !want.is_empty() {
             self.model.states.add(self.raw.len() as u64);
         }

@@ -251,3 +251,53 @@ fn the_digest_depends_on_every_byte_of_the_three_files() {
     digests.dedup();
     assert_eq!(digests.len(), 4, "{digests:?}");
 }
+
+#[test]
+fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_number_of_threads() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+    let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
+    let n = model.info().count;
+    let mut by_state = Gradients::new(n, Columns::all(), 3);
+    for column in Columns::all().iter() {
+        // Low-discrepancy steps, as good as noise.
+        let sums = by_state.column_mut(column).planes_mut().iter_mut().enumerate();
+        sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
+    }
+    let mut by_raw = by_state.clone();
+    model.pull_back(1, &mut by_raw).unwrap();
+    for threads in [1, 2, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mut again = by_state.clone();
+        pool.install(|| model.pull_back(1, &mut again)).unwrap();
+        assert!(again == by_raw, "{threads} threads");
+    }
+    for column in Columns::all().difference(Columns::POSITION).iter() {
+        assert!(by_raw.column(column) == by_state.column(column), "{} follows the field", column.name());
+    }
+
+    let weights = by_state.column(Columns::POSITION);
+    let (mut off, mut through_field) = (0, 0);
+    for axis in 0..3 {
+        let placed = |step: f32| {
+            let mut moved = model.canonical().clone();
+            moved.position.plane_mut(axis).iter_mut().for_each(|x| *x += step);
+            let state =
+                gather(&model.with_canonical(moved.clone()), &(0..n as u32).collect::<Vec<_>>(), 1, Columns::POSITION);
+            (moved.position, state.unwrap().position)
+        };
+        let ((low, at_low), (high, at_high)) = (placed(-2e-4), placed(2e-4));
+        for i in 0..n {
+            let apart = f64::from(high.plane(axis)[i]) - f64::from(low.plane(axis)[i]);
+            let change = |c: usize| f64::from(at_high.plane(c)[i]) - f64::from(at_low.plane(c)[i]);
+            let expected = (0..3).map(|c| f64::from(weights.plane(c)[i]) * change(c)).sum::<f64>() / apart;
+            let got = f64::from(by_raw.column(Columns::POSITION).plane(axis)[i]);
+            // States are f32: about 1e-7 over 4e-4, times three.
+            off += usize::from((got - expected).abs() > 3e-3 * (1.0 + expected.abs()));
+            through_field += usize::from((got - f64::from(weights.plane(axis)[i])).abs() > 1e-2);
+        }
+    }
+    // Within a step some cross the edge of a texel or a ReLU, where there is no one derivative.
+    assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
+    assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
+    assert!(model.pull_back(3, &mut by_raw).is_err(), "there are three frames");
+}
