@@ -289,9 +289,8 @@ impl Need {
 }
 
 /// Every limit halved, first those that cost most time.
-const HALVINGS: [fn(&Limits) -> Limits; 6] = [
+const HALVINGS: [fn(&Limits) -> Limits; 5] = [
     |limits| Limits { pictures_together: limits.pictures_together.div_ceil(2), ..*limits },
-    |limits| Limits { operators_together: limits.operators_together / 2, ..*limits },
     |limits| Limits { pairs_together: limits.pairs_together.div_ceil(2), ..*limits },
     |limits| Limits { gaussians_together: (limits.gaussians_together / 2).max(GAUSSIAN_BLOCK), ..*limits },
     |limits| Limits { frames_together: limits.frames_together.div_ceil(2), ..*limits },
@@ -330,7 +329,6 @@ impl Plan {
             frames_held: FRAME_BLOCK,
             frames_together: PICTURES_PER_THREAD * work.threads as usize,
             pictures_together: work.threads as usize,
-            operators_together: usize::MAX,
             gaussians_together: work.gaussians.max(GAUSSIAN_BLOCK as u64) as usize,
             pairs_together: 8 * work.gaussians.max(1) as usize,
             rows_aside: false,

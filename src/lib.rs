@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
 //! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
-//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`refit`], [`metrics`] | pure mathematics: slices in, values out |
+//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`families`], [`demo`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
@@ -36,7 +36,6 @@ pub mod model;
 pub mod recipe;
 pub mod reduction;
 pub mod refine;
-pub mod refit;
 pub mod render;
 pub mod report;
 pub mod scene;

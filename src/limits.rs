@@ -9,8 +9,6 @@ pub struct Limits {
     pub frames_together: usize,
     /// Pictures worked on at once; at least 1.
     pub pictures_together: usize,
-    /// Pictures that colours are fitted to whose footprints stay from one iteration to the next.
-    pub operators_together: usize,
     /// Gaussians of a result whose frames wait together to be written.
     pub gaussians_together: usize,
     /// Pairs of Gaussians whose motion is measured together; at least 1.
@@ -27,7 +25,6 @@ impl Limits {
         frames_held: usize::MAX,
         frames_together: usize::MAX,
         pictures_together: usize::MAX,
-        operators_together: usize::MAX,
         gaussians_together: usize::MAX,
         pairs_together: usize::MAX,
         rows_aside: false,

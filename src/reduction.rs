@@ -121,6 +121,16 @@ impl Reduction {
         self.kept.is_empty()
     }
 
+    /// Those at `places` (increasing) alone, of a reduction without proxies.
+    ///
+    /// # Panics
+    /// If there is a proxy.
+    pub fn pick(&self, places: &[u32]) -> Reduction {
+        assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
+        let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
+        Reduction { change: self.change.pick(places), ..Reduction::pruned(kept, &self.rule) }
+    }
+
     /// For every Gaussian of an input of `count` its place in the output, if it has one.
     pub fn index_map(&self, count: usize) -> Vec<Option<u32>> {
         let mut map = vec![None; count];

@@ -169,11 +169,10 @@ pub trait FrameSource: Send + Sync {
         None
     }
 
-    /// Turns derivatives by the state at `frame` of all Gaussians into derivatives by what is stored of them once for
-    /// all frames. What has a body here is right for explicit trajectories, of which a change of a state is a change at
-    /// every frame.
-    fn pull_back(&self, _frame: usize, _gradients: &mut Gradients) -> Result<()> {
-        Ok(())
+    /// How states follow from what is stored, where that is more than a sum; none of explicit trajectories, of which a
+    /// change of what is stored is that change at every frame.
+    fn deformation(&self) -> Option<&dyn Deformation> {
+        None
     }
 
     /// What was read so far, by all readers; nothing where nobody counts.
@@ -185,6 +184,33 @@ pub trait FrameSource: Send + Sync {
     fn ahead(&self) -> Option<&dyn Ahead> {
         None
     }
+}
+
+/// States that follow from what is stored, once for all frames, by a function that can be differentiated.
+pub trait Deformation: Sync {
+    /// What is stored.
+    fn stored(&self) -> &Gaussians;
+
+    /// Columns of what is stored that a derivative leads to.
+    fn movable(&self) -> Columns;
+
+    /// Columns of a state that must be found anew when what is stored moves a little. The others follow by as much as
+    /// they moved themselves.
+    fn bound(&self) -> Columns;
+
+    /// Writes the columns `want` of the state at `frame` of Gaussians stored as `stored` into `out`, which is resized in
+    /// them. Where positions alone are bound and wanted, other columns of `stored` may be empty.
+    ///
+    /// # Errors
+    /// A frame that the sequence does not have.
+    fn state(&self, frame: usize, stored: &Gaussians, want: Columns, out: &mut Gaussians) -> Result<()>;
+
+    /// Turns derivatives by the state at `frame` of Gaussians stored as `stored` into derivatives by what is stored.
+    /// Where positions alone are bound, other columns of `stored` may be empty.
+    ///
+    /// # Errors
+    /// A frame that the sequence does not have.
+    fn pull_back(&self, frame: usize, stored: &Gaussians, gradients: &mut Gradients) -> Result<()>;
 }
 
 /// A source on a disk, whose bytes can be brought ahead of their use, from a thread that does nothing else.

@@ -271,7 +271,7 @@ fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
     let workplace = Workplace::new();
     let run = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq");
     assert_eq!(run.code, 0, "{}", run.stderr);
-    for stage in ["scan", "visible", "score", "choose", "emit"] {
+    for stage in ["scan", "visible", "score", "refine", "emit"] {
         let lines: Vec<&str> = run.stderr.lines().filter(|line| line.contains(&format!("] {stage}  "))).collect();
         assert_eq!(lines.len(), 1, "{stage}: {}", run.stderr);
         assert!(lines[0].starts_with('[') && lines[0].contains("/s, ") && lines[0].ends_with(" s"), "{}", lines[0]);

@@ -35,7 +35,7 @@ fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &st
     let name = format!("out_{preset}");
     let (input, output) = (model.display().to_string(), workplace.path(&name));
     let summary = workplace.summary(&format!(
-        "{input} --cameras {input} --split test -o {name} --preset {preset} --choose-by-views=false"
+        "{input} --cameras {input} --split test -o {name} --preset {preset} --choose-by-views=false --no-refine"
     ));
     let map = index_map(&output.join("index_map.npy"));
     let members = members(&map);
@@ -283,7 +283,8 @@ fn threads_change_no_byte_of_deform2() {
     let input = model.display();
     let [one, two] = ["1", "2"].map(|threads| {
         workplace.done(&format!(
-            "compress {input} --cameras {input} --split test --target-ratio 0.3 --threads {threads} --overwrite -o out"
+            "compress {input} --cameras {input} --split test --target-ratio 0.3 --refine-steps 40 \
+             --refine-cut-steps 10 --threads {threads} --overwrite -o out"
         ));
         lasting_files(&workplace.path("out"))
     });

@@ -107,7 +107,7 @@ fn static_neighbours_merge_and_the_dynamic_arm_is_off() {
     for frame in 0..4 {
         workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
     }
-    let summary = workplace.summary("frames -o out");
+    let summary = workplace.summary("frames -o out --no-refine");
     assert!(says(&summary, "left_out", "grading by motion"), "{}", summary["left_out"]);
     assert!(says(&summary, "left_out", "grading by the dynamic score"));
     assert_eq!(summary["merge"]["proxies"], summary["gaussians"], "each pair is one");
@@ -130,7 +130,7 @@ fn movers_around_one_percent_are_kept_whatever_their_number() {
             }
             workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
         }
-        let default = "--preset default --tau-static 0.99 --tau-dynamic 1";
+        let default = "--preset default --tau-static 0.99 --tau-dynamic 1 --no-refine";
         for request in ["--preset paper --target-count 20", default] {
             workplace.done(&format!("compress frames -o out --overwrite --prune-only {request}"));
             let map = index_map(&workplace.path("out/index_map.npy"));
@@ -169,7 +169,8 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
     workplace.done("score frames -o rows.npz");
     assert!(scene::arrays(&workplace.path("rows.npz"))["V"].iter().all(|&v| v == 0.0));
     for preset in ["paper", "default"] {
-        let summary = workplace.summary(&format!("frames --preset {preset} --trajectory alignment --overwrite -o out"));
+        let summary = workplace
+            .summary(&format!("frames --preset {preset} --trajectory alignment --no-refine --overwrite -o out"));
         assert!(summary["merge"]["proxies"].as_u64().unwrap() > 0);
         let rows = PlyRows::read(&workplace.path("out/frame_0.ply"));
         assert!((0..rows.rows.len()).all(|i| rows.value(i, "opacity").is_finite() && rows.value(i, "opacity") > 10.0));
@@ -196,11 +197,11 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
             &["odd.ply", "Gaussian 7", "NaN or infinity", "--non-finite"],
         );
 
-        let summary = workplace.summary("odd.ply -o dropped.ply --non-finite drop --merge-only");
+        let summary = workplace.summary("odd.ply -o dropped.ply --non-finite drop --merge-only --no-refine");
         assert_eq!((&summary["gaussians"], &summary["flags"]["non_finite"]), (&99.into(), &1.into()), "{what}");
         assert_eq!(index_map(&workplace.path("dropped.ply.index_map.npy"))[7], -1, "{what}");
 
-        workplace.done("compress odd.ply -o kept.ply --non-finite keep");
+        workplace.done("compress odd.ply -o kept.ply --non-finite keep --refine-steps 40");
         let place = index_map(&workplace.path("kept.ply.index_map.npy"))[7];
         let (before, after) = (PlyRows::read(&odd), PlyRows::read(&workplace.path("kept.ply")));
         assert!(place >= 0 && after.rows[place as usize] == before.rows[7], "{what}");
@@ -237,7 +238,7 @@ fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
     // Three opacities of 0.731 over one area.
     let rules = [("sum", 1.0f64), ("union", 1.0 - (1.0f64 - 0.731_058_6).powi(3)), ("area", 1.0)];
     for (rule, opacity) in rules {
-        let request = format!("three.ply --overwrite -o out.ply --merge-only --opacity {rule}");
+        let request = format!("three.ply --overwrite -o out.ply --merge-only --no-refine --opacity {rule}");
         let summary = workplace.summary(&request);
         assert_eq!((&summary["gaussians"], &summary["merge"]["opacity"]), (&10.into(), &rule.into()));
         let rows = PlyRows::read(&workplace.path("out.ply"));

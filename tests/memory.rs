@@ -109,7 +109,7 @@ fn the_least_that_is_named_works_holds_and_changes_no_byte() {
     for (input, rest) in [
         ("packed.gseq", ""),
         ("raw.gseq", ""),
-        ("packed.gseq", "--target-ratio 0.4 --refit-pictures 6"),
+        ("packed.gseq", "--target-ratio 0.4 --no-refine"),
         ("packed.gseq", "--preset paper"),
     ] {
         let request = |output: &str| format!("compress {input} {REQUEST} {rest} -o {output}/small.gseq --overwrite");

@@ -2,9 +2,14 @@
 
 mod oracle;
 
+use std::path::Path;
+
+use glam::DVec3;
 use oracle::scenes::{Random, camera, plain_camera, scene, single};
+use splatsieve::families::ModelFolder;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
 use splatsieve::render::{Image, Renderer, render};
+use splatsieve::source::FrameSource;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
@@ -278,6 +283,62 @@ fn pixels_that_are_not_finite_count_as_ones_the_loss_does_not_depend_on() {
         assert!(spoiled(value) == expected, "{value}");
     }
     assert!(expected != gradients(&scene, &camera, Image::clone), "the pixel says nothing");
+}
+
+#[test]
+fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_them() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+    let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
+    let (deformation, frame) = (model.deformation().unwrap(), 1);
+    let stored = deformation.stored();
+    let state_of = |stored: &Gaussians| {
+        let mut state = Gaussians::zeros(0, stored.sh_degree());
+        deformation.state(frame, stored, Columns::all(), &mut state).unwrap();
+        state
+    };
+    let state = state_of(stored);
+    let camera = Camera::look_at(DVec3::new(0.5, -4.0, 1.0), DVec3::ZERO, 0.7, (64, 64));
+    let blended = oracle::blended(&state, &camera);
+    let sure: Vec<f64> = oracle::picture(&state, &camera, BACKGROUND, 1)
+        .doubtful
+        .iter()
+        .map(|&doubtful| if doubtful { 0.0 } else { 1.0 })
+        .collect();
+    let mut random = Random(7);
+    let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next()).collect();
+    let mut found = gradients(&state, &camera, |picture| Image {
+        data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
+        ..*picture
+    });
+    let direct = found.clone();
+    deformation.pull_back(frame, stored, &mut found).unwrap();
+
+    let loss = |stored: &Gaussians| -> f64 {
+        // A step of the position moves other columns too, which a derivative by the position's head alone leaves out.
+        let moved = Gaussians { position: state_of(stored).position, ..state.clone() };
+        let pixels = oracle::decided(&moved, &camera, BACKGROUND, &blended);
+        let square = |at: usize| (pixels[at / 3][at % 3] - f64::from(target[at])).powi(2);
+        (0..target.len()).map(|at| 0.5 * sure[at / 3] * square(at)).sum()
+    };
+    let got = found.column(Columns::POSITION).planes();
+    let mut largest: Vec<usize> = (0..got.len()).collect();
+    largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
+    let (mut off, mut through_field) = (0, 0);
+    for &at in largest.iter().take(60) {
+        let mut changed = stored.clone();
+        let (both, apart) = nudged(stored.position.planes()[at], 2e-4);
+        let losses = both.map(|x| {
+            changed.position.planes_mut()[at] = x;
+            loss(&changed)
+        });
+        let expected = (losses[1] - losses[0]) / apart;
+        // States are f32, and within a step some cross the edge of a texel or a ReLU.
+        off += usize::from((f64::from(got[at]) - expected).abs() > 0.01 * expected.abs());
+        let alone = direct.column(Columns::POSITION).planes()[at];
+        through_field += usize::from((alone - got[at]).abs() > 0.03 * got[at].abs());
+    }
+    assert!(off <= 3, "{off} of 60 derivatives are off");
+    assert!(through_field > 20, "the field adds to {through_field} of 60 derivatives only");
 }
 
 #[test]

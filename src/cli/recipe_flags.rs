@@ -79,6 +79,11 @@ impl Args for RecipeFlags {
             }
             command = command.arg(arg);
         }
+        command = command.arg(
+            Arg::new("no_refine").long("no-refine").action(clap::ArgAction::SetTrue).conflicts_with("refine").help(
+                "Leave what stays as it was stored, as --refine none does; what looks and moves alike merges instead",
+            ),
+        );
         command.arg(
             Arg::new("merge_pass")
                 .long("merge-pass")
@@ -110,6 +115,9 @@ impl FromArgMatches for RecipeFlags {
             .into_iter()
             .filter_map(|p| Some((p.section, p.key.clone(), matches.get_one::<String>(&p.key)?.clone())))
             .collect();
+        if matches.get_flag("no_refine") {
+            self.set.push(("refine".to_owned(), "refine".to_owned(), "none".to_owned()));
+        }
         self.passes = matches.get_many::<MergePass>("merge_pass").into_iter().flatten().copied().collect();
         Ok(())
     }
@@ -129,6 +137,7 @@ fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::Columns;
 
     fn parse(args: &[&str]) -> Result<Recipe> {
         let command = RecipeFlags::augment_args(Command::new("t").no_binary_name(true));
@@ -145,6 +154,24 @@ mod tests {
         expected.score.weigh_motion_by_life = true;
         expected.select.low_priority = crate::recipe::LowPriority::Rescue;
         assert_eq!(recipe, expected);
+    }
+
+    #[test]
+    fn groups_are_named_and_none_of_them_is_said_in_two_ways() {
+        let refined = |args: &[&str]| parse(args).unwrap().refine.refine.0;
+        assert_eq!(refined(&[]), Columns::all());
+        assert_eq!(refined(&["--refine", "colour, scale"]), Columns::SH | Columns::LOG_SCALE);
+        for none in [&["--no-refine"][..], &["--refine", "none"], &["--preset", "gentle"]] {
+            assert_eq!(refined(none), Columns::empty());
+        }
+        let message = parse(&["--refine", "colour,size"]).unwrap_err().to_string();
+        assert!(
+            message.contains("--refine") && message.contains("\"size\"") && message.contains("rotation"),
+            "{message}"
+        );
+        assert!(parse(&["--refine", "scale", "--no-refine"]).is_err());
+        let text = parse(&["--refine", "position,opacity"]).unwrap().to_toml();
+        assert!(text.contains("refine = \"opacity,position\""), "{text}");
     }
 
     #[test]

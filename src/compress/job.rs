@@ -8,7 +8,6 @@ use super::measure::{Measure, Outlook, Stages};
 use super::merge::Merge;
 use super::prune::Prune;
 use super::refine::Refine;
-use super::refit::Refit;
 use super::request::{Only, Request};
 use super::rounds::Rounds;
 use super::score::UserOverrides;
@@ -30,8 +29,6 @@ pub struct Job {
     pub merge: Option<Merge>,
     /// Lets pictures choose.
     pub choose: Option<Choose>,
-    /// Recolours what is left.
-    pub refit: Option<Refit>,
     /// Moves what is stored of what is left.
     pub refine: Option<Refine>,
     /// Writes.
@@ -55,18 +52,20 @@ impl Job {
         let measure = Measure::new(recipe, outlook.has_cameras, user);
         let looks = measure.visible.is_some();
         let prunes = *only != Only::Merge;
-        let merges = *only != Only::Prune && !recipe.merge.passes.is_empty();
+        let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
+        let refine = Refine::of(recipe, part, looks && prunes);
+        // What refining gains at a count is more than merging and choosing ever did.
+        let refines = refine.is_some() && prunes;
+        let merges = *only != Only::Prune && !recipe.merge.passes.is_empty() && !refines;
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
         let choose =
             || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
-        let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
         Ok(Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
-            choose: (looks && prunes && recipe.select.choose_by_views).then(choose),
-            refit: Refit::of(&recipe.refit).filter(|_| looks),
-            refine: Refine::of(&recipe.refine).filter(|_| looks),
+            choose: (looks && prunes && !refines && recipe.select.choose_by_views).then(choose),
+            refine,
             emit: Emit::new(request, outlook.own_output, merges),
             measure,
             has_cameras: outlook.has_cameras,
@@ -79,7 +78,11 @@ impl Job {
             journal.leave_out("pruning", "--merge-only");
         }
         if self.merge.is_none() {
-            let why = if request.only == Only::Prune { "--prune-only" } else { "the recipe has no merge pass" };
+            let why = match request.only {
+                Only::Prune => "--prune-only",
+                _ if request.recipe.merge.passes.is_empty() => "the recipe has no merge pass",
+                _ => "refining what is left gains more at the same count (--no-refine merges)",
+            };
             journal.leave_out("merging, and its pass over the frames", why);
         }
         if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
@@ -99,7 +102,6 @@ impl Stages for Job {
         needs.extend(self.rounds.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.refit.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits));
         needs
@@ -125,10 +127,9 @@ mod tests {
         Budget { bytes: Some(bytes), ..Budget::default() }
     }
 
-    /// Everything compressing does under `preset`, colours fitted too.
+    /// Everything compressing does under `preset`.
     fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<Need> {
-        let mut recipe = Recipe::preset(preset).unwrap();
-        recipe.refit.refit_pictures = 36;
+        let recipe = Recipe::preset(preset).unwrap();
         let job = Job::new(&request(recipe), OUTLOOK).unwrap();
         move |work, limits| job.needs(work, limits)
     }

@@ -1,4 +1,4 @@
-//! The main job: scan, score, rank, prune, merge, refit, emit. Types flow scene → statistics → ranking → reduction →
+//! The main job: scan, score, rank, prune, merge, refine, emit. Types flow scene → statistics → ranking → reduction →
 //! files; the order of the passes stands in [`reduce`].
 
 mod arrival;
@@ -12,7 +12,6 @@ mod merge;
 mod prune;
 mod record;
 mod refine;
-mod refit;
 mod request;
 mod rounds;
 mod scan;
@@ -106,11 +105,14 @@ fn reduce(
 
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
+    // A refinement lets the last ones go by itself.
+    let before_cuts = |wanted| job.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, scored.count()));
     if let Some(rounds) = &job.rounds {
         let fewest = job.prune.target.unwrap_or(scored.selection.counts.kept);
-        ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
+        ranked = rounds.run(scene, &scored, ranked, before_cuts(fewest), &mut journal)?;
     }
-    let survivors = job.prune.run(scene, &scored, &ranked, &mut journal)?;
+    let wanted = job.prune.run(scene, &scored, &ranked, &mut journal)?;
+    let survivors = before_cuts(wanted).min(ranked.ranking.order().len());
     let mut outcome = match &job.merge {
         Some(merge) => merge.run(scene, &scored, &ranked, survivors, &mut journal)?,
         None => Outcome {
@@ -123,11 +125,9 @@ fn reduce(
     }
     let Outcome { mut reduction, summary: merge } = outcome;
     journal.notes.extend(reduction.proxies.notes.iter().cloned());
-    if let Some(refit) = &job.refit {
-        reduction = refit.run(scene, &scored, reduction, &mut journal)?;
-    }
     if let Some(refine) = &job.refine {
-        reduction = refine.run(scene, &scored, reduction, &mut journal)?;
+        let wanted = wanted.min(reduction.len());
+        reduction = refine.run(scene, &scored, reduction, wanted, &mut journal)?;
     }
     job.write_down(request, &mut journal);
 

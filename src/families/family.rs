@@ -107,12 +107,6 @@ pub trait Family: Send + Sync {
         Ok(Proxies::default())
     }
 
-    /// Columns of which what is added to the stored values is added to the state at every time, so that a state's
-    /// derivative is that of what is stored.
-    fn refinable(&self) -> Columns {
-        Columns::all()
-    }
-
     /// The frames of what `reduction` leaves, as they will be once it is written.
     ///
     /// # Errors

@@ -10,6 +10,7 @@ use std::num::NonZeroU32;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
+use crate::model::Columns;
 
 pub use parameters::{Parameter, parameters};
 
@@ -25,7 +26,11 @@ pub const PRESETS: [(&str, &str); 4] = [
 ];
 
 /// Parameters of earlier versions, by table and key, and why they went: recipes written beside results name all.
-const REMOVED: [(&str, &str, &str); 1] = [("score", "exact_percentiles", "as percentiles are always exact")];
+const REMOVED: [(&str, &str, &str); 3] = [
+    ("score", "exact_percentiles", "as percentiles are always exact"),
+    ("refit", "refit_pictures", "as refine.refine = \"colour\" does more; its table goes with it"),
+    ("refit", "refit_ridge", "as refine.refine = \"colour\" does more; its table goes with it"),
+];
 
 /// All hyper-parameters; see `paper.toml` for the meaning of each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,8 +44,6 @@ pub struct Recipe {
     pub select: Select,
     /// Stage 3.
     pub merge: Merge,
-    /// Colours of what is left.
-    pub refit: Refit,
     /// Everything that is stored of what is left.
     pub refine: Refine,
 }
@@ -178,21 +181,52 @@ pub struct Merge {
     pub passes: Vec<MergePass>,
 }
 
-/// Parameters of the colours of what is left.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Refit {
-    pub refit_pictures: u32,
-    pub refit_ridge: f64,
-}
-
 /// Parameters of everything that is stored of what is left.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
 pub struct Refine {
+    pub refine: Groups,
     pub refine_steps: u32,
+    pub refine_cut_steps: u32,
+}
+
+/// Groups of stored values, by names that a person gives them: `colour,opacity,scale,rotation,position`, any of them, or
+/// `none`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Groups(pub Columns);
+
+/// Every group and its column.
+const GROUPS: [(&str, Columns); 5] = [
+    ("colour", Columns::SH),
+    ("opacity", Columns::OPACITY),
+    ("scale", Columns::LOG_SCALE),
+    ("rotation", Columns::ROTATION),
+    ("position", Columns::POSITION),
+];
+
+impl TryFrom<String> for Groups {
+    type Error = String;
+
+    fn try_from(text: String) -> std::result::Result<Groups, String> {
+        let mut columns = Columns::empty();
+        for name in text.split(',').map(str::trim).filter(|&name| text != "none" && !name.is_empty()) {
+            let group = GROUPS.iter().find(|group| group.0 == name).ok_or_else(|| {
+                let names = GROUPS.map(|group| group.0).join(",");
+                format!("{name:?}: expected some of {names}, or none")
+            })?;
+            columns |= group.1;
+        }
+        Ok(Groups(columns))
+    }
+}
+
+impl From<Groups> for String {
+    fn from(groups: Groups) -> String {
+        let names: Vec<&str> = GROUPS.iter().filter(|group| groups.0.contains(group.1)).map(|group| group.0).collect();
+        if names.is_empty() { "none".to_owned() } else { names.join(",") }
+    }
 }
 
 /// Thresholds of one merge pass.
@@ -339,7 +373,6 @@ impl Recipe {
                 "0.1 to 1",
             ),
             ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
-            ("refit.refit_ridge", self.refit.refit_ridge, finite(self.refit.refit_ridge), "finite, 0 or more"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
             ("merge.max_color_difference", max_color_difference, nonnegative(max_color_difference), "0 or more"),
             ("merge.motion_noise", motion_noise, finite(motion_noise), "finite, 0 or more"),

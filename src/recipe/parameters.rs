@@ -3,7 +3,7 @@
 /// One hyper-parameter of the recipe.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
-    /// Table it stands in: `scan`, `score`, `select`, `merge`, `refit`, `refine`.
+    /// Table it stands in: `scan`, `score`, `select`, `merge`, `refine`.
     pub section: String,
     /// Its key, unique over all sections.
     pub key: String,

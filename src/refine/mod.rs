@@ -4,6 +4,8 @@
 //! (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015) with a rate for each group of values and no
 //! correction but its own. Memory: [`bytes_per_gaussian`].
 
+use rayon::prelude::*;
+
 use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
 use crate::reduction::Change;
 
@@ -13,10 +15,30 @@ const BETAS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 /// Steps over which rates grow to their full size: the first means say little.
 const WARM_UP: usize = 10;
-/// Rates at the last step, as a part of those at the first.
-const LAST: f32 = 0.05;
 /// Root mean square error of pictures from which rates are full: what is nearly right must not be shaken.
 const FULL_ERROR: f64 = 0.045;
+
+/// How rates change from step to step.
+#[derive(Debug, Clone, Copy)]
+pub struct Schedule {
+    steps: usize,
+    last: f32,
+    factor: f32,
+}
+
+impl Schedule {
+    /// Of `steps` steps, down to `last` of the first's rates. `error` is the root mean square error of the pictures at
+    /// the start.
+    pub fn new(steps: usize, last: f32, error: f64) -> Schedule {
+        Schedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
+    }
+
+    /// What rates are multiplied by in step `done`.
+    fn at(&self, done: usize) -> f32 {
+        let [warm, late] = [(done + 1) as f32 / WARM_UP as f32, done as f32 / self.steps.max(1) as f32];
+        self.factor * warm.min(1.0) * self.last.powf(late)
+    }
+}
 
 /// What is stored of Gaussians on its way down.
 #[derive(Debug)]
@@ -24,34 +46,29 @@ pub struct Descent {
     change: Gaussians,
     /// Means of the derivatives, and of their squares.
     means: [Gaussians; 2],
-    /// Rates of positions, by Gaussian.
-    reach: Vec<f32>,
-    /// Whose values stay, `[N]`.
-    fixed: Vec<bool>,
+    /// `[N]`, by what rates are multiplied: 1, and of positions four hundredths of the mean extent; 0 of what stays.
+    reach: [Vec<f32>; 2],
     columns: Columns,
-    done: i32,
-    steps: usize,
-    factor: f32,
+    done: usize,
 }
 
 /// Memory of a [`Descent`] and of the derivatives that it follows, for `columns` with harmonics up to `sh_degree`.
 pub fn bytes_per_gaussian(columns: Columns, sh_degree: usize) -> usize {
-    4 * 4 * columns.width(sh_degree) + size_of::<f32>() + size_of::<bool>()
+    4 * 4 * columns.width(sh_degree) + 2 * size_of::<f32>()
 }
 
 impl Descent {
-    /// From `start`, of which the columns `columns` may move, in `steps` steps; those `fixed` do not. `error` is the
-    /// root mean square error of the pictures at the start.
-    pub fn new(start: &Gaussians, columns: Columns, fixed: Vec<bool>, steps: usize, error: f64) -> Descent {
+    /// From `start`, of which the columns `columns` may move but for the Gaussians `fixed`.
+    pub fn new(start: &Gaussians, columns: Columns, fixed: &[bool]) -> Descent {
         let mut change = Gaussians::default();
         for column in columns.iter() {
             *change.column_mut(column) = Column::zeros(start.column(column).width(), start.len());
         }
-        // Two hundredths of the mean extent.
         let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
-        let reach = (0..start.len()).map(|i| 0.02 * extent(i).clamp(-80.0, 80.0).exp()).collect();
-        let factor = (error / FULL_ERROR).min(1.0) as f32;
-        Descent { means: [change.clone(), change.clone()], change, reach, fixed, columns, done: 0, steps, factor }
+        let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
+        let of_positions = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
+        let reach = [free.iter().enumerate().map(of_positions).collect(), free];
+        Descent { means: [change.clone(), change.clone()], change, reach, columns, done: 0 }
     }
 
     /// What is to be added to the start.
@@ -59,47 +76,46 @@ impl Descent {
         Change(self.change.clone())
     }
 
-    /// Adds what is to be added to the start to `state`, in the columns that move.
-    pub fn add_to(&self, state: &mut Gaussians) {
-        for column in self.columns.iter() {
+    /// Adds what is to be added to the start to the columns `of` of `state`, as far as they move.
+    pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
+        for column in (self.columns & of).iter() {
             let (by, to) = (self.change.column(column), state.column_mut(column));
             to.planes_mut().iter_mut().zip(by.planes()).for_each(|(to, by)| *to += by);
         }
     }
 
-    /// One step against `gradients`.
+    /// One step against `gradients`, at rates of `schedule`.
     ///
     /// # Panics
     /// If they are of other Gaussians or columns.
-    pub fn step(&mut self, gradients: &Gradients) {
-        let [warm, late] = [self.done as f32 + 1.0, self.done as f32 / self.steps.max(1) as f32];
-        let schedule = self.factor * (warm / WARM_UP as f32).min(1.0) * LAST.powf(late);
+    pub fn step(&mut self, gradients: &Gradients, schedule: &Schedule) {
+        let factor = schedule.at(self.done);
         self.done += 1;
-        let [first, second] = BETAS;
         // Of means that began at 0.
-        let unbiased = [first, second].map(|beta| 1.0 / (1.0 - beta.powi(self.done)));
-        for column in self.columns.iter() {
-            let of = gradients.column(column);
-            for c in 0..of.width() {
-                let rate = schedule * rate(column, c);
-                let [means, squares] = &mut self.means;
-                let planes = [means, squares, &mut self.change].map(|of| of.column_mut(column).plane_mut(c));
-                let [mean, square, value] = planes;
-                for (i, &slope) in of.plane(c).iter().enumerate() {
-                    if self.fixed[i] {
-                        continue;
-                    }
-                    mean[i] += (1.0 - first) * (slope - mean[i]);
-                    square[i] += (1.0 - second) * (slope * slope - square[i]);
-                    let root = (square[i] * unbiased[1]).sqrt() + EPSILON;
-                    let reach = if column == Columns::POSITION { self.reach[i] } else { 1.0 };
-                    let next = value[i] - rate * reach * mean[i] * unbiased[0] / root;
-                    if next.is_finite() {
-                        value[i] = next;
-                    }
-                }
-            }
+        let unbiased = BETAS.map(|beta| 1.0 / (1.0 - beta.powi(self.done as i32)));
+        let [of_positions, of_others] = &self.reach;
+        let count = of_others.len().max(1);
+        let [means, squares] = &mut self.means;
+        let moved = means.columns_mut(self.columns).zip(squares.columns_mut(self.columns));
+        let moved = self.columns.iter().zip(moved.zip(self.change.columns_mut(self.columns)));
+        let mut planes = Vec::new();
+        for (column, ((means, squares), values)) in moved {
+            let reach = if column == Columns::POSITION { of_positions } else { of_others };
+            let of = gradients.column(column).planes().chunks_exact(count);
+            let own = means.planes_mut().chunks_exact_mut(count).zip(squares.planes_mut().chunks_exact_mut(count));
+            let own = own.zip(values.planes_mut().chunks_exact_mut(count)).zip(of).enumerate();
+            planes.extend(own.map(|(c, own)| (factor * rate(column, c), reach, own)));
         }
+        planes.into_par_iter().for_each(|(rate, reach, (((mean, square), value), slope))| {
+            let own = mean.iter_mut().zip(square).zip(value).zip(slope).zip(reach);
+            for ((((mean, square), value), &slope), &reach) in own {
+                *mean += (1.0 - BETAS[0]) * (slope - *mean);
+                *square += (1.0 - BETAS[1]) * (slope * slope - *square);
+                let root = (*square * unbiased[1]).sqrt() + EPSILON;
+                let next = *value - rate * reach * (*mean * unbiased[0]) / root;
+                *value = if next.is_finite() { next } else { *value };
+            }
+        });
     }
 }
 
@@ -132,11 +148,11 @@ mod tests {
     #[test]
     fn values_come_to_rest_where_the_slope_is_zero_and_fixed_ones_do_not_move() {
         let start = Gaussians::zeros(3, 0);
-        let mut descent = Descent::new(&start, Columns::all(), vec![false, true, false], 2000, 1.0);
+        let mut descent = Descent::new(&start, Columns::all(), &[false, true, false]);
         for _ in 0..2000 {
             let mut now = start.clone();
-            descent.add_to(&mut now);
-            descent.step(&slopes(&now, 0.25));
+            descent.add_to(&mut now, Columns::all());
+            descent.step(&slopes(&now, 0.25), &Schedule::new(2000, 0.05, 1.0));
         }
         let mut end = start.clone();
         descent.change().add_to(&mut end, Columns::all());
@@ -153,13 +169,13 @@ mod tests {
     fn a_step_is_that_of_adam_written_out_in_f64() {
         let start = Gaussians::zeros(1, 0);
         let (steps, error) = (50, 0.009);
-        let mut descent = Descent::new(&start, Columns::OPACITY, vec![false], steps, error);
+        let mut descent = Descent::new(&start, Columns::OPACITY, &[false]);
         let (mut value, mut mean, mut square) = (0.0f64, 0.0f64, 0.0f64);
         for k in 0..steps {
             let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
             let slope = (k as f64 * 0.7).sin() + 0.3;
             gradients.column_mut(Columns::OPACITY).set_row(0, [slope as f32]);
-            descent.step(&gradients);
+            descent.step(&gradients, &Schedule::new(steps, 0.05, error));
             mean = 0.9 * mean + 0.1 * slope;
             square = 0.999 * square + 0.001 * slope * slope;
             let t = k as i32 + 1;
@@ -173,13 +189,13 @@ mod tests {
 
     #[test]
     fn slopes_of_any_size_leave_every_value_finite() {
-        let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), vec![false; 4], 10, 1.0);
+        let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), &[false; 4]);
         for slope in [f32::MAX, 1e-38, -f32::MAX, 0.0, 3e20] {
             let mut gradients = Gradients::new(4, Columns::all(), 0);
             for column in Columns::all().iter() {
                 gradients.column_mut(column).planes_mut().fill(slope);
             }
-            descent.step(&gradients);
+            descent.step(&gradients, &Schedule::new(10, 0.05, 1.0));
         }
         let change = descent.change();
         assert!(Columns::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));

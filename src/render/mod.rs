@@ -3,10 +3,9 @@
 //! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend` (pixels), and
 //! `backward` from there. Data in: [`Gaussians`](crate::model::Gaussians) in stored encoding and a
 //! [`Camera`](crate::model::Camera). Data out: an [`Image`], or the [`Contribution`] or [`RemovalError`] of every
-//! Gaussian, or a [`ColorOperator`], the picture as a linear map from colours, or the
-//! [`Gradients`](crate::model::Gradients) of a loss. Memory: [`BYTES_PER_VISIBLE`], and up to [`STRIP_BYTES`] for pairs
-//! of a Gaussian and a 16×16 tile it can change, which are made for as many tiles at a time as that takes; a tile that
-//! more Gaussians than that reach takes 12 bytes for each.
+//! Gaussian, or the [`Gradients`](crate::model::Gradients) of a loss. Memory: [`BYTES_PER_VISIBLE`], and up to
+//! [`STRIP_BYTES`] for pairs of a Gaussian and a 16×16 tile it can change, which are made for as many tiles at a time as
+//! that takes; a tile that more Gaussians than that reach takes 12 bytes for each.
 //!
 //! Every convention is that of the original CUDA rasteriser (Kerbl et al., "3D Gaussian Splatting", 2023),
 //! decided to the sentence because each costs tens of dB; what the reach of alpha ≥ 1/255 lets us skip
@@ -16,7 +15,6 @@
 mod backward;
 mod bin;
 mod blend;
-mod color_operator;
 mod colour;
 mod contribution;
 mod convention;
@@ -26,7 +24,6 @@ mod removal;
 mod renderer;
 
 pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
-pub use color_operator::{ColorOperator, PerVisible};
 pub use contribution::Contribution;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};

@@ -289,7 +289,6 @@ fn paint(blend: Blend, splats: &[Splat], pairs: &[u32], lattice: &Lattice, backg
 mod tests {
     use glam::{DMat3, DVec3};
 
-    use super::super::ColorOperator;
     use super::*;
     use crate::model::{Columns, Gradients};
 
@@ -351,12 +350,6 @@ mod tests {
             for parallel in [false, true] {
                 assert!(made(Renderer { strip_pairs, ..Renderer::with(parallel) }) == whole, "{strip_pairs} at a time");
             }
-            let operator =
-                |strip_pairs| ColorOperator::with(Renderer { strip_pairs, ..Renderer::new() }, &scene, &camera);
-            let (kept, in_strips) = (operator(pairs), operator(strip_pairs));
-            assert!(
-                in_strips.diagonal() == kept.diagonal() && in_strips.transposed(&whole.0) == kept.transposed(&whole.0)
-            );
             renderer.bins.begin(&renderer.splats, [7, 5], false);
             let mut at = 0;
             while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {

@@ -1,7 +1,7 @@
 //! A sequence with its Gaussians changed, frame by frame as it is read.
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, Gradients, SequenceInfo};
+use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::reduction::Change;
 use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
 
@@ -39,11 +39,6 @@ impl FrameSource for Changed<'_> {
         let changed =
             |reader| -> Box<dyn BlockReader + '_> { Box::new(ChangedReader { reader, change: self.change.clone() }) };
         Some(opened.map(changed))
-    }
-
-    /// A change of what is stored is one of what it is added to.
-    fn pull_back(&self, frame: usize, gradients: &mut Gradients) -> Result<()> {
-        self.source.pull_back(frame, gradients)
     }
 
     fn reads(&self) -> Reads {

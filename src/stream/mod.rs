@@ -24,6 +24,7 @@ pub use frames::Frames;
 pub use gather::{gather, gather_all};
 pub use held::HeldFrames;
 pub use merged::MergedSequence;
+pub use parts::Parts;
 pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, View, show};
 pub use progress::{Mode, Progress, begin_run, duration};
 pub use removal::removal_error;

@@ -4,11 +4,11 @@ use super::BLOCK;
 use crate::model::{Columns, Gaussians};
 
 /// Where the values of one block go: a slice for every component of every column, in their order.
-pub(super) struct Parts<'a>(Vec<&'a mut [f32]>);
+pub struct Parts<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> Parts<'a> {
     /// The parts of the columns `want` of `state`, which are resized to `count` Gaussians: one for each [`BLOCK`].
-    pub(super) fn of(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<Parts<'a>> {
+    pub fn of(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<Parts<'a>> {
         let mut parts: Vec<Parts<'a>> = (0..count.div_ceil(BLOCK)).map(|_| Parts(Vec::new())).collect();
         for column in state.columns_mut(want) {
             column.resize(count);
@@ -20,7 +20,7 @@ impl<'a> Parts<'a> {
     }
 
     /// Copies the columns `want` of `block`.
-    pub(super) fn write(self, block: &Gaussians, want: Columns) {
+    pub fn write(self, block: &Gaussians, want: Columns) {
         let columns = want.iter().map(|column| block.column(column));
         let planes = columns.flat_map(|column| (0..column.width()).map(|c| column.plane(c)));
         self.0.into_iter().zip(planes).for_each(|(part, plane)| part.copy_from_slice(plane));

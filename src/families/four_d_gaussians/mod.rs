@@ -110,11 +110,6 @@ impl Family for ModelFolder {
         proxies::solve(self, clusters, reference, rule)
     }
 
-    /// Positions are where the field is asked, and what it multiplies has another derivative.
-    fn refinable(&self) -> Columns {
-        self.field().added().difference(Columns::POSITION)
-    }
-
     fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(Box::new(self.with_canonical(canonical_cloud(self, reduction))))
     }

@@ -27,8 +27,11 @@ const SPAN: usize = 32 * BLOCK;
 
 /// Memory of a picture that is differentiated per Gaussian it shows.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<Sums<f64>>();
+/// Pairs of splats and tiles whose sums lie ready at a time: of small pictures all.
+const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
+
 /// Memory of a picture that is differentiated for pairs of Gaussians and tiles.
-pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Sums<f32>>());
+pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<Sums<f32>>();
 
 impl Renderer {
     /// Renders as [`Renderer::render`], asks `loss` for a number and its derivative by each value of the picture,
@@ -84,7 +87,7 @@ impl Renderer {
             false => totals.len().max(1),
         };
         self.bins.rewind();
-        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+        while self.bins.next_strip(&self.splats, self.strip_pairs.min(SUMMED_PAIRS)).is_some() {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             fill_pairs(bins, self.parallel, &mut of_pairs, |tile, pairs, sums| {
                 let lattice = Lattice::new(tile, view.size, 1);

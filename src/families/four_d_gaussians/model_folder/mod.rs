@@ -15,8 +15,8 @@ use xxhash_rust::xxh3::Xxh3;
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Gradients, SequenceInfo};
-use crate::source::{BlockReader, Count, FrameSource, Ids, Reads, Wanted};
-use crate::stream::{BLOCK, gather};
+use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, Reads, Wanted};
+use crate::stream::{BLOCK, Parts, gather};
 
 use super::cfg_args::ModelConfig;
 use super::pth::read_state_dict;
@@ -229,16 +229,54 @@ impl FrameSource for ModelFolder {
         Some(Ok(Box::new(WholeModel { model: self, ids: (0..self.info.count as u32).collect() })))
     }
 
-    /// Blocks at once.
-    fn pull_back(&self, frame: usize, gradients: &mut Gradients) -> Result<()> {
-        assert_eq!(gradients.len(), self.info.count, "gradients of another model");
-        let time = self.time_of(frame)?;
-        let mut blocks = gradients.spans(BLOCK);
-        blocks.par_iter_mut().try_for_each(|block| self.field.pull_back(&self.canonical, time, block))
+    fn deformation(&self) -> Option<&dyn Deformation> {
+        Some(self)
     }
 
     fn reads(&self) -> Reads {
         Reads { states: self.states.get(), ..Reads::default() }
+    }
+}
+
+/// Blocks at once.
+impl Deformation for ModelFolder {
+    fn stored(&self) -> &Gaussians {
+        &self.canonical
+    }
+
+    /// Under a mask, which counts as constant, moving a position is worse than leaving it where it is.
+    fn movable(&self) -> Columns {
+        if self.field.has_mask() { Columns::all().difference(Columns::POSITION) } else { Columns::all() }
+    }
+
+    /// Positions, where they are deformed, and what is multiplied.
+    fn bound(&self) -> Columns {
+        Columns::all().difference(self.field.added()) | self.field.active() & self.movable() & Columns::POSITION
+    }
+
+    fn state(&self, frame: usize, stored: &Gaussians, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let time = self.time_of(frame)?;
+        let ids: Vec<u32> = (0..stored.len() as u32).collect();
+        let nothing = || Gaussians::zeros(0, self.info.sh_degree);
+        let parts = Parts::of(out, want, ids.len());
+        ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
+            || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
+            |(raw, state, scratch, deltas), (ids, parts)| {
+                for column in (want | Columns::POSITION).iter() {
+                    *raw.column_mut(column) = stored.column(column).pick(ids);
+                }
+                self.field.deltas(&self.field.prepare(&raw.position), time, want, scratch, deltas)?;
+                deltas.apply(raw, want, state);
+                parts.write(state, want);
+                Ok::<_, Error>(())
+            },
+        )
+    }
+
+    fn pull_back(&self, frame: usize, stored: &Gaussians, gradients: &mut Gradients) -> Result<()> {
+        let time = self.time_of(frame)?;
+        let mut blocks = gradients.spans(BLOCK);
+        blocks.par_iter_mut().try_for_each(|block| self.field.pull_back(stored, time, block))
     }
 }
 

@@ -264,11 +264,11 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
     let mut by_raw = by_state.clone();
-    model.pull_back(1, &mut by_raw).unwrap();
+    model.pull_back(1, model.canonical(), &mut by_raw).unwrap();
     for threads in [1, 2, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let mut again = by_state.clone();
-        pool.install(|| model.pull_back(1, &mut again)).unwrap();
+        pool.install(|| model.pull_back(1, model.canonical(), &mut again)).unwrap();
         assert!(again == by_raw, "{threads} threads");
     }
     for column in Columns::all().difference(Columns::POSITION).iter() {
@@ -299,5 +299,5 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
     // Within a step some cross the edge of a texel or a ReLU, where there is no one derivative.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
-    assert!(model.pull_back(3, &mut by_raw).is_err(), "there are three frames");
+    assert!(model.pull_back(3, model.canonical(), &mut by_raw).is_err(), "there are three frames");
 }

@@ -1,0 +1,375 @@
+//! Stage `refine`: moving what is stored of the survivors until their pictures come closest to the original's.
+//!
+//! Pruning leaves holes that only what is left can fill: footprints must grow over them. So the stored values of the
+//! survivors descend the gradient of the squared error of one picture after another, of the cameras that the scene is
+//! scored by and of cameras in between, so that what comes out fits no view more than others. A strong reduction goes
+//! there in cuts with steps between them, each ranked anew. A part of the pictures is kept apart; of the states on the
+//! last way down the one that those like best stays, its start included. A field stays as it is.
+//!
+//! Memory: what [`Descent`] and one differentiated picture take, three states, and the best change so far. The
+//! original's pictures and the states that they show wait in scratch files.
+
+mod moving;
+mod targets;
+
+use super::journal::Journal;
+use super::score::{Scored, scored};
+use crate::budget::{Need, REMOVE, RENDER, Workload};
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::model::Columns;
+use crate::recipe;
+use crate::reduction::{Change, Reduction};
+use crate::refine::{self, Schedule};
+use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
+use crate::scene::Scene;
+use crate::scene::between::Dice;
+use crate::stream::Progress;
+use moving::Moving;
+use targets::Targets;
+
+/// What the stage is called.
+const NAME: &str = "refine";
+
+/// Steps between two looks at the pictures kept apart.
+const JUDGE_EVERY: usize = 500;
+/// Part of the Gaussians that ranking alone leaves, before the first steps of a stronger reduction.
+const CUTS_FROM: f64 = 0.4;
+/// Part that a cut leaves, at least.
+const CUT: f64 = 0.8;
+/// Pictures that a cut is ranked on, others each time.
+const RANKED_ON: usize = 48;
+/// Pictures that tell how large steps after a cut should be.
+const LOOKED_AT: usize = 16;
+/// Rates of the last step, as a part of the first's: where a cut follows, and at the end.
+const LAST_RATE: [f32; 2] = [1.0, 0.05];
+
+/// The refinement of a run.
+#[derive(Debug, Clone)]
+pub struct Refine {
+    /// What moves.
+    pub columns: Columns,
+    /// Pictures that are stepped along, one at a time, at the size that is wanted.
+    pub steps: usize,
+    /// And before each cut.
+    pub cut_steps: usize,
+    /// Whether a strong reduction goes there in cuts.
+    pub cuts: bool,
+    /// Contrast that every Gaussian is taken to have at least with what it hides, for a cut.
+    pub contrast_floor: f64,
+    /// Part of the Gaussians that is asked for.
+    pub target: Option<f64>,
+}
+
+impl Refine {
+    /// The stage, unless `recipe` lets nothing move. Of a run that ranks by pictures (`cuts`), down to the part `target`.
+    pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<Refine> {
+        let recipe::Refine { refine, refine_steps, refine_cut_steps } = recipe.refine;
+        let refine = Refine {
+            columns: refine.0,
+            steps: refine_steps as usize,
+            cut_steps: refine_cut_steps as usize,
+            cuts,
+            contrast_floor: recipe.select.contrast_floor,
+            target,
+        };
+        (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
+    }
+
+    /// Steps at the end where a part `kept` of the Gaussians stays: the fewer go, the fewer.
+    fn last_steps(&self, kept: f64) -> usize {
+        let part = ((1.0 - kept) / (1.0 - CUTS_FROM)).clamp(0.0, 1.0);
+        (part * self.steps as f64).ceil() as usize
+    }
+
+    /// How many of `all` Gaussians to begin with, if `wanted` are to stay.
+    pub fn first(&self, wanted: usize, all: usize) -> usize {
+        if self.cuts { wanted.max((CUTS_FROM * all as f64).ceil() as usize).min(all) } else { wanted }
+    }
+
+    /// States, the descent, and a picture that is differentiated.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let whole = work.state(Columns::all());
+        let per_gaussian = vec![
+            ("kept", 24),
+            ("states", (3 + work.threads) * whole),
+            ("descent", whole + refine::bytes_per_gaussian(self.columns, work.sh_degree) as u64),
+            ("result", 2 * work.input.reduced),
+            ("readers", 2 * work.input.reader),
+            ("held", 2 * work.held(limits, Columns::all())),
+            ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
+        ];
+        let pictures = targets::numbers(work.pixels).iter().sum::<usize>() as f64;
+        let own = targets::numbers(work.pixels)[0] as u64;
+        let frames = own.min(work.frames.max(1));
+        let wanted = self.target.unwrap_or(0.5);
+        let sizes = sizes(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
+        let steps = self.last_steps(wanted);
+        let judged = pictures / targets::APART_EVERY as f64 * (1 + steps.div_ceil(JUDGE_EVERY)) as f64;
+        let seconds = |(k, size): (usize, &usize)| {
+            let left = *size as f64 / 1e6 * work.count();
+            let (renders, ranked) = match k + 1 == sizes.len() {
+                true => (judged + 2.5 * steps as f64, 0.0),
+                false => (LOOKED_AT as f64 + 2.5 * self.cut_steps as f64, RANKED_ON as f64),
+            };
+            work.reading(left, frames as f64 + renders)
+                + work.picturing(renders, left, RENDER)
+                + work.picturing(ranked, left, REMOVE)
+        };
+        Need {
+            stage: NAME,
+            reads: (1 + sizes.len()) as f64 * work.scattered_reads(frames, limits),
+            seconds: work.reading(work.count(), frames as f64)
+                + work.picturing(pictures, work.count(), RENDER)
+                + sizes.iter().enumerate().map(seconds).sum::<f64>(),
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![
+                work.arriving(),
+                ("pairs", GRADIENT_STRIP_BYTES as u64),
+                ("pictures", (work.threads + 4) * 12 * work.pixels),
+            ],
+        }
+    }
+
+    /// Refines what is left, and cuts it down to `wanted`; at the end not further than pictures kept apart come closer
+    /// to the original's. Protected Gaussians keep what is stored of them.
+    ///
+    /// # Errors
+    /// Frames that cannot be read; a scratch file that cannot be written.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        reduction: Reduction,
+        wanted: usize,
+        journal: &mut Journal,
+    ) -> Result<Reduction> {
+        let count = reduction.len();
+        let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
+        let why = match () {
+            () if count == 0 || scene.schedule.pairs() == 0 => "there is nothing to be seen",
+            () if steps == 0 => "nothing went that what stays could stand for",
+            () => "",
+        };
+        if !why.is_empty() {
+            journal.leave_out("refinement", why);
+            return Ok(reduction);
+        }
+        journal.stage(NAME, count, scene.source(), |journal| {
+            let targets = Targets::new(scene)?;
+            let (stepped, apart) = targets.parted();
+            let mut turns = Turns::of(stepped);
+            let sizes = sizes(count, wanted);
+            let all_steps = (sizes.len() - 1) * self.cut_steps + steps;
+            let progress = Progress::new(NAME, "steps", all_steps as u64);
+            let mut walk = Walk { refine: self, scene, scored, targets: &targets, turns: &mut turns, progress };
+            let mut reduction = reduction;
+            for &size in &sizes[1..] {
+                reduction = walk.to_a_cut(reduction, &apart, size)?;
+            }
+            Ok((walk.to_the_end(reduction, &apart, steps, journal)?, wanted))
+        })
+    }
+}
+
+/// How many Gaussians there are from `first` to `last`, cut by cut.
+fn sizes(first: usize, last: usize) -> Vec<usize> {
+    let ratio = last.max(1) as f64 / first.max(1) as f64;
+    let cuts = (ratio.ln() / CUT.ln() - 1e-9).ceil().max(0.0) as usize;
+    let after = |k: usize| (first as f64 * ratio.powf(k as f64 / cuts as f64)).round() as usize;
+    let mut sizes: Vec<usize> = std::iter::once(first).chain((1..cuts).map(after)).collect();
+    sizes.extend((cuts > 0).then_some(last));
+    sizes
+}
+
+/// Which picture comes next: all in an order, then all in another.
+struct Turns {
+    pictures: Vec<usize>,
+    at: usize,
+    dice: Dice,
+}
+
+impl Turns {
+    fn of(pictures: Vec<usize>) -> Turns {
+        Turns { at: pictures.len(), pictures, dice: Dice(1) }
+    }
+
+    fn next(&mut self) -> usize {
+        if self.at == self.pictures.len() {
+            self.dice.shuffle(&mut self.pictures);
+            self.at = 0;
+        }
+        self.at += 1;
+        self.pictures[self.at - 1]
+    }
+}
+
+/// What all legs of the way share.
+struct Walk<'a> {
+    refine: &'a Refine,
+    scene: &'a Scene,
+    scored: &'a Scored,
+    targets: &'a Targets,
+    turns: &'a mut Turns,
+    progress: Progress,
+}
+
+impl Walk<'_> {
+    /// Which of what is left stays as it is.
+    fn fixed(&self, reduction: &Reduction) -> Vec<bool> {
+        reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect()
+    }
+
+    fn step(&mut self, moving: &mut Moving<'_>, schedule: &Schedule) -> Result<()> {
+        moving.step(self.turns.next(), schedule)?;
+        self.progress.advance(1);
+        Ok(())
+    }
+
+    /// Steps, and lets go of all but the `size` that pictures would lose most with.
+    fn to_a_cut(&mut self, mut reduction: Reduction, apart: &[usize], size: usize) -> Result<Reduction> {
+        let (change, mut left) = {
+            let result = self.scene.input.reduced(&reduction)?;
+            let fixed = self.fixed(&reduction);
+            let mut moving = Moving::new(self.scene, &*result, self.targets, self.refine.columns, &fixed)?;
+            let some: Vec<usize> = apart.iter().step_by(apart.len().div_ceil(LOOKED_AT).max(1)).copied().collect();
+            let error = moving.closeness(&some)?.error;
+            let schedule = Schedule::new(self.refine.cut_steps, LAST_RATE[0], error);
+            for _ in 0..self.refine.cut_steps {
+                self.step(&mut moving, &schedule)?;
+            }
+            let of: Vec<usize> = (0..RANKED_ON).map(|_| self.turns.next()).collect();
+            let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?.sum;
+            let mut order: Vec<u32> = (0..reduction.len() as u32).collect();
+            // Stable: ties by id.
+            order.sort_by_key(|&place| std::cmp::Reverse((fixed[place as usize], errors[place as usize])));
+            (moving.descent.change(), order)
+        };
+        left.truncate(size);
+        left.sort_unstable();
+        reduction.change = reduction.change.and(change);
+        Ok(reduction.pick(&left))
+    }
+
+    /// Steps, and keeps the state that the pictures `apart` like best.
+    fn to_the_end(
+        &mut self,
+        mut reduction: Reduction,
+        apart: &[usize],
+        steps: usize,
+        journal: &mut Journal,
+    ) -> Result<Reduction> {
+        let change = {
+            let result = self.scene.input.reduced(&reduction)?;
+            let fixed = self.fixed(&reduction);
+            let mut moving = Moving::new(self.scene, &*result, self.targets, self.refine.columns, &fixed)?;
+            let before = moving.closeness(apart)?;
+            let schedule = Schedule::new(steps, LAST_RATE[1], before.error);
+            let (mut best, mut kept) = (before, Change::default());
+            for step in 1..=steps {
+                self.step(&mut moving, &schedule)?;
+                if step % JUDGE_EVERY == 0 || step == steps {
+                    let now = moving.closeness(apart)?;
+                    if now.psnr > best.psnr {
+                        (best, kept) = (now, moving.descent.change());
+                    }
+                }
+            }
+            let ([start, end], count) = ([before.psnr, best.psnr], apart.len());
+            if kept.is_empty() {
+                journal
+                    .leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
+            } else {
+                journal.notes.push(format!("refined: {count} pictures kept apart keep {end:.2} dB, not {start:.2}"));
+            }
+            kept
+        };
+        reduction.change = reduction.change.and(change);
+        Ok(reduction)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compress::score::UserOverrides;
+    use crate::compress::tests::{scene, score_scene};
+    use crate::metrics::psnr;
+    use crate::model::{Rig, Split};
+    use crate::recipe::Recipe;
+    use crate::render::render;
+    use crate::stream::gather_all;
+
+    /// The first `count` of the ranking of `scene`, refined in `steps` steps; `keep` are protected.
+    fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Reduction, Journal) {
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
+        let reduction = Reduction::pruned(scored.ranked().ranking.take(count), &recipe.merge);
+        let mut journal = Journal::default();
+        let refine = Refine { steps, ..Refine::of(&recipe, None, false).unwrap() };
+        (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
+    }
+
+    /// Mean PSNR of `reduction` over the pictures of `rig` that the scene is not scored by.
+    fn held_out(scene: &Scene, rig: &Rig, reduction: &Reduction) -> f64 {
+        let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
+        let result = scene.input.reduced(reduction).unwrap();
+        let of_frame = |(frame, views): (usize, &Vec<(u32, u32)>)| -> f64 {
+            let [original, now] =
+                [scene.source(), &*result].map(|source| gather_all(source, frame, Columns::all()).unwrap());
+            let of_view = |&(_, camera): &(u32, u32)| {
+                let made = |state| render(state, &schedule.cameras[camera as usize], scene.background);
+                psnr(&made(&now), &made(&original))
+            };
+            views.iter().map(of_view).sum()
+        };
+        schedule.frames.iter().enumerate().map(of_frame).sum::<f64>() / schedule.pairs() as f64
+    }
+
+    #[test]
+    fn pictures_of_no_camera_that_was_looked_through_come_closer_by_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let rig = scene.rig.clone();
+        let (plain, _) = refined(&scene, 300, 0, Vec::new());
+        let (moved, journal) = refined(&scene, 300, 200, Vec::new());
+        let [before, after] = [&plain, &moved].map(|reduction| held_out(&scene, &rig, reduction));
+        assert!(after > before + 3.0, "{before:.2} dB before, {after:.2} after");
+        assert_eq!((journal.left_out.len(), journal.notes.len()), (0, 1));
+        assert_eq!(moved.kept, plain.kept);
+    }
+
+    #[test]
+    fn what_comes_out_depends_neither_on_threads_nor_on_limits_and_what_is_protected_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut scene = scene(folder.path());
+        let keep: Vec<u32> = (100..140).collect();
+        let on = |threads: usize, scene: &Scene| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| refined(scene, 200, 110, keep.clone())).0
+        };
+        let one = on(1, &scene);
+        assert!(!one.change.is_empty());
+        assert!(on(3, &scene).change == one.change, "threads change it");
+        scene.limits = Limits { frames_held: 1, pictures_together: 1, ..Limits::NONE };
+        assert!(on(2, &scene).change == one.change, "limits change it");
+        for (place, id) in one.kept.iter().enumerate().filter(|(_, id)| keep.contains(id)) {
+            let moved = |column: Columns| {
+                let of = one.change.0.column(column);
+                (0..of.width()).any(|c| of.plane(c)[place] != 0.0)
+            };
+            assert!(!Columns::all().iter().any(moved), "Gaussian {id} is protected and moved");
+        }
+    }
+
+    #[test]
+    fn what_cannot_come_closer_stays_and_says_so() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let (whole, journal) = refined(&scene, 1500, 120, Vec::new());
+        assert!(whole.change.is_empty());
+        assert_eq!((journal.left_out.len(), journal.left_out[0].what.as_str()), (1, "refinement"));
+        let (none, journal) = refined(&scene, 0, 120, Vec::new());
+        assert_eq!((none.len(), journal.left_out.len()), (0, 1));
+    }
+}

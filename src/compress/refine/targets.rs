@@ -1,0 +1,167 @@
+//! The original's pictures that what is left is to come close to.
+
+use rayon::prelude::*;
+
+use crate::emit::atomic::Spill;
+use crate::error::Result;
+use crate::model::{Camera, Picture};
+use crate::render::{Image, render};
+use crate::scene::Scene;
+use crate::scene::between::{Dice, between};
+use crate::stream::{Batch, Subject, VIEWS_AT_ONCE, show, spread};
+
+/// Pictures of the scene's cameras, and of cameras in between: fewer of large ones.
+const PICTURES: [usize; 2] = [60, 460];
+/// Bytes that they may take in a scratch file, as long as there are [`FEWEST`].
+const MOST_BYTES: u64 = 1 << 30;
+/// See [`MOST_BYTES`].
+const FEWEST: u64 = 96;
+/// Of all every eighth is kept apart.
+pub(super) const APART_EVERY: usize = 8;
+
+/// How many pictures of the scene's cameras are looked at, and how many of cameras in between, if one has `pixels`.
+pub(super) fn numbers(pixels: u64) -> [usize; 2] {
+    let all = PICTURES.iter().sum::<usize>() as u64;
+    let count = (MOST_BYTES / (6 * pixels.max(1))).max(FEWEST).min(all);
+    PICTURES.map(|of| of * count as usize / all as usize)
+}
+
+/// The original's pictures, of the cameras that the scene is scored by and of cameras in between, in a scratch file.
+pub(super) struct Targets {
+    cameras: Vec<Camera>,
+    /// By frame.
+    pub(super) pictures: Vec<Picture>,
+    /// Of every picture its values from 0 to 1 as 16 bits, one after the other from its place.
+    values: Spill,
+    places: Vec<u64>,
+}
+
+impl Targets {
+    /// Renders them.
+    ///
+    /// # Errors
+    /// Frames that cannot be read; a scratch file that cannot be written.
+    pub(super) fn new(scene: &Scene) -> Result<Targets> {
+        let (cameras, pictures) = looked_at(scene);
+        let (mut values, mut places, mut end) = (Spill::new(&scene.scratch)?, Vec::new(), 0);
+        show([Subject::all(scene.source())], &cameras, &pictures, Batch::of_frame(&scene.limits), |views| {
+            let made: Vec<Vec<u16>> =
+                views.par_iter().map(|view| narrow(&render(view.states[0], view.camera, scene.background))).collect();
+            made.iter().try_for_each(|picture| {
+                places.push(end);
+                end += 2 * picture.len() as u64;
+                values.write(bytemuck::cast_slice(picture))
+            })
+        })?;
+        values.finish()?;
+        Ok(Targets { cameras, pictures, values, places })
+    }
+
+    /// The pictures that are stepped along, and those that are kept apart.
+    pub(super) fn parted(&self) -> (Vec<usize>, Vec<usize>) {
+        (0..self.pictures.len()).partition(|k| k % APART_EVERY != APART_EVERY - 1)
+    }
+
+    /// What took picture `k`.
+    pub(super) fn camera(&self, k: usize) -> &Camera {
+        &self.cameras[self.pictures[k].camera as usize]
+    }
+
+    /// The values of picture `k`.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be read.
+    pub(super) fn values(&self, k: usize) -> Result<Vec<u16>> {
+        let camera = self.camera(k);
+        let mut values = vec![0u16; 3 * camera.width as usize * camera.height as usize];
+        self.values.read(self.places[k], bytemuck::cast_slice_mut(&mut values))?;
+        Ok(values)
+    }
+}
+
+/// Cameras and pictures that are looked at, by frame: those that the scene is scored by, and those in between.
+fn looked_at(scene: &Scene) -> (Vec<Camera>, Vec<Picture>) {
+    let [own, more] = numbers(scene.workload().pixels);
+    let mut pictures = spread(&scene.schedule, own, VIEWS_AT_ONCE);
+    let mut used: Vec<u32> = scene.schedule.frames.iter().flatten().map(|&(_, camera)| camera).collect();
+    used.sort_unstable();
+    used.dedup();
+    let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
+    for picture in &mut pictures {
+        picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;
+    }
+    let (seen, mut dice) = (pictures.len(), Dice(2));
+    for camera in between(&cameras, if seen == 0 { 0 } else { more }) {
+        let frame = pictures[dice.below(seen)].frame;
+        pictures.push(Picture { frame, view: u32::MAX, camera: cameras.len() as u32 });
+        cameras.push(camera);
+    }
+    pictures.sort_by_key(|picture| picture.frame);
+    (cameras, pictures)
+}
+
+/// How a picture's squared error, `[H, W, 3]` summed, changes with each of its values. What a screen cannot show does
+/// not count.
+pub(super) fn slope(picture: &Image, target: &[u16]) -> Image {
+    let mut slope = picture.clone();
+    for (value, &wanted) in slope.data.iter_mut().zip(target) {
+        let shown = value.clamp(0.0, 1.0);
+        *value = if shown == *value { 2.0 * (shown - wide(wanted)) } else { 0.0 };
+    }
+    slope
+}
+
+/// Mean square error of a picture.
+pub(super) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
+    let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
+    picture.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
+}
+
+/// Values from 0 to 1 as 16 bits.
+fn narrow(picture: &Image) -> Vec<u16> {
+    // NaN becomes 0.
+    picture.data.iter().map(|value| (value.clamp(0.0, 1.0) * f32::from(u16::MAX)).round() as u16).collect()
+}
+
+fn wide(value: u16) -> f32 {
+    f32::from(value) / f32::from(u16::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sixteen_bits_hold_a_value_to_a_hundred_thousandth() {
+        let picture = Image { width: 1, height: 1, data: vec![0.0, 1.0, 0.123_456] };
+        let back: Vec<f32> = narrow(&picture).into_iter().map(wide).collect();
+        assert!(back.iter().zip(&picture.data).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?}");
+        let odd = Image { data: vec![-3.0, f32::NAN, 7.0], ..picture };
+        assert_eq!(narrow(&odd), [0, 0, u16::MAX]);
+    }
+
+    #[test]
+    fn a_slope_is_the_difference_of_squared_errors_and_what_no_screen_shows_has_none() {
+        let target = narrow(&Image { width: 2, height: 1, data: vec![0.5, 0.25, 1.0, 0.0, 0.75, 0.5] });
+        let picture = Image { width: 2, height: 1, data: vec![0.75, 0.125, 1.5, -0.5, 0.75, 0.625] };
+        let slopes = slope(&picture, &target).data;
+        for k in 0..6 {
+            let at = |by: f32| {
+                let mut moved = picture.clone();
+                moved.data[k] += by;
+                6.0 * mean_square(&moved, &target)
+            };
+            let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
+            assert!((f64::from(slopes[k]) - expected).abs() < 1e-3, "{k}: {} and {expected}", slopes[k]);
+        }
+        assert_eq!([slopes[2], slopes[3]], [0.0, 0.0]);
+    }
+
+    #[test]
+    fn large_pictures_are_fewer_but_never_too_few() {
+        assert_eq!(numbers(320 * 256), PICTURES);
+        assert_eq!(numbers(0), PICTURES);
+        assert_eq!(numbers(1352 * 1014), [15, 115]);
+        assert_eq!(numbers(1 << 40), [11, 84]);
+    }
+}
