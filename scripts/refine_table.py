@@ -1,30 +1,67 @@
 #!/usr/bin/env python3
-"""What refining survivors gains: prunes every 4DGaussians model below a folder to some sizes, with and without it.
+"""What refining survivors gains: reduces every model below a folder to some sizes, with and without it.
 
     cargo build --release
-    python3 scripts/refine_table.py target/release/splatsieve DATA [STEPS [RATIO ...]]
+    python3 scripts/refine_table.py target/release/splatsieve DATA [RATIO ...]
 
-DATA/<name>/ is a model folder with its cameras inside and, if there are any, held-out photographs in test/. Prints a
-Markdown table: mean PSNR of 15 frames of every held-out view against the unpruned model's own pictures and against the
-photographs, plain → refined, and the peak of both runs. Standard library only.
+DATA/<name>/ is a 4DGaussians model folder with its cameras inside and, if there are any, held-out photographs in test/;
+DATA/static/<name>.ply is a model without cameras, for which an orbit of 12 to score by and 4 to compare by is made.
+Prints a Markdown table: pruned alone (--no-refine --prune-only) → `default`, by mean PSNR of 15 frames of every held-out
+view against the unpruned model's own pictures, SSIM, and PSNR against the photographs; wall seconds of the whole run and
+those before refinement; the largest peak of both. Standard library only.
 """
 
+import json
+import math
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from models_table import run
+from sweep_table import positions
 
 
-def point(binary, model, ratio, steps, output):
-    options = ["--prune-only", "--target-ratio", ratio, "--refine-steps", steps, "--json"]
-    summary = run(binary, "compress", model, "--cameras", model, "-o", output, *options)
+def orbit(ply, path, pixels=300, focal=330):
+    """Cameras around the median position, 2.2 times as far as nine tenths of all lie; up is y."""
+    axes = positions(ply)
+    middle = [sorted(axis)[len(axis) // 2] for axis in axes]
+    distances = sorted(math.dist(middle, place) for place in zip(*axes))
+    radius = 2.2 * distances[len(distances) * 9 // 10]
+    train = [(math.tau * i / 12, 0.25 + 0.35 * (i % 3 - 1), "train") for i in range(12)]
+    test = [(math.tau * (i + 0.37) / 4, (0.1, 0.45, -0.05, 0.3)[i], "test") for i in range(4)]
+    frames = []
+    for view, (azimuth, elevation, split) in enumerate(train + test):
+        flat, high = math.cos(elevation), math.sin(elevation)
+        out = [flat * math.sin(azimuth), high, flat * math.cos(azimuth)]
+        right = [math.cos(azimuth), 0, -math.sin(azimuth)]
+        down = [high * math.sin(azimuth), -flat, high * math.cos(azimuth)]
+        eye = [m + radius * x for m, x in zip(middle, out)]
+        rows = [[*axis, -sum(a * e for a, e in zip(axis, eye))] for axis in (right, down, [-x for x in out])]
+        frames.append(
+            {"v": view, "split": split, "width": pixels, "height": pixels, "fx": focal, "fy": focal}
+            | {"cx": pixels / 2, "cy": pixels / 2, "w2c": [*rows, [0, 0, 0, 1]]}
+        )
+    path.write_text(json.dumps({"background": [0, 0, 0], "frames": frames}) + "\n")
+    return path
+
+
+def point(binary, model, cameras, ratio, output, *options):
+    start = time.monotonic()
+    summary = run(
+        binary, "compress", model, "--cameras", cameras, "-o", output, "--target-ratio", ratio, "--json", *options
+    )
+    wall = time.monotonic() - start
     truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
-    quality = run(binary, "evaluate", model, output, "--cameras", model, *truth, "--max-frames", 15, "--json")
+    quality = run(binary, "evaluate", model, output, "--cameras", cameras, *truth, "--max-frames", 15, "--json")
+    refining = sum(stage["seconds"] for stage in summary["stages"] if stage["name"] == "refine")
     return {
         "psnr": quality["psnr"],
+        "ssim": quality["ssim"],
         "photos": quality["ground_truth"]["psnr"] if truth else None,
         "original": quality["ground_truth"]["original"]["psnr"] if truth else None,
+        "wall": wall,
+        "before": wall - refining,
         "peak": max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"]) / 2**20,
     }
 
@@ -34,23 +71,28 @@ def main():
         print(__doc__)
         sys.exit(2)
     binary, data = sys.argv[1], Path(sys.argv[2])
-    steps = sys.argv[3] if len(sys.argv) > 3 else "500"
-    ratios = sys.argv[4:] or ["0.4", "0.2", "0.1", "0.05"]
-    print("| model | kept | PSNR dB to the original | PSNR dB to photographs (unpruned) | MiB |")
-    print("|---|---|---|---|---|")
-    for model in sorted(path.parent for path in data.glob("*/cfg_args")):
-        for ratio in ratios:
-            with tempfile.TemporaryDirectory() as folder:
-                plain = point(binary, model, ratio, 0, Path(folder) / "plain")
-                moved = point(binary, model, ratio, steps, Path(folder) / "refined")
-            photos = "–"
-            if plain["photos"] is not None:
-                photos = f"{plain['photos']:.2f} → {moved['photos']:.2f} ({moved['original']:.2f})"
-            print(
-                f"| {model.name} | {100 * float(ratio):.0f}% | {plain['psnr']:.1f} → {moved['psnr']:.1f} | {photos} "
-                f"| {plain['peak']:.0f} → {moved['peak']:.0f} |",
-                flush=True,
-            )
+    ratios = sys.argv[3:] or ["0.4", "0.2", "0.1", "0.05"]
+    print("| model | kept | PSNR dB to the original | SSIM | PSNR dB to photographs (unpruned) | s (before refining) | MiB |")
+    print("|---|---|---|---|---|---|---|")
+    models = [path.parent for path in sorted(data.glob("*/cfg_args"))] + sorted(data.glob("static/*.ply"))
+    with tempfile.TemporaryDirectory() as folder:
+        for model in models:
+            kind = "" if model.is_dir() else ".ply"
+            cameras = model if model.is_dir() else orbit(model, Path(folder) / f"{model.stem}.json")
+            for ratio in ratios:
+                name = f"{model.stem}{ratio}"
+                only = ["--no-refine", "--prune-only"]
+                plain = point(binary, model, cameras, ratio, Path(folder) / f"{name}_plain{kind}", *only)
+                moved = point(binary, model, cameras, ratio, Path(folder) / f"{name}{kind}")
+                photos = "–"
+                if plain["photos"] is not None:
+                    photos = f"{plain['photos']:.2f} → {moved['photos']:.2f} ({moved['original']:.2f})"
+                print(
+                    f"| {model.stem} | {100 * float(ratio):.0f}% | {plain['psnr']:.1f} → {moved['psnr']:.1f} "
+                    f"| {plain['ssim']:.3f} → {moved['ssim']:.3f} | {photos} "
+                    f"| {moved['wall']:.0f} ({moved['before']:.0f}) | {max(plain['peak'], moved['peak']):.0f} |",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

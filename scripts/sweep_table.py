@@ -26,12 +26,13 @@ def positions(ply):
     width = head.count(b"property float")
     values = array.array("f")
     values.frombytes(body[: len(body) // 4 * 4])
-    return [sorted(values[axis::width]) for axis in range(3)]
+    return [values[axis::width] for axis in range(3)]
 
 
 def cameras_around(ply, path, count=16, pixels=300, field_of_view=60):
     """Cameras on a Fibonacci sphere of two extents around the robust middle, every fourth held out."""
-    ranges = [(axis[len(axis) // 100], axis[-1 - len(axis) // 100]) for axis in positions(ply)]
+    axes = [sorted(axis) for axis in positions(ply)]
+    ranges = [(axis[len(axis) // 100], axis[-1 - len(axis) // 100]) for axis in axes]
     middle = [(low + high) / 2 for low, high in ranges]
     radius = 2 * max(high - low for low, high in ranges)
     focal = pixels / 2 / math.tan(math.radians(field_of_view / 2))

@@ -8,8 +8,18 @@ use std::fs;
 use scene::Workplace;
 use serde_json::Value;
 
-const NAMES: [&str; 9] =
-    ["default", "paper", "paper-prune", "paper-merge", "visible", "projected", "opacity", "scale", "random"];
+const NAMES: [&str; 10] = [
+    "default",
+    "no-refine",
+    "paper",
+    "paper-prune",
+    "paper-merge",
+    "visible",
+    "projected",
+    "opacity",
+    "scale",
+    "random",
+];
 
 fn json(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
@@ -54,9 +64,11 @@ fn every_method_has_its_points_at_the_counts_asked_for() {
 fn a_point_is_what_compress_and_evaluate_give() {
     let place = Workplace::new();
     let swept = json(&place.done(
-        "sweep {tiny} --cameras {tiny} -o curves --methods default,paper-prune --fractions 0.4 --max-frames 3 --json",
+        "sweep {tiny} --cameras {tiny} -o curves --methods default,no-refine,paper-prune --fractions 0.4 --max-frames 3 --json",
     ));
-    for (method, flags) in [("default", "--preset default"), ("paper-prune", "--preset paper --prune-only")] {
+    for (method, flags) in
+        [("default", ""), ("no-refine", "--no-refine"), ("paper-prune", "--preset paper --prune-only")]
+    {
         place.done(&format!("compress {{tiny}} --cameras {{tiny}} -o {method} --target-ratio 0.4 {flags}"));
         let evaluated =
             json(&place.done(&format!("evaluate {{tiny}} {method} --cameras {{tiny}} --max-frames 3 --json")));
@@ -90,7 +102,7 @@ fn odd_requests_are_refused_and_leave_nothing() {
     for (flags, expected) in [
         ("--fractions 0.5,0", "--fractions: expected numbers above 0 and at most 1, found 0"),
         ("--fractions nan", "found NaN"),
-        ("--methods best", "possible values: default, paper"),
+        ("--methods best", "possible values: default, no-refine, paper"),
         ("--cameras nowhere.json", "nowhere.json"),
     ] {
         let run = place.run(&format!("sweep {{tiny}} -o curves {flags}"));

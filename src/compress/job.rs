@@ -54,9 +54,9 @@ impl Job {
         let prunes = *only != Only::Merge;
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
         let refine = Refine::of(recipe, part, looks && prunes);
-        // What refining gains at a count is more than merging and choosing ever did.
-        let refines = refine.is_some() && prunes;
-        let merges = *only != Only::Prune && !recipe.merge.passes.is_empty() && !refines;
+        // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
+        let merges = *only != Only::Prune && !recipe.merge.passes.is_empty() && !(refine.is_some() && prunes);
+        let cuts = refine.as_ref().is_some_and(Refine::will_cut);
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
         let choose =
             || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
@@ -64,7 +64,7 @@ impl Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
-            choose: (looks && prunes && !refines && recipe.select.choose_by_views).then(choose),
+            choose: (looks && prunes && !cuts && recipe.select.choose_by_views).then(choose),
             refine,
             emit: Emit::new(request, outlook.own_output, merges),
             measure,

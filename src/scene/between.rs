@@ -7,11 +7,14 @@ use crate::model::Camera;
 
 /// Part of the way from one camera to the other: from this, and as far before the end.
 const NEAR_END: f64 = 0.15;
+/// Cosine of the angle between two cameras, as seen from where the optical axes meet, up to which there is a way from one
+/// to the other: a third of a turn and a bit. Halfway between opposite ones a camera could look anywhere.
+const WIDEST: f64 = -0.6;
 
-/// `count` cameras, each on the way from one of `cameras` to another that stands less than a quarter turn away, as seen
-/// from where the optical axes meet, or else to the nearest one: turned evenly, and as far from there as its way along
-/// says. Ways between neighbours alone leave the middle of a rig empty. None where all cameras stand at one place. The
-/// same for the same cameras.
+/// `count` cameras, each on the way from one of `cameras` to another that stands no more than a third of a turn away, as
+/// seen from where the optical axes meet, or else to the nearest one: turned evenly, that point at its place in the
+/// pictures, and as far from it as its way along says. Ways between neighbours alone leave the middle of a rig empty. None
+/// where all cameras stand at one place. The same for the same cameras.
 pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
     let mut dice = Dice(0);
@@ -20,8 +23,9 @@ pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
         let Some(from) = cameras.get(dice.below(cameras.len())) else { break };
         let away = |other: &&Camera| other.center().distance_squared(from.center());
         let elsewhere = || cameras.iter().filter(|other| away(other) > 0.0);
-        let here = from.center() - focus;
-        let near: Vec<&Camera> = elsewhere().filter(|other| (other.center() - focus).dot(here) > 0.0).collect();
+        let direction = |camera: &Camera| (camera.center() - focus).normalize_or_zero();
+        let is_near = |other: &&Camera| direction(other).dot(direction(from)) > WIDEST;
+        let near: Vec<&Camera> = elsewhere().filter(is_near).collect();
         let nearest = || elsewhere().min_by(|a, b| away(a).total_cmp(&away(b)));
         let Some(to) = near.get(dice.below(near.len())).copied().or_else(nearest) else { continue };
         let way = NEAR_END + (1.0 - 2.0 * NEAR_END) * dice.unit();
@@ -32,12 +36,19 @@ pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
 
 fn on_the_way(from: &Camera, to: &Camera, way: f64, focus: DVec3) -> Camera {
     let [a, b] = [from, to].map(|camera| DQuat::from_mat3(&camera.rotation));
-    let rotation = DMat3::from_quat(a.slerp(b, way));
+    let turned = DMat3::from_quat(a.slerp(b, way));
     let [start, end] = [from, to].map(|camera| camera.center() - focus);
     let straight = start.lerp(end, way);
     let distance = start.length() * (1.0 - way) + end.length() * way;
     // Where the way leads through that point it stays straight.
     let center = focus + straight.try_normalize().map_or(straight, |direction| direction * distance);
+    // On a wide way turning evenly loses sight of that point: it stays at its place in the pictures.
+    let seen = |camera: &Camera| (camera.rotation * (focus - camera.center())).normalize_or_zero();
+    let wanted = seen(from).lerp(seen(to), way).normalize_or_zero();
+    let found = (turned * (focus - center)).normalize_or_zero();
+    let is_known = wanted.is_normalized() && found.is_normalized();
+    let back = if is_known { DQuat::from_rotation_arc(found, wanted) } else { DQuat::IDENTITY };
+    let rotation = DMat3::from_quat(back) * turned;
     Camera { rotation, translation: -(rotation * center), ..from.clone() }
 }
 

@@ -17,8 +17,8 @@ use crate::budget::{peak_memory_bytes, reset_peak_memory};
 use crate::compress::{Only, Request, Target, compress};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
-use crate::model::Split;
-use crate::recipe::{Coverage, Recipe, StaticTerm};
+use crate::model::{Columns, Split};
+use crate::recipe::{Coverage, Groups, Recipe, StaticTerm};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, open_scene};
 use crate::stream::Progress;
@@ -28,6 +28,8 @@ use crate::stream::Progress;
 pub enum Method {
     /// Preset `default`.
     Default,
+    /// Preset `default` that leaves what stays as it was.
+    NoRefine,
     /// Preset `paper`: prunes and merges.
     Paper,
     /// Preset `paper` without merging.
@@ -48,8 +50,9 @@ pub enum Method {
 
 impl Method {
     /// Every method, ours first.
-    pub const ALL: [Method; 9] = [
+    pub const ALL: [Method; 10] = [
         Method::Default,
+        Method::NoRefine,
         Method::Paper,
         Method::PaperPrune,
         Method::PaperMerge,
@@ -64,6 +67,7 @@ impl Method {
     pub fn name(self) -> &'static str {
         match self {
             Method::Default => "default",
+            Method::NoRefine => "no-refine",
             Method::Paper => "paper",
             Method::PaperPrune => "paper-prune",
             Method::PaperMerge => "paper-merge",
@@ -77,8 +81,13 @@ impl Method {
 
     /// How it compresses.
     fn means(self) -> Result<Means> {
-        let pruning = |coverage| {
+        let unrefined = || {
             let mut recipe = Recipe::preset("default")?;
+            recipe.refine.refine = Groups(Columns::empty());
+            Ok::<_, Error>(recipe)
+        };
+        let pruning = |coverage| {
+            let mut recipe = unrefined()?;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticTerm::Mean;
             // S = C without clipping, so that no two Gaussians tie that differ in C.
@@ -91,6 +100,7 @@ impl Method {
         let paper = |only| Ok(Means::Recipe(Box::new(Recipe::preset("paper")?), only));
         match self {
             Method::Default => Ok(Means::Recipe(Box::new(Recipe::preset("default")?), Only::Both)),
+            Method::NoRefine => Ok(Means::Recipe(Box::new(unrefined()?), Only::Both)),
             Method::Paper => paper(Only::Both),
             Method::PaperPrune => paper(Only::Prune),
             Method::PaperMerge => paper(Only::Merge),
@@ -104,7 +114,7 @@ impl Method {
 
     /// Whether it has a size of its own choice, by thresholds.
     fn chooses_size(self) -> bool {
-        matches!(self, Method::Default | Method::Paper | Method::PaperPrune | Method::PaperMerge)
+        matches!(self, Method::Default | Method::NoRefine | Method::Paper | Method::PaperPrune | Method::PaperMerge)
     }
 }
 

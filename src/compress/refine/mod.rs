@@ -14,7 +14,7 @@ mod targets;
 
 use super::journal::Journal;
 use super::score::{Scored, scored};
-use crate::budget::{Need, REMOVE, RENDER, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::Columns;
@@ -76,6 +76,11 @@ impl Refine {
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
     }
 
+    /// Whether what is wanted is so few that cuts lead there.
+    pub fn will_cut(&self) -> bool {
+        self.cuts && self.target.is_some_and(|target| target < CUTS_FROM)
+    }
+
     /// Steps at the end where a part `kept` of the Gaussians stays: the fewer go, the fewer.
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - CUTS_FROM)).clamp(0.0, 1.0);
@@ -90,15 +95,21 @@ impl Refine {
     /// States, the descent, and a picture that is differentiated.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let whole = work.state(Columns::all());
-        let per_gaussian = vec![
-            ("kept", 24),
-            ("states", (3 + work.threads) * whole),
+        let read = [("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
+        let original = [("states", whole), ("pictures", PICTURE_ON_ALL_THREADS)];
+        let original: Vec<Part> = read.into_iter().chain(original).collect();
+        let left = [
+            ("states", (4 + work.threads) * whole),
             ("descent", whole + refine::bytes_per_gaussian(self.columns, work.sh_degree) as u64),
-            ("result", 2 * work.input.reduced),
-            ("readers", 2 * work.input.reader),
-            ("held", 2 * work.held(limits, Columns::all())),
+            ("result", work.input.reduced),
             ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
         ];
+        // First the original is looked at, then only what is left, of which there are fewer.
+        let part = self.target.map_or(1.0, |target| target.max(CUTS_FROM)).min(1.0);
+        let of_left = |(name, bytes): Part| (name, (bytes as f64 * part).ceil() as u64);
+        let left: Vec<Part> = read.into_iter().chain(left).map(of_left).collect();
+        let bytes = |parts: &[Part]| parts.iter().map(|part| part.1).sum::<u64>();
+        let per_gaussian = if bytes(&left) > bytes(&original) { left } else { original };
         let pictures = targets::numbers(work.pixels).iter().sum::<usize>() as f64;
         let own = targets::numbers(work.pixels)[0] as u64;
         let frames = own.min(work.frames.max(1));
@@ -122,7 +133,7 @@ impl Refine {
             seconds: work.reading(work.count(), frames as f64)
                 + work.picturing(pictures, work.count(), RENDER)
                 + sizes.iter().enumerate().map(seconds).sum::<f64>(),
-            per_gaussian: [scored(limits), per_gaussian].concat(),
+            per_gaussian: [scored(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![
                 work.arriving(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
@@ -165,9 +176,9 @@ impl Refine {
             let mut walk = Walk { refine: self, scene, scored, targets: &targets, turns: &mut turns, progress };
             let mut reduction = reduction;
             for &size in &sizes[1..] {
-                reduction = walk.to_a_cut(reduction, &apart, size)?;
+                reduction = walk.cut(reduction, &apart, size)?;
             }
-            Ok((walk.to_the_end(reduction, &apart, steps, journal)?, wanted))
+            Ok((walk.finish(reduction, &apart, steps, journal)?, wanted))
         })
     }
 }
@@ -227,7 +238,7 @@ impl Walk<'_> {
     }
 
     /// Steps, and lets go of all but the `size` that pictures would lose most with.
-    fn to_a_cut(&mut self, mut reduction: Reduction, apart: &[usize], size: usize) -> Result<Reduction> {
+    fn cut(&mut self, mut reduction: Reduction, apart: &[usize], size: usize) -> Result<Reduction> {
         let (change, mut left) = {
             let result = self.scene.input.reduced(&reduction)?;
             let fixed = self.fixed(&reduction);
@@ -252,7 +263,7 @@ impl Walk<'_> {
     }
 
     /// Steps, and keeps the state that the pictures `apart` like best.
-    fn to_the_end(
+    fn finish(
         &mut self,
         mut reduction: Reduction,
         apart: &[usize],

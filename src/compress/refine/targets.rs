@@ -145,14 +145,14 @@ mod tests {
         let target = narrow(&Image { width: 2, height: 1, data: vec![0.5, 0.25, 1.0, 0.0, 0.75, 0.5] });
         let picture = Image { width: 2, height: 1, data: vec![0.75, 0.125, 1.5, -0.5, 0.75, 0.625] };
         let slopes = slope(&picture, &target).data;
-        for k in 0..6 {
+        for (k, &slope) in slopes.iter().enumerate() {
             let at = |by: f32| {
                 let mut moved = picture.clone();
                 moved.data[k] += by;
                 6.0 * mean_square(&moved, &target)
             };
             let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
-            assert!((f64::from(slopes[k]) - expected).abs() < 1e-3, "{k}: {} and {expected}", slopes[k]);
+            assert!((f64::from(slope) - expected).abs() < 1e-3, "{k}: {slope} and {expected}");
         }
         assert_eq!([slopes[2], slopes[3]], [0.0, 0.0]);
     }
