@@ -83,7 +83,7 @@ def runs(args, gaussians, frames):
     cameras.write_text(cameras_json(args.views))
     packing = None if packed.exists() else pack(args, gaussians, frames, packed)
     for budget in args.budgets:
-        command = [args.binary, "compress", packed, "--cameras", cameras, "-o", output, "--overwrite", "--json"]
+        command = [args.binary, "compress", packed, "--cameras", cameras, "-o", output, "--overwrite", "--no-refine", "--json"]
         command += ["--preset", args.preset, "--frame-stride", args.every, *memory(budget), *args.extra]
         printed, cost = measured(command)
         summary = json.loads(printed)

@@ -132,8 +132,9 @@ fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
                 continue;
             }
             let output = format!("{preset}{k}.gseq");
-            let arguments =
-                format!("demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} -o {output}");
+            let arguments = format!(
+                "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --refine-steps 60 --refine-cut-steps 10 -o {output}"
+            );
             let read = reads_as_planned(&workplace, &arguments);
             // What fits into memory is read once; two threads may begin the same tile at once.
             assert!(k > 0 || read <= 1.1, "{preset}: {read}");
