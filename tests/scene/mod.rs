@@ -202,12 +202,14 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
     names.iter().map(|name| (name.clone(), read(name))).collect()
 }
 
-/// A preset that scores by projected coverage and leaves no choice to renders: what the formulas decide alone.
+/// A preset that scores by projected coverage and leaves nothing to renders: what the formulas decide alone.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
-    use splatsieve::recipe::{Coverage, Recipe, StaticTerm};
+    use splatsieve::model::Columns;
+    use splatsieve::recipe::{Coverage, Groups, Recipe, StaticTerm};
     let mut recipe = Recipe::preset(preset).unwrap();
     recipe.scan.coverage = Coverage::Projected;
     recipe.score.static_term = StaticTerm::Mean;
     recipe.select.choose_by_views = false;
+    recipe.refine.refine = Groups(Columns::empty());
     recipe
 }
