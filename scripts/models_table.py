@@ -23,20 +23,34 @@ def run(*command):
     return json.loads(result.stdout)
 
 
+def evaluated(binary, model, output, cameras):
+    """What `evaluate` says of `output`, with photographs where the model has some."""
+    truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
+    return run(binary, "evaluate", model, output, "--cameras", cameras, *truth, "--max-frames", 15, "--json")
+
+
+def photographs(quality):
+    """PSNR against photographs, of the unpruned model and of the result; none without them."""
+    truth = quality.get("ground_truth")
+    return (truth["original"]["psnr"], truth["psnr"]) if truth else None
+
+
+def peak(summary):
+    """MiB."""
+    return max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"]) / 2**20
+
+
 def row(binary, model, preset, output):
     summary = run(binary, "compress", model, "--cameras", model, "--preset", preset, "-o", output, "--json")
-    truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
-    quality = run(binary, "evaluate", model, output, "--cameras", model, *truth, "--max-frames", 15, "--json")
+    quality = evaluated(binary, model, output, model)
     before, after = summary["input"]["gaussians"], summary["gaussians"]
     size = f"{summary['input']['bytes'] / 1e6:.1f} → {summary['output_bytes'] / 1e6:.1f} MB"
     seconds = sum(stage["seconds"] for stage in summary["stages"])
-    peak = max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"])
-    photos = "–"
-    if truth:
-        photos = f"{quality['ground_truth']['original']['psnr']:.2f} → {quality['ground_truth']['psnr']:.2f}"
+    photos = photographs(quality)
+    photos = f"{photos[0]:.2f} → {photos[1]:.2f}" if photos else "–"
     return (
         f"| {model.name} | {preset} | {before} → {after} ({100 * after / before:.0f}%) | {size} "
-        f"| {quality['psnr']:.1f} / {quality['ssim']:.4f} | {photos} | {seconds:.1f} s | {peak / 2**20:.0f} MiB |"
+        f"| {quality['psnr']:.1f} / {quality['ssim']:.4f} | {photos} | {seconds:.1f} s | {peak(summary):.0f} MiB |"
     )
 
 

@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from models_table import run
+from models_table import evaluated, peak, photographs, run
 from sweep_table import positions
 
 
@@ -52,17 +52,15 @@ def point(binary, model, cameras, ratio, output, *options):
         binary, "compress", model, "--cameras", cameras, "-o", output, "--target-ratio", ratio, "--json", *options
     )
     wall = time.monotonic() - start
-    truth = ["--ground-truth", model / "test"] if (model / "test").is_dir() else []
-    quality = run(binary, "evaluate", model, output, "--cameras", cameras, *truth, "--max-frames", 15, "--json")
+    quality = evaluated(binary, model, output, cameras)
     refining = sum(stage["seconds"] for stage in summary["stages"] if stage["name"] == "refine")
     return {
         "psnr": quality["psnr"],
         "ssim": quality["ssim"],
-        "photos": quality["ground_truth"]["psnr"] if truth else None,
-        "original": quality["ground_truth"]["original"]["psnr"] if truth else None,
+        "photos": photographs(quality),
         "wall": wall,
         "before": wall - refining,
-        "peak": max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"]) / 2**20,
+        "peak": peak(summary),
     }
 
 
@@ -85,8 +83,9 @@ def main():
                 plain = point(binary, model, cameras, ratio, Path(folder) / f"{name}_plain{kind}", *only)
                 moved = point(binary, model, cameras, ratio, Path(folder) / f"{name}{kind}")
                 photos = "–"
-                if plain["photos"] is not None:
-                    photos = f"{plain['photos']:.2f} → {moved['photos']:.2f} ({moved['original']:.2f})"
+                if plain["photos"]:
+                    original, refined = moved["photos"]
+                    photos = f"{plain['photos'][1]:.2f} → {refined:.2f} ({original:.2f})"
                 print(
                     f"| {model.stem} | {100 * float(ratio):.0f}% | {plain['psnr']:.1f} → {moved['psnr']:.1f} "
                     f"| {plain['ssim']:.3f} → {moved['ssim']:.3f} | {photos} "

@@ -82,8 +82,9 @@ impl Change {
         for column in (self.columns() & of).iter() {
             let (by, values) = (self.0.column(column), state.column_mut(column));
             for c in 0..by.width().min(values.width()) {
-                let changed = values.plane_mut(c).iter_mut().zip(by.plane(c)).filter(|(_, by)| **by != 0.0);
-                changed.for_each(|(value, by)| *value += by);
+                for (value, &by) in values.plane_mut(c).iter_mut().zip(by.plane(c)) {
+                    *value = if by == 0.0 { *value } else { *value + by };
+                }
             }
         }
     }

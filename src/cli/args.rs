@@ -374,8 +374,8 @@ pub(super) struct Sweep {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: CameraFile,
-    /// Methods to compare: `default` and `paper`, the presets; `no-refine`, the first without refining; `paper-prune`, `paper-merge`, the paper's ablations;
-    /// prunings by `visible` contribution, `projected` coverage, `opacity` or `scale` alone, and at `random`
+    /// Methods to compare: `default` and `paper`, the presets; `no-refine`, the first without refining; `paper-prune`,
+    /// `paper-merge`, the paper's ablations; prunings by `visible` contribution, `projected` coverage, `opacity` or `scale` alone, and at `random`
     #[arg(long, value_name = "METHODS", value_delimiter = ',', default_values_t = Method::ALL.map(Method::name).map(str::to_owned),
           value_parser = clap::builder::PossibleValuesParser::new(Method::ALL.map(Method::name)))]
     pub(super) methods: Vec<String>,

@@ -27,8 +27,12 @@ pub const PSNR_CAP_DB: f64 = 100.0;
 /// # Panics
 /// If the sizes differ.
 pub fn psnr(a: &Image, b: &Image) -> f64 {
-    let squares = mean_square(channels(a, b).map(|(a, b)| a - b));
-    let db = -10.0 * squares.log10();
+    decibels(mean_square(channels(a, b).map(|(a, b)| a - b)))
+}
+
+/// PSNR of a mean squared difference; NaN of NaN.
+pub fn decibels(mean_square: f64) -> f64 {
+    let db = -10.0 * mean_square.log10();
     if db > PSNR_CAP_DB { PSNR_CAP_DB } else { db }
 }
 

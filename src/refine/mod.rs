@@ -43,7 +43,7 @@ impl Schedule {
 /// What is stored of Gaussians on its way down.
 #[derive(Debug)]
 pub struct Descent {
-    change: Gaussians,
+    change: Change,
     /// Means of the derivatives, and of their squares.
     means: [Gaussians; 2],
     /// `[N]`, by what rates are multiplied: 1, and of positions four hundredths of the mean extent; 0 of what stays.
@@ -68,20 +68,12 @@ impl Descent {
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
         let of_positions = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
         let reach = [free.iter().enumerate().map(of_positions).collect(), free];
-        Descent { means: [change.clone(), change.clone()], change, reach, columns, done: 0 }
+        Descent { means: [change.clone(), change.clone()], change: Change(change), reach, columns, done: 0 }
     }
 
     /// What is to be added to the start.
-    pub fn change(&self) -> Change {
-        Change(self.change.clone())
-    }
-
-    /// Adds what is to be added to the start to the columns `of` of `state`, as far as they move.
-    pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
-        for column in (self.columns & of).iter() {
-            let (by, to) = (self.change.column(column), state.column_mut(column));
-            to.planes_mut().iter_mut().zip(by.planes()).for_each(|(to, by)| *to += by);
-        }
+    pub fn change(&self) -> &Change {
+        &self.change
     }
 
     /// One step against `gradients`, at rates of `schedule`.
@@ -97,7 +89,7 @@ impl Descent {
         let count = of_others.len().max(1);
         let [means, squares] = &mut self.means;
         let moved = means.columns_mut(self.columns).zip(squares.columns_mut(self.columns));
-        let moved = self.columns.iter().zip(moved.zip(self.change.columns_mut(self.columns)));
+        let moved = self.columns.iter().zip(moved.zip(self.change.0.columns_mut(self.columns)));
         let mut planes = Vec::new();
         for (column, ((means, squares), values)) in moved {
             let reach = if column == Columns::POSITION { of_positions } else { of_others };
@@ -151,7 +143,7 @@ mod tests {
         let mut descent = Descent::new(&start, Columns::all(), &[false, true, false]);
         for _ in 0..2000 {
             let mut now = start.clone();
-            descent.add_to(&mut now, Columns::all());
+            descent.change().add_to(&mut now, Columns::all());
             descent.step(&slopes(&now, 0.25), &Schedule::new(2000, 0.05, 1.0));
         }
         let mut end = start.clone();

@@ -110,9 +110,8 @@ impl Refine {
         let left: Vec<Part> = read.into_iter().chain(left).map(of_left).collect();
         let bytes = |parts: &[Part]| parts.iter().map(|part| part.1).sum::<u64>();
         let per_gaussian = if bytes(&left) > bytes(&original) { left } else { original };
-        let pictures = targets::numbers(work.pixels).iter().sum::<usize>() as f64;
-        let own = targets::numbers(work.pixels)[0] as u64;
-        let frames = own.min(work.frames.max(1));
+        let [own, between] = targets::numbers(work.pixels);
+        let (pictures, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let sizes = sizes(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted);
@@ -157,23 +156,21 @@ impl Refine {
     ) -> Result<Reduction> {
         let count = reduction.len();
         let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
-        let why = match () {
-            () if count == 0 || scene.schedule.pairs() == 0 => "there is nothing to be seen",
-            () if steps == 0 => "nothing went that what stays could stand for",
-            () => "",
-        };
-        if !why.is_empty() {
-            journal.leave_out("refinement", why);
+        if count == 0 || scene.schedule.pairs() == 0 {
+            journal.leave_out("refinement", "there is nothing to be seen");
+            return Ok(reduction);
+        }
+        if steps == 0 {
+            journal.leave_out("refinement", "nothing went that what stays could stand for");
             return Ok(reduction);
         }
         journal.stage(NAME, count, scene.source(), |journal| {
             let targets = Targets::new(scene)?;
             let (stepped, apart) = targets.parted();
-            let mut turns = Turns::of(stepped);
             let sizes = sizes(count, wanted);
             let all_steps = (sizes.len() - 1) * self.cut_steps + steps;
             let progress = Progress::new(NAME, "steps", all_steps as u64);
-            let mut walk = Walk { refine: self, scene, scored, targets: &targets, turns: &mut turns, progress };
+            let mut walk = Walk { refine: self, scene, scored, targets: &targets, turns: Turns::of(stepped), progress };
             let mut reduction = reduction;
             for &size in &sizes[1..] {
                 reduction = walk.cut(reduction, &apart, size)?;
@@ -221,7 +218,7 @@ struct Walk<'a> {
     scene: &'a Scene,
     scored: &'a Scored,
     targets: &'a Targets,
-    turns: &'a mut Turns,
+    turns: Turns,
     progress: Progress,
 }
 
@@ -254,7 +251,7 @@ impl Walk<'_> {
             let mut order: Vec<u32> = (0..reduction.len() as u32).collect();
             // Stable: ties by id.
             order.sort_by_key(|&place| std::cmp::Reverse((fixed[place as usize], errors[place as usize])));
-            (moving.descent.change(), order)
+            (moving.descent.change().clone(), order)
         };
         left.truncate(size);
         left.sort_unstable();
@@ -282,7 +279,7 @@ impl Walk<'_> {
                 if step % JUDGE_EVERY == 0 || step == steps {
                     let now = moving.closeness(apart)?;
                     if now.psnr > best.psnr {
-                        (best, kept) = (now, moving.descent.change());
+                        (best, kept) = (now, moving.descent.change().clone());
                     }
                 }
             }

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use super::targets::{Targets, mean_square, slope};
 use crate::emit::atomic::Spill;
 use crate::error::{Error, Result};
+use crate::metrics::decibels;
 use crate::model::{Columns, Gaussians, Gradients};
 use crate::refine::{Descent, Schedule};
 use crate::render::{RemovalError, Renderer};
@@ -106,7 +107,7 @@ impl<'a> Moving<'a> {
                 to.planes_mut().copy_from_slice(self.still.column(column).planes());
             }
         }
-        self.descent.add_to(now, Columns::all().difference(anew));
+        self.descent.change().add_to(now, Columns::all().difference(anew));
         match self.deformation {
             Some(deformation) if !anew.is_empty() => deformation.state(frame, &self.stored, anew, now),
             _ => Ok(()),
@@ -125,7 +126,7 @@ impl<'a> Moving<'a> {
             let from = deformation.stored().column(column).planes();
             self.stored.column_mut(column).planes_mut().copy_from_slice(from);
         }
-        self.descent.add_to(&mut self.stored, columns);
+        self.descent.change().add_to(&mut self.stored, columns);
     }
 
     /// One step along picture `k`, at rates `schedule`.
@@ -163,7 +164,7 @@ impl<'a> Moving<'a> {
         };
         let squares: Vec<f64> = of.par_iter().map_init(|| self.worker(), square).collect::<Result<_>>()?;
         let count = squares.len().max(1) as f64;
-        let psnr = squares.iter().map(|square| -10.0 * square.max(1e-10).log10()).sum::<f64>() / count;
+        let psnr = squares.iter().map(|&square| decibels(square)).sum::<f64>() / count;
         Ok(Closeness { psnr, error: (squares.iter().sum::<f64>() / count).sqrt() })
     }
 
