@@ -11,7 +11,7 @@ use std::path::Path;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Deltas, Field, FieldConfig, Scratch, Tensor, Tensors};
-use splatsieve::model::{Column, Columns, Gaussians, Gradients};
+use splatsieve::model::{Column, Columns, Gaussians};
 
 const BLOCK: usize = 1024;
 
@@ -82,19 +82,12 @@ fn deform(criterion: &mut Criterion) {
             });
         });
     }
-    // The derivative of a step that changes positions: forward to the position's head and back.
+    // How states change with positions: forward to the position's head, and back for each component.
     let mut raw = Gaussians::zeros(BLOCK, 3);
     raw.position = position;
-    for (name, field) in
-        [("dnerf_pull_back", field(64, 32, three)), ("dynerf_pull_back", field(128, 16, Columns::all()))]
+    for (name, field) in [("dnerf_jacobian", field(64, 32, three)), ("dynerf_jacobian", field(128, 16, Columns::all()))]
     {
-        let mut gradients = Gradients::new(BLOCK, Columns::POSITION, 0);
-        group.bench_function(name, |bencher| {
-            bencher.iter(|| {
-                gradients.column_mut(Columns::POSITION).planes_mut().fill(1.0);
-                gradients.spans(BLOCK).iter_mut().try_for_each(|span| field.pull_back(&raw, 0.4, span))
-            });
-        });
+        group.bench_function(name, |bencher| bencher.iter(|| field.jacobian(&raw, 0.4, Columns::POSITION)));
     }
     group.finish();
 }

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, Gradients, SequenceInfo};
+use crate::model::{Columns, Gaussians, Jacobian, SequenceInfo};
 
 /// Which Gaussians of a sequence a reader covers.
 #[derive(Debug, Clone)]
@@ -194,23 +194,18 @@ pub trait Deformation: Sync {
     /// Columns of what is stored that a derivative leads to.
     fn movable(&self) -> Columns;
 
-    /// Columns of a state that must be found anew when what is stored moves a little. The others follow by as much as
-    /// they moved themselves.
-    fn bound(&self) -> Columns;
-
     /// Writes the columns `want` of the state at `frame` of Gaussians stored as `stored` into `out`, which is resized in
-    /// them. Where positions alone are bound and wanted, other columns of `stored` may be empty.
+    /// them.
     ///
     /// # Errors
     /// A frame that the sequence does not have.
     fn state(&self, frame: usize, stored: &Gaussians, want: Columns, out: &mut Gaussians) -> Result<()>;
 
-    /// Turns derivatives by the state at `frame` of Gaussians stored as `stored` into derivatives by what is stored.
-    /// Where positions alone are bound, other columns of `stored` may be empty.
+    /// How the columns `want` of that state change with what is stored in them.
     ///
     /// # Errors
     /// A frame that the sequence does not have.
-    fn pull_back(&self, frame: usize, stored: &Gaussians, gradients: &mut Gradients) -> Result<()>;
+    fn jacobian(&self, frame: usize, stored: &Gaussians, want: Columns) -> Result<Jacobian>;
 }
 
 /// A source on a disk, whose bytes can be brought ahead of their use, from a thread that does nothing else.

@@ -311,7 +311,7 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
         ..*picture
     });
     let direct = found.clone();
-    deformation.pull_back(frame, stored, &mut found).unwrap();
+    deformation.jacobian(frame, stored, Columns::all()).unwrap().pull_back(&mut found);
 
     let loss = |stored: &Gaussians| -> f64 {
         // A step of the position moves other columns too, which a derivative by the position's head alone leaves out.

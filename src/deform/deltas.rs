@@ -1,6 +1,6 @@
 //! What the field changes: state = raw·mask + delta, back, and the derivative.
 
-use crate::model::{Column, Columns, Gaussians, GradientSpan};
+use crate::model::{Column, Columns, Gaussians, Jacobian};
 
 /// Changes of a block of Gaussians at one time.
 ///
@@ -59,22 +59,24 @@ impl Deltas {
         }
     }
 
-    /// Turns derivatives by the state into derivatives by the raw parameters, deltas and masks held as they are; 0
-    /// where one would not be finite. `rotation` is raw; it and this are of the Gaussians of `gradients`.
-    pub(super) fn pull_back(&self, rotation: &Column, gradients: &mut GradientSpan<'_>) {
+    /// How the state changes with the raw parameters, deltas and masks held as they are, where it is not by as much; 0
+    /// where that would not be finite. `rotation` is raw.
+    pub(super) fn jacobian(&self, rotation: &Column, out: &mut Jacobian) {
         for column in self.active.iter() {
-            let planes = gradients.planes(column);
             if column == Columns::ROTATION && self.multiply_rotation {
-                let [w, x, y, z] = planes else { continue };
+                *out.column_mut(column) = Column::zeros(16, rotation.len());
                 for i in 0..rotation.len() {
-                    let by_state = [w[i], x[i], y[i], z[i]];
-                    let by_raw = pull_unit_product(rotation.row(i), self.delta.rotation.row(i), by_state);
-                    [w[i], x[i], y[i], z[i]] = by_raw.map(finite);
+                    let (raw, delta) = (rotation.row(i), self.delta.rotation.row(i));
+                    for component in 0..4 {
+                        let by_state = std::array::from_fn(|c| f32::from(u8::from(c == component)));
+                        let by_raw = pull_unit_product(raw, delta, by_state);
+                        for (c, by) in by_raw.into_iter().enumerate() {
+                            out.column_mut(column).plane_mut(4 * component + c)[i] = finite(by);
+                        }
+                    }
                 }
             } else if let Some(mask) = self.mask.as_ref().filter(|_| column != Columns::ROTATION) {
-                for plane in planes {
-                    plane.iter_mut().zip(mask).for_each(|(by, mask)| *by = finite(*by * mask));
-                }
+                *out.column_mut(column) = Column::from_planes(1, mask.iter().copied().map(finite).collect());
             }
         }
     }
@@ -126,7 +128,7 @@ fn unit(q: [f32; 4]) -> [f32; 4] {
 }
 
 /// `x`, or 0 if it is not finite.
-fn finite(x: f32) -> f32 {
+pub(super) fn finite(x: f32) -> f32 {
     if x.is_finite() { x } else { 0.0 }
 }
 

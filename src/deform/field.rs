@@ -150,16 +150,6 @@ impl Field {
         self.config.active
     }
 
-    /// Columns of which the state is the raw value, or that and a delta.
-    pub fn added(&self) -> Columns {
-        let mut multiplied =
-            if self.has_mask() { self.active().difference(Columns::ROTATION) } else { Columns::empty() };
-        if self.config.apply_rotation {
-            multiplied |= Columns::ROTATION;
-        }
-        Columns::all().difference(multiplied)
-    }
-
     /// Whether a mask multiplies what is stored.
     pub fn has_mask(&self) -> bool {
         !matches!(self.mask, Mask::None)

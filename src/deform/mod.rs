@@ -2,11 +2,11 @@
 
 mod deltas;
 mod field;
+mod jacobian;
 mod linear;
 #[cfg(test)]
 mod oracle;
 mod planes;
-mod pull;
 mod slopes;
 mod tensors;
 #[cfg(test)]

@@ -356,12 +356,10 @@ fn noisy_gradients(len: usize, of: Columns) -> Gradients {
     gradients
 }
 
-/// Pulls back in spans of so many Gaussians.
-fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients, span: usize) -> Gradients {
+/// Derivatives by raw parameters, given those by the state.
+fn pulled_back(field: &Field, raw: &Gaussians, time: f64, gradients: &Gradients) -> Gradients {
     let mut pulled = gradients.clone();
-    for mut span in pulled.spans(span) {
-        field.pull_back(raw, time, &mut span).unwrap();
-    }
+    field.jacobian(raw, time, gradients.columns()).unwrap().pull_back(&mut pulled);
     pulled
 }
 
@@ -373,7 +371,7 @@ fn derivatives_agree(what: &str, config: FieldConfig, depth: usize, columns: Col
     let mut clipped = 0;
     for (column, time) in columns.iter().flat_map(|column| [(column, 0.0), (column, 0.37)]) {
         let by_state = noisy_gradients(raw.len(), column);
-        let by_raw = pulled_back(&field, &raw, time, &by_state, 7);
+        let by_raw = pulled_back(&field, &raw, time, &by_state);
         for i in 0..raw.len() {
             let weights = values(by_state.column(column), i);
             for c in 0..raw.column(column).width() {
@@ -424,7 +422,7 @@ fn masked_positions_take_what_their_state_takes_times_the_mask() {
     let raw = cloud(40);
     let (_, deltas) = states(&field, &raw, 0.3, Columns::all());
     let by_state = noisy_gradients(raw.len(), Columns::POSITION);
-    let by_raw = pulled_back(&field, &raw, 0.3, &by_state, 40);
+    let by_raw = pulled_back(&field, &raw, 0.3, &by_state);
     for (i, mask) in deltas.mask.unwrap().into_iter().enumerate() {
         let expected = by_state.column(Columns::POSITION).row::<3>(i).map(|x| mask * x);
         assert_eq!(by_raw.column(Columns::POSITION).row(i), expected, "Gaussian {i}");
@@ -432,16 +430,18 @@ fn masked_positions_take_what_their_state_takes_times_the_mask() {
 }
 
 #[test]
-fn derivatives_have_the_same_bits_in_every_span_and_none_are_made_for_frozen_columns() {
-    let field = build(&plain(), 2);
+fn derivatives_have_the_same_bits_in_every_block_and_none_are_made_for_other_columns() {
+    let field = build(&FieldConfig { apply_rotation: true, ..plain() }, 2);
     let raw = cloud(300);
-    let by_state = noisy_gradients(300, Columns::all());
-    let expected = pulled_back(&field, &raw, 0.6, &by_state, 300);
-    for span in [1, 16, 37, 1000] {
-        assert!(pulled_back(&field, &raw, 0.6, &by_state, span) == expected, "spans of {span}");
+    let whole = field.jacobian(&raw, 0.6, Columns::all()).unwrap();
+    for block in [1, 16, 37] {
+        let rows: Vec<u32> = (0..300).collect();
+        for ids in rows.chunks(block) {
+            let found = field.jacobian(&raw.pick(ids), 0.6, Columns::all()).unwrap();
+            assert!(found == whole.pick(ids), "blocks of {block}");
+        }
     }
-    let frozen = Gradients::new(300, Columns::SH, 0);
-    assert!(pulled_back(&field, &raw, 0.6, &frozen, 64) == frozen);
+    assert!(field.jacobian(&raw, 0.6, Columns::SH).unwrap() == Default::default());
 }
 
 #[test]
@@ -453,7 +453,7 @@ fn derivatives_at_odd_positions_are_finite() {
             raw.position.set_row(i, [value; 3]);
             raw.rotation.set_row(i, [0.0; 4]);
         }
-        let by_raw = pulled_back(&field, &raw, 0.6, &noisy_gradients(8, Columns::all()), 8);
+        let by_raw = pulled_back(&field, &raw, 0.6, &noisy_gradients(8, Columns::all()));
         for column in Columns::all().iter() {
             assert!(by_raw.column(column).planes().iter().all(|x| x.is_finite()), "{}", column.name());
         }

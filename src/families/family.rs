@@ -148,6 +148,8 @@ pub struct Residence {
     pub reader: u64,
     /// Bytes per Gaussian of a reduced copy of it, of which frames are read.
     pub reduced: u64,
+    /// Bytes per Gaussian of how states change with what is stored, where that is by more than a sum; else 0.
+    pub jacobian: u64,
     /// Bytes per Gaussian of a file that is mapped while it is read whole.
     pub file: u64,
     /// Bytes however many Gaussians there are.
@@ -172,6 +174,7 @@ impl Residence {
             opening: 0,
             reader: 8,
             reduced: 0,
+            jacobian: 0,
             file: 0,
             fixed: 0,
             frame_block,

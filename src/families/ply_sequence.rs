@@ -62,6 +62,7 @@ impl Family for PlySequence {
             opening: 0,
             reader: 4,
             reduced: 0,
+            jacobian: 0,
             // Normals and the like stand beside the values.
             file: state_bytes(self.info().sh_degree, Columns::all()) + 24,
             fixed: 0,

@@ -3,11 +3,13 @@
 mod camera;
 mod gaussians;
 mod gradients;
+mod jacobian;
 mod rows;
 
 pub use camera::{Camera, Picture, Rig, Schedule, Shot, Split};
 pub use gaussians::{Column, Columns, Gaussians};
 pub use gradients::{GradientSpan, Gradients};
+pub use jacobian::Jacobian;
 pub use rows::{Flags, Rows, Statistic, Values};
 
 /// Zeroth spherical-harmonic basis constant: colour = 0.5 + SH_C0 · f_dc.

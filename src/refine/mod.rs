@@ -76,6 +76,18 @@ impl Descent {
         &self.change
     }
 
+    /// Whether anything was done.
+    pub fn has_begun(&self) -> bool {
+        self.done > 0
+    }
+
+    /// What is to be added to the start, which from now on counts as the start's own.
+    pub fn take(&mut self) -> Change {
+        let moved = self.change.clone();
+        self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
+        moved
+    }
+
     /// One step against `gradients`, at rates of `schedule`.
     ///
     /// # Panics

@@ -9,6 +9,7 @@
 //! Memory: what [`Descent`] and one differentiated picture take, three states, and the best change so far. The
 //! original's pictures and the states that they show wait in scratch files.
 
+mod local;
 mod moving;
 mod targets;
 
@@ -87,6 +88,12 @@ impl Refine {
         (part * self.steps as f64).ceil() as usize
     }
 
+    /// Steps before a cut of what is `left`, if `wanted` are to stay: fewer where a step takes longer and more of what it
+    /// does will go.
+    fn steps_before(&self, left: usize, wanted: usize) -> usize {
+        (self.cut_steps as f64 * (wanted as f64 / left.max(1) as f64).sqrt()).ceil() as usize
+    }
+
     /// How many of `all` Gaussians to begin with, if `wanted` are to stay.
     pub fn first(&self, wanted: usize, all: usize) -> usize {
         if self.cuts { wanted.max((CUTS_FROM * all as f64).ceil() as usize).min(all) } else { wanted }
@@ -99,7 +106,8 @@ impl Refine {
         let original = [("states", whole), ("pictures", PICTURE_ON_ALL_THREADS)];
         let original: Vec<Part> = read.into_iter().chain(original).collect();
         let left = [
-            ("states", (4 + work.threads) * whole),
+            ("states", (5 + work.threads) * whole),
+            ("jacobians", (3 + work.threads) * work.input.jacobian),
             ("descent", whole + refine::bytes_per_gaussian(self.columns, work.sh_degree) as u64),
             ("result", work.input.reduced),
             ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
@@ -116,20 +124,22 @@ impl Refine {
         let sizes = sizes(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted);
         let judged = pictures / targets::APART_EVERY as f64 * (1 + steps.div_ceil(JUDGE_EVERY)) as f64;
-        let seconds = |(k, size): (usize, &usize)| {
-            let left = *size as f64 / 1e6 * work.count();
-            let (renders, ranked) = match k + 1 == sizes.len() {
-                true => (judged + 2.5 * steps as f64, 0.0),
-                false => (LOOKED_AT as f64 + 2.5 * self.cut_steps as f64, RANKED_ON as f64),
+        let seconds = |(k, &size): (usize, &usize)| {
+            let (of, left) = (size as f64 / 1e6 * work.count(), (wanted * 1e6) as usize);
+            let (steps, renders, ranked) = match k + 1 == sizes.len() {
+                true => (steps, judged, 0.0),
+                false => (self.steps_before(size, left), LOOKED_AT as f64, RANKED_ON as f64),
             };
-            work.reading(left, frames as f64 + renders)
-                + work.picturing(renders, left, RENDER)
-                + work.picturing(ranked, left, REMOVE)
+            // States and twice as long again for how they change.
+            let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / moving::FOUND_EVERY as f64 } else { 0.0 };
+            work.reading(of, frames as f64 * found)
+                + work.picturing(renders + 2.5 * steps as f64, of, RENDER)
+                + work.picturing(ranked, of, REMOVE)
         };
         Need {
             stage: NAME,
-            reads: (1 + sizes.len()) as f64 * work.scattered_reads(frames, limits),
-            seconds: work.reading(work.count(), frames as f64)
+            reads: 2.0 * work.scattered_reads(frames, limits),
+            seconds: 2.0 * work.reading(work.count(), frames as f64)
                 + work.picturing(pictures, work.count(), RENDER)
                 + sizes.iter().enumerate().map(seconds).sum::<f64>(),
             per_gaussian: [scored(limits), vec![("kept", 24)], per_gaussian].concat(),
@@ -166,16 +176,20 @@ impl Refine {
         }
         journal.stage(NAME, count, scene.source(), |journal| {
             let targets = Targets::new(scene)?;
+            let result = scene.input.reduced(&reduction)?;
+            let fixed = reduction.kept.iter().map(|id| scored.protected.binary_search(id).is_ok()).collect();
+            let mut moving = Moving::new(scene, &*result, &targets, self.columns, fixed)?;
             let (stepped, apart) = targets.parted();
             let sizes = sizes(count, wanted);
-            let all_steps = (sizes.len() - 1) * self.cut_steps + steps;
-            let progress = Progress::new(NAME, "steps", all_steps as u64);
-            let mut walk = Walk { refine: self, scene, scored, targets: &targets, turns: Turns::of(stepped), progress };
-            let mut reduction = reduction;
-            for &size in &sizes[1..] {
-                reduction = walk.cut(reduction, &apart, size)?;
+            let of_cuts: usize = sizes.windows(2).map(|pair| self.steps_before(pair[0], wanted)).sum();
+            let progress = Progress::new(NAME, "steps", (of_cuts + steps) as u64);
+            let mut walk = Walk { refine: self, turns: Turns::of(stepped), apart, progress };
+            let mut left = reduction.clone();
+            for pair in sizes.windows(2) {
+                left = left.pick(&walk.cut(&mut moving, self.steps_before(pair[0], wanted), pair[1])?);
             }
-            Ok((walk.finish(reduction, &apart, steps, journal)?, wanted))
+            left.change = left.change.and(walk.finish(&mut moving, steps, journal)?);
+            Ok((left, wanted))
         })
     }
 }
@@ -215,85 +229,63 @@ impl Turns {
 /// What all legs of the way share.
 struct Walk<'a> {
     refine: &'a Refine,
-    scene: &'a Scene,
-    scored: &'a Scored,
-    targets: &'a Targets,
     turns: Turns,
+    /// The pictures kept apart.
+    apart: Vec<usize>,
     progress: Progress,
 }
 
 impl Walk<'_> {
-    /// Which of what is left stays as it is.
-    fn fixed(&self, reduction: &Reduction) -> Vec<bool> {
-        reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect()
-    }
-
     fn step(&mut self, moving: &mut Moving<'_>, schedule: &Schedule) -> Result<()> {
         moving.step(self.turns.next(), schedule)?;
         self.progress.advance(1);
         Ok(())
     }
 
-    /// Steps, and lets go of all but the `size` that pictures would lose most with.
-    fn cut(&mut self, mut reduction: Reduction, apart: &[usize], size: usize) -> Result<Reduction> {
-        let (change, mut left) = {
-            let result = self.scene.input.reduced(&reduction)?;
-            let fixed = self.fixed(&reduction);
-            let mut moving = Moving::new(self.scene, &*result, self.targets, self.refine.columns, &fixed)?;
-            let some: Vec<usize> = apart.iter().step_by(apart.len().div_ceil(LOOKED_AT).max(1)).copied().collect();
-            let error = moving.closeness(&some)?.error;
-            let schedule = Schedule::new(self.refine.cut_steps, LAST_RATE[0], error);
-            for _ in 0..self.refine.cut_steps {
-                self.step(&mut moving, &schedule)?;
-            }
-            let of: Vec<usize> = (0..RANKED_ON).map(|_| self.turns.next()).collect();
-            let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?.sum;
-            let mut order: Vec<u32> = (0..reduction.len() as u32).collect();
-            // Stable: ties by id.
-            order.sort_by_key(|&place| std::cmp::Reverse((fixed[place as usize], errors[place as usize])));
-            (moving.descent.change().clone(), order)
-        };
+    /// Takes `steps` steps, and lets go of all but the `size` Gaussians that pictures would lose most with; gives their
+    /// places.
+    fn cut(&mut self, moving: &mut Moving<'_>, steps: usize, size: usize) -> Result<Vec<u32>> {
+        let some = self.apart.iter().step_by(self.apart.len().div_ceil(LOOKED_AT).max(1));
+        let error = moving.closeness(&some.copied().collect::<Vec<_>>())?.error;
+        let schedule = Schedule::new(steps, LAST_RATE[0], error);
+        for _ in 0..steps {
+            self.step(moving, &schedule)?;
+        }
+        let of: Vec<usize> = (0..RANKED_ON).map(|_| self.turns.next()).collect();
+        let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?.sum;
+        let mut left: Vec<u32> = (0..errors.len() as u32).collect();
+        // Stable: ties by id.
+        left.sort_by_key(|&place| std::cmp::Reverse((moving.fixed()[place as usize], errors[place as usize])));
         left.truncate(size);
         left.sort_unstable();
-        reduction.change = reduction.change.and(change);
-        Ok(reduction.pick(&left))
+        moving.pick(&left)?;
+        Ok(left)
     }
 
-    /// Steps, and keeps the state that the pictures `apart` like best.
-    fn finish(
-        &mut self,
-        mut reduction: Reduction,
-        apart: &[usize],
-        steps: usize,
-        journal: &mut Journal,
-    ) -> Result<Reduction> {
-        let change = {
-            let result = self.scene.input.reduced(&reduction)?;
-            let fixed = self.fixed(&reduction);
-            let mut moving = Moving::new(self.scene, &*result, self.targets, self.refine.columns, &fixed)?;
-            let before = moving.closeness(apart)?;
-            let schedule = Schedule::new(steps, LAST_RATE[1], before.error);
-            let (mut best, mut kept) = (before, Change::default());
-            for step in 1..=steps {
-                self.step(&mut moving, &schedule)?;
-                if step % JUDGE_EVERY == 0 || step == steps {
-                    let now = moving.closeness(apart)?;
-                    if now.psnr > best.psnr {
-                        (best, kept) = (now, moving.descent.change().clone());
-                    }
+    /// Takes `steps` steps; gives what is to be added to what is stored for the state that the pictures kept apart like
+    /// best.
+    fn finish(&mut self, moving: &mut Moving<'_>, steps: usize, journal: &mut Journal) -> Result<Change> {
+        moving.find()?;
+        let before = moving.closeness(&self.apart)?;
+        let schedule = Schedule::new(steps, LAST_RATE[1], before.error);
+        let (mut best, mut kept) = (before, moving.change());
+        for step in 1..=steps {
+            self.step(moving, &schedule)?;
+            if step % JUDGE_EVERY == 0 || step == steps {
+                moving.find()?;
+                let now = moving.closeness(&self.apart)?;
+                if now.psnr > best.psnr {
+                    (best, kept) = (now, moving.change());
                 }
             }
-            let ([start, end], count) = ([before.psnr, best.psnr], apart.len());
-            if kept.is_empty() {
-                journal
-                    .leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
-            } else {
-                journal.notes.push(format!("refined: {count} pictures kept apart keep {end:.2} dB, not {start:.2}"));
-            }
-            kept
-        };
-        reduction.change = reduction.change.and(change);
-        Ok(reduction)
+        }
+        let ([start, end], count) = ([before.psnr, best.psnr], self.apart.len());
+        if end > start {
+            journal.notes.push(format!("refined: {count} pictures kept apart keep {end:.2} dB, not {start:.2}"));
+        } else {
+            journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
+        }
+        Ok(kept)
     }
 }
 

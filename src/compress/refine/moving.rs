@@ -2,11 +2,12 @@
 
 use rayon::prelude::*;
 
+use super::local::{Local, Locals};
 use super::targets::{Targets, mean_square, slope};
-use crate::emit::atomic::Spill;
 use crate::error::{Error, Result};
 use crate::metrics::decibels;
-use crate::model::{Columns, Gaussians, Gradients};
+use crate::model::{Columns, Gaussians, Gradients, SequenceInfo};
+use crate::reduction::Change;
 use crate::refine::{Descent, Schedule};
 use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
@@ -22,26 +23,38 @@ pub(super) struct Closeness {
     pub(super) error: f64,
 }
 
-/// What is left, the states in which pictures show it before anything moved, and how far it moved.
+/// Steps after which states are found anew, where they follow from what is stored by more than a sum.
+pub(super) const FOUND_EVERY: usize = 500;
+
+/// What is left, its states at the frames that are shown, and how far it moved.
 ///
-/// Memory: three states, [`Descent`], and a differentiated picture; on a scratch file a state for every frame shown.
+/// Where states follow from what is stored by more than a sum they are found every [`FOUND_EVERY`] steps, and move along
+/// their Jacobians in between: a field and its derivative at every step take a third of the time and gain nothing
+/// (method.md, section 6.2).
+///
+/// Memory: six states, [`Descent`], and a differentiated picture; on a scratch file a state for every frame shown.
 pub(super) struct Moving<'a> {
+    scene: &'a Scene,
     targets: &'a Targets,
-    background: [f32; 3],
     deformation: Option<&'a dyn Deformation>,
-    /// Of every frame that is shown the columns that vary.
-    states: Spill,
+    /// Increasing.
     frames: Vec<usize>,
     varying: Columns,
-    /// The state at the first frame that is shown: the other columns.
-    still: Gaussians,
-    pub(super) descent: Descent,
-    /// What is stored, where states follow from it by more than a sum; moved in columns that are asked for.
+    /// What is at each of them, before `descent` moved anything.
+    locals: Locals,
+    /// What is stored, before `descent` moved anything, where states follow from it by more than a sum.
     stored: Gaussians,
+    /// What was added to what is stored before that.
+    before: Change,
+    fixed: Vec<bool>,
+    columns: Columns,
+    descent: Descent,
     gradients: Gradients,
-    /// The state of the picture in the making.
-    now: Gaussians,
+    /// What the picture in the making shows.
+    now: Local,
     renderer: Renderer,
+    /// Steps since states were found.
+    steps: usize,
 }
 
 impl<'a> Moving<'a> {
@@ -50,103 +63,152 @@ impl<'a> Moving<'a> {
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
     pub(super) fn new(
-        scene: &Scene,
+        scene: &'a Scene,
         result: &'a dyn FrameSource,
         targets: &'a Targets,
         columns: Columns,
-        fixed: &[bool],
+        fixed: Vec<bool>,
     ) -> Result<Moving<'a>> {
         let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
-        let varying = result.info().varying;
-        let mut of_result = States::open(result, &Wanted::of(frames.clone()).holding(scene.limits.frames_held))?;
-        let (mut states, mut still) = (Spill::new(&scene.scratch)?, None);
-        for &frame in &frames {
-            let state = of_result.at(frame)?;
-            varying.iter().try_for_each(|column| states.write(bytemuck::cast_slice(state.column(column).planes())))?;
-            still.get_or_insert_with(|| state.clone());
-        }
-        states.finish()?;
-        let still = still.unwrap_or_default();
+        let SequenceInfo { varying, sh_degree, .. } = *result.info();
         let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
-        let stored = deformation.map_or(Gaussians::default(), |deformation| deformation.stored().clone());
-        Ok(Moving {
+        let nothing = Gaussians::zeros(0, sh_degree);
+        let mut moving = Moving {
+            scene,
             targets,
-            background: scene.background,
             deformation,
-            states,
+            locals: Locals::new(&scene.scratch, varying)?,
+            stored: deformation.map_or(nothing.clone(), |deformation| deformation.stored().clone()),
+            before: Change::default(),
+            descent: Descent::new(&nothing, columns, &[]),
+            gradients: Gradients::new(0, columns, sh_degree),
+            now: Local::none(sh_degree),
+            renderer: Renderer::on_all_threads(),
+            steps: 0,
             frames,
             varying,
-            descent: Descent::new(&still, columns, fixed),
-            stored,
-            gradients: Gradients::new(still.len(), columns, scene.source().info().sh_degree),
-            now: still.clone(),
-            still,
-            renderer: Renderer::on_all_threads(),
-        })
-    }
-
-    /// Makes `now` the state that picture `k` shows. What follows from what is stored by more than a sum is found anew
-    /// as far as one of `anew`.
-    fn state(&self, k: usize, anew: Columns, now: &mut Gaussians) -> Result<()> {
-        let frame = self.targets.pictures[k].frame;
-        let place = self.frames.binary_search(&frame).unwrap_or_default() as u64;
-        let bytes = |column: Columns| 4 * self.still.column(column).planes().len() as u64;
-        let mut at = place * self.varying.iter().map(bytes).sum::<u64>();
-        for column in Columns::all().iter() {
-            let is_anew = anew.contains(column);
-            let to = now.column_mut(column);
-            to.resize(self.still.len());
-            if self.varying.contains(column) {
-                if !is_anew {
-                    self.states.read(at, bytemuck::cast_slice_mut(to.planes_mut()))?;
-                }
-                at += bytes(column);
-            } else if !is_anew {
-                to.planes_mut().copy_from_slice(self.still.column(column).planes());
+            fixed,
+            columns,
+        };
+        if deformation.is_some() {
+            moving.find()?;
+        } else {
+            let wanted = Wanted::of(moving.frames.clone()).holding(scene.limits.frames_held);
+            let mut states = States::open(result, &wanted)?;
+            let mut locals = Locals::new(&scene.scratch, varying)?;
+            for &frame in &moving.frames {
+                locals.push(Local { state: states.at(frame)?.clone(), ..Local::none(sh_degree) })?;
             }
+            moving.locals = locals.finish()?;
         }
-        self.descent.change().add_to(now, Columns::all().difference(anew));
-        match self.deformation {
-            Some(deformation) if !anew.is_empty() => deformation.state(frame, &self.stored, anew, now),
-            _ => Ok(()),
-        }
+        moving.begin();
+        Ok(moving)
     }
 
-    /// Columns that are found anew at every step.
-    fn bound(&self) -> Columns {
-        self.deformation.map_or(Columns::empty(), Deformation::bound)
+    /// Begins to descend from here.
+    fn begin(&mut self) {
+        let Some(Local { state, .. }) = self.locals.first() else { return };
+        self.descent = Descent::new(state, self.columns, &self.fixed);
+        self.gradients = Gradients::new(state.len(), self.columns, state.sh_degree());
     }
 
-    /// Moves the columns `columns` of what is stored, as far as states follow from it by more than a sum.
-    fn follow(&mut self, columns: Columns) {
-        let Some(deformation) = self.deformation else { return };
-        for column in columns.iter() {
-            let from = deformation.stored().column(column).planes();
-            self.stored.column_mut(column).planes_mut().copy_from_slice(from);
+    /// Which Gaussians stay as they are.
+    pub(super) fn fixed(&self) -> &[bool] {
+        &self.fixed
+    }
+
+    /// What is to be added to what is stored.
+    pub(super) fn change(&self) -> Change {
+        let before = self.before.clone();
+        if self.descent.has_begun() { before.and(self.descent.change().clone()) } else { before }
+    }
+
+    /// Finds states anew, where they follow from what is stored by more than a sum.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be written.
+    pub(super) fn find(&mut self) -> Result<()> {
+        let Some(deformation) = self.deformation else { return Ok(()) };
+        self.settle();
+        let mut locals = Locals::new(&self.scene.scratch, self.varying)?;
+        for &frame in &self.frames {
+            let want = if locals.first().is_none() { Columns::all() } else { self.varying };
+            deformation.state(frame, &self.stored, want, &mut self.now.state)?;
+            self.now.jacobian = deformation.jacobian(frame, &self.stored, self.columns)?;
+            locals.push(self.now.clone())?;
         }
-        self.descent.change().add_to(&mut self.stored, columns);
+        self.locals = locals.finish()?;
+        self.steps = 0;
+        Ok(())
+    }
+
+    /// What was descended so far counts as what is stored.
+    fn settle(&mut self) {
+        if !self.descent.has_begun() {
+            return;
+        }
+        let moved = self.descent.take();
+        if self.deformation.is_some() {
+            moved.add_to(&mut self.stored, Columns::all());
+        }
+        self.before = std::mem::take(&mut self.before).and(moved);
+    }
+
+    /// Goes on with those at `places` alone, from where they are.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be read or written.
+    pub(super) fn pick(&mut self, places: &[u32]) -> Result<()> {
+        let mut locals = Locals::new(&self.scene.scratch, self.varying)?;
+        let mut now = std::mem::take(&mut self.now);
+        for k in 0..self.frames.len() {
+            self.show(k, &mut now)?;
+            locals.push(now.pick(places))?;
+        }
+        (self.locals, self.now) = (locals.finish()?, now);
+        self.settle();
+        if self.deformation.is_some() {
+            self.stored = self.stored.pick(places);
+        }
+        self.before = self.before.pick(places);
+        self.fixed = places.iter().map(|&place| self.fixed[place as usize]).collect();
+        self.begin();
+        Ok(())
+    }
+
+    /// Makes `now` what is at the frame in place `k` by now.
+    fn show(&self, k: usize, now: &mut Local) -> Result<()> {
+        self.locals.read(k, now)?;
+        now.jacobian.add_to(&self.descent.change().0, &mut now.state);
+        Ok(())
+    }
+
+    /// The place of the frame of picture `k`.
+    fn place(&self, k: usize) -> usize {
+        self.frames.binary_search(&self.targets.pictures[k].frame).unwrap_or_default()
     }
 
     /// One step along picture `k`, at rates `schedule`.
     ///
     /// # Errors
-    /// A scratch file that cannot be read.
+    /// A scratch file that cannot be read or written.
     pub(super) fn step(&mut self, k: usize, schedule: &Schedule) -> Result<()> {
-        let target = self.targets.values(k)?;
-        self.follow(self.bound());
-        let mut now = std::mem::take(&mut self.now);
-        self.state(k, self.bound(), &mut now)?;
-        self.now = now;
-        self.gradients.clear();
-        let (camera, frame) = (self.targets.camera(k), self.targets.pictures[k].frame);
-        let pull = |picture: &_| (0.0, slope(picture, &target));
-        self.renderer.gradient(&self.now, camera, self.background, pull, &mut self.gradients);
-        if let Some(deformation) = self.deformation {
-            deformation.pull_back(frame, &self.stored, &mut self.gradients)?;
+        if self.steps == FOUND_EVERY {
+            self.find()?;
         }
+        self.steps += 1;
+        let target = self.targets.values(k)?;
+        let mut now = std::mem::take(&mut self.now);
+        self.show(self.place(k), &mut now)?;
+        self.gradients.clear();
+        let pull = |picture: &_| (0.0, slope(picture, &target));
+        let camera = self.targets.camera(k);
+        self.renderer.gradient(&now.state, camera, self.scene.background, pull, &mut self.gradients);
+        now.jacobian.pull_back(&mut self.gradients);
         self.descent.step(&self.gradients, schedule);
+        self.now = now;
         Ok(())
     }
 
@@ -154,12 +216,10 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be read.
-    pub(super) fn closeness(&mut self, of: &[usize]) -> Result<Closeness> {
-        self.follow(Columns::all());
-        let anew = if self.deformation.is_some() { self.varying | self.bound() } else { Columns::empty() };
-        let square = |(renderer, state): &mut (Renderer, Gaussians), &k: &usize| {
-            self.state(k, anew, state)?;
-            let picture = renderer.render(state, self.targets.camera(k), self.background);
+    pub(super) fn closeness(&self, of: &[usize]) -> Result<Closeness> {
+        let square = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
+            self.show(self.place(k), now)?;
+            let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
             Ok(mean_square(&picture, &self.targets.values(k)?))
         };
         let squares: Vec<f64> = of.par_iter().map_init(|| self.worker(), square).collect::<Result<_>>()?;
@@ -172,14 +232,12 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be read.
-    pub(super) fn removal_error(&mut self, of: &[usize], contrast_floor: f32) -> Result<RemovalError> {
-        self.follow(self.bound());
-        let none = || (self.worker(), RemovalError::new(self.still.len(), contrast_floor));
-        let of_picture = |((mut renderer, mut state), mut errors): ((Renderer, Gaussians), RemovalError),
-                          &k: &usize| {
-            self.state(k, self.bound(), &mut state)?;
-            renderer.removal_error(&state, self.targets.camera(k), self.background, &mut errors);
-            Ok::<_, Error>(((renderer, state), errors))
+    pub(super) fn removal_error(&self, of: &[usize], contrast_floor: f32) -> Result<RemovalError> {
+        let none = || (self.worker(), RemovalError::new(self.fixed.len(), contrast_floor));
+        let of_picture = |((mut renderer, mut now), mut errors): ((Renderer, Local), RemovalError), &k: &usize| {
+            self.show(self.place(k), &mut now)?;
+            renderer.removal_error(&now.state, self.targets.camera(k), self.scene.background, &mut errors);
+            Ok::<_, Error>(((renderer, now), errors))
         };
         // Sums of integers: the order does not show.
         let sums = of.par_iter().try_fold(none, of_picture).map(|found| Ok(found?.1));
@@ -191,7 +249,7 @@ impl<'a> Moving<'a> {
     }
 
     /// What one thread makes its pictures with.
-    fn worker(&self) -> (Renderer, Gaussians) {
-        (Renderer::new(), Gaussians::zeros(0, self.still.sh_degree()))
+    fn worker(&self) -> (Renderer, Local) {
+        (Renderer::new(), Local::default())
     }
 }

@@ -21,7 +21,7 @@ use crate::emit::ply::{out_rows, write_like};
 use crate::error::{Error, Result};
 use crate::ingest::ply::Ply;
 use crate::limits::Limits;
-use crate::model::{Columns, Gaussians};
+use crate::model::{Columns, Gaussians, Jacobian};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
@@ -66,6 +66,7 @@ impl Family for ModelFolder {
             reader: 2 * whole + self.field().bytes_per_gaussian() as u64 + 128,
             // The canonical values of what is left, and while they are made once more.
             reduced: 2 * whole,
+            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             file: whole + 24,
             // Tensors as they are read and as they are used.
             fixed: 2 * fs::metadata(&self.paths().deformation).map_or(0, |file| file.len()),

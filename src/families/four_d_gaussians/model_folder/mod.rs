@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians, Gradients, SequenceInfo};
+use crate::model::{Column, Columns, Gaussians, Jacobian, SequenceInfo};
 use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, Reads, Wanted};
 use crate::stream::{BLOCK, Parts, gather};
 
@@ -249,11 +249,6 @@ impl Deformation for ModelFolder {
         if self.field.has_mask() { Columns::all().difference(Columns::POSITION) } else { Columns::all() }
     }
 
-    /// Positions, where they are deformed, and what is multiplied.
-    fn bound(&self) -> Columns {
-        Columns::all().difference(self.field.added()) | self.field.active() & self.movable() & Columns::POSITION
-    }
-
     fn state(&self, frame: usize, stored: &Gaussians, want: Columns, out: &mut Gaussians) -> Result<()> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
@@ -273,10 +268,27 @@ impl Deformation for ModelFolder {
         )
     }
 
-    fn pull_back(&self, frame: usize, stored: &Gaussians, gradients: &mut Gradients) -> Result<()> {
+    fn jacobian(&self, frame: usize, stored: &Gaussians, want: Columns) -> Result<Jacobian> {
         let time = self.time_of(frame)?;
-        let mut blocks = gradients.spans(BLOCK);
-        blocks.par_iter_mut().try_for_each(|block| self.field.pull_back(stored, time, block))
+        let ids: Vec<u32> = (0..stored.len() as u32).collect();
+        let of_block = |ids: &[u32]| {
+            let mut raw = Gaussians::zeros(0, self.info.sh_degree);
+            for column in (want & Columns::ROTATION | Columns::POSITION).iter() {
+                *raw.column_mut(column) = stored.column(column).pick(ids);
+            }
+            self.field.jacobian(&raw, time, want)
+        };
+        let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;
+        let mut whole = Jacobian::default();
+        for (place, to) in whole.columns_mut().iter_mut().enumerate() {
+            let parts: Vec<&Column> = blocks.iter().map(|block| &block.columns()[place]).collect();
+            let width = parts.first().map_or(0, |part| part.width());
+            if width > 0 {
+                let plane = |c: usize| parts.iter().flat_map(move |part| part.plane(c)).copied();
+                *to = Column::from_planes(width, (0..width).flat_map(plane).collect());
+            }
+        }
+        Ok(whole)
     }
 }
 

@@ -1,6 +1,7 @@
 use std::collections::BTreeMap;
 
 use super::*;
+use crate::model::Gradients;
 
 /// The shared models, or None with a note when this machine has none.
 fn shared_model(name: &str) -> Option<PathBuf> {
@@ -264,12 +265,12 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
     let mut by_raw = by_state.clone();
-    model.pull_back(1, model.canonical(), &mut by_raw).unwrap();
+    let jacobian = model.jacobian(1, model.canonical(), Columns::all()).unwrap();
+    jacobian.pull_back(&mut by_raw);
     for threads in [1, 2, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let mut again = by_state.clone();
-        pool.install(|| model.pull_back(1, model.canonical(), &mut again)).unwrap();
-        assert!(again == by_raw, "{threads} threads");
+        let again = pool.install(|| model.jacobian(1, model.canonical(), Columns::all())).unwrap();
+        assert!(again == jacobian, "{threads} threads");
     }
     for column in Columns::all().difference(Columns::POSITION).iter() {
         assert!(by_raw.column(column) == by_state.column(column), "{} follows the field", column.name());
@@ -299,5 +300,5 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
     // Within a step some cross the edge of a texel or a ReLU, where there is no one derivative.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
-    assert!(model.pull_back(3, model.canonical(), &mut by_raw).is_err(), "there are three frames");
+    assert!(model.jacobian(3, model.canonical(), Columns::all()).is_err(), "there are three frames");
 }

@@ -1,16 +1,16 @@
-//! The field's derivative: from ∂L/∂ state to ∂L/∂ raw parameters.
+//! The field's derivative: how the state changes with raw parameters.
 //!
-//! state = raw + delta(position, time), so a position takes what its state takes and, through the position's delta,
-//! (∂delta/∂position)ᵀ of that: head and trunk transposed, with the masks of their ReLUs, then the planes. Through the
-//! deltas of other columns it takes nothing: that is worth less than 0.1 dB of a refinement and costs most of the
-//! field's time. Data in: canonical positions and derivatives by the state. Data out: the same derivatives, changed in
-//! place. Memory: positions of a span, and one group of [`LANES`] Gaussians. Derived in method.md, section 8.2.
+//! state = raw + delta(position, time), so a position's state changes as it does and, through its own delta, by ∂delta/
+//! ∂position: for each of its three components head and trunk transposed, with the masks of their ReLUs, then the planes.
+//! Through the deltas of other columns nothing changes: that is worth less than 0.1 dB of a refinement and costs most of
+//! the field's time. Data in: raw positions and rotations. Data out: a [`Jacobian`]. Memory: that, and one group of
+//! [`LANES`] Gaussians. Derived in method.md, section 8.2.
 
-use super::deltas::Deltas;
+use super::deltas::{Deltas, finite};
 use super::field::{Field, Head, Mask, Scratch, add_frequencies, place_features};
 use super::linear::{LANES, Lanes, Linear};
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians, GradientSpan};
+use crate::model::{Column, Columns, Gaussians, Jacobian};
 
 /// Derivatives and activations of one group of Gaussians.
 #[derive(Default)]
@@ -27,67 +27,62 @@ struct Group {
 }
 
 impl Field {
-    /// Turns `gradients`, derivatives by the state at `time` of some Gaussians of `raw`, into derivatives by their raw
-    /// parameters.
+    /// How the columns `want` of the state at `time` of a block of Gaussians change with their raw parameters. `raw` has
+    /// rows in position, and in rotation where `want` has it. A value that would not be finite is that of no delta.
     ///
-    /// Under a mask (`static_mlp`, `empty_voxel`) masks and deltas count as constant: a position takes what its state
-    /// takes times the mask and nothing through the field. Moving it by that alone is worse than leaving it where it
-    /// is.
+    /// Under a mask (`static_mlp`, `empty_voxel`) masks and deltas count as constant: a position's state changes by the
+    /// mask times its change.
     ///
     /// # Errors
     /// A time that is not finite.
-    pub fn pull_back(&self, raw: &Gaussians, time: f64, gradients: &mut GradientSpan<'_>) -> Result<()> {
+    pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Columns) -> Result<Jacobian> {
         if !time.is_finite() {
             return Err(Error::usage(format!("a deformation field has no state at time {time}")));
         }
-        let active = self.config.active & gradients.columns();
-        let rows: Vec<u32> = gradients.ids().map(|id| id as u32).collect();
+        let want = self.config.active & want;
+        let mut found = Jacobian::default();
         if let Mask::None = self.mask {
             let head = self.heads.iter().find(|head| head.column == Some(Columns::POSITION));
-            if let Some(head) = head.filter(|_| active.contains(Columns::POSITION)) {
-                self.pull_position(head, &raw.position.pick(&rows), time as f32, gradients);
+            if let Some(head) = head.filter(|_| want.contains(Columns::POSITION)) {
+                *found.column_mut(Columns::POSITION) = self.of_position(head, &raw.position, time as f32);
             }
         }
         let held = match self.mask {
-            Mask::None if self.config.apply_rotation => active & Columns::ROTATION,
+            Mask::None if self.config.apply_rotation => want & Columns::ROTATION,
             Mask::None => Columns::empty(),
-            Mask::Head | Mask::Voxel(_) => active,
+            Mask::Head | Mask::Voxel(_) => want,
         };
         if !held.is_empty() {
             let mut deltas = Deltas::new(raw.sh_degree());
-            self.deltas(&self.prepare(&raw.position.pick(&rows)), time, held, &mut Scratch::default(), &mut deltas)?;
-            deltas.pull_back(&raw.rotation.pick(&rows), gradients);
+            self.deltas(&self.prepare(&raw.position), time, held, &mut Scratch::default(), &mut deltas)?;
+            deltas.jacobian(&raw.rotation, &mut found);
         }
-        Ok(())
+        Ok(found)
     }
 
-    /// Adds what canonical positions take through their deltas. `position` is that of the Gaussians of `gradients`.
-    fn pull_position(&self, head: &Head, position: &Column, time: f32, gradients: &mut GradientSpan<'_>) {
+    /// How positions change.
+    fn of_position(&self, head: &Head, position: &Column, time: f32) -> Column {
+        let mut out = Column::zeros(9, position.len());
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
             // SAFETY: the line above saw that this processor has AVX2 and FMA.
-            unsafe { self.pull_groups_fma(head, position, time, gradients) };
-            return;
+            unsafe { self.of_groups_fma(head, position, time, &mut out) };
+            return out;
         }
-        self.pull_groups::<false>(head, position, time, gradients);
+        self.of_groups::<false>(head, position, time, &mut out);
+        out
     }
 
-    /// [`Field::pull_groups`] compiled for AVX2 and FMA.
+    /// [`Field::of_groups`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn pull_groups_fma(&self, head: &Head, position: &Column, time: f32, gradients: &mut GradientSpan<'_>) {
-        self.pull_groups::<true>(head, position, time, gradients);
+    fn of_groups_fma(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
+        self.of_groups::<true>(head, position, time, out);
     }
 
     /// Group by group; inlined, with all it calls, into each instruction set's copy.
     #[inline(always)]
-    fn pull_groups<const FMA: bool>(
-        &self,
-        head: &Head,
-        position: &Column,
-        time: f32,
-        gradients: &mut GradientSpan<'_>,
-    ) {
+    fn of_groups<const FMA: bool>(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
         let mut group = Group::default();
         for start in (0..position.len()).step_by(LANES) {
@@ -102,22 +97,23 @@ impl Field {
             }
             group.forward::<FMA>(self, head);
 
-            group.by.clear();
-            group.by.resize(head.output.padded_outputs(), Lanes([0.0; LANES]));
-            for (by, plane) in group.by.iter_mut().zip(gradients.planes(Columns::POSITION).iter()) {
-                by.0[..rows.len()].copy_from_slice(&plane[rows.clone()]);
-            }
-            group.backward::<FMA>(self, head);
-            if self.planes.is_some() && self.config.grid_pe > 1 {
-                pull_frequencies(&group.features, self.config.grid_pe as f32, &mut group.by);
-            }
-            let first = gradients.ids().start + start;
-            for axis in 0..3 {
-                let parts = match &self.planes {
-                    Some(_) => group.along(axis),
-                    None => group.by[axis],
-                };
-                gradients.add(Columns::POSITION, axis, first, parts.0[..rows.len()].iter().copied());
+            for component in 0..3 {
+                group.by.clear();
+                group.by.resize(head.output.padded_outputs(), Lanes([0.0; LANES]));
+                group.by[component] = Lanes([1.0; LANES]);
+                group.backward::<FMA>(self, head);
+                if self.planes.is_some() && self.config.grid_pe > 1 {
+                    pull_frequencies(&group.features, self.config.grid_pe as f32, &mut group.by);
+                }
+                for axis in 0..3 {
+                    let parts = match &self.planes {
+                        Some(_) => group.along(axis),
+                        None => group.by[axis],
+                    };
+                    let of_raw = f32::from(u8::from(component == axis));
+                    let out = &mut out.plane_mut(3 * component + axis)[rows.clone()];
+                    out.iter_mut().zip(parts.0).for_each(|(out, part)| *out = of_raw + finite(part));
+                }
             }
         }
     }

@@ -1,0 +1,93 @@
+//! States at the frames that are shown, and how they change with what is stored, in a scratch file.
+
+use std::path::Path;
+
+use crate::emit::atomic::Spill;
+use crate::error::Result;
+use crate::model::{Column, Columns, Gaussians, Jacobian};
+
+/// A state, and how it changes with what is stored.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Local {
+    pub(super) state: Gaussians,
+    pub(super) jacobian: Jacobian,
+}
+
+impl Local {
+    /// Of no Gaussians, with harmonics up to `sh_degree`.
+    pub(super) fn none(sh_degree: usize) -> Local {
+        Local { state: Gaussians::zeros(0, sh_degree), jacobian: Jacobian::default() }
+    }
+
+    /// The Gaussians at `places`, in that order.
+    pub(super) fn pick(&self, places: &[u32]) -> Local {
+        Local { state: self.state.pick(places), jacobian: self.jacobian.pick(places) }
+    }
+
+    /// What is kept of every frame: the columns `varying` of the state, and the Jacobian.
+    fn kept(&mut self, varying: Columns) -> impl Iterator<Item = &mut Column> {
+        self.state.columns_mut(varying).chain(self.jacobian.columns_mut())
+    }
+}
+
+/// [`Local`] of one frame after the other. Memory: one.
+#[derive(Debug)]
+pub(super) struct Locals {
+    file: Spill,
+    varying: Columns,
+    /// The first frame's: what does not vary, and the shape of what does.
+    first: Option<Local>,
+}
+
+impl Locals {
+    /// Of no frames yet; the columns `varying` of states differ from frame to frame.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be made in `scratch`.
+    pub(super) fn new(scratch: &Path, varying: Columns) -> Result<Locals> {
+        Ok(Locals { file: Spill::new(scratch)?, varying, first: None })
+    }
+
+    /// Keeps the next frame's.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be written.
+    pub(super) fn push(&mut self, mut next: Local) -> Result<()> {
+        for column in next.kept(self.varying) {
+            self.file.write(bytemuck::cast_slice(column.planes()))?;
+        }
+        self.first.get_or_insert(next);
+        Ok(())
+    }
+
+    /// Ends writing: only then can be read.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be written.
+    pub(super) fn finish(mut self) -> Result<Locals> {
+        self.file.finish()?;
+        Ok(self)
+    }
+
+    /// The first frame's, if there is one.
+    pub(super) fn first(&self) -> Option<&Local> {
+        self.first.as_ref()
+    }
+
+    /// Makes `to` that of frame `k`, counted as they were kept.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be read.
+    pub(super) fn read(&self, k: usize, to: &mut Local) -> Result<()> {
+        let Some(first) = &self.first else { return Ok(()) };
+        to.clone_from(first);
+        let bytes: u64 = to.kept(self.varying).map(|column| 4 * column.planes().len() as u64).sum();
+        let mut at = k as u64 * bytes;
+        for column in to.kept(self.varying) {
+            let values = bytemuck::cast_slice_mut(column.planes_mut());
+            self.file.read(at, values)?;
+            at += values.len() as u64;
+        }
+        Ok(())
+    }
+}
