@@ -77,6 +77,16 @@ impl Change {
         more
     }
 
+    /// What leads from `before` here; both are of the same columns, or `before` of none.
+    pub fn since(&self, before: &Change) -> Change {
+        let mut since = self.clone();
+        for column in before.columns().iter() {
+            let planes = since.0.column_mut(column).planes_mut().iter_mut();
+            planes.zip(before.0.column(column).planes()).for_each(|(to, of)| *to -= of);
+        }
+        since
+    }
+
     /// Changes the columns `of` of `state`, row by row. A zero leaves the value its bits.
     pub fn add_to(&self, state: &mut Gaussians, of: Columns) {
         for column in (self.columns() & of).iter() {

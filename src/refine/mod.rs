@@ -33,6 +33,11 @@ impl Schedule {
         Schedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
 
+    /// With rates that are `part` of these.
+    pub fn times(self, part: f32) -> Schedule {
+        Schedule { factor: part * self.factor, ..self }
+    }
+
     /// What rates are multiplied by in step `done`.
     fn at(&self, done: usize) -> f32 {
         let [warm, late] = [(done + 1) as f32 / WARM_UP as f32, done as f32 / self.steps.max(1) as f32];
@@ -76,9 +81,9 @@ impl Descent {
         &self.change
     }
 
-    /// Whether anything was done.
-    pub fn has_begun(&self) -> bool {
-        self.done > 0
+    /// Whether anything moved.
+    pub fn has_moved(&self) -> bool {
+        self.columns.iter().any(|column| self.change.0.column(column).planes().iter().any(|&x| x != 0.0))
     }
 
     /// What is to be added to the start, which from now on counts as the start's own.
@@ -86,6 +91,18 @@ impl Descent {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
+    }
+
+    /// Begins anew with `change` already added to the start; columns that it does not have are where they began.
+    pub fn restart(&mut self, change: &Change) {
+        self.take();
+        for column in (self.columns & change.columns()).iter() {
+            self.change.0.column_mut(column).clone_from(change.0.column(column));
+        }
+        for means in &mut self.means {
+            means.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
+        }
+        self.done = 0;
     }
 
     /// One step against `gradients`, at rates of `schedule`.

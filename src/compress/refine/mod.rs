@@ -32,8 +32,12 @@ use targets::Targets;
 /// What the stage is called.
 const NAME: &str = "refine";
 
-/// Steps between two looks at the pictures kept apart.
-const JUDGE_EVERY: usize = 500;
+/// Steps between two looks at the pictures kept apart: a third of all, within these.
+const JUDGE_EVERY: [usize; 2] = [100, 500];
+/// Decibels beyond which nothing is to be gained: less than a quarter of a step of 8 bits.
+const CLOSE_ENOUGH: f64 = 60.0;
+/// Part of the rates to go on with, where they led away from the pictures kept apart.
+const TOO_FAST: f32 = 0.3;
 /// Part of the Gaussians that ranking alone leaves, before the first steps of a stronger reduction.
 const CUTS_FROM: f64 = 0.4;
 /// Part that a cut leaves, at least.
@@ -123,7 +127,7 @@ impl Refine {
         let wanted = self.target.unwrap_or(0.5);
         let sizes = sizes(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
         let steps = self.last_steps(wanted);
-        let judged = pictures / targets::APART_EVERY as f64 * (1 + steps.div_ceil(JUDGE_EVERY)) as f64;
+        let judged = pictures / targets::APART_EVERY as f64 * 4.0;
         let seconds = |(k, &size): (usize, &usize)| {
             let (of, left) = (size as f64 / 1e6 * work.count(), (wanted * 1e6) as usize);
             let (steps, renders, ranked) = match k + 1 == sizes.len() {
@@ -267,19 +271,29 @@ impl Walk<'_> {
     fn finish(&mut self, moving: &mut Moving<'_>, steps: usize, journal: &mut Journal) -> Result<Change> {
         moving.find()?;
         let before = moving.closeness(&self.apart)?;
-        let schedule = Schedule::new(steps, LAST_RATE[1], before.error);
-        let (mut best, mut kept) = (before, moving.change());
+        let count = self.apart.len();
+        if before.psnr >= CLOSE_ENOUGH {
+            journal.leave_out("refinement", format!("{count} pictures kept apart keep {:.2} dB without", before.psnr));
+            return Ok(moving.change());
+        }
+        let mut schedule = Schedule::new(steps, LAST_RATE[1], before.error);
+        let (mut best, mut kept, mut part) = (before, moving.change(), 1.0);
+        let judge_every = steps.div_ceil(3).clamp(JUDGE_EVERY[0], JUDGE_EVERY[1]);
         for step in 1..=steps {
             self.step(moving, &schedule)?;
-            if step % JUDGE_EVERY == 0 || step == steps {
+            if step % judge_every == 0 || step == steps {
                 moving.find()?;
                 let now = moving.closeness(&self.apart)?;
                 if now.psnr > best.psnr {
                     (best, kept) = (now, moving.change());
+                } else if step < steps {
+                    part *= TOO_FAST;
+                    moving.turn_back(&kept)?;
+                    schedule = Schedule::new(steps - step, LAST_RATE[1], best.error).times(part);
                 }
             }
         }
-        let ([start, end], count) = ([before.psnr, best.psnr], self.apart.len());
+        let [start, end] = [before.psnr, best.psnr];
         if end > start {
             journal.notes.push(format!("refined: {count} pictures kept apart keep {end:.2} dB, not {start:.2}"));
         } else {
@@ -298,6 +312,7 @@ mod tests {
     use crate::model::{Rig, Split};
     use crate::recipe::Recipe;
     use crate::render::render;
+    use crate::scene::{InputOptions, open_scene};
     use crate::stream::gather_all;
 
     /// The first `count` of the ranking of `scene`, refined in `steps` steps; `keep` are protected.
@@ -371,5 +386,44 @@ mod tests {
         assert_eq!((journal.left_out.len(), journal.left_out[0].what.as_str()), (1, "refinement"));
         let (none, journal) = refined(&scene, 0, 120, Vec::new());
         assert_eq!((none.len(), journal.left_out.len()), (0, 1));
+    }
+
+    #[test]
+    fn a_descent_goes_back_to_where_it_was_and_on_with_some() {
+        let folder = tempfile::tempdir().unwrap();
+        let explicit = scene(folder.path());
+        let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+        let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
+        for scene in [explicit, open_scene(&options).unwrap()] {
+            let targets = Targets::new(&scene).unwrap();
+            let count = scene.source().info().count;
+            let kept = (0..count as u32).step_by(2).collect();
+            let reduction = Reduction::pruned(kept, &Recipe::preset("default").unwrap().merge);
+            let result = scene.input.reduced(&reduction).unwrap();
+            let fixed = vec![false; reduction.len()];
+            let mut moving = Moving::new(&scene, &*result, &targets, Columns::all(), fixed).unwrap();
+            let (of, schedule) = ([0, 7, 20], Schedule::new(20, 1.0, 1.0));
+            let start = moving.closeness(&of).unwrap().psnr;
+            let walk = |moving: &mut Moving<'_>| (0..20).for_each(|k| moving.step(k, &schedule).unwrap());
+            walk(&mut moving);
+            moving.find().unwrap();
+            let (there, change) = (moving.closeness(&of).unwrap().psnr, moving.change());
+            assert!(there > start + 0.5, "{start:.2} dB before, {there:.2} after");
+            walk(&mut moving);
+            moving.turn_back(&change).unwrap();
+            let back = moving.closeness(&of).unwrap().psnr;
+            assert!((back - there).abs() < 1e-3, "{there:.4} dB there, {back:.4} when back");
+
+            let some: Vec<u32> = (0..reduction.len() as u32).step_by(3).collect();
+            let whole = moving.change();
+            moving.pick(&some).unwrap();
+            let picked = moving.closeness(&of).unwrap().psnr;
+            let thinned = Reduction { change: whole.pick(&some), ..reduction.pick(&some) };
+            let result = scene.input.reduced(&thinned).unwrap();
+            let fixed = vec![false; some.len()];
+            let anew = Moving::new(&scene, &*result, &targets, Columns::all(), fixed).unwrap();
+            let expected = anew.closeness(&of).unwrap().psnr;
+            assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
+        }
     }
 }

@@ -122,7 +122,7 @@ impl<'a> Moving<'a> {
     /// What is to be added to what is stored.
     pub(super) fn change(&self) -> Change {
         let before = self.before.clone();
-        if self.descent.has_begun() { before.and(self.descent.change().clone()) } else { before }
+        if self.descent.has_moved() { before.and(self.descent.change().clone()) } else { before }
     }
 
     /// Finds states anew, where they follow from what is stored by more than a sum.
@@ -144,9 +144,18 @@ impl<'a> Moving<'a> {
         Ok(())
     }
 
+    /// Begins anew from where `change` led, a [`Moving::change`] since the last cut.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be written.
+    pub(super) fn turn_back(&mut self, change: &Change) -> Result<()> {
+        self.descent.restart(&change.since(&self.before));
+        self.find()
+    }
+
     /// What was descended so far counts as what is stored.
     fn settle(&mut self) {
-        if !self.descent.has_begun() {
+        if !self.descent.has_moved() {
             return;
         }
         let moved = self.descent.take();
