@@ -13,6 +13,7 @@ Examples:
   splatsieve demo                                        a built-in scene, no files needed
   splatsieve compress model --cameras data -o small      a trained 4DGaussians model, drop-in result
   splatsieve compress model --cameras data -o small --target-ratio 0.3
+  splatsieve compress model --cameras data -o small --min-psnr 35dB
   splatsieve compress frames/ -o small.gseq --preset paper
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
@@ -42,7 +43,7 @@ pub(super) struct Cli {
 #[derive(Debug, Subcommand)]
 pub(super) enum Verb {
     /// Write a smaller model that the same renderer opens
-    Compress(Compress),
+    Compress(Box<Compress>),
     /// Write the statistics and scores of every Gaussian as .npz or .csv
     Score(Score),
     /// Render an input as its cameras see it, into PNG or float32 NPY files
@@ -75,8 +76,8 @@ impl Verb {
     /// Whether it is to say what memory it takes. A sweep's table does, run by run.
     pub(super) fn explains(&self) -> bool {
         match self {
-            Verb::Compress(Compress { input, .. })
-            | Verb::Score(Score { input, .. })
+            Verb::Compress(args) => args.input.memory.explain,
+            Verb::Score(Score { input, .. })
             | Verb::Render(Render { input, .. })
             | Verb::Pack(Pack { input, .. })
             | Verb::Info(Info { input, .. })
@@ -188,12 +189,8 @@ pub(super) struct Compress {
     /// What to write [default: by the output's name; a folder is of the input's own kind]
     #[arg(long = "as", value_enum, value_name = "KIND")]
     pub(super) kind: Option<OutputKind>,
-    /// Exactly this many Gaussians in the output
-    #[arg(long, value_name = "N", conflicts_with = "target_ratio")]
-    pub(super) target_count: Option<u64>,
-    /// Exactly this fraction of the Gaussians in the output
-    #[arg(long, value_name = "R")]
-    pub(super) target_ratio: Option<f64>,
+    #[command(flatten)]
+    pub(super) size: OutputSize,
     /// Prune, do not merge
     #[arg(long, conflicts_with = "merge_only")]
     pub(super) prune_only: bool,
@@ -212,6 +209,31 @@ pub(super) struct Compress {
     pub(super) json: bool,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
+}
+
+/// How large the output is to be [default: what pictures can do without goes].
+#[derive(Debug, Args)]
+#[command(group(clap::ArgGroup::new("size_of_output")))]
+pub(super) struct OutputSize {
+    /// Exactly this many Gaussians in the output
+    #[arg(long, value_name = "N", group = "size_of_output")]
+    pub(super) target_count: Option<u64>,
+    /// Exactly this fraction of the Gaussians in the output
+    #[arg(long, value_name = "R", group = "size_of_output")]
+    pub(super) target_ratio: Option<f64>,
+    /// The smallest output whose pictures stay this close to the original's own: mean PSNR, such as 35 or 35dB
+    #[arg(long, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
+    pub(super) min_psnr: Option<f64>,
+    /// The smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
+    #[arg(long, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
+    pub(super) max_loss: Option<f64>,
+    /// The best output that is at most this large with everything written beside it, such as 5MB
+    #[arg(long, value_name = "SIZE", group = "size_of_output", value_parser = parse_bytes)]
+    pub(super) target_size: Option<u64>,
+    /// Folder of photographs of the held-out cameras for --max-loss: tNNN_vNN.png, or named as the cameras name them. A
+    /// quarter of them is not searched on and gives the figure that is reported
+    #[arg(long, value_name = "FOLDER", requires = "max_loss")]
+    pub(super) ground_truth: Option<PathBuf>,
 }
 
 /// What the user knows better.
@@ -515,6 +537,14 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
     match text.parse::<bytesize::ByteSize>() {
         Ok(bytes) if bytes.as_u64() > 0 => Ok(bytes.as_u64()),
         _ => Err(format!("expected a size such as 512MiB or 4GB, found {text:?}")),
+    }
+}
+
+fn parse_decibels(text: &str) -> Result<f64, String> {
+    let number = text.trim().trim_end_matches(['b', 'B']).trim_end_matches(['d', 'D']).trim_end();
+    match number.parse::<f64>() {
+        Ok(decibels) if decibels > 0.0 && decibels <= 100.0 => Ok(decibels),
+        _ => Err(format!("expected decibels above 0 and at most 100, such as 0.5 or 35dB, found {text:?}")),
     }
 }
 

@@ -13,7 +13,7 @@ use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
 use crate::budget::{self, Budget, Tell};
-use crate::compress::{Only, Request, Run, Target, compress};
+use crate::compress::{Only, Request, Run, compress};
 use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
@@ -28,7 +28,9 @@ use crate::verbs::evaluate::EvaluateOptions;
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::{Method, SweepOptions};
 use crate::verbs::{container, demo, evaluate, render, score, sweep};
-use args::{CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, Render, SideBySide, SplitArg, Sweep, Verb};
+use args::{
+    CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, OutputSize, Render, SideBySide, SplitArg, Sweep, Verb,
+};
 
 /// Runs the program on the arguments of this process.
 pub fn main() -> ExitCode {
@@ -70,7 +72,7 @@ fn run(cli: Cli) -> Result<()> {
     match cli.verb {
         Verb::Compress(args) => {
             let json = args.json;
-            let summary = compress(&compress_options(args, cli.quiet)?)?;
+            let summary = compress(&compress_options(*args, cli.quiet)?)?;
             print(&if json { summary.json() } else { summary.text() })
         }
         Verb::Score(args) => {
@@ -220,7 +222,11 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
         }
         None => Run::default(),
     };
-    let target = args.target_count.map(Target::Count).or(args.target_ratio.map(Target::Ratio));
+    let OutputSize { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth } = args.size;
+    let asked = Run { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth, ..Run::default() };
+    // One of them, of the command line if it names one.
+    let of = if asked == Run::default() { &run } else { &asked };
+    let (target, goal) = (of.target(), of.goal());
     Ok(Request {
         input,
         output: args.output,
@@ -232,7 +238,8 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
             (_, true) => Only::Merge,
             _ => run.mode,
         },
-        target: target.or(run.target_count.map(Target::Count)).or(run.target_ratio.map(Target::Ratio)),
+        target,
+        goal,
         keep_ids: args.overrides.keep_ids.or(run.keep_ids),
         drop_ids: args.overrides.drop_ids.or(run.drop_ids),
         keep_box: args.overrides.keep_box.or(run.keep_box),

@@ -9,7 +9,7 @@ use super::request::Request;
 use super::score::scored;
 use super::summary::Summary;
 use crate::budget::{Need, Workload};
-use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target, commit_files};
+use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFile, StagedFolder, check_target, commit_files};
 use crate::emit::container::FRAME_BLOCK;
 use crate::emit::index_map::write_index_map;
 use crate::emit::kind::OutputKind;
@@ -27,6 +27,9 @@ const NAME: &str = "emit";
 const LEFT: f64 = 0.5;
 /// Seconds that a state takes to be encoded and written (`benches/pack.rs`).
 pub const ENCODING: f64 = 3.5e-7;
+
+/// Bytes of the recipe, the summary and a header beside a result, at most but for long lists of ids or notes.
+const BESIDE: u64 = 24 << 10;
 
 /// File beside every result: all parameters it was made with.
 pub const RECIPE: &str = "recipe.toml";
@@ -114,6 +117,21 @@ impl Emit {
         let left = LEFT * work.count();
         let seconds = work.reading(left, frames) + left * frames * ENCODING;
         Need { stage: NAME, reads, seconds, per_gaussian, fixed }
+    }
+
+    /// Bytes of everything that is written of `reduction`; made in a scratch folder, and removed.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, a failed write.
+    pub fn bytes(&self, scene: &Scene, reduction: &Reduction) -> Result<u64> {
+        let folder = ScratchFolder::new(&scene.scratch)?;
+        let path = folder.path().join("result");
+        if self.kind.is_folder() {
+            fs::create_dir(&path).map_err(Error::io("create", &path))?;
+        }
+        scene.input.write(reduction, self.kind, &path, &scene.limits)?;
+        let beside = BESIDE + size_of::<i64>() as u64 * scene.source().info().count as u64;
+        Ok(bytes_below(&path)? + beside)
     }
 
     /// Writes the result and what goes beside it; everything appears under its name at the end, a file

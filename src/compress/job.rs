@@ -8,9 +8,10 @@ use super::measure::{Measure, Outlook, Stages};
 use super::merge::Merge;
 use super::prune::Prune;
 use super::refine::Refine;
-use super::request::{Only, Request};
+use super::request::{Goal, Only, Request};
 use super::rounds::Rounds;
 use super::score::UserOverrides;
+use super::search::Search;
 use crate::budget::{Need, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
@@ -31,6 +32,8 @@ pub struct Job {
     pub choose: Option<Choose>,
     /// Moves what is stored of what is left.
     pub refine: Option<Refine>,
+    /// Finds the size, instead of the four before it.
+    pub search: Option<Search>,
     /// Writes.
     pub emit: Emit,
     has_cameras: bool,
@@ -44,6 +47,11 @@ impl Job {
     pub fn new(request: &Request, outlook: Outlook) -> Result<Job> {
         let Request { recipe, only, .. } = request;
         recipe.validate().map_err(Error::usage)?;
+        if request.goal.is_some() && (*only == Only::Merge || request.target.is_some()) {
+            return Err(Error::usage(
+                "a quality or a size on disk is found by pruning: not with --merge-only, nor beside a target",
+            ));
+        }
         let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
         let ids =
             |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, outlook.gaussians));
@@ -55,7 +63,9 @@ impl Job {
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
         let refine = Refine::of(recipe, part, looks && prunes);
         // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
-        let merges = *only != Only::Prune && !recipe.merge.passes.is_empty() && !(refine.is_some() && prunes);
+        let searches = matches!(request.goal, Some(Goal::Quality(_)));
+        let prunes_alone = *only == Only::Prune || searches || (refine.is_some() && prunes);
+        let merges = !prunes_alone && !recipe.merge.passes.is_empty();
         let cuts = refine.as_ref().is_some_and(Refine::will_cut);
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
         let choose =
@@ -64,8 +74,14 @@ impl Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
-            choose: (looks && prunes && !cuts && recipe.select.choose_by_views).then(choose),
-            refine,
+            choose: (looks && prunes && !cuts && !searches && recipe.select.choose_by_views).then(choose),
+            search: match &request.goal {
+                Some(Goal::Quality(quality)) => {
+                    Some(Search { quality: quality.clone(), refine: refine.clone(), rule: recipe.merge.clone() })
+                }
+                _ => None,
+            },
+            refine: refine.filter(|_| !searches),
             emit: Emit::new(request, outlook.own_output, merges),
             measure,
             has_cameras: outlook.has_cameras,
@@ -81,6 +97,7 @@ impl Job {
             let why = match request.only {
                 Only::Prune => "--prune-only",
                 _ if request.recipe.merge.passes.is_empty() => "the recipe has no merge pass",
+                _ if self.search.is_some() => "a quality is searched by pruning",
                 _ => "refining what is left gains more at the same count (--no-refine merges)",
             };
             journal.leave_out("merging, and its pass over the frames", why);
@@ -103,6 +120,7 @@ impl Stages for Job {
         needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits));
         needs
     }

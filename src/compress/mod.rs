@@ -16,6 +16,8 @@ mod request;
 mod rounds;
 mod scan;
 pub mod score;
+mod search;
+mod size;
 mod statistics;
 pub mod summary;
 mod visible;
@@ -23,7 +25,7 @@ mod visible;
 pub use arrival::open_to_measure;
 pub use job::Job;
 pub use record::{Record, Run};
-pub use request::{Only, Request, Target};
+pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
 use crate::budget::seconds;
@@ -35,7 +37,7 @@ use crate::stream::begin_run;
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
-use score::{Scored, UserOverrides};
+use score::{Ranked, Scored, UserOverrides};
 use summary::{CameraSummary, InputSummary, Summary};
 
 /// Writes a smaller model and says what was done.
@@ -103,32 +105,35 @@ fn reduce(
     }
     let recipe = Record::of(request, &job.measure.score.user, input.digest.clone()).text(request);
 
+    let of_bytes;
+    let job = match request.goal {
+        Some(Goal::Bytes(most)) => {
+            let count = size::count_within(scene, &job.emit, most, &request.recipe.merge, &mut journal)?;
+            let target = Some(Target::Count(count as u64));
+            of_bytes = Job::new(&Request { target, goal: None, ..request.clone() }, Outlook::of(scene))?;
+            &of_bytes
+        }
+        _ => job,
+    };
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
     // A refinement lets the last ones go by itself.
     let before_cuts = |wanted| job.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, scored.count()));
     if let Some(rounds) = &job.rounds {
         let fewest = job.prune.target.unwrap_or(scored.selection.counts.kept);
-        ranked = rounds.run(scene, &scored, ranked, before_cuts(fewest), &mut journal)?;
+        let fewest = job.search.as_ref().map_or(before_cuts(fewest), |search| search.fewest(scored.count()));
+        ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
     }
-    let wanted = job.prune.run(scene, &scored, &ranked, &mut journal)?;
-    let survivors = before_cuts(wanted).min(ranked.ranking.order().len());
-    let mut outcome = match &job.merge {
-        Some(merge) => merge.run(scene, &scored, &ranked, survivors, &mut journal)?,
-        None => Outcome {
-            reduction: Reduction::pruned(ranked.ranking.take(survivors), &request.recipe.merge),
-            summary: None,
-        },
+    let (reduction, merge, goal) = match &job.search {
+        Some(search) => {
+            let (reduction, goal) = search.run(scene, &scored, &ranked, &mut journal)?;
+            (reduction, None, Some(goal))
+        }
+        None => {
+            let Outcome { reduction, summary } = of_size(scene, job, request, &scored, &ranked, &mut journal)?;
+            (reduction, summary, None)
+        }
     };
-    if let Some(choose) = &job.choose {
-        outcome = choose.run(scene, &scored, &ranked, outcome, &mut journal)?;
-    }
-    let Outcome { mut reduction, summary: merge } = outcome;
-    journal.notes.extend(reduction.proxies.notes.iter().cloned());
-    if let Some(refine) = &job.refine {
-        let wanted = wanted.min(reduction.len());
-        reduction = refine.run(scene, &scored, reduction, wanted, &mut journal)?;
-    }
     job.write_down(request, &mut journal);
 
     let map = reduction.index_map(scene.source().info().count);
@@ -143,6 +148,7 @@ fn reduce(
         terms: scored.term_summaries(),
         flags: scored.flags.clone(),
         merge,
+        goal: goal.clone(),
         left_out: journal.left_out,
         notes: journal.notes,
         planned_reads: scene.planned_reads,
@@ -155,6 +161,40 @@ fn reduce(
     }
     let written = |journal, bytes| summarise(journal, Some(bytes));
     Ok((job.emit.run(scene, &reduction, &recipe, journal, written)?, map))
+}
+
+/// What is left where its size is known before, or is the recipe's own.
+fn of_size(
+    scene: &Scene,
+    job: &Job,
+    request: &Request,
+    scored: &Scored,
+    ranked: &Ranked,
+    journal: &mut Journal,
+) -> Result<Outcome> {
+    let wanted = job.prune.run(scene, scored, ranked, journal)?;
+    // A refinement lets the last ones go by itself.
+    let first = job.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, scored.count()));
+    let survivors = first.min(ranked.ranking.order().len());
+    let mut outcome = match &job.merge {
+        Some(merge) => merge.run(scene, scored, ranked, survivors, journal)?,
+        None => Outcome {
+            reduction: Reduction::pruned(ranked.ranking.take(survivors), &request.recipe.merge),
+            summary: None,
+        },
+    };
+    if let Some(choose) = &job.choose {
+        outcome = choose.run(scene, scored, ranked, outcome, journal)?;
+    }
+    journal.notes.extend(outcome.reduction.proxies.notes.iter().cloned());
+    if let Some(refine) = &job.refine {
+        let wanted = wanted.min(outcome.reduction.len());
+        outcome.reduction = refine.run(scene, scored, outcome.reduction, wanted, journal)?;
+    }
+    if let Some(Goal::Bytes(most)) = request.goal {
+        outcome.reduction = size::shrink(scene, &job.emit, most, outcome.reduction)?;
+    }
+    Ok(outcome)
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::request::{Only, Request, Target};
+use super::request::{Goal, Only, Quality, Request, Target};
 use super::score::UserOverrides;
 use crate::TOOL;
 use crate::emit::kind::OutputKind;
@@ -32,6 +32,14 @@ pub struct Run {
     pub target_count: Option<u64>,
     /// Exact fraction of them.
     pub target_ratio: Option<f64>,
+    /// Least PSNR against the original's own pictures, dB.
+    pub min_psnr: Option<f64>,
+    /// Most loss of PSNR against photographs, dB.
+    pub max_loss: Option<f64>,
+    /// Folder of these photographs.
+    pub ground_truth: Option<PathBuf>,
+    /// Most bytes of everything that is written.
+    pub target_size: Option<u64>,
     /// Ids to keep, as a list with ranges.
     pub keep_ids: Option<String>,
     /// Ids to drop, as a list with ranges.
@@ -63,6 +71,21 @@ pub struct Record {
     pub run: Option<Run>,
 }
 
+impl Run {
+    /// The exact size that was asked for.
+    pub fn target(&self) -> Option<Target> {
+        self.target_count.map(Target::Count).or(self.target_ratio.map(Target::Ratio))
+    }
+
+    /// The goal that was asked for.
+    pub fn goal(&self) -> Option<Goal> {
+        let loss = self.max_loss.zip(self.ground_truth.clone());
+        let loss = loss.map(|(most, photographs)| Quality::Loss { most, photographs });
+        let quality = self.min_psnr.map(Quality::Psnr).or(loss);
+        quality.map(Goal::Quality).or(self.target_size.map(Goal::Bytes))
+    }
+}
+
 impl Record {
     /// Of `request`, whose ids are those of `user`.
     pub(super) fn of(request: &Request, user: &UserOverrides, input_digest: String) -> Record {
@@ -71,6 +94,15 @@ impl Record {
             Some(Target::Count(count)) => (Some(count), None),
             Some(Target::Ratio(ratio)) => (None, Some(ratio)),
         };
+        let mut run = Run::default();
+        match &request.goal {
+            None => (),
+            Some(Goal::Bytes(most)) => run.target_size = Some(*most),
+            Some(Goal::Quality(Quality::Psnr(least))) => run.min_psnr = Some(*least),
+            Some(Goal::Quality(Quality::Loss { most, photographs })) => {
+                (run.max_loss, run.ground_truth) = (Some(*most), Some(photographs.clone()));
+            }
+        }
         let ids = |ids: &[u32]| (!ids.is_empty()).then(|| ranges(ids));
         let input = &request.input;
         let run = Run {
@@ -86,6 +118,7 @@ impl Record {
             split: input.split,
             frames: input.frames,
             size: input.size,
+            ..run
         };
         let tool = TOOL.to_owned();
         Record { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }

@@ -32,6 +32,29 @@ pub enum Target {
     Ratio(f64),
 }
 
+/// What the size of the output is to be found by.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Goal {
+    /// The smallest that is as good as this.
+    Quality(Quality),
+    /// The best with at most this many bytes of everything that is written.
+    Bytes(u64),
+}
+
+/// How good an output is to be.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Quality {
+    /// At least this mean PSNR against the original's own pictures, dB.
+    Psnr(f64),
+    /// At most this much PSNR against photographs less than the original has, dB.
+    Loss {
+        /// dB.
+        most: f64,
+        /// Folder of the photographs.
+        photographs: PathBuf,
+    },
+}
+
 /// Everything a compression is asked for.
 #[derive(Debug, Clone)]
 pub struct Request {
@@ -49,6 +72,8 @@ pub struct Request {
     pub only: Only,
     /// Exact size of the output, if asked for.
     pub target: Option<Target>,
+    /// What the output's size is to be found by, if it is; then there is no target.
+    pub goal: Option<Goal>,
     /// Ids to keep: a list or a file.
     pub keep_ids: Option<String>,
     /// Ids to drop: a list or a file.
@@ -72,6 +97,7 @@ impl Request {
             made_for: None,
             only: Only::Both,
             target: None,
+            goal: None,
             keep_ids: None,
             drop_ids: None,
             keep_box: None,

@@ -48,6 +48,25 @@ pub struct LeftOut {
     pub why: String,
 }
 
+/// What the output's size was found by.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GoalSummary {
+    /// `min_psnr` or `max_loss`, dB.
+    pub name: String,
+    /// What was asked for.
+    pub asked: f64,
+    /// What the output has, by what was searched on.
+    #[serde(deserialize_with = "number")]
+    pub searched: f64,
+    /// The same by pictures that nothing was searched on.
+    #[serde(deserialize_with = "number")]
+    pub held: f64,
+    /// Names of these pictures; of those that no camera of the scene takes, their frames.
+    pub held_pictures: Vec<String>,
+    /// Every size that was tried, and what it has by what was searched on.
+    pub tried: Vec<(usize, f64)>,
+}
+
 /// The input, as the summary names it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct InputSummary {
@@ -196,6 +215,9 @@ pub struct Summary {
     pub flags: FlagSummary,
     /// Stage 3, unless it was left out.
     pub merge: Option<MergeSummary>,
+    /// What its size was found by, if by a quality.
+    #[serde(default)]
+    pub goal: Option<GoalSummary>,
     /// What the scene did not need.
     pub left_out: Vec<LeftOut>,
     /// Things a person should know.

@@ -17,11 +17,11 @@ use crate::compress::summary::CameraSummary;
 use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::error::{Error, Result};
 use crate::families::{self, Family, OpenOptions, Timing};
-use crate::ingest::image::read_png;
 use crate::limits::Limits;
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
-use crate::model::{Camera, Gaussians, Picture, Rig};
+use crate::model::{Camera, Gaussians, Picture};
 use crate::render::{Image, render};
+use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, PictureSet, background, pictures, thin};
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::stream::{Batch, Progress, Subject, View, show};
@@ -97,7 +97,7 @@ pub struct SideBySide {
     flip: bool,
     pictures: Vec<Picture>,
     truth_folder: Option<PathBuf>,
-    truth: Option<GroundTruth>,
+    truth: Option<Photographs>,
 }
 
 impl SideBySide {
@@ -115,7 +115,7 @@ impl SideBySide {
         if let Some(frames) = options.max_frames {
             chosen = thin(chosen, frames);
         }
-        let truth = options.ground_truth.as_deref().map(|folder| GroundTruth::find(folder, &scene.rig, times, &chosen));
+        let truth = options.ground_truth.as_deref().map(|folder| Photographs::find(folder, &scene.rig, times, &chosen));
         Ok(SideBySide {
             truth: truth.transpose()?,
             truth_folder: options.ground_truth.clone(),
@@ -256,12 +256,10 @@ impl SideBySide {
     }
 
     fn take(&self, &View { picture, camera, states: [original, compressed] }: &View<'_, 2>) -> Result<Taken> {
-        let read = |file: &PathBuf| read_png(file, (camera.width, camera.height), self.background);
-        let file = self.truth.as_ref().and_then(|truth| truth.files.get(&(picture.frame, picture.view)));
         Ok(Taken {
             original: render(original, camera, self.background),
             compressed: render(compressed, camera, self.background),
-            truth: file.map(read).transpose()?,
+            truth: self.truth.as_ref().map(|truth| truth.read(picture, camera, self.background)).transpose()?,
         })
     }
 }
@@ -295,54 +293,6 @@ fn open_compressed(path: &Path, original: &Scene) -> Result<Box<dyn Family>> {
         }
         None => Ok(input),
     }
-}
-
-/// Where the photographs are.
-struct GroundTruth {
-    /// By frame and view.
-    files: HashMap<(usize, u32), PathBuf>,
-}
-
-impl GroundTruth {
-    /// Finds the photograph of every picture: `tNNN_vNN.png`, else the file its camera names, by as
-    /// much of its path as leads to one inside `folder`.
-    fn find(folder: &Path, rig: &Rig, times: &[f64], pictures: &[Picture]) -> Result<GroundTruth> {
-        if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
-            return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.display())));
-        }
-        let mut files = HashMap::new();
-        let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
-        for &picture in pictures {
-            let place = || format!("frame {}, view {}", picture.frame, picture.view);
-            let named = rig.image(picture, times);
-            let numbered = folder.join(format!("{}.png", picture.name()));
-            let file = if numbered.is_file() {
-                numbered
-            } else {
-                named.and_then(|image| inside(folder, image)).ok_or_else(|| {
-                    let named = named.and_then(Path::file_name).map(|name| format!(" or {}", name.display()));
-                    let expected = format!("{}.png{}", picture.name(), named.unwrap_or_default());
-                    Error::input(folder, place(), expected, "no such file")
-                        .hint("--max-frames compares fewer frames, --split other pictures")
-                })?
-            };
-            // The names that a time-stamped rig gives its files are shared by all of its cameras.
-            if let Some(other) = takers.insert(file.clone(), picture) {
-                let found = format!("{}, as for frame {}, view {}", file.display(), other.frame, other.view);
-                return Err(Error::input(folder, place(), "a picture of its own", found)
-                    .hint("give the folder that the cameras' file paths start from"));
-            }
-            files.insert((picture.frame, picture.view), file);
-        }
-        Ok(GroundTruth { files })
-    }
-}
-
-/// The file inside `folder` that ends as `image` does, by the longest such end.
-fn inside(folder: &Path, image: &Path) -> Option<PathBuf> {
-    let parts: Vec<_> = image.components().collect();
-    let ends = (0..parts.len()).map(|start| parts[start..].iter().collect::<PathBuf>());
-    ends.filter(|end| end.is_relative()).map(|end| folder.join(end)).find(|file| file.is_file())
 }
 
 /// The pictures of one (frame, view), all of one size.

@@ -11,7 +11,7 @@
 
 mod local;
 mod moving;
-mod targets;
+pub(super) mod targets;
 
 use super::journal::Journal;
 use super::score::{Scored, scored};
@@ -25,9 +25,10 @@ use crate::refine::{self, Schedule};
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 use crate::scene::Scene;
 use crate::scene::between::Dice;
+use crate::source::FrameSource;
 use crate::stream::Progress;
 use moving::Moving;
-use targets::Targets;
+use targets::{Parted, Targets};
 
 /// What the stage is called.
 const NAME: &str = "refine";
@@ -41,7 +42,7 @@ const TOO_FAST: f32 = 0.3;
 /// Part of the Gaussians that ranking alone leaves, before the first steps of a stronger reduction.
 const CUTS_FROM: f64 = 0.4;
 /// Part that a cut leaves, at least.
-const CUT: f64 = 0.8;
+pub(super) const CUT: f64 = 0.8;
 /// Pictures that a cut is ranked on, others each time.
 const RANKED_ON: usize = 48;
 /// Pictures that tell how large steps after a cut should be.
@@ -180,14 +181,12 @@ impl Refine {
         }
         journal.stage(NAME, count, scene.source(), |journal| {
             let targets = Targets::new(scene)?;
+            let mut walk = Walk::new(self, scene, scored, &targets, targets.parted(false));
             let result = scene.input.reduced(&reduction)?;
-            let fixed = reduction.kept.iter().map(|id| scored.protected.binary_search(id).is_ok()).collect();
-            let mut moving = Moving::new(scene, &*result, &targets, self.columns, fixed)?;
-            let (stepped, apart) = targets.parted();
+            let mut moving = walk.begin(&reduction, &*result)?;
             let sizes = sizes(count, wanted);
             let of_cuts: usize = sizes.windows(2).map(|pair| self.steps_before(pair[0], wanted)).sum();
-            let progress = Progress::new(NAME, "steps", (of_cuts + steps) as u64);
-            let mut walk = Walk { refine: self, turns: Turns::of(stepped), apart, progress };
+            walk.expect(of_cuts + steps);
             let mut left = reduction.clone();
             for pair in sizes.windows(2) {
                 left = left.pick(&walk.cut(&mut moving, self.steps_before(pair[0], wanted), pair[1])?);
@@ -231,15 +230,68 @@ impl Turns {
 }
 
 /// What all legs of the way share.
-struct Walk<'a> {
+pub(super) struct Walk<'a> {
     refine: &'a Refine,
+    scene: &'a Scene,
+    scored: &'a Scored,
+    targets: &'a Targets,
     turns: Turns,
     /// The pictures kept apart.
     apart: Vec<usize>,
     progress: Progress,
 }
 
-impl Walk<'_> {
+impl<'a> Walk<'a> {
+    /// Along the pictures of `parts`.
+    pub(super) fn new(
+        refine: &'a Refine,
+        scene: &'a Scene,
+        scored: &'a Scored,
+        targets: &'a Targets,
+        parts: Parted,
+    ) -> Walk<'a> {
+        let (turns, apart) = (Turns::of(parts.stepped), parts.apart);
+        Walk { refine, scene, scored, targets, turns, apart, progress: Progress::new(NAME, "steps", 0) }
+    }
+
+    /// Shows how far it is of so many steps.
+    fn expect(&mut self, steps: usize) {
+        self.progress = Progress::new(NAME, "steps", steps as u64);
+    }
+
+    /// What moves of `reduction`, which `result` shows.
+    fn begin<'b>(&self, reduction: &Reduction, result: &'b dyn FrameSource) -> Result<Moving<'b>>
+    where
+        'a: 'b,
+    {
+        let fixed = reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect();
+        Moving::new(self.scene, result, self.targets, self.refine.columns, fixed)
+    }
+
+    /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
+    pub(super) fn cut_down(&mut self, reduction: &Reduction, size: usize, wanted: usize) -> Result<Reduction> {
+        let result = self.scene.input.reduced(reduction)?;
+        let mut moving = self.begin(reduction, &*result)?;
+        let steps = self.refine.steps_before(reduction.len(), wanted);
+        self.expect(steps);
+        let mut left = reduction.pick(&self.cut(&mut moving, steps, size)?);
+        left.change = left.change.and(moving.change());
+        Ok(left)
+    }
+
+    /// `reduction` at its best: as the last steps leave it.
+    pub(super) fn best_of(&mut self, mut reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.count().max(1) as f64);
+        self.expect(steps);
+        let change = {
+            let result = self.scene.input.reduced(&reduction)?;
+            let mut moving = self.begin(&reduction, &*result)?;
+            self.finish(&mut moving, steps, journal)?
+        };
+        reduction.change = reduction.change.and(change);
+        Ok(reduction)
+    }
+
     fn step(&mut self, moving: &mut Moving<'_>, schedule: &Schedule) -> Result<()> {
         moving.step(self.turns.next(), schedule)?;
         self.progress.advance(1);

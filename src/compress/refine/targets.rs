@@ -19,6 +19,19 @@ const FEWEST: u64 = 96;
 /// Of all every eighth is kept apart.
 pub(super) const APART_EVERY: usize = 8;
 
+/// Of a run that is asked for a quality every fourth gives nothing but the figure that is reported.
+const HELD_EVERY: usize = 4;
+
+/// What pictures are for, by their numbers.
+pub(in crate::compress) struct Parted {
+    /// To step along.
+    pub(in crate::compress) stepped: Vec<usize>,
+    /// To judge by.
+    pub(in crate::compress) apart: Vec<usize>,
+    /// To report.
+    pub(in crate::compress) held: Vec<usize>,
+}
+
 /// How many pictures of the scene's cameras are looked at, and how many of cameras in between, if one has `pixels`.
 pub(super) fn numbers(pixels: u64) -> [usize; 2] {
     let all = PICTURES.iter().sum::<usize>() as u64;
@@ -27,10 +40,10 @@ pub(super) fn numbers(pixels: u64) -> [usize; 2] {
 }
 
 /// The original's pictures, of the cameras that the scene is scored by and of cameras in between, in a scratch file.
-pub(super) struct Targets {
-    cameras: Vec<Camera>,
+pub(in crate::compress) struct Targets {
+    pub(in crate::compress) cameras: Vec<Camera>,
     /// By frame.
-    pub(super) pictures: Vec<Picture>,
+    pub(in crate::compress) pictures: Vec<Picture>,
     /// Of every picture its values from 0 to 1 as 16 bits, one after the other from its place.
     values: Spill,
     places: Vec<u64>,
@@ -41,7 +54,7 @@ impl Targets {
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
-    pub(super) fn new(scene: &Scene) -> Result<Targets> {
+    pub(in crate::compress) fn new(scene: &Scene) -> Result<Targets> {
         let (cameras, pictures) = looked_at(scene);
         let (mut values, mut places, mut end) = (Spill::new(&scene.scratch)?, Vec::new(), 0);
         show([Subject::all(scene.source())], &cameras, &pictures, Batch::of_frame(&scene.limits), |views| {
@@ -57,9 +70,13 @@ impl Targets {
         Ok(Targets { cameras, pictures, values, places })
     }
 
-    /// The pictures that are stepped along, and those that are kept apart.
-    pub(super) fn parted(&self) -> (Vec<usize>, Vec<usize>) {
-        (0..self.pictures.len()).partition(|k| k % APART_EVERY != APART_EVERY - 1)
+    /// What each picture is for; every fourth for nothing but the figure that is reported, if some are to be `held`.
+    pub(in crate::compress) fn parted(&self, held: bool) -> Parted {
+        let (held, rest): (Vec<usize>, Vec<usize>) =
+            (0..self.pictures.len()).partition(|k| held && k % HELD_EVERY == HELD_EVERY - 1);
+        // Never one of those held.
+        let (apart, stepped) = rest.into_iter().partition(|k| k % APART_EVERY == 1);
+        Parted { stepped, apart, held }
     }
 
     /// What took picture `k`.
@@ -71,7 +88,7 @@ impl Targets {
     ///
     /// # Errors
     /// A scratch file that cannot be read.
-    pub(super) fn values(&self, k: usize) -> Result<Vec<u16>> {
+    pub(in crate::compress) fn values(&self, k: usize) -> Result<Vec<u16>> {
         let camera = self.camera(k);
         let mut values = vec![0u16; 3 * camera.width as usize * camera.height as usize];
         self.values.read(self.places[k], bytemuck::cast_slice_mut(&mut values))?;
@@ -112,7 +129,7 @@ pub(super) fn slope(picture: &Image, target: &[u16]) -> Image {
 }
 
 /// Mean square error of a picture.
-pub(super) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
+pub(in crate::compress) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
     let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
     picture.data.iter().zip(target).map(square).sum::<f64>() / target.len().max(1) as f64
 }
