@@ -111,3 +111,10 @@ fn goals_that_contradict_each_other_are_refused() {
         workplace.refused(2, &format!("compress {{tiny}} --cameras {{tiny}} -o out {arguments}"), &[part]);
     }
 }
+
+#[test]
+fn more_bytes_than_everything_takes_leave_out_what_is_to_be_dropped_alone() {
+    let workplace = with_demo();
+    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --target-size 10MB --drop-ids 5-14 -o small.gseq"));
+    assert_eq!(summary["gaussians"], 790);
+}

@@ -88,6 +88,14 @@ impl Job {
         })
     }
 
+    /// Asks for no more than `most` Gaussians, where it asks for some number.
+    pub fn ask_for_at_most(&mut self, most: usize) {
+        let targets = [Some(&mut self.prune.target), self.merge.as_mut().map(|merge| &mut merge.target)];
+        for target in targets.into_iter().flatten() {
+            *target = target.map(|target| target.min(most));
+        }
+    }
+
     /// Writes down the stages that the request leaves out.
     pub fn write_down(&self, request: &Request, journal: &mut Journal) {
         if !self.prune.prunes {

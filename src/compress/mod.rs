@@ -105,18 +105,18 @@ fn reduce(
     }
     let recipe = Record::of(request, &job.measure.score.user, input.digest.clone()).text(request);
 
-    let of_bytes;
-    let job = match request.goal {
-        Some(Goal::Bytes(most)) => {
-            let count = size::count_within(scene, &job.emit, most, &request.recipe.merge, &mut journal)?;
-            let target = Some(Target::Count(count as u64));
-            of_bytes = Job::new(&Request { target, goal: None, ..request.clone() }, Outlook::of(scene))?;
-            &of_bytes
-        }
-        _ => job,
-    };
+    let mut job = job.clone();
+    if let Some(Goal::Bytes(most)) = request.goal {
+        let count = size::count_within(scene, &job.emit, most, &request.recipe.merge, &mut journal)?;
+        let target = Some(Target::Count(count as u64));
+        job = Job::new(&Request { target, goal: None, ..request.clone() }, Outlook::of(scene))?;
+    }
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
+    if request.goal.is_some() {
+        // More may fit than may stay.
+        job.ask_for_at_most(ranked.ranking.order().len());
+    }
     // A refinement lets the last ones go by itself.
     let before_cuts = |wanted| job.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, scored.count()));
     if let Some(rounds) = &job.rounds {
@@ -130,7 +130,7 @@ fn reduce(
             (reduction, None, Some(goal))
         }
         None => {
-            let Outcome { reduction, summary } = of_size(scene, job, request, &scored, &ranked, &mut journal)?;
+            let Outcome { reduction, summary } = of_size(scene, &job, request, &scored, &ranked, &mut journal)?;
             (reduction, summary, None)
         }
     };
@@ -148,7 +148,7 @@ fn reduce(
         terms: scored.term_summaries(),
         flags: scored.flags.clone(),
         merge,
-        goal: goal.clone(),
+        goal,
         left_out: journal.left_out,
         notes: journal.notes,
         planned_reads: scene.planned_reads,

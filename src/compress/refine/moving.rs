@@ -24,7 +24,7 @@ pub(super) struct Closeness {
 }
 
 /// Steps after which states are found anew, where they follow from what is stored by more than a sum.
-pub(super) const FOUND_EVERY: usize = 500;
+pub(super) const FOUND_EVERY: usize = 200;
 
 /// What is left, its states at the frames that are shown, and how far it moved.
 ///
