@@ -1,6 +1,6 @@
 //! What is left of an input: which Gaussians stay, which of them stand for several, and what was changed of them.
 
-use crate::model::{Columns, Gaussians};
+use crate::model::{Column, Columns, Gaussians};
 use crate::recipe::Merge;
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
@@ -77,14 +77,11 @@ impl Change {
         more
     }
 
-    /// What leads from `before` here; both are of the same columns, or `before` of none.
+    /// What leads from `before` here.
     pub fn since(&self, before: &Change) -> Change {
-        let mut since = self.clone();
-        for column in before.columns().iter() {
-            let planes = since.0.column_mut(column).planes_mut().iter_mut();
-            planes.zip(before.0.column(column).planes()).for_each(|(to, of)| *to -= of);
-        }
-        since
+        let mut back = before.clone();
+        back.0.columns_mut(Columns::all()).flat_map(Column::planes_mut).for_each(|x| *x = -*x);
+        back.and(self.clone())
     }
 
     /// Changes the columns `of` of `state`, row by row. A zero leaves the value its bits.

@@ -8,13 +8,14 @@ use std::path::Path;
 use scene::{Workplace, files};
 use serde_json::Value;
 
-/// A made-up scene, `demo/scene.gseq`, with its cameras, and how to have it refined quickly.
+/// A made-up scene, `demo/scene.gseq`, with its cameras.
 fn with_demo() -> Workplace {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 800 --frames 4 -o demo");
     workplace
 }
 
+/// How to have it refined quickly.
 const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --refine-steps 120 --refine-cut-steps 20";
 
 /// Bytes of everything below `folder`, or of `folder` and what lies beside it under its name.

@@ -226,7 +226,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     let asked = Run { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth, ..Run::default() };
     // One of them, of the command line if it names one.
     let of = if asked == Run::default() { &run } else { &asked };
-    let (target, goal) = (of.target(), of.goal());
+    let (target, goal) = (of.target(), of.goal().map_err(Error::usage)?);
     Ok(Request {
         input,
         output: args.output,

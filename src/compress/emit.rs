@@ -28,8 +28,8 @@ const LEFT: f64 = 0.5;
 /// Seconds that a state takes to be encoded and written (`benches/pack.rs`).
 pub const ENCODING: f64 = 3.5e-7;
 
-/// Bytes of the recipe, the summary and a header beside a result, at most but for long lists of ids or notes.
-const BESIDE: u64 = 24 << 10;
+/// Bytes of the summary and a header beside a result, at most but for long lists of files or notes.
+const BESIDE: u64 = 16 << 10;
 
 /// File beside every result: all parameters it was made with.
 pub const RECIPE: &str = "recipe.toml";
@@ -119,18 +119,18 @@ impl Emit {
         Need { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
-    /// Bytes of everything that is written of `reduction`; made in a scratch folder, and removed.
+    /// Bytes of everything that is written of `reduction` with a recipe of so many; made in a scratch folder, and removed.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    pub fn bytes(&self, scene: &Scene, reduction: &Reduction) -> Result<u64> {
+    pub fn bytes(&self, scene: &Scene, reduction: &Reduction, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
         if self.kind.is_folder() {
             fs::create_dir(&path).map_err(Error::io("create", &path))?;
         }
         scene.input.write(reduction, self.kind, &path, &scene.limits)?;
-        let beside = BESIDE + size_of::<i64>() as u64 * scene.source().info().count as u64;
+        let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
         Ok(bytes_below(&path)? + beside)
     }
 

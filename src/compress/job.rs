@@ -45,6 +45,15 @@ impl Job {
     /// # Errors
     /// A recipe out of range; a target or ids that such an input does not have.
     pub fn new(request: &Request, outlook: Outlook) -> Result<Job> {
+        let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
+        Job::down_to(request, outlook, target)
+    }
+
+    /// [`Job::new`] down to `target` Gaussians, whatever the request's own target.
+    ///
+    /// # Errors
+    /// Those of [`Job::new`].
+    pub fn down_to(request: &Request, outlook: Outlook, target: Option<usize>) -> Result<Job> {
         let Request { recipe, only, .. } = request;
         recipe.validate().map_err(Error::usage)?;
         if request.goal.is_some() && (*only == Only::Merge || request.target.is_some()) {
@@ -52,7 +61,6 @@ impl Job {
                 "a quality or a size on disk is found by pruning: not with --merge-only, nor beside a target",
             ));
         }
-        let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
         let ids =
             |spec: &Option<String>| spec.as_deref().map_or(Ok(Vec::new()), |ids| parse_ids(ids, outlook.gaussians));
         let user =
@@ -64,7 +72,7 @@ impl Job {
         let refine = Refine::of(recipe, part, looks && prunes);
         // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
         let searches = matches!(request.goal, Some(Goal::Quality(_)));
-        let prunes_alone = *only == Only::Prune || searches || (refine.is_some() && prunes);
+        let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
         let cuts = refine.as_ref().is_some_and(Refine::will_cut);
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
@@ -88,12 +96,10 @@ impl Job {
         })
     }
 
-    /// Asks for no more than `most` Gaussians, where it asks for some number.
-    pub fn ask_for_at_most(&mut self, most: usize) {
-        let targets = [Some(&mut self.prune.target), self.merge.as_mut().map(|merge| &mut merge.target)];
-        for target in targets.into_iter().flatten() {
-            *target = target.map(|target| target.min(most));
-        }
+    /// How many of `all` Gaussians the ranking leaves, if `wanted` are to stay: a refinement lets the last ones go by
+    /// itself.
+    pub fn before_cuts(&self, wanted: usize, all: usize) -> usize {
+        self.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, all))
     }
 
     /// Writes down the stages that the request leaves out.
@@ -105,7 +111,7 @@ impl Job {
             let why = match request.only {
                 Only::Prune => "--prune-only",
                 _ if request.recipe.merge.passes.is_empty() => "the recipe has no merge pass",
-                _ if self.search.is_some() => "a quality is searched by pruning",
+                _ if request.goal.is_some() => "a quality or a size on disk is found by pruning",
                 _ => "refining what is left gains more at the same count (--no-refine merges)",
             };
             journal.leave_out("merging, and its pass over the frames", why);

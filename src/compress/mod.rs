@@ -38,6 +38,7 @@ use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
 use score::{Ranked, Scored, UserOverrides};
+use size::Space;
 use summary::{CameraSummary, InputSummary, Summary};
 
 /// Writes a smaller model and says what was done.
@@ -107,21 +108,23 @@ fn reduce(
 
     let mut job = job.clone();
     if let Some(Goal::Bytes(most)) = request.goal {
-        let count = size::count_within(scene, &job.emit, most, &request.recipe.merge, &mut journal)?;
-        let target = Some(Target::Count(count as u64));
-        job = Job::new(&Request { target, goal: None, ..request.clone() }, Outlook::of(scene))?;
+        let of = Space { emit: &job.emit, most, recipe: recipe.len() as u64 };
+        let count = of.count(scene, &request.recipe.merge, &mut journal)?;
+        job = Job::down_to(request, Outlook::of(scene), Some(count))?;
+    }
+    if let Some(search) = &job.search {
+        search.check(scene)?;
     }
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
     if request.goal.is_some() {
         // More may fit than may stay.
-        job.ask_for_at_most(ranked.ranking.order().len());
+        job.prune.target = job.prune.target.map(|target| target.min(ranked.ranking.order().len()));
     }
-    // A refinement lets the last ones go by itself.
-    let before_cuts = |wanted| job.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, scored.count()));
     if let Some(rounds) = &job.rounds {
         let fewest = job.prune.target.unwrap_or(scored.selection.counts.kept);
-        let fewest = job.search.as_ref().map_or(before_cuts(fewest), |search| search.fewest(scored.count()));
+        let fewest =
+            job.search.as_ref().map_or(job.before_cuts(fewest, scored.count()), |search| search.fewest(scored.count()));
         ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
     }
     let (reduction, merge, goal) = match &job.search {
@@ -130,7 +133,8 @@ fn reduce(
             (reduction, None, Some(goal))
         }
         None => {
-            let Outcome { reduction, summary } = of_size(scene, &job, request, &scored, &ranked, &mut journal)?;
+            let Outcome { reduction, summary } =
+                of_size(scene, &job, request, &scored, &ranked, recipe.len() as u64, &mut journal)?;
             (reduction, summary, None)
         }
     };
@@ -163,19 +167,18 @@ fn reduce(
     Ok((job.emit.run(scene, &reduction, &recipe, journal, written)?, map))
 }
 
-/// What is left where its size is known before, or is the recipe's own.
+/// What is left where its size is known before, or is the recipe's own. `recipe`: bytes of its text.
 fn of_size(
     scene: &Scene,
     job: &Job,
     request: &Request,
     scored: &Scored,
     ranked: &Ranked,
+    recipe: u64,
     journal: &mut Journal,
 ) -> Result<Outcome> {
     let wanted = job.prune.run(scene, scored, ranked, journal)?;
-    // A refinement lets the last ones go by itself.
-    let first = job.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, scored.count()));
-    let survivors = first.min(ranked.ranking.order().len());
+    let survivors = job.before_cuts(wanted, scored.count()).min(ranked.ranking.order().len());
     let mut outcome = match &job.merge {
         Some(merge) => merge.run(scene, scored, ranked, survivors, journal)?,
         None => Outcome {
@@ -192,7 +195,8 @@ fn of_size(
         outcome.reduction = refine.run(scene, scored, outcome.reduction, wanted, journal)?;
     }
     if let Some(Goal::Bytes(most)) = request.goal {
-        outcome.reduction = size::shrink(scene, &job.emit, most, outcome.reduction)?;
+        let of = Space { emit: &job.emit, most, recipe };
+        outcome.reduction = of.shrink(scene, scored, outcome.reduction, journal)?;
     }
     Ok(outcome)
 }

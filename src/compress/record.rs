@@ -78,11 +78,29 @@ impl Run {
     }
 
     /// The goal that was asked for.
-    pub fn goal(&self) -> Option<Goal> {
-        let loss = self.max_loss.zip(self.ground_truth.clone());
-        let loss = loss.map(|(most, photographs)| Quality::Loss { most, photographs });
-        let quality = self.min_psnr.map(Quality::Psnr).or(loss);
-        quality.map(Goal::Quality).or(self.target_size.map(Goal::Bytes))
+    ///
+    /// # Errors
+    /// Several, a part of one, or decibels that no goal has, in words.
+    pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
+        let decibels = |name: &str, value: f64| match value > 0.0 && value <= 100.0 {
+            true => Ok(value),
+            false => Err(format!("{name}: expected decibels above 0 and at most 100, found {value}")),
+        };
+        match (self.target(), self.min_psnr, self.max_loss, &self.ground_truth, self.target_size) {
+            (_, None, None, None, None) => Ok(None),
+            (None, Some(least), None, None, None) => {
+                Ok(Some(Goal::Quality(Quality::Psnr(decibels("min_psnr", least)?))))
+            }
+            (None, None, Some(most), Some(photographs), None) => {
+                let most = decibels("max_loss", most)?;
+                Ok(Some(Goal::Quality(Quality::Loss { most, photographs: photographs.clone() })))
+            }
+            (None, None, None, None, Some(most)) => Ok(Some(Goal::Bytes(most))),
+            _ => {
+                Err("expected one of target_count, target_ratio, min_psnr, max_loss with ground_truth, and target_size"
+                    .to_owned())
+            }
+        }
     }
 }
 

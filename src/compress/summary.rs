@@ -64,6 +64,7 @@ pub struct GoalSummary {
     /// Names of these pictures; of those that no camera of the scene takes, their frames.
     pub held_pictures: Vec<String>,
     /// Every size that was tried, and what it has by what was searched on.
+    #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
 }
 
@@ -143,6 +144,12 @@ pub struct TermSummary {
     pub p99: f64,
     /// Whether the percentiles differ, so that the term grades rather than splits.
     pub active: bool,
+}
+
+/// Sizes with a number each.
+fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
+    let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
+    Ok(found.into_iter().map(|(size, of)| (size, of.unwrap_or(f64::NAN))).collect())
 }
 
 /// A number as JSON has it: null stands for what is not finite.

@@ -28,7 +28,8 @@ struct Group {
 
 impl Field {
     /// How the columns `want` of the state at `time` of a block of Gaussians change with their raw parameters. `raw` has
-    /// rows in position, and in rotation where `want` has it. A value that would not be finite is that of no delta.
+    /// rows in position, and in rotation where `want` has it. A value that would not be finite is 0, of a position that of no
+    /// delta.
     ///
     /// Under a mask (`static_mlp`, `empty_voxel`) masks and deltas count as constant: a position's state changes by the
     /// mask times its change.

@@ -46,7 +46,7 @@ impl Photographs {
         Ok(Photographs { files })
     }
 
-    /// Those of `pictures` that have a photograph, and these.
+    /// Those of `pictures` that have a photograph, and their photographs.
     ///
     /// # Errors
     /// A folder that cannot be read; a picture that shares its photograph with another.

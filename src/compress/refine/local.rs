@@ -52,11 +52,11 @@ impl Locals {
     ///
     /// # Errors
     /// A scratch file that cannot be written.
-    pub(super) fn push(&mut self, mut next: Local) -> Result<()> {
+    pub(super) fn push(&mut self, next: &mut Local) -> Result<()> {
         for column in next.kept(self.varying) {
             self.file.write(bytemuck::cast_slice(column.planes()))?;
         }
-        self.first.get_or_insert(next);
+        self.first.get_or_insert_with(|| next.clone());
         Ok(())
     }
 
@@ -80,7 +80,21 @@ impl Locals {
     /// A scratch file that cannot be read.
     pub(super) fn read(&self, k: usize, to: &mut Local) -> Result<()> {
         let Some(first) = &self.first else { return Ok(()) };
-        to.clone_from(first);
+        let still = Columns::all().difference(self.varying);
+        let shape = |to: &mut Column, of: &Column| {
+            if to.width() != of.width() {
+                *to = Column::zeros(of.width(), of.len());
+            }
+            to.resize(of.len());
+        };
+        for column in Columns::all().iter() {
+            let (to, of) = (to.state.column_mut(column), first.state.column(column));
+            shape(to, of);
+            if still.contains(column) {
+                to.planes_mut().copy_from_slice(of.planes());
+            }
+        }
+        to.jacobian.columns_mut().iter_mut().zip(first.jacobian.columns()).for_each(|(to, of)| shape(to, of));
         let bytes: u64 = to.kept(self.varying).map(|column| 4 * column.planes().len() as u64).sum();
         let mut at = k as u64 * bytes;
         for column in to.kept(self.varying) {

@@ -111,7 +111,7 @@ impl Refine {
         let original = [("states", whole), ("pictures", PICTURE_ON_ALL_THREADS)];
         let original: Vec<Part> = read.into_iter().chain(original).collect();
         let left = [
-            ("states", (5 + work.threads) * whole),
+            ("states", (6 + work.threads) * whole),
             ("jacobians", (3 + work.threads) * work.input.jacobian),
             ("descent", whole + refine::bytes_per_gaussian(self.columns, work.sh_degree) as u64),
             ("result", work.input.reduced),
@@ -181,7 +181,7 @@ impl Refine {
         }
         journal.stage(NAME, count, scene.source(), |journal| {
             let targets = Targets::new(scene)?;
-            let mut walk = Walk::new(self, scene, scored, &targets, targets.parted(false));
+            let mut walk = Walk::new(NAME, self, scene, scored, &targets, targets.parted(false));
             let result = scene.input.reduced(&reduction)?;
             let mut moving = walk.begin(&reduction, &*result)?;
             let sizes = sizes(count, wanted);
@@ -238,12 +238,15 @@ pub(super) struct Walk<'a> {
     turns: Turns,
     /// The pictures kept apart.
     apart: Vec<usize>,
+    /// The stage that goes it.
+    stage: &'static str,
     progress: Progress,
 }
 
 impl<'a> Walk<'a> {
-    /// Along the pictures of `parts`.
+    /// Of `stage`, along the pictures of `parts`.
     pub(super) fn new(
+        stage: &'static str,
         refine: &'a Refine,
         scene: &'a Scene,
         scored: &'a Scored,
@@ -251,12 +254,13 @@ impl<'a> Walk<'a> {
         parts: Parted,
     ) -> Walk<'a> {
         let (turns, apart) = (Turns::of(parts.stepped), parts.apart);
-        Walk { refine, scene, scored, targets, turns, apart, progress: Progress::new(NAME, "steps", 0) }
+        let progress = Progress::new(stage, "steps", 0);
+        Walk { refine, scene, scored, targets, turns, apart, stage, progress }
     }
 
     /// Shows how far it is of so many steps.
     fn expect(&mut self, steps: usize) {
-        self.progress = Progress::new(NAME, "steps", steps as u64);
+        self.progress = Progress::new(self.stage, "steps", steps as u64);
     }
 
     /// What moves of `reduction`, which `result` shows.
@@ -456,7 +460,13 @@ mod tests {
             let mut moving = Moving::new(&scene, &*result, &targets, Columns::all(), fixed).unwrap();
             let (of, schedule) = ([0, 7, 20], Schedule::new(20, 1.0, 1.0));
             let start = moving.closeness(&of).unwrap().psnr;
+            let nowhere = moving.change();
             let walk = |moving: &mut Moving<'_>| (0..20).for_each(|k| moving.step(k, &schedule).unwrap());
+            walk(&mut moving);
+            moving.find().unwrap();
+            moving.turn_back(&nowhere).unwrap();
+            let back = moving.closeness(&of).unwrap().psnr;
+            assert!((back - start).abs() < 1e-3, "{start:.4} dB at the start, {back:.4} when back");
             walk(&mut moving);
             moving.find().unwrap();
             let (there, change) = (moving.closeness(&of).unwrap().psnr, moving.change());

@@ -99,7 +99,7 @@ impl<'a> Moving<'a> {
             let mut states = States::open(result, &wanted)?;
             let mut locals = Locals::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
-                locals.push(Local { state: states.at(frame)?.clone(), ..Local::none(sh_degree) })?;
+                locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::none(sh_degree) })?;
             }
             moving.locals = locals.finish()?;
         }
@@ -137,7 +137,7 @@ impl<'a> Moving<'a> {
             let want = if locals.first().is_none() { Columns::all() } else { self.varying };
             deformation.state(frame, &self.stored, want, &mut self.now.state)?;
             self.now.jacobian = deformation.jacobian(frame, &self.stored, self.columns)?;
-            locals.push(self.now.clone())?;
+            locals.push(&mut self.now)?;
         }
         self.locals = locals.finish()?;
         self.steps = 0;
@@ -174,7 +174,7 @@ impl<'a> Moving<'a> {
         let mut now = std::mem::take(&mut self.now);
         for k in 0..self.frames.len() {
             self.show(k, &mut now)?;
-            locals.push(now.pick(places))?;
+            locals.push(&mut now.pick(places))?;
         }
         (self.locals, self.now) = (locals.finish()?, now);
         self.settle();

@@ -10,10 +10,7 @@ use crate::render::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::source::FrameSource;
-use crate::stream::{Batch, Subject, show};
-
-/// Mean PSNR, dB, by the pictures that are searched on, and by those held back.
-pub(super) type Found = [f64; 2];
+use crate::stream::{Batch, Subject, View, show};
 
 /// What pictures are compared with.
 pub(super) enum With<'a> {
@@ -53,24 +50,25 @@ impl<'a> Gauge<'a> {
         Ok(Gauge { scene, cameras, pictures, with })
     }
 
-    /// How close what `source` shows is.
+    /// Mean PSNR, dB, of what `source` shows, by the pictures that are searched on or by those held back.
     ///
     /// # Errors
     /// Frames or photographs that cannot be read.
-    pub(super) fn measure(&self, source: &dyn FrameSource) -> Result<Found> {
+    pub(super) fn measure(&self, source: &dyn FrameSource, held: bool) -> Result<f64> {
         let background = self.scene.background;
-        let pictures: Vec<Picture> = self.pictures.iter().map(|picture| picture.0).collect();
+        let places: Vec<usize> = (0..self.pictures.len()).filter(|&k| self.pictures[k].1 == held).collect();
+        let pictures: Vec<Picture> = places.iter().map(|&k| self.pictures[k].0).collect();
         let mut found = Vec::with_capacity(pictures.len());
         show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
-            let of_view = |(place, view): (usize, &crate::stream::View<'_, 1>)| {
+            let of_view = |(place, view): (usize, &View<'_, 1>)| {
                 let picture = render(view.states[0], view.camera, background);
                 match &self.with {
                     With::Photographs(photographs) => {
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
                     With::Original(targets, numbers) => {
-                        Ok(decibels(mean_square(&picture, &targets.values(numbers[first + place])?)))
+                        Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
                     }
                 }
             };
@@ -78,11 +76,7 @@ impl<'a> Gauge<'a> {
             found.extend(of_batch);
             Ok(())
         })?;
-        Ok([false, true].map(|held| {
-            let of: Vec<f64> =
-                found.iter().zip(&self.pictures).filter(|(_, of)| of.1 == held).map(|of| *of.0).collect();
-            of.iter().sum::<f64>() / of.len() as f64
-        }))
+        Ok(found.iter().sum::<f64>() / found.len() as f64)
     }
 
     /// How many pictures are searched on.

@@ -14,17 +14,18 @@ use super::refine::{CUT, Refine, Walk};
 use super::request::Quality;
 use super::score::{Ranked, Scored, scored};
 use super::summary::GoalSummary;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, Workload};
-use crate::error::Result;
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, RENDER, Workload};
+use crate::error::{Error, Result};
 use crate::limits::Limits;
-use crate::model::Columns;
+use crate::model::{Columns, Picture};
 use crate::recipe;
 use crate::reduction::Reduction;
 use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{PictureSet, pictures};
-use gauge::{Found, Gauge, With};
+use crate::source::FrameSource;
+use gauge::{Gauge, With};
 
 /// What the stage is called.
 const NAME: &str = "search";
@@ -59,7 +60,8 @@ pub struct Search {
 /// A size that was tried.
 struct Tried {
     reduction: Reduction,
-    found: Found,
+    /// dB or dB lost, by the pictures that are searched on.
+    value: f64,
     journal: Journal,
 }
 
@@ -76,18 +78,22 @@ impl Search {
         // Cuts of a fifth from two fifths: twice the Gaussians.
         let ways: Vec<Part> = vec![("ways", 3 * (whole + 8)), ("result", work.input.reduced)];
         let refined = self.refine.as_ref().map(|refine| refine.need(work, limits));
+        let frames = work.frames.min(128);
+        // A picture, what it is compared with as it is read, and as it is used.
+        let compared = work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels);
         let looked = Need {
             stage: NAME,
-            reads: work.scattered_reads(work.frames.min(128), limits),
-            seconds: 0.0,
+            reads: work.scattered_reads(frames, limits),
+            seconds: work.reading(work.count(), frames as f64) + work.picturing(520.0, work.count(), RENDER),
             per_gaussian: [
                 scored(limits),
                 vec![("states", whole), ("readers", reader), ("held", held), ("pictures", PICTURE_ON_ALL_THREADS)],
             ]
             .concat(),
-            fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 8 * 24 * work.pixels)],
+            fixed: vec![work.arriving()],
         };
         let mut need = refined.unwrap_or(looked);
+        need.fixed.push(("compared", compared));
         need.stage = NAME;
         (need.seconds, need.reads) = (4.0 * need.seconds, 4.0 * need.reads);
         need.per_gaussian.extend(ways);
@@ -108,23 +114,16 @@ impl Search {
     ) -> Result<(Reduction, GoalSummary)> {
         let all = ranked.ranking.order().len();
         journal.stage(NAME, all, scene.source(), |journal| {
+            let photographs = self.photographs(scene)?;
             let targets = Targets::new(scene)?;
-            let by_photographs = matches!(self.quality, Quality::Loss { .. });
-            let parts = targets.parted(!by_photographs);
-            let gauge = match &self.quality {
-                Quality::Loss { photographs, .. } => {
-                    let times = &scene.source().info().times;
-                    let of = pictures(&scene.rig, times, PictureSet::HeldOut)?;
-                    let all = of.len();
-                    let (of, with) = Photographs::of_some(photographs, &scene.rig, times, of)?;
-                    if of.len() < all {
-                        let found = of.len();
-                        journal.notes.push(format!("{found} of {all} held-out pictures have photographs"));
-                    }
+            let parts = targets.parted(photographs.is_none());
+            let gauge = match photographs {
+                Some((of, photographs)) => {
+                    journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
                     let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
-                    Gauge::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(with))?
+                    Gauge::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))?
                 }
-                Quality::Psnr(_) => {
+                None => {
                     let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
                     numbers.sort_unstable();
                     let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
@@ -132,27 +131,45 @@ impl Search {
                     Gauge::new(scene, &targets.cameras, of, With::Original(&targets, numbers))?
                 }
             };
-            let original = if by_photographs { gauge.measure(scene.source())? } else { [0.0; 2] };
-            let walk = self.refine.as_ref().map(|refine| Walk::new(refine, scene, scored, &targets, parts));
-            let mut way = Way { search: self, scene, ranked, gauge: &gauge, walk, cuts: Vec::new() };
-            let (best, tried) = self.bracket(&mut way, original, scored.protected.len().max(1), all)?;
-            let summary = self.summary(&best, original, &gauge, tried);
+            let walk = self.refine.as_ref().map(|refine| Walk::new(NAME, refine, scene, scored, &targets, parts));
+            let mut way = Way { search: self, scene, scored, ranked, gauge: &gauge, walk, cuts: Vec::new() };
+            let (best, tried) = self.bracket(&mut way, scored.protected.len().max(1), all)?;
+            let result = scene.input.reduced(&best.reduction)?;
+            let summary = self.summary(&best, self.value(&gauge, &*result, scene, true)?, gauge.held(), tried);
+            drop(result);
+            let (count, does) = (best.reduction.len(), self.spare(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
-            journal.notes.push(note(&summary, gauge.searched(), best.reduction.len()));
-            let count = best.reduction.len();
+            journal.notes.push(note(&summary, gauge.searched(), count, does));
             Ok(((best.reduction, summary), count))
         })
     }
 
+    /// Confirms, before any work, that there are photographs, where a loss is asked for.
+    ///
+    /// # Errors
+    /// Photographs that are not there, or too few.
+    pub fn check(&self, scene: &Scene) -> Result<()> {
+        self.photographs(scene).map(|_| ())
+    }
+
+    /// The held-out pictures that have a photograph, and these, where a loss is asked for.
+    fn photographs(&self, scene: &Scene) -> Result<Option<(Vec<Picture>, Photographs)>> {
+        let Quality::Loss { photographs, .. } = &self.quality else { return Ok(None) };
+        let times = &scene.source().info().times;
+        let of = pictures(&scene.rig, times, PictureSet::HeldOut)?;
+        let found = Photographs::of_some(photographs, &scene.rig, times, of)?;
+        if found.0.len() < HELD_EVERY {
+            let (folder, found) = (photographs.display(), found.0.len());
+            return Err(Error::usage(format!(
+                "--ground-truth {folder}: expected photographs of {HELD_EVERY} or more held-out pictures, found {found}"
+            )));
+        }
+        Ok(Some(found))
+    }
+
     /// Tries sizes from `least` to `all`; the smallest that does, or everything, and every size tried with what it has.
-    fn bracket(
-        &self,
-        way: &mut Way<'_>,
-        original: Found,
-        least: usize,
-        all: usize,
-    ) -> Result<(Tried, Vec<(usize, f64)>)> {
+    fn bracket(&self, way: &mut Way<'_>, least: usize, all: usize) -> Result<(Tried, Vec<(usize, f64)>)> {
         let mut tried: Vec<(usize, f64)> = Vec::new();
         let mut best: Option<Tried> = None;
         // Sizes, and halvings that each has to spare: below what does not do, above what does.
@@ -161,8 +178,8 @@ impl Search {
         while tried.len() < MOST_TRIED && high.0 - low.0 > 1 && high.0 as f64 > SAME_SIZE * low.0 as f64 {
             let size = (next.round() as usize).clamp(low.0 + 1, high.0 - 1);
             let now = way.at(size)?;
-            let spare = self.spare(self.value(now.found[0], original[0]));
-            tried.push((size, self.value(now.found[0], original[0])));
+            let spare = self.spare(now.value);
+            tried.push((size, now.value));
             if spare >= 0.0 {
                 (high, best) = ((size, Some(spare)), Some(now));
                 if spare <= CLOSE {
@@ -182,48 +199,55 @@ impl Search {
         }
         let best = match best {
             Some(best) => best,
-            None => way.at(all)?,
+            None => {
+                let everything = way.at(all)?;
+                tried.push((all, everything.value));
+                everything
+            }
         };
         Ok((best, tried))
     }
 
-    /// What the goal is about: dB, or dB lost.
-    fn value(&self, found: f64, original: f64) -> f64 {
-        if let Quality::Loss { .. } = self.quality { original - found } else { found }
+    /// What the goal is about, dB or dB lost, of `result`, by the pictures that are searched on or by those held back.
+    fn value(&self, gauge: &Gauge<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
+        let found = gauge.measure(result, held)?;
+        match self.quality {
+            Quality::Loss { .. } => Ok(gauge.measure(scene.source(), held)? - found),
+            Quality::Psnr(_) => Ok(found),
+        }
     }
 
     /// Halvings of the number of Gaussians that `value` has to spare, about.
     fn spare(&self, value: f64) -> f64 {
         match self.quality {
+            // Of pictures that are not finite.
+            _ if value.is_nan() => f64::NEG_INFINITY,
             Quality::Loss { most, .. } => (most / value.max(LEAST_LOSS)).ln() / HALVING.1.ln(),
             Quality::Psnr(least) => (value - least) / HALVING.0,
         }
     }
 
-    fn summary(&self, best: &Tried, original: Found, gauge: &Gauge<'_>, tried: Vec<(usize, f64)>) -> GoalSummary {
+    fn summary(&self, best: &Tried, held: f64, held_pictures: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
         let (name, asked) = match self.quality {
             Quality::Psnr(least) => ("min_psnr", least),
             Quality::Loss { most, .. } => ("max_loss", most),
         };
-        GoalSummary {
-            name: name.to_owned(),
-            asked,
-            searched: self.value(best.found[0], original[0]),
-            held: self.value(best.found[1], original[1]),
-            held_pictures: gauge.held(),
-            tried,
-        }
+        GoalSummary { name: name.to_owned(), asked, searched: best.value, held, held_pictures, tried }
     }
 }
 
-/// What was found, for a person.
-fn note(summary: &GoalSummary, searched: usize, gaussians: usize) -> String {
+/// What was found, for a person: of `gaussians`, by so many pictures searched on, and whether it `does`.
+fn note(summary: &GoalSummary, searched: usize, gaussians: usize, does: bool) -> String {
     let GoalSummary { name, asked, searched: by_searched, held, held_pictures, tried } = summary;
     let (sizes, others) = (tried.len(), held_pictures.len());
-    let what = if name == "max_loss" { "of what photographs show lost" } else { "kept of the original's pictures" };
+    let (at, unit) = if name == "max_loss" { ("most", "dB lost against photographs") } else { ("least", "dB") };
+    let found = match does {
+        true => format!("of {sizes} sizes tried {gaussians} Gaussians are the fewest that do"),
+        false => format!("none of {sizes} sizes tried does, and everything that may stay is written"),
+    };
     format!(
-        "{asked} dB asked for: of {sizes} sizes tried {gaussians} Gaussians are the fewest that do; {by_searched:.2} dB \
-         {what} by the {searched} pictures searched on, {held:.2} dB by {others} others (goal.held_pictures in the summary)"
+        "at {at} {asked} {unit} asked for: {found}; {by_searched:.2} dB by the {searched} pictures searched on, \
+         {held:.2} dB by {others} held back (goal.held_pictures in the summary)"
     )
 }
 
@@ -231,6 +255,7 @@ fn note(summary: &GoalSummary, searched: usize, gaussians: usize) -> String {
 struct Way<'a> {
     search: &'a Search,
     scene: &'a Scene,
+    scored: &'a Scored,
     ranked: &'a Ranked,
     gauge: &'a Gauge<'a>,
     walk: Option<Walk<'a>>,
@@ -246,9 +271,9 @@ impl Way<'_> {
         let prefix = |size: usize| Reduction::pruned(self.ranked.ranking.take(size), &self.search.rule);
         let reduction = match (&self.search.refine, &mut self.walk) {
             (Some(refine), Some(walk)) if size < all => {
-                let first = refine.first(size, all);
-                let mut start = self.cuts.iter().rfind(|cut| cut.len() >= size).cloned();
-                let mut start = start.take().filter(|_| first > size).unwrap_or_else(|| prefix(first));
+                let first = refine.first(size, self.scored.count()).min(all);
+                let cut = self.cuts.iter().rfind(|cut| first > size && cut.len() >= size);
+                let mut start = cut.cloned().unwrap_or_else(|| prefix(first));
                 while start.len() > size {
                     let next = ((CUT * start.len() as f64).ceil() as usize).max(size);
                     start = walk.cut_down(&start, next, size)?;
@@ -260,7 +285,9 @@ impl Way<'_> {
             }
             _ => prefix(size),
         };
-        let found = self.gauge.measure(&*self.scene.input.reduced(&reduction)?)?;
-        Ok(Tried { reduction, found, journal })
+        let result = self.scene.input.reduced(&reduction)?;
+        let value = self.search.value(self.gauge, &*result, self.scene, false)?;
+        drop(result);
+        Ok(Tried { reduction, value, journal })
     }
 }

@@ -284,8 +284,15 @@ impl Deformation for ModelFolder {
             let parts: Vec<&Column> = blocks.iter().map(|block| &block.columns()[place]).collect();
             let width = parts.first().map_or(0, |part| part.width());
             if width > 0 {
-                let plane = |c: usize| parts.iter().flat_map(move |part| part.plane(c)).copied();
-                *to = Column::from_planes(width, (0..width).flat_map(plane).collect());
+                *to = Column::zeros(width, ids.len());
+                for c in 0..width {
+                    let mut rest = to.plane_mut(c);
+                    for part in &parts {
+                        let (here, after) = rest.split_at_mut(part.len());
+                        here.copy_from_slice(part.plane(c));
+                        rest = after;
+                    }
+                }
             }
         }
         Ok(whole)
