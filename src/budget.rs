@@ -323,6 +323,11 @@ impl Plan {
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
     }
 
+    /// Whether there are limits by which every stage that `needs` names fits into `budget`.
+    pub fn fits(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> bool {
+        Self::closest(work, budget.limit(), needs).excess() == 0
+    }
+
     /// The fastest plan that fits into `budget`, else the one that takes least.
     pub(crate) fn closest(work: Workload, budget: u64, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Plan {
         let mut limits = Limits {

@@ -33,7 +33,7 @@ use crate::stream::{HeldFrames, RunningContribution, RunningScan, Sampler};
 /// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
 pub fn open_to_measure<S: Stages>(
     options: &InputOptions,
-    plan: impl FnOnce(Outlook) -> Result<S>,
+    plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
     let start = Instant::now();
@@ -43,7 +43,7 @@ pub fn open_to_measure<S: Stages>(
         return Ok(found);
     }
     let mut scene = open_scene(options)?;
-    let stages = plan(Outlook::of(&scene))?;
+    let stages = plan(Outlook::of(&scene), &scene.workload())?;
     scene.keep_to(options.memory, |work, limits| stages.needs(work, limits))?;
     journal.opened("read", start, scene.source().info().count, scene.source().reads());
     Ok((scene, stages, None))
@@ -53,17 +53,17 @@ pub fn open_to_measure<S: Stages>(
 /// held. Gives the statistics if what was assumed held.
 fn receive_measured<S: Stages>(
     options: &InputOptions,
-    plan: impl FnOnce(Outlook) -> Result<S>,
+    plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
 ) -> Result<(Scene, S, Option<Measured>)> {
     let loaded = load_cameras(options, options.cameras.as_deref())?;
     let has_cameras = loaded.is_some();
     let stream = open_stream(options)?;
     let count = stream.header().count;
-    let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OWN_OUTPUT })?;
-    let Measure { scan, visible, .. } = stages.measure();
     let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
     let block = frame_block(stream.header());
     let work = Workload::of_stream(stream.header(), block, &of_rig);
+    let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
+    let Measure { scan, visible, .. } = stages.measure();
     let held = (block + AHEAD) as u64;
     let fit = |tell: Tell, measuring: Option<bool>| {
         Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {

@@ -12,7 +12,7 @@ use super::request::{Goal, Only, Request};
 use super::rounds::Rounds;
 use super::score::UserOverrides;
 use super::search::Search;
-use crate::budget::{Need, Workload};
+use crate::budget::{Need, Plan, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::recipe::Coverage;
@@ -37,6 +37,25 @@ pub struct Job {
     /// Writes.
     pub emit: Emit,
     has_cameras: bool,
+    spared: Spared,
+}
+
+/// What of refining a budget of memory is too small for, and what there would have to be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spared {
+    /// Nothing.
+    #[default]
+    Nothing,
+    /// That colours change with direction.
+    Bands {
+        /// Bytes that it would take.
+        least: u64,
+    },
+    /// All of it.
+    Refining {
+        /// Bytes that it would take.
+        least: u64,
+    },
 }
 
 impl Job {
@@ -46,14 +65,37 @@ impl Job {
     /// A recipe out of range; a target or ids that such an input does not have.
     pub fn new(request: &Request, outlook: Outlook) -> Result<Job> {
         let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
-        Job::down_to(request, outlook, target)
+        Job::down_to(request, outlook, target, Spared::Nothing)
     }
 
-    /// [`Job::new`] down to `target` Gaussians, whatever the request's own target.
+    /// [`Job::new`] within the request's budget of memory: harmonics above the first stay as they are, else nothing is
+    /// refined, where it does not reach for more. If it does not reach for that either, what is asked for stays, to be
+    /// refused.
     ///
     /// # Errors
     /// Those of [`Job::new`].
-    pub fn down_to(request: &Request, outlook: Outlook, target: Option<usize>) -> Result<Job> {
+    pub fn within(request: &Request, outlook: Outlook, work: &Workload) -> Result<Job> {
+        let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
+        let of = |spared| Job::down_to(request, outlook, target, spared);
+        let budget = request.input.memory;
+        let asked = of(Spared::Nothing)?;
+        if !asked.refines() || Plan::fits(*work, budget, |work, limits| asked.needs(work, limits)) {
+            return Ok(asked);
+        }
+        let least = |job: &Job| Plan::closest(*work, 1, |work, limits| job.needs(work, limits)).peak();
+        let bands = of(Spared::Bands { least: least(&asked) })?;
+        if work.sh_degree > 0 && Plan::fits(*work, budget, |work, limits| bands.needs(work, limits)) {
+            return Ok(bands);
+        }
+        let none = of(Spared::Refining { least: least(&bands) })?;
+        Ok(if Plan::fits(*work, budget, |work, limits| none.needs(work, limits)) { none } else { asked })
+    }
+
+    /// [`Job::new`] down to `target` Gaussians, whatever the request's own target, without what is `spared`.
+    ///
+    /// # Errors
+    /// Those of [`Job::new`].
+    pub fn down_to(request: &Request, outlook: Outlook, target: Option<usize>, spared: Spared) -> Result<Job> {
         let Request { recipe, only, .. } = request;
         recipe.validate().map_err(Error::usage)?;
         if request.goal.is_some() && (*only == Only::Merge || request.target.is_some()) {
@@ -69,7 +111,11 @@ impl Job {
         let looks = measure.visible.is_some();
         let prunes = *only != Only::Merge;
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
-        let refine = Refine::of(recipe, part, looks && prunes);
+        let refine = match spared {
+            Spared::Nothing => Refine::of(recipe, part, looks && prunes),
+            Spared::Bands { .. } => Refine::of(recipe, part, looks && prunes).map(Refine::without_bands),
+            Spared::Refining { .. } => None,
+        };
         // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
         let searches = matches!(request.goal, Some(Goal::Quality(_)));
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
@@ -93,7 +139,21 @@ impl Job {
             emit: Emit::new(request, outlook.own_output, merges),
             measure,
             has_cameras: outlook.has_cameras,
+            spared,
         })
+    }
+
+    /// Whether anything is refined.
+    fn refines(&self) -> bool {
+        self.refine.is_some() || self.search.as_ref().is_some_and(|search| search.refine.is_some())
+    }
+
+    /// [`Job::down_to`] `target` of the same request and within the same budget.
+    ///
+    /// # Errors
+    /// Those of [`Job::new`].
+    pub fn again(&self, request: &Request, outlook: Outlook, target: usize) -> Result<Job> {
+        Job::down_to(request, outlook, Some(target), self.spared)
     }
 
     /// How many of `all` Gaussians the ranking leaves, if `wanted` are to stay: a refinement lets the last ones go by
@@ -115,6 +175,12 @@ impl Job {
                 _ => "refining what is left gains more at the same count (--no-refine merges)",
             };
             journal.leave_out("merging, and its pass over the frames", why);
+        }
+        let takes = |least: u64| format!("memory: expected at least {}MiB for it (--memory)", least.div_ceil(1 << 20));
+        match self.spared {
+            Spared::Nothing => (),
+            Spared::Bands { least } => journal.leave_out("refining of harmonics above the first", takes(least)),
+            Spared::Refining { least } => journal.leave_out("refinement", takes(least)),
         }
         if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
             let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
@@ -143,7 +209,7 @@ impl Stages for Job {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::{Budget, Plan};
+    use crate::budget::Budget;
     use crate::compress::tests::work;
     use crate::emit::kind::OutputKind;
     use crate::recipe::Recipe;
@@ -179,6 +245,40 @@ mod tests {
             let message = Plan::fit(work(200_000), budget(least - 1), everything(preset)).unwrap_err().to_string();
             assert!(message.contains(&format!("at least {}MiB", least.div_ceil(1 << 20))), "{message}");
         }
+    }
+
+    #[test]
+    fn a_small_budget_leaves_out_bands_then_refining_and_names_what_there_would_have_to_be() {
+        let mut request = request(Recipe::preset("default").unwrap());
+        let work = work(200_000);
+        let mut within = |bytes: u64| {
+            request.input.memory = budget(bytes);
+            let job = Job::within(&request, OUTLOOK, &work).unwrap();
+            let mut journal = Journal::default();
+            job.write_down(&request, &mut journal);
+            let left_out =
+                |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
+            let [bands, all] = [left_out("refining of harmonics above the first"), left_out("refinement")];
+            (job.spared, job.refine.map(|refine| refine.sh_degree), bands, all)
+        };
+        let least = |spared: Spared| match spared {
+            Spared::Bands { least } | Spared::Refining { least } => least,
+            Spared::Nothing => 0,
+        };
+        let all = Plan::closest(work, 1, everything("default")).peak();
+        assert_eq!(within(all).0, Spared::Nothing);
+        let (spared, degree, named, none) = within(all - 1);
+        assert_eq!((spared, degree, none), (Spared::Bands { least: all }, Some(0), None));
+        assert!(named.unwrap().contains(&format!("{}MiB", all.div_ceil(1 << 20))));
+        let (spared, ..) = (1..).map(|k| within(all - k * (1 << 20))).find(|found| found.1.is_none()).unwrap();
+        let bands = least(spared);
+        assert!(matches!(spared, Spared::Refining { .. }) && bands < all, "{spared:?}");
+        assert!(matches!(within(bands).0, Spared::Bands { .. }));
+        let (spared, refine, _, named) = within(bands - 1);
+        assert_eq!((spared, refine), (Spared::Refining { least: bands }, None));
+        assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
+        // What nothing can be done about is refused as it was asked for.
+        assert_eq!(within(1 << 20).0, Spared::Nothing);
     }
 
     #[test]

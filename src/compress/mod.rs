@@ -28,7 +28,7 @@ pub use record::{Record, Run};
 pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
-use crate::budget::seconds;
+use crate::budget::{Workload, seconds};
 use crate::error::Result;
 use crate::recipe::Recipe;
 use crate::reduction::Reduction;
@@ -47,8 +47,8 @@ use summary::{CameraSummary, InputSummary, Summary};
 /// Whatever is wrong with input, cameras, recipe or output. Nothing is left behind then.
 pub fn compress(request: &Request) -> Result<Summary> {
     let mut journal = Journal::default();
-    let plan = |outlook| {
-        let job = Job::new(request, outlook)?;
+    let plan = |outlook, work: &Workload| {
+        let job = Job::within(request, outlook, work)?;
         job.emit.check(&[&request.input.path])?;
         Ok(job)
     };
@@ -61,7 +61,7 @@ pub fn compress(request: &Request) -> Result<Summary> {
 /// # Errors
 /// Those of [`compress`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
-    let job = Job::new(request, Outlook::of(scene))?;
+    let job = Job::within(request, Outlook::of(scene), &scene.workload())?;
     job.emit.check(&[&scene.path])?;
     reduce(scene, &job, None, request, Journal::default())
 }
@@ -71,7 +71,7 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<
 /// # Errors
 /// A budget that cannot work, and those of [`Job::new`].
 pub fn keep_to_budget(scene: &mut Scene, request: &Request) -> Result<()> {
-    let job = Job::new(request, Outlook::of(scene))?;
+    let job = Job::within(request, Outlook::of(scene), &scene.workload())?;
     scene.keep_to(request.input.memory, |work, limits| job.needs(work, limits))
 }
 
@@ -110,7 +110,7 @@ fn reduce(
     if let Some(Goal::Bytes(most)) = request.goal {
         let of = Space { emit: &job.emit, most, recipe: recipe.len() as u64 };
         let count = of.count(scene, &request.recipe.merge, &mut journal)?;
-        job = Job::down_to(request, Outlook::of(scene), Some(count))?;
+        job = job.again(request, Outlook::of(scene), count)?;
     }
     if let Some(search) = &job.search {
         search.check(scene)?;
@@ -204,7 +204,6 @@ fn of_size(
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::budget::Workload;
     use crate::demo;
     use crate::emit::container::{FRAME_BLOCK, write_container};
     use crate::families::Residence;

@@ -63,11 +63,11 @@ pub fn bytes_per_gaussian(columns: Columns, sh_degree: usize) -> usize {
 }
 
 impl Descent {
-    /// From `start`, of which the columns `columns` may move but for the Gaussians `fixed`.
-    pub fn new(start: &Gaussians, columns: Columns, fixed: &[bool]) -> Descent {
+    /// From `start`, of which the columns `columns` may move, harmonics up to `sh_degree`, but for the Gaussians `fixed`.
+    pub fn new(start: &Gaussians, columns: Columns, sh_degree: usize, fixed: &[bool]) -> Descent {
         let mut change = Gaussians::default();
         for column in columns.iter() {
-            *change.column_mut(column) = Column::zeros(start.column(column).width(), start.len());
+            *change.column_mut(column) = Column::zeros(column.width(sh_degree), start.len());
         }
         let extent = |i: usize| start.log_scale.row::<3>(i).iter().sum::<f32>() / 3.0;
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
@@ -169,7 +169,7 @@ mod tests {
     #[test]
     fn values_come_to_rest_where_the_slope_is_zero_and_fixed_ones_do_not_move() {
         let start = Gaussians::zeros(3, 0);
-        let mut descent = Descent::new(&start, Columns::all(), &[false, true, false]);
+        let mut descent = Descent::new(&start, Columns::all(), 0, &[false, true, false]);
         for _ in 0..2000 {
             let mut now = start.clone();
             descent.change().add_to(&mut now, Columns::all());
@@ -190,7 +190,7 @@ mod tests {
     fn a_step_is_that_of_adam_written_out_in_f64() {
         let start = Gaussians::zeros(1, 0);
         let (steps, error) = (50, 0.009);
-        let mut descent = Descent::new(&start, Columns::OPACITY, &[false]);
+        let mut descent = Descent::new(&start, Columns::OPACITY, 0, &[false]);
         let (mut value, mut mean, mut square) = (0.0f64, 0.0f64, 0.0f64);
         for k in 0..steps {
             let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
@@ -210,7 +210,7 @@ mod tests {
 
     #[test]
     fn slopes_of_any_size_leave_every_value_finite() {
-        let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), &[false; 4]);
+        let mut descent = Descent::new(&Gaussians::zeros(4, 0), Columns::all(), 0, &[false; 4]);
         for slope in [f32::MAX, 1e-38, -f32::MAX, 0.0, 3e20] {
             let mut gradients = Gradients::new(4, Columns::all(), 0);
             for column in Columns::all().iter() {

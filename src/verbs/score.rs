@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::budget::Workload;
 use crate::compress::journal::Journal;
 use crate::compress::measure::{Measure, Outlook};
 use crate::compress::open_to_measure;
@@ -21,7 +22,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     }
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let journal = &mut Journal::default();
-    let plan = |outlook: Outlook| Ok(Measure::new(recipe, outlook.has_cameras, UserOverrides::default()));
+    let plan = |outlook: Outlook, _: &Workload| Ok(Measure::new(recipe, outlook.has_cameras, UserOverrides::default()));
     let (scene, measure, arrived) = open_to_measure(input, plan, journal)?;
     let scored = measure.run(&scene, arrived, journal)?;
     let scores = scored.scores(&recipe.score)?;

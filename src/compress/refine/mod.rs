@@ -47,6 +47,8 @@ pub(super) const CUT: f64 = 0.8;
 const RANKED_ON: usize = 48;
 /// Pictures that tell how large steps after a cut should be.
 const LOOKED_AT: usize = 16;
+/// Degree that no harmonics reach.
+const ALL_HARMONICS: usize = usize::MAX;
 /// Rates of the last step, as a part of the first's: where a cut follows, and at the end.
 const LAST_RATE: [f32; 2] = [1.0, 0.05];
 
@@ -55,6 +57,8 @@ const LAST_RATE: [f32; 2] = [1.0, 0.05];
 pub struct Refine {
     /// What moves.
     pub columns: Columns,
+    /// Up to which harmonics move.
+    pub sh_degree: usize,
     /// Pictures that are stepped along, one at a time, at the size that is wanted.
     pub steps: usize,
     /// And before each cut.
@@ -73,6 +77,7 @@ impl Refine {
         let recipe::Refine { refine, refine_steps, refine_cut_steps } = recipe.refine;
         let refine = Refine {
             columns: refine.0,
+            sh_degree: ALL_HARMONICS,
             steps: refine_steps as usize,
             cut_steps: refine_cut_steps as usize,
             cuts,
@@ -80,6 +85,11 @@ impl Refine {
             target,
         };
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
+    }
+
+    /// The same, but that colours' change with direction stays.
+    pub fn without_bands(self) -> Refine {
+        Refine { sh_degree: 0, ..self }
     }
 
     /// Whether what is wanted is so few that cuts lead there.
@@ -113,7 +123,7 @@ impl Refine {
         let left = [
             ("states", (6 + work.threads) * whole),
             ("jacobians", (3 + work.threads) * work.input.jacobian),
-            ("descent", whole + refine::bytes_per_gaussian(self.columns, work.sh_degree) as u64),
+            ("descent", whole + refine::bytes_per_gaussian(self.columns, work.sh_degree.min(self.sh_degree)) as u64),
             ("result", work.input.reduced),
             ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
         ];
@@ -269,7 +279,8 @@ impl<'a> Walk<'a> {
         'a: 'b,
     {
         let fixed = reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect();
-        Moving::new(self.scene, result, self.targets, self.refine.columns, fixed)
+        let Refine { columns, sh_degree, .. } = *self.refine;
+        Moving::new(self.scene, result, self.targets, columns, sh_degree, fixed)
     }
 
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
@@ -434,6 +445,20 @@ mod tests {
     }
 
     #[test]
+    fn without_bands_colours_change_with_direction_as_they_did() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        let reduction = Reduction::pruned(scored.ranked().ranking.take(300), &recipe.merge);
+        let (mut journal, count) = (Journal::default(), reduction.len());
+        let refine = Refine { steps: 100, ..Refine::of(&recipe, None, false).unwrap() }.without_bands();
+        let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
+        assert_eq!((moved.change.0.sh.width(), moved.change.0.sh.len()), (3, count));
+        assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
+    }
+
+    #[test]
     fn what_cannot_come_closer_stays_and_says_so() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
@@ -457,7 +482,7 @@ mod tests {
             let reduction = Reduction::pruned(kept, &Recipe::preset("default").unwrap().merge);
             let result = scene.input.reduced(&reduction).unwrap();
             let fixed = vec![false; reduction.len()];
-            let mut moving = Moving::new(&scene, &*result, &targets, Columns::all(), fixed).unwrap();
+            let mut moving = Moving::new(&scene, &*result, &targets, Columns::all(), ALL_HARMONICS, fixed).unwrap();
             let (of, schedule) = ([0, 7, 20], Schedule::new(20, 1.0, 1.0));
             let start = moving.closeness(&of).unwrap().psnr;
             let nowhere = moving.change();
@@ -483,7 +508,7 @@ mod tests {
             let thinned = Reduction { change: whole.pick(&some), ..reduction.pick(&some) };
             let result = scene.input.reduced(&thinned).unwrap();
             let fixed = vec![false; some.len()];
-            let anew = Moving::new(&scene, &*result, &targets, Columns::all(), fixed).unwrap();
+            let anew = Moving::new(&scene, &*result, &targets, Columns::all(), ALL_HARMONICS, fixed).unwrap();
             let expected = anew.closeness(&of).unwrap().psnr;
             assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
         }

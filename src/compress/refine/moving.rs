@@ -48,6 +48,8 @@ pub(super) struct Moving<'a> {
     before: Change,
     fixed: Vec<bool>,
     columns: Columns,
+    /// Up to which harmonics move.
+    sh_degree: usize,
     descent: Descent,
     gradients: Gradients,
     /// What the picture in the making shows.
@@ -58,7 +60,7 @@ pub(super) struct Moving<'a> {
 }
 
 impl<'a> Moving<'a> {
-    /// What `result` shows of `targets`; `columns` of it may move but for those `fixed`.
+    /// What `result` shows of `targets`; `columns` of it may move, harmonics up to `sh_degree`, but for those `fixed`.
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
@@ -67,14 +69,16 @@ impl<'a> Moving<'a> {
         result: &'a dyn FrameSource,
         targets: &'a Targets,
         columns: Columns,
+        sh_degree: usize,
         fixed: Vec<bool>,
     ) -> Result<Moving<'a>> {
         let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
-        let SequenceInfo { varying, sh_degree, .. } = *result.info();
+        let SequenceInfo { varying, sh_degree: of_state, .. } = *result.info();
+        let sh_degree = sh_degree.min(of_state);
         let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
-        let nothing = Gaussians::zeros(0, sh_degree);
+        let nothing = Gaussians::zeros(0, of_state);
         let mut moving = Moving {
             scene,
             targets,
@@ -82,15 +86,16 @@ impl<'a> Moving<'a> {
             locals: Locals::new(&scene.scratch, varying)?,
             stored: deformation.map_or(nothing.clone(), |deformation| deformation.stored().clone()),
             before: Change::default(),
-            descent: Descent::new(&nothing, columns, &[]),
+            descent: Descent::new(&nothing, columns, sh_degree, &[]),
             gradients: Gradients::new(0, columns, sh_degree),
-            now: Local::none(sh_degree),
+            now: Local::none(of_state),
             renderer: Renderer::on_all_threads(),
             steps: 0,
             frames,
             varying,
             fixed,
             columns,
+            sh_degree,
         };
         if deformation.is_some() {
             moving.find()?;
@@ -99,7 +104,7 @@ impl<'a> Moving<'a> {
             let mut states = States::open(result, &wanted)?;
             let mut locals = Locals::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
-                locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::none(sh_degree) })?;
+                locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::none(of_state) })?;
             }
             moving.locals = locals.finish()?;
         }
@@ -110,8 +115,8 @@ impl<'a> Moving<'a> {
     /// Begins to descend from here.
     fn begin(&mut self) {
         let Some(Local { state, .. }) = self.locals.first() else { return };
-        self.descent = Descent::new(state, self.columns, &self.fixed);
-        self.gradients = Gradients::new(state.len(), self.columns, state.sh_degree());
+        self.descent = Descent::new(state, self.columns, self.sh_degree, &self.fixed);
+        self.gradients = Gradients::new(state.len(), self.columns, self.sh_degree);
     }
 
     /// Which Gaussians stay as they are.
