@@ -54,6 +54,23 @@ fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
 }
 
 #[test]
+fn who_asks_for_similarity_gets_it_for_decibels() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 1500 --frames 6 -o demo");
+    let found = ["0", "0.5"].map(|part| {
+        workplace.done(&format!(
+            "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio 0.2 --refine-steps 600 \
+             --refine-ssim {part} --overwrite -o small.gseq"
+        ));
+        let told = workplace.done("evaluate demo/scene.gseq small.gseq --cameras demo/cameras.json --json");
+        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
+        ["psnr", "ssim"].map(|name| told[name].as_f64().unwrap())
+    });
+    let [[decibels, similarity], [fewer, more]] = found;
+    assert!(more > similarity + 0.005 && fewer > decibels - 1.0, "without and with: {found:?}");
+}
+
+#[test]
 fn only_what_is_named_moves_and_nothing_of_what_is_protected() {
     let workplace = Workplace::new();
     let cloud = |root: &Path| {

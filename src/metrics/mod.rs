@@ -8,12 +8,15 @@ mod flip;
 mod ssim;
 
 pub use flip::flip;
-pub use ssim::ssim;
+pub use ssim::{ssim, ssim_slope};
 
 use crate::render::Image;
 
 /// Memory of comparing two pictures, per pixel: SSIM's sums are the most.
 pub const BYTES_PER_PIXEL: usize = 5 * size_of::<f64>();
+
+/// Memory of [`ssim_slope`], per pixel: SSIM's sums of three channels, and their slopes twice.
+pub const BYTES_PER_PIXEL_OF_SLOPE: usize = 3 * (BYTES_PER_PIXEL + size_of::<f64>() + size_of::<f32>());
 
 /// PSNR of pictures that agree to the last bit, and of any nearer than that: a mean over pictures then
 /// stays finite.

@@ -189,6 +189,7 @@ pub struct Refine {
     pub refine: Groups,
     pub refine_steps: u32,
     pub refine_cut_steps: u32,
+    pub refine_ssim: f64,
 }
 
 /// Groups of stored values, by names that a person gives them: `colour,opacity,scale,rotation,position`, any of them, or
@@ -372,6 +373,7 @@ impl Recipe {
                 (0.1..=1.0).contains(&self.select.round_fraction),
                 "0.1 to 1",
             ),
+            ("refine.refine_ssim", self.refine.refine_ssim, in_unit(self.refine.refine_ssim), "0 to 1"),
             ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),
             ("merge.max_color_difference", max_color_difference, nonnegative(max_color_difference), "0 or more"),

@@ -10,6 +10,7 @@
 //! original's pictures and the states that they show wait in scratch files.
 
 mod local;
+mod loss;
 mod moving;
 pub(super) mod targets;
 
@@ -27,6 +28,7 @@ use crate::scene::Scene;
 use crate::scene::between::Dice;
 use crate::source::FrameSource;
 use crate::stream::Progress;
+use loss::Loss;
 use moving::Moving;
 use targets::{Parted, Targets};
 
@@ -59,6 +61,8 @@ pub struct Refine {
     pub columns: Columns,
     /// Up to which harmonics move.
     pub sh_degree: usize,
+    /// What is made small.
+    loss: Loss,
     /// Pictures that are stepped along, one at a time, at the size that is wanted.
     pub steps: usize,
     /// And before each cut.
@@ -74,10 +78,11 @@ pub struct Refine {
 impl Refine {
     /// The stage, unless `recipe` lets nothing move. Of a run that ranks by pictures (`cuts`), down to the part `target`.
     pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<Refine> {
-        let recipe::Refine { refine, refine_steps, refine_cut_steps } = recipe.refine;
+        let recipe::Refine { refine, refine_steps, refine_cut_steps, refine_ssim } = recipe.refine;
         let refine = Refine {
             columns: refine.0,
             sh_degree: ALL_HARMONICS,
+            loss: Loss { ssim: refine_ssim },
             steps: refine_steps as usize,
             cut_steps: refine_cut_steps as usize,
             cuts,
@@ -162,6 +167,7 @@ impl Refine {
                 work.arriving(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
                 ("pictures", (work.threads + 4) * 12 * work.pixels),
+                ("similarity", self.loss.bytes_per_pixel(work.threads) * work.pixels),
             ],
         }
     }
@@ -279,8 +285,7 @@ impl<'a> Walk<'a> {
         'a: 'b,
     {
         let fixed = reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect();
-        let Refine { columns, sh_degree, .. } = *self.refine;
-        Moving::new(self.scene, result, self.targets, columns, sh_degree, fixed)
+        Moving::new(self.scene, result, self.targets, self.refine, fixed)
     }
 
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
@@ -351,7 +356,7 @@ impl<'a> Walk<'a> {
             if step % judge_every == 0 || step == steps {
                 moving.find()?;
                 let now = moving.closeness(&self.apart)?;
-                if now.psnr > best.psnr {
+                if self.refine.loss.is_closer(&now, &best) {
                     (best, kept) = (now, moving.change());
                 } else if step < steps {
                     part *= TOO_FAST;
@@ -361,7 +366,7 @@ impl<'a> Walk<'a> {
             }
         }
         let [start, end] = [before.psnr, best.psnr];
-        if end > start {
+        if self.refine.loss.is_closer(&best, &before) {
             journal.notes.push(format!("refined: {count} pictures kept apart keep {end:.2} dB, not {start:.2}"));
         } else {
             journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
@@ -481,8 +486,9 @@ mod tests {
             let kept = (0..count as u32).step_by(2).collect();
             let reduction = Reduction::pruned(kept, &Recipe::preset("default").unwrap().merge);
             let result = scene.input.reduced(&reduction).unwrap();
+            let refine = Refine::of(&Recipe::preset("default").unwrap(), None, false).unwrap();
             let fixed = vec![false; reduction.len()];
-            let mut moving = Moving::new(&scene, &*result, &targets, Columns::all(), ALL_HARMONICS, fixed).unwrap();
+            let mut moving = Moving::new(&scene, &*result, &targets, &refine, fixed).unwrap();
             let (of, schedule) = ([0, 7, 20], Schedule::new(20, 1.0, 1.0));
             let start = moving.closeness(&of).unwrap().psnr;
             let nowhere = moving.change();
@@ -508,7 +514,7 @@ mod tests {
             let thinned = Reduction { change: whole.pick(&some), ..reduction.pick(&some) };
             let result = scene.input.reduced(&thinned).unwrap();
             let fixed = vec![false; some.len()];
-            let anew = Moving::new(&scene, &*result, &targets, Columns::all(), ALL_HARMONICS, fixed).unwrap();
+            let anew = Moving::new(&scene, &*result, &targets, &refine, fixed).unwrap();
             let expected = anew.closeness(&of).unwrap().psnr;
             assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
         }

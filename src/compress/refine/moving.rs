@@ -2,10 +2,11 @@
 
 use rayon::prelude::*;
 
+use super::Refine;
 use super::local::{Local, Locals};
-use super::targets::{Targets, mean_square, slope};
+use super::loss::{Closeness, Loss};
+use super::targets::Targets;
 use crate::error::{Error, Result};
-use crate::metrics::decibels;
 use crate::model::{Columns, Gaussians, Gradients, SequenceInfo};
 use crate::reduction::Change;
 use crate::refine::{Descent, Schedule};
@@ -13,15 +14,6 @@ use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, Wanted};
 use crate::stream::States;
-
-/// How close pictures are to the original's.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Closeness {
-    /// Mean, dB.
-    pub(super) psnr: f64,
-    /// Root of the mean square error of all.
-    pub(super) error: f64,
-}
 
 /// Steps after which states are found anew, where they follow from what is stored by more than a sum.
 pub(super) const FOUND_EVERY: usize = 200;
@@ -50,6 +42,7 @@ pub(super) struct Moving<'a> {
     columns: Columns,
     /// Up to which harmonics move.
     sh_degree: usize,
+    loss: Loss,
     descent: Descent,
     gradients: Gradients,
     /// What the picture in the making shows.
@@ -60,7 +53,7 @@ pub(super) struct Moving<'a> {
 }
 
 impl<'a> Moving<'a> {
-    /// What `result` shows of `targets`; `columns` of it may move, harmonics up to `sh_degree`, but for those `fixed`.
+    /// What `result` shows of `targets`, to move as `refine` has it but for those `fixed`.
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
@@ -68,16 +61,15 @@ impl<'a> Moving<'a> {
         scene: &'a Scene,
         result: &'a dyn FrameSource,
         targets: &'a Targets,
-        columns: Columns,
-        sh_degree: usize,
+        refine: &Refine,
         fixed: Vec<bool>,
     ) -> Result<Moving<'a>> {
         let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
         let SequenceInfo { varying, sh_degree: of_state, .. } = *result.info();
-        let sh_degree = sh_degree.min(of_state);
-        let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
+        let sh_degree = refine.sh_degree.min(of_state);
+        let columns = refine.columns & deformation.map_or(Columns::all(), Deformation::movable);
         let nothing = Gaussians::zeros(0, of_state);
         let mut moving = Moving {
             scene,
@@ -96,6 +88,7 @@ impl<'a> Moving<'a> {
             fixed,
             columns,
             sh_degree,
+            loss: refine.loss,
         };
         if deformation.is_some() {
             moving.find()?;
@@ -217,7 +210,7 @@ impl<'a> Moving<'a> {
         let mut now = std::mem::take(&mut self.now);
         self.show(self.place(k), &mut now)?;
         self.gradients.clear();
-        let pull = |picture: &_| (0.0, slope(picture, &target));
+        let pull = |picture: &_| (0.0, self.loss.slope(picture, &target));
         let camera = self.targets.camera(k);
         self.renderer.gradient(&now.state, camera, self.scene.background, pull, &mut self.gradients);
         now.jacobian.pull_back(&mut self.gradients);
@@ -231,15 +224,13 @@ impl<'a> Moving<'a> {
     /// # Errors
     /// A scratch file that cannot be read.
     pub(super) fn closeness(&self, of: &[usize]) -> Result<Closeness> {
-        let square = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
+        let lost = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
             self.show(self.place(k), now)?;
             let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
-            Ok(mean_square(&picture, &self.targets.values(k)?))
+            Ok(self.loss.of(&picture, &self.targets.values(k)?))
         };
-        let squares: Vec<f64> = of.par_iter().map_init(|| self.worker(), square).collect::<Result<_>>()?;
-        let count = squares.len().max(1) as f64;
-        let psnr = squares.iter().map(|&square| decibels(square)).sum::<f64>() / count;
-        Ok(Closeness { psnr, error: (squares.iter().sum::<f64>() / count).sqrt() })
+        let losses: Vec<[f64; 2]> = of.par_iter().map_init(|| self.worker(), lost).collect::<Result<_>>()?;
+        Ok(Closeness::of(&losses))
     }
 
     /// What the pictures numbered `of` would lose with each.

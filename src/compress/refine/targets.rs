@@ -117,17 +117,6 @@ fn looked_at(scene: &Scene) -> (Vec<Camera>, Vec<Picture>) {
     (cameras, pictures)
 }
 
-/// How a picture's squared error, `[H, W, 3]` summed, changes with each of its values. What a screen cannot show does
-/// not count.
-pub(super) fn slope(picture: &Image, target: &[u16]) -> Image {
-    let mut slope = picture.clone();
-    for (value, &wanted) in slope.data.iter_mut().zip(target) {
-        let shown = value.clamp(0.0, 1.0);
-        *value = if shown == *value { 2.0 * (shown - wide(wanted)) } else { 0.0 };
-    }
-    slope
-}
-
 /// Mean square error of a picture.
 pub(in crate::compress) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
     let square = |(value, &wanted): (&f32, &u16)| f64::from(value.clamp(0.0, 1.0) - wide(wanted)).powi(2);
@@ -135,12 +124,13 @@ pub(in crate::compress) fn mean_square(picture: &Image, target: &[u16]) -> f64 {
 }
 
 /// Values from 0 to 1 as 16 bits.
-fn narrow(picture: &Image) -> Vec<u16> {
+pub(super) fn narrow(picture: &Image) -> Vec<u16> {
     // NaN becomes 0.
     picture.data.iter().map(|value| (value.clamp(0.0, 1.0) * f32::from(u16::MAX)).round() as u16).collect()
 }
 
-fn wide(value: u16) -> f32 {
+/// The value that [`narrow`] made 16 bits of.
+pub(super) fn wide(value: u16) -> f32 {
     f32::from(value) / f32::from(u16::MAX)
 }
 
@@ -155,23 +145,6 @@ mod tests {
         assert!(back.iter().zip(&picture.data).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?}");
         let odd = Image { data: vec![-3.0, f32::NAN, 7.0], ..picture };
         assert_eq!(narrow(&odd), [0, 0, u16::MAX]);
-    }
-
-    #[test]
-    fn a_slope_is_the_difference_of_squared_errors_and_what_no_screen_shows_has_none() {
-        let target = narrow(&Image { width: 2, height: 1, data: vec![0.5, 0.25, 1.0, 0.0, 0.75, 0.5] });
-        let picture = Image { width: 2, height: 1, data: vec![0.75, 0.125, 1.5, -0.5, 0.75, 0.625] };
-        let slopes = slope(&picture, &target).data;
-        for (k, &slope) in slopes.iter().enumerate() {
-            let at = |by: f32| {
-                let mut moved = picture.clone();
-                moved.data[k] += by;
-                6.0 * mean_square(&moved, &target)
-            };
-            let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
-            assert!((f64::from(slope) - expected).abs() < 1e-3, "{k}: {slope} and {expected}");
-        }
-        assert_eq!([slopes[2], slopes[3]], [0.0, 0.0]);
     }
 
     #[test]
