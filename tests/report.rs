@@ -27,7 +27,7 @@ fn data(at: &Workplace, folder: &str) -> Value {
     serde_json::from_str(&read(&at.path(folder).join("report.json"))).unwrap()
 }
 
-/// What `sweep` writes, of two methods.
+/// What `sweep` writes, of two methods and a knob.
 fn sweep() -> Value {
     let point = |method: &str, count: usize, psnr: f64| {
         json!({
@@ -35,10 +35,16 @@ fn sweep() -> Value {
             "temporal": null, "seconds": 1.5, "peak_memory_bytes": 1 << 26,
         })
     };
+    let setting = |value: u32, psnr: f64| {
+        let mut setting = point("default", 300, psnr);
+        setting["value"] = json!(value);
+        setting
+    };
     json!({
         "tool": "splatsieve 0.1.0", "path": "d/scene.gseq", "digest": "00", "gaussians": 1200, "bytes": 72_000,
         "threads": 2, "pictures": 5, "cameras": "d/cameras.json",
         "points": [point("default", 600, 40.0), point("default", 300, 30.0), point("<i>odd</i>", 600, 20.0)],
+        "runs": 3, "knobs": [{ "parameter": "<b>knob</b>", "settings": [setting(20, 31.0), setting(50, 33.0)] }],
         "notes": ["three <b>points</b>"],
     })
 }
@@ -61,6 +67,7 @@ fn data_beside_the_page_are_those_of_evaluate_and_of_the_run() {
     assert_eq!(read(&at.path("r/stages.csv")).lines().count(), 1 + run["stages"].as_array().unwrap().len());
     assert_eq!(found["trade_off"], sweep());
     assert_eq!(read(&at.path("r/trade_off.csv")).lines().count(), 4);
+    assert_eq!(read(&at.path("r/knobs.csv")).lines().count(), 3);
     assert_eq!(found["missing"], json!([]));
     // Scores computed anew are those that decided, and where they are not, that is said.
     assert_eq!(found["notes"], json!([]));

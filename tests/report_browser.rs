@@ -94,6 +94,34 @@ fn the_page_asks_for_nothing_and_its_slider_and_choices_work() {
     assert_eq!(page.complaints(), Vec::<String>::new());
 }
 
+/// Pairs of words of one chart that lie on one another, and words that reach beyond their chart.
+const UNREADABLE: &str = "[...document.querySelectorAll('svg')].flatMap(svg => {
+    const outer = svg.getBoundingClientRect();
+    const words = [...svg.querySelectorAll('text')].map(text => [text.textContent, text.getBoundingClientRect()]);
+    const apart = (a, b) => a.right <= b.left || b.right <= a.left || a.bottom <= b.top || b.bottom <= a.top;
+    const inside = a => a.left >= outer.left && a.right <= outer.right && a.top >= outer.top && a.bottom <= outer.bottom;
+    const on = words.flatMap(([a, at], k) => words.slice(k + 1).filter(b => !apart(at, b[1])).map(b => a + ' | ' + b[0]));
+    return [...on, ...words.filter(word => !inside(word[1])).map(word => word[0])];
+})";
+
+#[test]
+fn a_sweep_draws_every_chart_with_words_that_can_be_read_and_asks_for_nothing() {
+    let Some(program) = browser::installed() else { return };
+    let at = Workplace::new();
+    let steps = "--fractions 0.8,0.5,0.3 --steps 0,5,10,20 --steps-at 0.3";
+    let methods = "--methods default,no-refine,visible,random";
+    at.done(&format!("sweep {{tiny}} --cameras {{tiny}} -o curves {methods} {steps} --max-frames 1"));
+    let mut page = Browser::start(&program);
+    page.open(&at.path("curves/sweep.html"));
+    assert_eq!(page.complaints(), Vec::<String>::new());
+    assert_eq!(page.value("document.querySelectorAll('figure svg').length"), json!(8));
+    assert_eq!(page.value(UNREADABLE), json!([]));
+    // The pair: one colour, and the one that is not refined hollow.
+    let colour = |class: &str| format!("getComputedStyle(document.querySelector('svg .line.{class}')).stroke");
+    assert_eq!(page.value(&colour("s0.hollow")), page.value(&colour("s0")));
+    assert_ne!(page.value(&colour("s1")), page.value(&colour("s0")));
+}
+
 #[test]
 fn a_page_that_fails_or_asks_for_something_would_be_seen() {
     let Some(program) = browser::installed() else { return };

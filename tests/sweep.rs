@@ -57,7 +57,12 @@ fn every_method_has_its_points_at_the_counts_asked_for() {
     let mut left: Vec<_> =
         fs::read_dir(place.path("curves")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();
-    assert_eq!(left, ["summary.json", "sweep.csv", "sweep.json"]);
+    assert_eq!(left, ["summary.json", "sweep.csv", "sweep.html", "sweep.json"]);
+    let page = fs::read_to_string(place.path("curves/sweep.html")).unwrap();
+    for chart in ["PSNR by kept Gaussians", "SSIM by size", "PSNR by run time"] {
+        assert!(page.contains(&format!("<figcaption>{chart}</figcaption>")), "{chart} is missing");
+    }
+    assert!(!page.contains("knobs.csv"), "a link to what is not there");
 }
 
 #[test]
@@ -83,6 +88,33 @@ fn a_point_is_what_compress_and_evaluate_give() {
 }
 
 #[test]
+fn a_setting_of_steps_is_what_compress_gives_with_them_and_none_is_no_refining() {
+    let place = Workplace::new();
+    let sweep = "sweep {tiny} --cameras {tiny} -o curves --methods no-refine --fractions 0.3 --max-frames 2 --json";
+    let swept = json(&place.done(&format!("{sweep} --steps 25,0,25 --steps-at 0.3 --repeat 2")));
+    assert_eq!(swept["runs"], 2);
+    let knob = &swept["knobs"][0];
+    assert_eq!(knob["parameter"], "refine_steps");
+    let settings = knob["settings"].as_array().unwrap();
+    assert_eq!(settings.iter().map(|setting| setting["value"].as_u64().unwrap()).collect::<Vec<_>>(), [0, 25]);
+    // Cuts take 8% of the steps each, as in the preset.
+    place.done("compress {tiny} --cameras {tiny} -o small --target-ratio 0.3 --refine-steps 25 --refine-cut-steps 2");
+    let evaluated = json(&place.done("evaluate {tiny} small --cameras {tiny} --max-frames 2 --json"));
+    let unrefined = swept["points"].as_array().unwrap().iter().find(|point| point["asked"] == 0.3).unwrap();
+    for name in ["psnr", "ssim"] {
+        assert_eq!(settings[1][name], evaluated[name], "{name}");
+        assert_eq!(settings[0][name], unrefined[name], "{name}");
+    }
+    assert_eq!(settings[1]["bytes"], evaluated["bytes"]["compressed"]);
+    assert!(settings.iter().all(|of| of["seconds"].as_f64().unwrap() > 0.0 && of["asked"] == 0.3), "{knob}");
+    let csv = fs::read_to_string(place.path("curves/knobs.csv")).unwrap();
+    assert_eq!(csv.lines().count(), 3);
+    assert!(csv.lines().last().unwrap().starts_with("refine_steps,25,default,0.3,"), "{csv}");
+    let page = fs::read_to_string(place.path("curves/sweep.html")).unwrap();
+    assert!(page.contains("Error by run time") && page.contains(">25</text>") && page.contains("knobs.csv"), "{page}");
+}
+
+#[test]
 fn default_is_not_below_another_method_at_the_same_count() {
     let place = Workplace::new();
     let swept = json(&place.done("sweep {tiny} --cameras {tiny} -o curves --fractions 0.8,0.5,0.3,0.15 --json"));
@@ -102,6 +134,9 @@ fn odd_requests_are_refused_and_leave_nothing() {
     for (flags, expected) in [
         ("--fractions 0.5,0", "--fractions: expected numbers above 0 and at most 1, found 0"),
         ("--fractions nan", "found NaN"),
+        ("--steps 5 --steps-at 1.5", "--steps-at: expected numbers above 0 and at most 1, found 1.5"),
+        ("--steps-at 0.5", "--steps"),
+        ("--repeat 0", "--repeat"),
         ("--methods best", "possible values: default, no-refine, paper"),
         ("--cameras nowhere.json", "nowhere.json"),
     ] {

@@ -6,7 +6,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::RecipeFlags;
 use crate::emit::atomic::Replace;
-use crate::verbs::sweep::Method;
+use crate::verbs::method::Method;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -17,7 +17,7 @@ Examples:
   splatsieve compress frames/ -o small.gseq --preset paper
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
-  splatsieve sweep model --cameras data -o curves        every method at every size
+  splatsieve sweep model --cameras data -o curves        every method at every size, curves as a page
   splatsieve report model small --cameras data -o page   what it cost, as a page to look at
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
@@ -404,12 +404,22 @@ pub(super) struct Sweep {
     /// Fractions of the Gaussians to keep
     #[arg(long, value_name = "FRACTIONS", value_delimiter = ',', default_values_t = [0.8, 0.6, 0.4, 0.2, 0.1])]
     pub(super) fractions: Vec<f64>,
+    /// Run `default` with these steps of refinement too, for error against run time; 0 refines nothing. Steps before
+    /// cuts are as many in proportion
+    #[arg(long, value_name = "STEPS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(..=1_000_000))]
+    pub(super) steps: Vec<u32>,
+    /// Fraction of the Gaussians to keep with --steps
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.1, requires = "steps")]
+    pub(super) steps_at: f64,
+    /// Run every point so often and give the median time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(super) repeat: u32,
     /// Compare on at most this many frames, evenly from first to last
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) max_frames: u32,
     #[command(flatten)]
     pub(super) background: Background,
-    /// Folder to write sweep.json and sweep.csv into
+    /// Folder to write sweep.html into, a page with the curves, and what it shows as JSON and CSV
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
     #[command(flatten)]

@@ -20,13 +20,14 @@ use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::model::Split;
 use crate::recipe::preset_text;
-use crate::report::{self, ReportOptions};
+use crate::report::{self, ReportOptions, trade_off};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, scratch_beside};
 use crate::stream::{Mode, Progress};
 use crate::verbs::evaluate::EvaluateOptions;
+use crate::verbs::method::Method;
 use crate::verbs::render::{RenderOptions, Wanted};
-use crate::verbs::sweep::{Method, SweepOptions};
+use crate::verbs::sweep::SweepOptions;
 use crate::verbs::{container, demo, evaluate, render, score, sweep};
 use args::{
     CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, OutputSize, Render, SideBySide, SplitArg, Sweep, Verb,
@@ -101,9 +102,9 @@ fn run(cli: Cli) -> Result<()> {
             print(&if as_json { json(&found) } else { found.text() })
         }
         Verb::Sweep(args) => {
-            let as_json = args.json;
+            let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
             let found = sweep::sweep(&sweep_options(args))?;
-            print(&if as_json { found.json() } else { found.text() })
+            print(&if as_json { found.json() } else { format!("{}{}\n", found.text(), page.display()) })
         }
         Verb::Report(args) => {
             let page = args.output.join(report::PAGE);
@@ -294,6 +295,9 @@ fn sweep_options(args: Sweep) -> SweepOptions {
         input,
         methods: args.methods.iter().filter_map(named).collect(),
         fractions: args.fractions,
+        steps: args.steps,
+        steps_at: args.steps_at,
+        runs: args.repeat as usize,
         max_frames: Some(args.max_frames as usize),
         background: args.background.background,
         output: args.output,

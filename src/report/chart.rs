@@ -5,7 +5,7 @@
 //! shape and dash as well as by colour, and the colours are those of Okabe and Ito ("Color Universal
 //! Design", 2008), which colour-blind people tell apart.
 
-use std::fmt::Write as _;
+use std::fmt::{self, Write as _};
 
 use super::html::{escape, figure};
 
@@ -36,7 +36,7 @@ pub struct Axis {
 }
 
 /// Points with a name.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Series {
     /// For the legend; without one it is not listed.
     pub name: String,
@@ -44,6 +44,10 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
     /// Whether a line joins the points.
     pub joined: bool,
+    /// Whether it is the other one of a pair with the series before it: in the same colour, dashed and hollow.
+    pub paired: bool,
+    /// What stands beside the points where there is room, as many as they are, or nothing.
+    pub labels: Vec<String>,
 }
 
 /// Series over two axes.
@@ -122,6 +126,12 @@ impl Scale {
         })
     }
 
+    /// Leaves `room` pixels more behind the last value.
+    fn leave(&mut self, room: f64) {
+        let length = self.to - self.from;
+        self.high += (self.high - self.low) * room / (length - room).max(0.5 * length);
+    }
+
     /// Pixel of a value; none if it cannot be shown.
     fn at(&self, value: f64) -> Option<f64> {
         let value = if self.log { value.log10() } else { value };
@@ -167,26 +177,48 @@ fn even_ticks(low: f64, high: f64) -> Vec<f64> {
 impl Plot {
     /// The chart.
     pub fn svg(&self) -> String {
-        let names: Vec<&str> = self.series.iter().map(|series| series.name.as_str()).collect();
-        let mut out = Drawing::new(&self.title, &names, HEIGHT);
+        let looks = self.looks();
+        let legend: Vec<Entry<'_>> = self
+            .series
+            .iter()
+            .zip(&looks)
+            .map(|(of, &look)| Entry { name: &of.name, look, joined: of.joined })
+            .collect();
+        let mut out = Drawing::new(&self.title, &legend, HEIGHT);
         let points = || self.series.iter().flat_map(|series| series.points.iter().copied());
         let x = Scale::of(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
         let y = Scale::of(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
-        let (Some(x), Some(y)) = (x, y) else { return out.empty() };
+        let (Some(mut x), Some(y)) = (x, y) else { return out.empty() };
+        let longest = self.series.iter().flat_map(|series| &series.labels).map(|label| label.chars().count()).max();
+        x.leave(longest.unwrap_or(0) as f64 * LETTER);
         out.axes(&x, &y, &self.x.label, &self.y.label);
-        for (number, series) in self.series.iter().enumerate() {
-            let look = number % LOOKS;
-            let places: Vec<_> = series.points.iter().filter_map(|&(a, b)| Some((x.at(a)?, y.at(b)?, a, b))).collect();
+        for (series, look) in self.series.iter().zip(looks) {
+            let place = |(k, &(a, b)): (usize, &(f64, f64))| Some((k, x.at(a)?, y.at(b)?));
+            let places: Vec<(usize, f64, f64)> = series.points.iter().enumerate().filter_map(place).collect();
             if series.joined && places.len() > 1 {
-                let line: Vec<String> = places.iter().map(|p| format!("{:.1},{:.1}", p.0, p.1)).collect();
-                out.push(&format!("<polyline class=\"line s{look}\" points=\"{}\"/>", line.join(" ")));
+                let line: Vec<String> = places.iter().map(|p| format!("{:.1},{:.1}", p.1, p.2)).collect();
+                out.push(&format!("<polyline class=\"line {look}\" points=\"{}\"/>", line.join(" ")));
             }
-            for (px, py, a, b) in places {
-                let tip = format!("{} {}, {}", series.name, figure(a), figure(b));
+            for (k, px, py) in places {
+                let (a, b) = series.points[k];
+                let words = [series.name.as_str(), series.labels.get(k).map_or("", String::as_str)];
+                let tip = format!("{} {}, {}", words.join(" ").trim(), figure(a), figure(b));
                 out.mark(look, px, py, tip.trim_start());
+                out.label(px, py, words[1]);
             }
         }
         out.finish()
+    }
+
+    /// The look of every series.
+    fn looks(&self) -> Vec<Look> {
+        let mut colours = 0;
+        let look = |series: &Series| {
+            let hollow = series.paired && colours > 0;
+            colours += usize::from(!hollow);
+            Look { hollow, ..Look::of(colours - 1) }
+        };
+        self.series.iter().map(look).collect()
     }
 }
 
@@ -226,8 +258,10 @@ impl Bars {
 impl Stack {
     /// The chart.
     pub fn svg(&self) -> String {
-        let names: Vec<&str> = self.groups.iter().map(|group| group.0.as_str()).collect();
-        let mut out = Drawing::new(&self.title, &names, HEIGHT);
+        let names = self.groups.iter().enumerate();
+        let legend: Vec<Entry<'_>> =
+            names.map(|(number, of)| Entry { name: &of.0, look: Look::of(number), joined: false }).collect();
+        let mut out = Drawing::new(&self.title, &legend, HEIGHT);
         let bins = self.edges.len().saturating_sub(1);
         let count = |group: &(String, Vec<usize>), bin: usize| group.1.get(bin).copied().unwrap_or(0);
         let total = |bin| self.groups.iter().map(|group| count(group, bin)).sum::<usize>() as f64;
@@ -246,9 +280,9 @@ impl Stack {
                 below += here;
                 if here > 0 {
                     out.push(&format!(
-                        "<rect class=\"area s{}\" x=\"{left:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
+                        "<rect class=\"area {}\" x=\"{left:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
                          <title>{}: {here} from {} to {}</title></rect>",
-                        number % LOOKS,
+                        Look::of(number),
                         (right - left - 0.6).max(0.4),
                         bottom - top,
                         escape(&group.0),
@@ -262,30 +296,66 @@ impl Stack {
     }
 }
 
+/// How a series is drawn: class names of [`STYLE`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Look {
+    /// Below [`LOOKS`].
+    number: usize,
+    hollow: bool,
+}
+
+impl Look {
+    /// Of the series of that number, alone.
+    fn of(number: usize) -> Look {
+        Look { number: number % LOOKS, hollow: false }
+    }
+}
+
+impl fmt::Display for Look {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "s{}{}", self.number, if self.hollow { " hollow" } else { "" })
+    }
+}
+
+/// A line of a legend.
+struct Entry<'a> {
+    name: &'a str,
+    look: Look,
+    joined: bool,
+}
+
 /// An SVG being written.
 struct Drawing {
     text: String,
     height: f64,
     /// Where the plot begins, below the legend.
     top: f64,
+    /// Left end, foot and width of words beside points.
+    labels: Vec<(f64, f64, f64)>,
 }
 
 impl Drawing {
-    fn new(title: &str, legend: &[&str], height: f64) -> Drawing {
+    fn new(title: &str, legend: &[Entry<'_>], height: f64) -> Drawing {
         let title = escape(title);
         let mut out = Drawing {
             text: format!("<svg class=\"chart\" viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" aria-label=\"{title}\">"),
             height,
             top: 10.0,
+            labels: Vec::new(),
         };
         let (mut x, mut y) = (LEFT, 14.0);
-        for (number, name) in legend.iter().enumerate().filter(|(_, name)| !name.is_empty()) {
-            let wide = name.chars().count() as f64 * LETTER + 34.0;
+        for Entry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
+            // The mark, with a piece of the line through it.
+            let sample = if *joined { 26.0 } else { 12.0 };
+            let wide = name.chars().count() as f64 * LETTER + sample + 22.0;
             if x + wide > WIDTH && x > LEFT {
                 (x, y) = (LEFT, y + LINE);
             }
-            out.mark(number % LOOKS, x + 6.0, y - 4.0, name);
-            out.push(&format!("<text x=\"{:.1}\" y=\"{y:.1}\">{}</text>", x + 16.0, escape(name)));
+            if *joined {
+                out.push(&format!("<path class=\"line {look}\" d=\"M{x:.1} {:.1}h{sample}\"/>", y - 4.0));
+            }
+            out.mark(*look, x + 0.5 * sample, y - 4.0, name);
+            out.push(&format!("<text x=\"{:.1}\" y=\"{y:.1}\">{}</text>", x + sample + 4.0, escape(name)));
             x += wide;
             out.top = y + 12.0;
         }
@@ -297,23 +367,44 @@ impl Drawing {
     }
 
     /// A point in the shape of its series.
-    fn mark(&mut self, look: usize, x: f64, y: f64, tip: &str) {
-        let shape = match look % 4 {
-            0 => format!("<circle class=\"mark s{look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
+    fn mark(&mut self, look: Look, x: f64, y: f64, tip: &str) {
+        let shape = match look.number % 4 {
+            0 => format!("<circle class=\"mark {look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
             1 => format!(
-                "<rect class=\"mark s{look}\" x=\"{:.1}\" y=\"{:.1}\" width=\"6.4\" height=\"6.4\">",
+                "<rect class=\"mark {look}\" x=\"{:.1}\" y=\"{:.1}\" width=\"6.4\" height=\"6.4\">",
                 x - 3.2,
                 y - 3.2
             ),
-            2 => format!("<path class=\"mark s{look}\" d=\"M{x:.1} {:.1}l4.2 7.4h-8.4z\">", y - 4.6),
-            _ => format!("<path class=\"mark s{look}\" d=\"M{x:.1} {:.1}l4.6 4.6l-4.6 4.6l-4.6 -4.6z\">", y - 4.6),
+            2 => format!("<path class=\"mark {look}\" d=\"M{x:.1} {:.1}l4.2 7.4h-8.4z\">", y - 4.6),
+            _ => format!("<path class=\"mark {look}\" d=\"M{x:.1} {:.1}l4.6 4.6l-4.6 4.6l-4.6 -4.6z\">", y - 4.6),
         };
-        let close = match look % 4 {
+        let close = match look.number % 4 {
             0 => "</circle>",
             1 => "</rect>",
             _ => "</path>",
         };
         let _ = write!(self.text, "{shape}<title>{}</title>{close}", escape(tip));
+    }
+
+    /// Words beside a point where they lie on no others, inside the plot; none where there is no such place.
+    fn label(&mut self, x: f64, y: f64, words: &str) {
+        let wide = words.chars().count() as f64 * LETTER;
+        // Left end and foot; above first, as curves of what more time buys fall.
+        let places = [(x + 6.0, y - 4.0), (x - 6.0 - wide, y - 4.0), (x - 6.0 - wide, y + 14.0), (x + 6.0, y + 14.0)];
+        let is_free = |&(left, foot): &(f64, f64)| {
+            let inside = left > LEFT && left + wide < WIDTH && foot >= self.top + 2.0 && foot < HEIGHT - BOTTOM;
+            let apart = |&(other, at, width): &(f64, f64, f64)| {
+                left + wide < other || other + width < left || (foot - at).abs() >= LINE
+            };
+            inside && self.labels.iter().all(apart)
+        };
+        if words.is_empty() {
+            return;
+        }
+        if let Some((left, foot)) = places.into_iter().find(is_free) {
+            self.labels.push((left, foot, wide));
+            self.push(&format!("<text x=\"{left:.1}\" y=\"{foot:.1}\">{}</text>", escape(words)));
+        }
     }
 
     fn axes(&mut self, x: &Scale, y: &Scale, x_label: &str, y_label: &str) {
@@ -378,7 +469,7 @@ mod tests {
     use super::*;
 
     fn plot(points: &[(f64, f64)]) -> Plot {
-        let series = Series { name: "<b>".into(), points: points.to_vec(), joined: true };
+        let series = Series { name: "<b>".into(), points: points.to_vec(), joined: true, ..Series::default() };
         Plot { title: "t".into(), series: vec![series], ..Plot::default() }
     }
 
@@ -395,6 +486,27 @@ mod tests {
     #[test]
     fn names_cannot_become_elements() {
         assert!(!plot(&[(0.0, 1.0)]).svg().contains("<b>"));
+    }
+
+    #[test]
+    fn a_pair_has_one_colour_and_labels_stay_with_their_points() {
+        let series = |paired: bool| Series {
+            name: "a".into(),
+            points: vec![(1.0, 1.0), (f64::NAN, 2.0), (3.0, 3.0)],
+            joined: true,
+            paired,
+            labels: ["first", "lost", "last"].map(String::from).to_vec(),
+        };
+        let plot = Plot { series: [false, true, false, true].map(series).to_vec(), ..Plot::default() };
+        let looks: Vec<String> = plot.looks().iter().map(Look::to_string).collect();
+        assert_eq!(looks, ["s0", "s0 hollow", "s1", "s1 hollow"]);
+        let svg = plot.svg();
+        let times = |label: &str| svg.matches(&format!(">{label}</text>")).count();
+        // In the corner below there is room for one, around the point above for all.
+        assert_eq!(["first", "lost", "last"].map(times), [1, 0, 4], "{svg}");
+        // A pair needs a first.
+        let alone = Plot { series: vec![series(true)], ..Plot::default() };
+        assert_eq!(alone.looks(), [Look::of(0)]);
     }
 
     #[test]

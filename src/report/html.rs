@@ -16,6 +16,12 @@ pub(super) fn escape(text: &str) -> String {
     out
 }
 
+/// The last name of a path.
+pub(super) fn file_name(path: &str) -> &str {
+    let name = path.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or("");
+    if name.is_empty() { path } else { name }
+}
+
 /// A number in at most four significant digits, without needless zeros: for ticks and bars.
 pub(super) fn figure(value: f64) -> String {
     let size = value.abs();

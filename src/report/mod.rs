@@ -3,11 +3,12 @@
 //! Data in: two models, their cameras, and what `compress` left beside its result. Data out: a folder
 //! with `report.html`, which needs nothing but a browser, and everything it shows as JSON and CSV. Reads
 //! as a pipeline: `run` (what compress left), `traits` (which Gaussians are at risk), the evaluation with
-//! `failure` looking on, `histogram`, `shown` (pictures), `page` with `chart` and `html`.
+//! `failure` looking on, `histogram`, `shown` (pictures), `page` with `document`, `chart` and `html`.
 //!
 //! Memory: that of an evaluation and of scoring, one after the other, and the page.
 
 pub mod chart;
+mod document;
 pub mod failure;
 mod findings;
 pub mod histogram;
@@ -252,6 +253,8 @@ fn write(options: &ReportOptions, report: &Report, page: &str, run: &Run) -> Res
     files.extend(report.histograms.as_ref().map(|of| ("histograms.csv", histogram::csv(of))));
     files.extend(run.summary.as_ref().map(|(of, _)| ("stages.csv", tables::stages(&of.stages))));
     files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", of.csv())));
+    let turned = report.trade_off.as_ref().filter(|of| !of.knobs.is_empty());
+    files.extend(turned.map(|of| ("knobs.csv", of.knobs_csv())));
     for (name, text) in files {
         let path = staged.path().join(name);
         fs::write(&path, text).map_err(Error::io("write", &path))?;

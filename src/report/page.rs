@@ -1,34 +1,24 @@
-//! The page: one HTML file that needs no network.
-//!
-//! Everything that comes from files or paths passes through [`escape`]; the content policy in its head
-//! lets a browser load nothing but what is inside.
+//! The page of a report, section by section.
 
-use super::chart::{self, Axis, Bars, Plot, Series, Stack};
+use super::chart::{Axis, Bars, Plot, Series, Stack};
+use super::document::{document, figure_of, links, list};
 use super::failure::{APART_DB, FailureMode, LOST, VISIBLE_DB, Verdict};
 use super::findings::{Close, Report};
 use super::histogram::Histogram;
-use super::html::{bytes, count, escape, figure, percent};
+use super::html::{bytes, count, escape, figure, file_name, percent};
 use super::run::Run;
 use super::shown::Shown;
 use super::trade_off;
 use crate::compress::summary::{Stage, Summary};
 use crate::verbs::evaluation::{Comparison, FrameMeans, Means, ViewMeans};
 
-const STYLE: &str = include_str!("page.css");
+/// What moves the slider.
 const SCRIPT: &str = include_str!("page.js");
 
 /// Puts the page together.
 pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close]) -> String {
     let title = format!("{} – what compression cost", file_name(&report.evaluation.path.compressed));
-    let mut out = format!(
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; \
-         style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <title>{}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<main>\n",
-        escape(&title),
-        chart::STYLE,
-    );
+    let mut out = String::new();
     let sections = [
         ("", header(report)),
         ("Compare", compare(shown)),
@@ -49,13 +39,8 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
             }
         }
     }
-    out += &format!("</main>\n<script>\n{SCRIPT}</script>\n</body>\n</html>\n");
-    out
-}
-
-fn file_name(path: &str) -> &str {
-    let name = path.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or("");
-    if name.is_empty() { path } else { name }
+    out += &format!("<script>\n{SCRIPT}</script>\n");
+    document(&title, &out)
 }
 
 fn header(report: &Report) -> String {
@@ -182,6 +167,7 @@ fn by_frame_and_view(report: &Report) -> String {
             name: (*name).to_owned(),
             points: of.per_frame.iter().filter_map(point).collect(),
             joined: true,
+            ..Series::default()
         });
         let axis = |label: &str| Axis { label: label.to_owned(), ..Axis::default() };
         Plot { title: title.to_owned(), x: axis("frame"), y: axis(label), series: series.collect() }.svg()
@@ -209,10 +195,6 @@ fn by_frame_and_view(report: &Report) -> String {
 
 /// Views that bars are drawn for, the worst.
 const MOST_VIEWS: usize = 16;
-
-fn figure_of(caption: &str, svg: &str) -> String {
-    format!("<figure><figcaption>{}</figcaption>{svg}</figure>\n", escape(caption))
-}
 
 fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
     let mut out = format!(
@@ -373,10 +355,7 @@ fn left_out(report: &Report, run: &Run) -> String {
     let mut notes: Vec<&String> = report.notes.iter().collect();
     notes.extend(run.summary.iter().flat_map(|(summary, _)| &summary.notes));
     notes.extend(&report.missing);
-    if !notes.is_empty() {
-        let items: Vec<String> = notes.iter().map(|note| format!("<li>{}</li>", escape(note))).collect();
-        out += &format!("<ul class=\"note\">{}</ul>\n", items.join("\n"));
-    }
+    out += &list(notes);
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
@@ -389,23 +368,7 @@ fn sweep(report: &Report) -> String {
             escape(&report.evaluation.path.original)
         ));
     };
-    let mut out = format!(
-        "<p class=\"note\">{}: {} Gaussians, {}; {} pictures, {} threads.</p>\n<div class=\"charts\">\n",
-        escape(&found.path),
-        count(found.gaussians),
-        bytes(found.bytes),
-        found.pictures,
-        found.threads
-    );
-    for (caption, svg) in trade_off::charts(found) {
-        out += &figure_of(caption, &svg);
-    }
-    out += "</div>\n";
-    let items: Vec<String> = found.notes.iter().map(|note| format!("<li>{}</li>", escape(note))).collect();
-    if !items.is_empty() {
-        out += &format!("<ul class=\"note\">{}</ul>\n", items.join("\n"));
-    }
-    out
+    trade_off::section(found)
 }
 
 fn data(report: &Report, run: &Run) -> String {
@@ -413,10 +376,10 @@ fn data(report: &Report, run: &Run) -> String {
     names.extend(report.histograms.as_ref().map(|_| "histograms.csv"));
     names.extend(run.summary.as_ref().map(|_| "stages.csv"));
     names.extend(report.trade_off.as_ref().map(|_| "trade_off.csv"));
-    let links: Vec<String> = names.iter().map(|name| format!("<a href=\"{name}\">{name}</a>")).collect();
+    names.extend(report.trade_off.as_ref().filter(|of| !of.knobs.is_empty()).map(|_| "knobs.csv"));
     format!(
         "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        links.join(", "),
+        links(&names),
         escape(&report.tool)
     )
 }

@@ -1,63 +1,168 @@
-//! The curves of a sweep: what quality costs in Gaussians, bytes, time and memory.
+//! The curves of a sweep: what quality costs in Gaussians, bytes, time and memory, and what more time buys.
 //!
-//! Data in: a [`TradeOff`]. Data out: charts as SVG, which need [`super::chart::STYLE`] around them.
+//! Data in: a [`TradeOff`]. Data out: charts as SVG, which need [`super::chart::STYLE`] around them, and pages with them.
 
 use super::chart::{Axis, Plot, Series};
-use crate::verbs::trade_off::{Point, TradeOff};
+use super::document::{document, figure_of, links, list};
+use super::html::{bytes, count, escape, figure, file_name};
+use crate::verbs::method::Method;
+use crate::verbs::trade_off::{Knob, Point, TradeOff};
+
+/// The page's name in the folder of a sweep.
+pub const PAGE: &str = "sweep.html";
 
 /// What a chart is about, and its SVG.
-pub type Chart = (&'static str, String);
+pub type Chart = (String, String);
 
 /// A coordinate of a point, if it is known.
 type Value<'a> = &'a dyn Fn(&Point) -> Option<f64>;
 
-/// Every curve of a sweep, a series per method in the order of its points.
+/// The page of a sweep, to lie beside its data.
+pub fn page(found: &TradeOff) -> String {
+    let mut files = vec!["sweep.json", "sweep.csv"];
+    files.extend((!found.knobs.is_empty()).then_some("knobs.csv"));
+    let body = format!(
+        "<header>\n<h1>What quality costs: {}</h1>\n</header>\n<section>\n{}</section>\n\
+         <p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
+        escape(file_name(&found.path)),
+        section(found),
+        links(&files),
+        escape(&found.tool)
+    );
+    document(&format!("{} – what quality costs", file_name(&found.path)), &body)
+}
+
+/// What was swept, the charts and the notes.
+pub(super) fn section(found: &TradeOff) -> String {
+    let runs = if found.runs > 1 { format!("; times are medians of {} runs", found.runs) } else { String::new() };
+    let paired = curves(found).iter().any(|curve| curve.paired);
+    let pair = if paired { " Hollow, in the same colour: the same method without refining." } else { "" };
+    let mut out = format!(
+        "<p class=\"note\">{}: {} Gaussians, {}; {} pictures, {} threads{runs}. Lines go from few Gaussians to \
+         many.{pair}</p>\n<div class=\"charts\">\n",
+        escape(&found.path),
+        count(found.gaussians),
+        bytes(found.bytes),
+        found.pictures,
+        found.threads
+    );
+    for (caption, svg) in charts(found) {
+        out += &figure_of(&caption, &svg);
+    }
+    out + "</div>\n" + &list(&found.notes)
+}
+
+/// Every curve of a sweep, a series per method in the order of its points, and every knob.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
-    let whole = found.gaussians.max(1) as f64;
-    let kept = |point: &Point| Some(100.0 * point.count as f64 / whole);
+    let curves = curves(found);
+    let kept = |point: &Point| Some(100.0 * found.fraction(point));
     let megabytes = |point: &Point| Some(point.bytes as f64 / 1e6);
-    let psnr = |point: &Point| Some(point.psnr);
-    let ssim = |point: &Point| Some(point.ssim);
-    let error = |point: &Point| Some(10f64.powf(-point.psnr / 20.0));
     let seconds = |point: &Point| Some(point.seconds);
     let memory = |point: &Point| point.peak_memory_bytes.map(|bytes| bytes as f64 / (1 << 20) as f64);
-    let linear = |label: &str| Axis { label: label.to_owned(), ..Axis::default() };
-    let log = |label: &str| Axis { label: label.to_owned(), log: true, from_zero: false };
-    let plot = |title: &'static str, x: Axis, y: Axis, of: [Value<'_>; 2], joined: bool| {
-        let series = methods(found)
-            .into_iter()
-            .map(|(name, points)| {
-                let mut points: Vec<(f64, f64)> = points.iter().filter_map(|p| Some((of[0](p)?, of[1](p)?))).collect();
-                points.sort_by(|a, b| a.0.total_cmp(&b.0));
-                Series { name: name.to_owned(), points, joined }
-            })
-            .collect();
-        (title, Plot { title: title.to_owned(), x, y, series }.svg())
+    let psnr = |point: &Point| Some(point.psnr);
+    let ssim = |point: &Point| Some(point.ssim);
+    let plot = |title: &str, x: Axis, y: Axis, of: [Value<'_>; 2], joined: bool| {
+        let series = curves.iter().map(|curve| Series {
+            name: curve.name.to_owned(),
+            points: curve.points.iter().filter_map(|p| Some((of[0](p)?, of[1](p)?))).collect(),
+            joined,
+            paired: curve.paired,
+            labels: Vec::new(),
+        });
+        (title.to_owned(), Plot { title: title.to_owned(), x, y, series: series.collect() }.svg())
     };
-    vec![
+    let mut charts = vec![
         plot("PSNR by kept Gaussians", linear("Gaussians kept, %"), linear("PSNR, dB"), [&kept, &psnr], true),
         plot("SSIM by kept Gaussians", linear("Gaussians kept, %"), linear("SSIM"), [&kept, &ssim], true),
         plot("PSNR by size", log("size, MB"), linear("PSNR, dB"), [&megabytes, &psnr], true),
-        plot("Error by run time", log("time to compress, s"), log("root mean square error"), [&seconds, &error], false),
-        plot("Error by memory", log("peak memory, MiB"), log("root mean square error"), [&memory, &error], false),
-    ]
+        plot("SSIM by size", log("size, MB"), linear("SSIM"), [&megabytes, &ssim], true),
+        plot("PSNR by run time", log("time to compress, s"), linear("PSNR, dB"), [&seconds, &psnr], true),
+        plot("SSIM by run time", log("time to compress, s"), linear("SSIM"), [&seconds, &ssim], true),
+    ];
+    charts.extend(found.knobs.iter().map(|knob| turned(knob, found)));
+    charts.push(plot("Error by memory", log("peak memory, MiB"), log(ERROR), [&memory, &|p| Some(error(p))], false));
+    charts
 }
 
-/// Points by method, as they come.
-fn methods(found: &TradeOff) -> Vec<(&str, Vec<&Point>)> {
-    let mut methods: Vec<(&str, Vec<&Point>)> = Vec::new();
+/// Error against run time as a parameter is turned, beside the same method without refining at that size.
+fn turned(knob: &Knob, found: &TradeOff) -> Chart {
+    let at = |point: &Point| (point.seconds, error(point));
+    let first = knob.settings.first().map(|setting| &setting.point);
+    let is_beside = |point: &&Point| {
+        let without = Method::ALL.into_iter().find(|method| method.name() == point.method);
+        let refined = without.and_then(Method::refined).map(Method::name);
+        first.is_some_and(|first| first.asked == point.asked && refined == Some(first.method.as_str()))
+    };
+    let mut series = vec![Series {
+        name: format!("{}, {} beside the marks", first.map_or("", |point| &point.method), knob.parameter),
+        points: knob.settings.iter().map(|setting| at(&setting.point)).collect(),
+        joined: true,
+        paired: false,
+        labels: knob.settings.iter().map(|setting| setting.value.to_string()).collect(),
+    }];
+    series.extend(found.points.iter().filter(is_beside).map(|point| Series {
+        name: point.method.clone(),
+        points: vec![at(point)],
+        paired: true,
+        ..Series::default()
+    }));
+    let kept = first.map_or(1.0, |point| found.fraction(point));
+    let title = format!("Error by run time, {}% kept, by {}", figure(100.0 * kept), knob.parameter);
+    let (x, y) = (log("time to compress, s"), log(ERROR));
+    (title.clone(), Plot { title, x, y, series }.svg())
+}
+
+/// Label of an axis of [`error`].
+const ERROR: &str = "root mean square error";
+
+/// Of colours from 0 to 1, as the mean PSNR has it.
+fn error(point: &Point) -> f64 {
+    10f64.powf(-point.psnr / 20.0)
+}
+
+fn linear(label: &str) -> Axis {
+    Axis { label: label.to_owned(), ..Axis::default() }
+}
+
+fn log(label: &str) -> Axis {
+    Axis { label: label.to_owned(), log: true, from_zero: false }
+}
+
+/// The points of a method.
+struct Curve<'a> {
+    name: &'a str,
+    /// By count, rising.
+    points: Vec<&'a Point>,
+    /// Whether it is what the method before it refines.
+    paired: bool,
+}
+
+/// Methods as they come, behind one that is there with and without refining: that pair has the solid look.
+fn curves(found: &TradeOff) -> Vec<Curve<'_>> {
+    let mut curves: Vec<Curve<'_>> = Vec::new();
     for point in &found.points {
-        match methods.iter_mut().find(|(name, _)| *name == point.method) {
-            Some((_, points)) => points.push(point),
-            None => methods.push((&point.method, vec![point])),
+        match curves.iter_mut().find(|curve| curve.name == point.method) {
+            Some(curve) => curve.points.push(point),
+            None => curves.push(Curve { name: &point.method, points: vec![point], paired: false }),
         }
     }
-    methods
+    curves.iter_mut().for_each(|curve| curve.points.sort_by_key(|point| point.count));
+    for (method, refined) in Method::ALL.into_iter().filter_map(|method| Some((method, method.refined()?))) {
+        let pair = [refined, method].map(Method::name);
+        if pair.iter().all(|&name| curves.iter().any(|curve| curve.name == name)) {
+            let place = |curve: &Curve<'_>| pair.iter().position(|&name| name == curve.name).unwrap_or(pair.len());
+            // Stable: the others stay in their order.
+            curves.sort_by_key(place);
+            curves[1].paired = true;
+        }
+    }
+    curves
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::verbs::trade_off::Setting;
 
     fn point(method: &str, count: usize, psnr: f64, peak_memory_bytes: Option<u64>) -> Point {
         let bytes = count as u64 * 248;
@@ -74,29 +179,66 @@ mod tests {
         }
     }
 
-    #[test]
-    fn every_point_that_is_known_is_drawn_once_in_its_methods_series() {
-        let found = TradeOff {
+    fn found(points: Vec<Point>, knobs: Vec<Knob>) -> TradeOff {
+        TradeOff {
             tool: String::new(),
-            path: String::new(),
+            path: "<b>/scene".to_owned(),
             digest: String::new(),
             gaussians: 100,
             bytes: 24_800,
             threads: 1,
             pictures: 3,
             cameras: String::new(),
-            points: vec![
-                point("random", 50, 20.0, None),
-                point("default", 50, 40.0, Some(1 << 20)),
-                point("random", 20, 15.0, Some(3 << 20)),
-            ],
+            runs: 3,
+            points,
+            knobs,
             notes: Vec::new(),
-        };
-        let charts = charts(&found);
-        let marks = |svg: &str| svg.matches("class=\"mark ").count();
+        }
+    }
+
+    fn marks(svg: &str) -> usize {
+        svg.matches("class=\"mark ").count()
+    }
+
+    #[test]
+    fn every_point_that_is_known_is_drawn_once_in_its_methods_series() {
+        let points = vec![
+            point("random", 50, 20.0, None),
+            point("default", 50, 40.0, Some(1 << 20)),
+            point("random", 20, 15.0, Some(3 << 20)),
+        ];
+        let charts = charts(&found(points, Vec::new()));
         // Two of every chart are the legend's.
-        assert_eq!(charts.iter().map(|chart| marks(&chart.1) - 2).collect::<Vec<_>>(), [3, 3, 3, 3, 2]);
+        assert_eq!(charts.iter().map(|chart| marks(&chart.1) - 2).collect::<Vec<_>>(), [3, 3, 3, 3, 3, 3, 2]);
         assert!(charts.iter().all(|chart| chart.1.contains(">random</text>")));
         assert_eq!(charts[0].1.matches("<polyline").count(), 1, "a single point has no line");
+    }
+
+    #[test]
+    fn a_method_and_the_same_without_refining_are_a_pair_in_any_order() {
+        let points = ["no-refine", "random", "default"].map(|name| point(name, 50, 30.0, None)).to_vec();
+        let all = found(points.clone(), Vec::new());
+        let drawn: Vec<(&str, bool)> = curves(&all).iter().map(|curve| (curve.name, curve.paired)).collect();
+        assert_eq!(drawn, [("default", false), ("no-refine", true), ("random", false)]);
+        let alone = found(points[..2].to_vec(), Vec::new());
+        assert!(curves(&alone).iter().all(|curve| !curve.paired));
+    }
+
+    #[test]
+    fn a_knob_is_drawn_with_its_values_beside_what_it_starts_from() {
+        let setting = |(value, psnr): (u32, f64)| Setting { value, point: point("default", 10, psnr, None) };
+        let settings = [(100, 20.0), (1500, 40.0)].map(setting).to_vec();
+        let knob = Knob { parameter: "refine_steps".to_owned(), settings };
+        let mut other_size = point("no-refine", 50, 30.0, None);
+        other_size.asked = Some(0.5);
+        let points = vec![point("no-refine", 10, 15.0, None), other_size, point("random", 10, 5.0, None)];
+        let found = found(points, vec![knob]);
+        let charts = charts(&found);
+        let (title, svg) = &charts[6];
+        assert_eq!(title, "Error by run time, 10% kept, by refine_steps");
+        assert_eq!(marks(svg), 2 + 3, "the legend's two, the knob's two and no-refine at this size: {svg}");
+        assert!(svg.contains(">100</text>") && svg.contains(">1500</text>"), "{svg}");
+        let page = page(&found);
+        assert!(page.contains("knobs.csv") && page.contains("medians of 3 runs") && !page.contains("<b>"), "{page}");
     }
 }

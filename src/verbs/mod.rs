@@ -6,6 +6,7 @@ pub(crate) mod csv;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluation;
+pub mod method;
 pub mod render;
 pub mod score;
 pub mod sweep;

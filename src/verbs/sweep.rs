@@ -1,5 +1,5 @@
-//! Trade-off curves: every method at every kept fraction, compressed as a user would and compared with
-//! the original on held-out pictures.
+//! Trade-off curves: every method at every kept fraction, and `default` at one of them with more and less time to
+//! refine, compressed as a user would and compared with the original on held-out pictures.
 //!
 //! Every point is a whole run, from opening the input to a result on the disk, so that its time and
 //! memory are those of that run alone; the result is deleted once it is measured. Memory: that of
@@ -9,120 +9,20 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use super::baseline::{Baseline, prune_by};
+use super::baseline::prune_by;
 use super::evaluate::{EvaluateOptions, evaluate};
-use super::trade_off::{Point, TradeOff};
+use super::method::{Means, Method, STEPS, refining_by};
+use super::trade_off::{Knob, Point, Setting, TradeOff};
 use crate::TOOL;
 use crate::budget::{peak_memory_bytes, reset_peak_memory};
-use crate::compress::{Only, Request, Target, compress};
+use crate::compress::{Request, Target, compress};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
-use crate::model::{Columns, Split};
-use crate::recipe::{Coverage, Groups, Recipe, StaticTerm};
+use crate::model::Split;
+use crate::report::trade_off::{PAGE, page};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, open_scene};
 use crate::stream::Progress;
-
-/// A way to make a model smaller.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Method {
-    /// Preset `default`.
-    Default,
-    /// Preset `default` that leaves what stays as it was.
-    NoRefine,
-    /// Preset `paper`: prunes and merges.
-    Paper,
-    /// Preset `paper` without merging.
-    PaperPrune,
-    /// Preset `paper` without pruning.
-    PaperMerge,
-    /// Prunes by visible contribution C alone.
-    Visible,
-    /// Prunes by projected coverage C alone.
-    Projected,
-    /// Prunes by opacity alone.
-    Opacity,
-    /// Prunes by size alone.
-    Scale,
-    /// Prunes at random.
-    Random,
-}
-
-impl Method {
-    /// Every method, ours first.
-    pub const ALL: [Method; 10] = [
-        Method::Default,
-        Method::NoRefine,
-        Method::Paper,
-        Method::PaperPrune,
-        Method::PaperMerge,
-        Method::Visible,
-        Method::Projected,
-        Method::Opacity,
-        Method::Scale,
-        Method::Random,
-    ];
-
-    /// As the command line and the results name it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Method::Default => "default",
-            Method::NoRefine => "no-refine",
-            Method::Paper => "paper",
-            Method::PaperPrune => "paper-prune",
-            Method::PaperMerge => "paper-merge",
-            Method::Visible => "visible",
-            Method::Projected => "projected",
-            Method::Opacity => "opacity",
-            Method::Scale => "scale",
-            Method::Random => "random",
-        }
-    }
-
-    /// How it compresses.
-    fn means(self) -> Result<Means> {
-        let unrefined = || {
-            let mut recipe = Recipe::preset("default")?;
-            recipe.refine.refine = Groups(Columns::empty());
-            Ok::<_, Error>(recipe)
-        };
-        let pruning = |coverage| {
-            let mut recipe = unrefined()?;
-            recipe.scan.coverage = coverage;
-            recipe.score.static_term = StaticTerm::Mean;
-            // S = C without clipping, so that no two Gaussians tie that differ in C.
-            recipe.score.w_dynamic = 0.0;
-            recipe.score.clip_norm = false;
-            recipe.select.round_fraction = 1.0;
-            recipe.select.choose_by_views = false;
-            Ok::<_, Error>(Means::Recipe(Box::new(recipe), Only::Prune))
-        };
-        let paper = |only| Ok(Means::Recipe(Box::new(Recipe::preset("paper")?), only));
-        match self {
-            Method::Default => Ok(Means::Recipe(Box::new(Recipe::preset("default")?), Only::Both)),
-            Method::NoRefine => Ok(Means::Recipe(Box::new(unrefined()?), Only::Both)),
-            Method::Paper => paper(Only::Both),
-            Method::PaperPrune => paper(Only::Prune),
-            Method::PaperMerge => paper(Only::Merge),
-            Method::Visible => pruning(Coverage::Visible),
-            Method::Projected => pruning(Coverage::Projected),
-            Method::Opacity => Ok(Means::Baseline(Baseline::Opacity)),
-            Method::Scale => Ok(Means::Baseline(Baseline::Scale)),
-            Method::Random => Ok(Means::Baseline(Baseline::Random)),
-        }
-    }
-
-    /// Whether it has a size of its own choice, by thresholds.
-    fn chooses_size(self) -> bool {
-        matches!(self, Method::Default | Method::NoRefine | Method::Paper | Method::PaperPrune | Method::PaperMerge)
-    }
-}
-
-/// How a method compresses.
-enum Means {
-    Recipe(Box<Recipe>, Only),
-    Baseline(Baseline),
-}
 
 /// What to sweep.
 #[derive(Debug, Clone)]
@@ -133,24 +33,32 @@ pub struct SweepOptions {
     pub methods: Vec<Method>,
     /// Kept fractions, in (0, 1].
     pub fractions: Vec<f64>,
+    /// Steps of refinement to run `default` with; 0 refines nothing.
+    pub steps: Vec<u32>,
+    /// Kept fraction of these, in (0, 1].
+    pub steps_at: f64,
+    /// Times to run every point, at least 1: the median time counts.
+    pub runs: usize,
     /// Compare on at most this many frames, evenly; none: all.
     pub max_frames: Option<usize>,
     /// Red, green, blue in [0, 1]; none: as `evaluate`.
     pub background: Option<[f32; 3]>,
-    /// Folder for `sweep.json`, `sweep.csv`.
+    /// Folder for `sweep.json`, `sweep.csv`, `knobs.csv` and the page.
     pub output: PathBuf,
     /// Replace an earlier folder.
     pub overwrite: Replace,
 }
 
-/// Runs every method at every fraction, and those that choose a size by themselves at that too. Scores by
-/// the training pictures, compares by the held-out ones.
+/// Runs every method at every fraction, and those that choose a size by themselves at that too; then `default` with
+/// every number of steps. Scores by the training pictures, compares by the held-out ones.
 ///
 /// # Errors
 /// Whatever is wrong with input, cameras, fractions or output. Nothing is left behind then.
 pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
-    if let Some(&odd) = options.fractions.iter().find(|&&fraction| !(fraction > 0.0 && fraction <= 1.0)) {
-        return Err(Error::usage(format!("--fractions: expected numbers above 0 and at most 1, found {odd}")));
+    for (flag, fractions) in [("--fractions", &options.fractions[..]), ("--steps-at", &[options.steps_at])] {
+        if let Some(odd) = fractions.iter().find(|&&fraction| !(fraction > 0.0 && fraction <= 1.0)) {
+            return Err(Error::usage(format!("{flag}: expected numbers above 0 and at most 1, found {odd}")));
+        }
     }
     if options.input.is_stream() {
         return Err(Error::usage("sweep reads its input many times: pack the stream first, then sweep the .gseq"));
@@ -162,6 +70,9 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     let mut fractions = options.fractions.clone();
     fractions.sort_unstable_by(|a, b| b.total_cmp(a));
     fractions.dedup();
+    let mut steps = options.steps.clone();
+    steps.sort_unstable();
+    steps.dedup();
 
     let (mut found, name) = start(options)?;
     let scratch = staged.path().join("point");
@@ -173,13 +84,23 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
             own.into_iter().chain(fractions.iter().copied().map(Some)).map(move |asked| (method, asked))
         })
         .collect();
-    let progress = Progress::new("sweep", "points", points.len() as u64);
+    let progress = Progress::new("sweep", "points", (points.len() + steps.len()) as u64);
     for (method, asked) in points {
         if !beyond_merging(method, asked, &found) {
-            let point = measure(options, method, asked, &scratch, name, &mut found)?;
+            let point = measure(options, method, asked, method.means()?, &scratch, name, &mut found)?;
             found.points.push(point);
         }
         progress.advance(1);
+    }
+    let mut settings = Vec::with_capacity(steps.len());
+    for value in steps {
+        let (method, asked) = (Method::Default, Some(options.steps_at));
+        let point = measure(options, method, asked, refining_by(value)?, &scratch, name, &mut found)?;
+        settings.push(Setting { value, point });
+        progress.advance(1);
+    }
+    if !settings.is_empty() {
+        found.knobs.push(Knob { parameter: STEPS.to_owned(), settings });
     }
     if let Some(least) = merged_alone(&found) {
         let name = Method::PaperMerge.name();
@@ -190,7 +111,11 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
         fs::write(&path, text).map_err(Error::io("write", &path))
     };
     write("sweep.csv", found.csv())?;
+    if !found.knobs.is_empty() {
+        write("knobs.csv", found.knobs_csv())?;
+    }
     write("sweep.json", found.json())?;
+    write(PAGE, page(&found))?;
     // By this a later run knows the folder as one that it may replace.
     write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
     staged.commit()?;
@@ -210,7 +135,9 @@ fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
         threads: rayon::current_num_threads(),
         pictures: 0,
         cameras: scene.rig.origin.clone(),
+        runs: options.runs.max(1),
         points: Vec::new(),
+        knobs: Vec::new(),
         notes: scene.notes,
     };
     Ok((found, name))
@@ -232,33 +159,42 @@ fn beyond_merging(method: Method, asked: Option<f64>, found: &TradeOff) -> bool 
     wanted.zip(merged_alone(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// One point: compresses to `name` in the new folder `scratch`, measures, deletes both.
+/// One point: compresses to `name` in the new folder `scratch` as often as is asked for, measures, deletes both.
 fn measure(
     options: &SweepOptions,
     method: Method,
     asked: Option<f64>,
+    means: Means,
     scratch: &Path,
     name: &str,
     found: &mut TradeOff,
 ) -> Result<Point> {
     let input = train(&options.input);
-    fs::create_dir(scratch).map_err(Error::io("create", scratch))?;
     let output = scratch.join(name);
-    let resets = reset_peak_memory();
-    let start = Instant::now();
     let target = asked.map(Target::Ratio);
-    let bytes = match method.means()? {
-        Means::Recipe(recipe, only) => {
-            let run = Request::new(input.clone(), output.clone(), *recipe);
-            compress(&Request { only, target, ..run })?.output_bytes
+    let clear = || fs::remove_dir_all(scratch).map_err(Error::io("remove", scratch));
+    let (mut bytes, mut seconds, mut peak) = (None, Vec::with_capacity(found.runs), None);
+    for run in 0..found.runs {
+        if run > 0 {
+            clear()?;
         }
-        Means::Baseline(baseline) => Some(prune_by(baseline, &input, target, &output)?),
-    };
-    let seconds = start.elapsed().as_secs_f64();
-    let peak_memory_bytes = if resets { peak_memory_bytes() } else { None };
+        fs::create_dir(scratch).map_err(Error::io("create", scratch))?;
+        let resets = reset_peak_memory();
+        let start = Instant::now();
+        bytes = match &means {
+            Means::Recipe(recipe, only) => {
+                let run = Request::new(input.clone(), output.clone(), (**recipe).clone());
+                compress(&Request { only: *only, target, ..run })?.output_bytes
+            }
+            Means::Baseline(baseline) => Some(prune_by(*baseline, &input, target, &output)?),
+        };
+        seconds.push(start.elapsed().as_secs_f64());
+        // None is less than any.
+        peak = peak.max(if resets { peak_memory_bytes() } else { None });
+    }
     let evaluation = evaluate(&EvaluateOptions {
         original: input,
-        compressed: output,
+        compressed: output.clone(),
         ground_truth: None,
         part: PictureSet::HeldOut,
         max_frames: options.max_frames,
@@ -267,7 +203,7 @@ fn measure(
         csv: None,
         overwrite: Replace::Never,
     })?;
-    fs::remove_dir_all(scratch).map_err(Error::io("remove", scratch))?;
+    clear()?;
     found.pictures = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(Point {
@@ -278,7 +214,25 @@ fn measure(
         psnr: means.psnr,
         ssim: means.ssim,
         temporal: means.temporal,
-        seconds,
-        peak_memory_bytes,
+        seconds: median(seconds),
+        peak_memory_bytes: peak,
     })
+}
+
+/// Of at least one value the one in the middle, or the mean of the two there.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_median_is_the_middle_of_any_number() {
+        for (values, expected) in [(vec![7.0], 7.0), (vec![9.0, 1.0], 5.0), (vec![9.0, 1.0, 2.0], 2.0)] {
+            assert_eq!(median(values), expected);
+        }
+    }
 }
