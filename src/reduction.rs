@@ -1,7 +1,7 @@
 //! What is left of an input: which Gaussians stay, which of them stand for several, and what was changed of them.
 
 use crate::model::{Column, Columns, Gaussians};
-use crate::recipe::Merge;
+use crate::recipe::{Merge, Precision};
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -110,13 +110,16 @@ pub struct Reduction {
     pub proxies: Proxies,
     /// What is added to their parameters.
     pub change: Change,
+    /// How the field that deforms them is written, where there is one.
+    pub field: Precision,
 }
 
 impl Reduction {
-    /// The Gaussians `kept` (increasing) as they are. Nothing is merged, so that nothing goes by `rule`.
+    /// The Gaussians `kept` (increasing) as they are, with their field. Nothing is merged, so that nothing goes by
+    /// `rule`.
     pub fn pruned(kept: Vec<u32>, rule: &Merge) -> Self {
         let (clusters, proxies, change) = (Vec::new(), Proxies::default(), Change::default());
-        Reduction { kept, clusters, rule: rule.clone(), proxies, change }
+        Reduction { kept, clusters, rule: rule.clone(), proxies, change, field: Precision::Exact }
     }
 
     /// Number of Gaussians in the output.
@@ -136,7 +139,7 @@ impl Reduction {
     pub fn pick(&self, places: &[u32]) -> Reduction {
         assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
         let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
-        Reduction { change: self.change.pick(places), ..Reduction::pruned(kept, &self.rule) }
+        Reduction { change: self.change.pick(places), field: self.field, ..Reduction::pruned(kept, &self.rule) }
     }
 
     /// For every Gaussian of an input of `count` its place in the output, if it has one.

@@ -35,7 +35,8 @@ fn kept_gaussians_are_untouched(workplace: &Workplace, model: &Path, preset: &st
     let name = format!("out_{preset}");
     let (input, output) = (model.display().to_string(), workplace.path(&name));
     let summary = workplace.summary(&format!(
-        "{input} --cameras {input} --split test -o {name} --preset {preset} --choose-by-views=false --no-refine"
+        "{input} --cameras {input} --split test -o {name} --preset {preset} --choose-by-views=false --no-refine \
+         --field exact"
     ));
     let map = index_map(&output.join("index_map.npy"));
     let members = members(&map);

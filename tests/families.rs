@@ -10,7 +10,7 @@ use splatsieve::emit::kind::OutputKind;
 use splatsieve::families::{self, Family, OpenOptions};
 use splatsieve::limits::Limits;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::recipe::Recipe;
+use splatsieve::recipe::{Precision, Recipe};
 use splatsieve::reduction::{Change, Cluster, Reduction, Reference};
 
 /// Opens `path`, at three times where it leaves them open.
@@ -88,6 +88,13 @@ fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_change
                 assert!(reduced != plain, "{of}: nothing changed");
                 let moved = |k: &usize| plain[0].position.row::<3>(*k) != reduced[0].position.row(*k);
                 assert_eq!((0..reduction.len()).find(|k| k % 3 != 0 && moved(k)), None, "{of}: a zero moved it");
+            }
+            if kind == OutputKind::Model {
+                let [exact, _] = both(&workplace, &*input, &reduction, kind);
+                reduction.field = Precision::Half;
+                let [reduced, written] = both(&workplace, &*input, &reduction, kind);
+                assert!(input.can_round_field().unwrap() && reduced != exact, "nothing was rounded");
+                assert!(reduced == written, "a field in half precision differs from what was promised");
             }
         }
     }

@@ -104,6 +104,10 @@ impl Emit {
                 per_gaussian.push(("members", CLUSTERED));
             }
         }
+        if self.kind == OutputKind::Model {
+            // A field's tensors as they are read and as they are stored.
+            fixed.push(("field", work.input.fixed));
+        }
         // Of a family that is solved only sequences take states; of others, merged ones are read part by part.
         let parts = match self.kind {
             OutputKind::Gseq if self.merges => work.gaussians.div_ceil(limits.gaussians_together as u64).max(1),

@@ -2,6 +2,7 @@
 
 use super::choose::Choose;
 use super::emit::Emit;
+use super::field::Field;
 use super::ids::parse_ids;
 use super::journal::Journal;
 use super::measure::{Measure, Outlook, Stages};
@@ -32,7 +33,9 @@ pub struct Job {
     pub choose: Option<Choose>,
     /// Moves what is stored of what is left.
     pub refine: Option<Refine>,
-    /// Finds the size, instead of the four before it.
+    /// Rounds the field of what is left.
+    pub field: Option<Field>,
+    /// Finds the size, instead of the five before it.
     pub search: Option<Search>,
     /// Writes.
     pub emit: Emit,
@@ -124,6 +127,8 @@ impl Job {
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
         let choose =
             || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
+        let emit = Emit::new(request, outlook.own_output, merges);
+        let field = Field::of(request, emit.kind);
         Ok(Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             prune: Prune { prunes, merges, target },
@@ -131,12 +136,14 @@ impl Job {
             choose: (looks && prunes && !cuts && !searches && recipe.select.choose_by_views).then(choose),
             search: match &request.goal {
                 Some(Goal::Quality(quality)) => {
-                    Some(Search { quality: quality.clone(), refine: refine.clone(), rule: recipe.merge.clone() })
+                    let (quality, rule) = (quality.clone(), recipe.merge.clone());
+                    Some(Search { quality, refine: refine.clone(), field: field.clone(), rule })
                 }
                 _ => None,
             },
             refine: refine.filter(|_| !searches),
-            emit: Emit::new(request, outlook.own_output, merges),
+            field: field.filter(|_| !searches),
+            emit,
             measure,
             has_cameras: outlook.has_cameras,
             spared,
@@ -200,6 +207,7 @@ impl Stages for Job {
         needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits));
         needs

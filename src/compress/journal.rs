@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use super::summary::{LeftOut, Stage};
+use super::summary::{FieldSummary, LeftOut, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::emit::atomic::Spill;
 use crate::error::Result;
@@ -20,6 +20,8 @@ pub struct Journal {
     pub left_out: Vec<LeftOut>,
     /// Things a person should know.
     pub notes: Vec<String>,
+    /// What was found about the field's precision.
+    pub field: Option<FieldSummary>,
 }
 
 impl Journal {

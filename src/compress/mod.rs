@@ -4,6 +4,7 @@
 mod arrival;
 mod choose;
 pub mod emit;
+mod field;
 mod ids;
 mod job;
 pub mod journal;
@@ -30,7 +31,7 @@ pub use request::{Goal, Only, Quality, Request, Target};
 use crate::TOOL;
 use crate::budget::{Workload, seconds};
 use crate::error::Result;
-use crate::recipe::Recipe;
+use crate::recipe::{Precision, Recipe};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 use crate::stream::begin_run;
@@ -109,7 +110,10 @@ fn reduce(
     let mut job = job.clone();
     if let Some(Goal::Bytes(most)) = request.goal {
         let of = Space { emit: &job.emit, most, recipe: recipe.len() as u64 };
-        let count = of.count(scene, &request.recipe.merge, &mut journal)?;
+        // A field that is to stay exact takes its room at the end.
+        let field = if job.field.is_some() { Precision::Half } else { Precision::Exact };
+        let like = Reduction { field, ..Reduction::pruned(Vec::new(), &request.recipe.merge) };
+        let count = of.count(scene, &like, &mut journal)?;
         job = job.again(request, Outlook::of(scene), count)?;
     }
     if let Some(search) = &job.search {
@@ -153,6 +157,7 @@ fn reduce(
         flags: scored.flags.clone(),
         merge,
         goal,
+        field: journal.field,
         left_out: journal.left_out,
         notes: journal.notes,
         planned_reads: scene.planned_reads,
@@ -193,6 +198,9 @@ fn of_size(
     if let Some(refine) = &job.refine {
         let wanted = wanted.min(outcome.reduction.len());
         outcome.reduction = refine.run(scene, scored, outcome.reduction, wanted, journal)?;
+    }
+    if let Some(field) = &job.field {
+        outcome.reduction = field.run(scene, outcome.reduction, journal)?;
     }
     if let Some(Goal::Bytes(most)) = request.goal {
         let of = Space { emit: &job.emit, most, recipe };

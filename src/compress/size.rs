@@ -4,7 +4,6 @@ use super::emit::Emit;
 use super::journal::Journal;
 use super::score::Scored;
 use crate::error::{Error, Result};
-use crate::recipe;
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 use crate::stream::{VIEWS_AT_ONCE, removal_error, spread};
@@ -29,16 +28,16 @@ pub(super) struct Space<'a> {
 }
 
 impl Space<'_> {
-    /// As many of all Gaussians as fit, of any of them.
+    /// As many of all Gaussians as fit, of any of them, with the rule and the field of `like`.
     ///
     /// # Errors
     /// Not even one fits; frames that cannot be read, a failed write.
-    pub(super) fn count(&self, scene: &Scene, rule: &recipe::Merge, journal: &mut Journal) -> Result<usize> {
+    pub(super) fn count(&self, scene: &Scene, like: &Reduction, journal: &mut Journal) -> Result<usize> {
         let (all, most) = (scene.source().info().count, self.most);
         journal.stage(NAME, all, scene.source(), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| (k * all / count) as u32).collect();
-                self.emit.bytes(scene, &Reduction::pruned(kept, rule), self.recipe)
+                self.emit.bytes(scene, &Reduction { kept, ..like.clone() }, self.recipe)
             };
             let one = 1.min(all);
             let least = bytes(one)?;
@@ -83,7 +82,7 @@ impl Space<'_> {
     ) -> Result<Reduction> {
         journal.stage(NAME, reduction.len(), scene.source(), |_| {
             let bytes = |reduction: &Reduction| self.emit.bytes(scene, reduction, self.recipe);
-            let empty = bytes(&Reduction::pruned(Vec::new(), &reduction.rule))?;
+            let empty = bytes(&reduction.pick(&[]))?;
             loop {
                 let found = bytes(&reduction)?;
                 if found <= self.most {

@@ -192,6 +192,35 @@ pub struct MergeSummary {
     pub deviation: Option<f64>,
 }
 
+/// What half precision of the field does to pictures of the result.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FieldSummary {
+    /// Whether the field is written in half precision.
+    pub half: bool,
+    /// Pictures that were compared.
+    pub pictures: usize,
+    /// Mean PSNR of pictures with the field in half precision against those with the exact field, dB.
+    #[serde(deserialize_with = "number")]
+    pub rounding: f64,
+    /// Mean PSNR of pictures with the exact field against the original's, dB; none where it did not matter.
+    pub result: Option<f64>,
+    /// What `rounding` was to be at least, dB.
+    #[serde(deserialize_with = "number")]
+    pub least: f64,
+}
+
+impl FieldSummary {
+    /// Why the field is as it is.
+    pub(super) fn why(&self) -> String {
+        let FieldSummary { pictures, rounding, result, least, .. } = self;
+        let result = result.map_or(String::new(), |result| format!(", {result:.1} dB from the original's to these"));
+        format!(
+            "{pictures} pictures with it are {rounding:.1} dB from those with the exact field{result}; \
+             at least {least:.1} dB were asked for"
+        )
+    }
+}
+
 /// Version of the schema: grows when a field changes its meaning or goes.
 pub const SCHEMA: u32 = 2;
 
@@ -225,6 +254,9 @@ pub struct Summary {
     /// What its size was found by, if by a quality.
     #[serde(default)]
     pub goal: Option<GoalSummary>,
+    /// What half precision does to the field that is written; none where it was not asked for.
+    #[serde(default)]
+    pub field: Option<FieldSummary>,
     /// What the scene did not need.
     pub left_out: Vec<LeftOut>,
     /// Things a person should know.
@@ -280,6 +312,9 @@ impl Summary {
         }
         if let Some(planned) = self.planned_reads {
             let _ = writeln!(out, "full reads of the input: {:.2}, planned at most {planned:.2}", self.full_reads());
+        }
+        if let Some(field) = self.field.as_ref().filter(|field| field.half) {
+            let _ = writeln!(out, "field: in half precision: {}", field.why());
         }
         for left in &self.left_out {
             let _ = writeln!(out, "  left out: {} ({})", left.what, left.why);

@@ -15,4 +15,5 @@ mod voxel;
 
 pub use deltas::Deltas;
 pub use field::{Field, FieldConfig, Prepared, Scratch};
+pub use planes::rows_before_zero;
 pub use tensors::{Tensor, Tensors};

@@ -17,6 +17,8 @@ use super::tensors::Lookup;
 const X: usize = 0;
 const Y: usize = 1;
 const Z: usize = 2;
+/// What the names of all planes begin with in the state dict; level and place follow.
+const GRIDS: &str = "deformation_net.grid.grids.";
 /// Axis pairs of the planes without time, as (place in the state dict, a, b).
 pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
 /// Places in the state dict of the planes (x,t), (y,t), (z,t).
@@ -113,6 +115,16 @@ pub(super) fn tap(u: f32, size: usize) -> Tap {
     Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
 }
 
+/// How many of the first rows, along its third extent, of a tensor of that name and `shape` no time from 0 on reads;
+/// 0 of what is no plane of time. Time is not mapped to [−1, 1], so about half of each such plane is never read.
+pub fn rows_before_zero(name: &str, shape: &[usize]) -> usize {
+    let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
+    match (place, shape) {
+        (Some(place), &[1, _, rows, _]) if rows > 0 && TEMPORAL.contains(&place) => tap(0.0, rows).low as usize,
+        _ => 0,
+    }
+}
+
 /// The two texels of a line that a tap lies between, and its fraction.
 #[inline(always)]
 pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
@@ -130,7 +142,7 @@ impl Planes {
         if factor.iter().any(|f: &f32| !f.is_finite()) {
             return Err(lookup.mismatch(AABB, "two corners that differ along every axis", format!("{aabb:?}")));
         }
-        let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
+        let name = |level: usize, plane: usize| format!("{GRIDS}{level}.{plane}");
         let mut levels = Vec::new();
         while levels.is_empty() || lookup.has(&name(levels.len(), 0)) {
             let level = levels.len();

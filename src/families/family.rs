@@ -107,6 +107,14 @@ pub trait Family: Send + Sync {
         Ok(Proxies::default())
     }
 
+    /// Whether a model of it has a field that can be written in half precision.
+    ///
+    /// # Errors
+    /// A field that cannot be read any more.
+    fn can_round_field(&self) -> Result<bool> {
+        Ok(false)
+    }
+
     /// The frames of what `reduction` leaves, as they will be once it is written.
     ///
     /// # Errors

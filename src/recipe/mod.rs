@@ -46,6 +46,8 @@ pub struct Recipe {
     pub merge: Merge,
     /// Everything that is stored of what is left.
     pub refine: Refine,
+    /// What deforms it.
+    pub field: Field,
 }
 
 /// Parameters of the pass over all frames.
@@ -190,6 +192,26 @@ pub struct Refine {
     pub refine_steps: u32,
     pub refine_cut_steps: u32,
     pub refine_ssim: f64,
+}
+
+/// Parameters of the deformation field that is written.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Field {
+    pub field: Precision,
+    pub field_margin: f64,
+}
+
+/// How a deformation field is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// As it was, byte for byte.
+    #[default]
+    Exact,
+    /// In IEEE 754 binary16.
+    Half,
 }
 
 /// Groups of stored values, by names that a person gives them: `colour,opacity,scale,rotation,position`, any of them, or
@@ -380,6 +402,7 @@ impl Recipe {
             ("merge.motion_noise", motion_noise, finite(motion_noise), "finite, 0 or more"),
             ("merge.max_drift", max_drift, nonnegative(max_drift), "0 or more"),
             ("merge.max_dead_time", max_dead_time, nonnegative(max_dead_time), "0 or more"),
+            ("field.field_margin", self.field.field_margin, finite(self.field.field_margin), "finite, 0 or more"),
             (
                 "merge.max_neighbors",
                 self.merge.max_neighbors as f64,

@@ -5,7 +5,7 @@ use super::baseline::Baseline;
 use crate::compress::Only;
 use crate::error::{Error, Result};
 use crate::model::Columns;
-use crate::recipe::{Coverage, Groups, Recipe, StaticTerm};
+use crate::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm};
 
 /// A way to make a model smaller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -80,6 +80,8 @@ impl Method {
         };
         let pruning = |coverage| {
             let mut recipe = unrefined()?;
+            // Pruning and nothing else.
+            recipe.field.field = Precision::Exact;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticTerm::Mean;
             // S = C without clipping, so that no two Gaussians tie that differ in C.

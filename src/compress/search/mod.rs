@@ -8,6 +8,7 @@
 mod gauge;
 
 use super::choose::CLUSTERED;
+use super::field::Field;
 use super::journal::Journal;
 use super::refine::targets::Targets;
 use super::refine::{CUT, Refine, Walk};
@@ -53,6 +54,8 @@ pub struct Search {
     pub quality: Quality,
     /// How a size is refined.
     pub refine: Option<Refine>,
+    /// How its field is rounded.
+    pub field: Option<Field>,
     /// Merging does not take part.
     pub rule: recipe::Merge,
 }
@@ -94,6 +97,7 @@ impl Search {
         };
         let mut need = refined.unwrap_or(looked);
         need.fixed.push(("compared", compared));
+        need.fixed.extend(self.field.as_ref().map(|_| ("field", work.input.fixed)));
         need.stage = NAME;
         (need.seconds, need.reads) = (4.0 * need.seconds, 4.0 * need.reads);
         need.per_gaussian.extend(ways);
@@ -140,6 +144,7 @@ impl Search {
             let (count, does) = (best.reduction.len(), self.spare(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
+            journal.field = best.journal.field;
             journal.notes.push(note(&summary, gauge.searched(), count, does));
             Ok(((best.reduction, summary), count))
         })
@@ -269,7 +274,7 @@ impl Way<'_> {
         let mut journal = Journal::default();
         let all = self.ranked.ranking.order().len();
         let prefix = |size: usize| Reduction::pruned(self.ranked.ranking.take(size), &self.search.rule);
-        let reduction = match (&self.search.refine, &mut self.walk) {
+        let mut reduction = match (&self.search.refine, &mut self.walk) {
             (Some(refine), Some(walk)) if size < all => {
                 let first = refine.first(size, self.scored.count()).min(all);
                 let cut = self.cuts.iter().rfind(|cut| first > size && cut.len() >= size);
@@ -285,6 +290,9 @@ impl Way<'_> {
             }
             _ => prefix(size),
         };
+        if let Some(field) = &self.search.field {
+            reduction = field.round(self.scene, reduction, &mut journal)?;
+        }
         let result = self.scene.input.reduced(&reduction)?;
         let value = self.search.value(self.gauge, &*result, self.scene, false)?;
         drop(result);

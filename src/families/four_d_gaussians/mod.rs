@@ -1,13 +1,14 @@
 //! 4DGaussians model folders as a family: a canonical cloud, and a field that deforms it.
 //!
-//! The result is a folder of the same layout with a smaller point cloud; the field and the configuration stay byte
-//! for byte as they were.
+//! The result is a folder of the same layout with a smaller point cloud. The configuration stays byte for byte as it
+//! was; so does the field, or its tensors keep their names and shapes and take fewer bytes.
 
 mod cfg_args;
 mod model_folder;
 mod proxies;
 mod pth;
 mod python_literal;
+mod small_field;
 
 use std::fs::{self, File};
 use std::io;
@@ -22,10 +23,11 @@ use crate::error::{Error, Result};
 use crate::ingest::ply::Ply;
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
-use crate::recipe::Merge;
+use crate::recipe::{Merge, Precision};
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
 pub use model_folder::ModelFolder;
+use pth::{is_floating, read_state_dict, write_state_dict};
 
 /// A model folder.
 pub(super) const ENTRY: Entry = Entry {
@@ -69,7 +71,7 @@ impl Family for ModelFolder {
             jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
             file: whole + 24,
             // Tensors as they are read and as they are used.
-            fixed: 2 * fs::metadata(&self.paths().deformation).map_or(0, |file| file.len()),
+            fixed: 2 * self.tensor_bytes(),
             frame_block: 0,
             gaussian_block: GAUSSIAN_BLOCK as u64,
             columns: 0,
@@ -112,7 +114,15 @@ impl Family for ModelFolder {
     }
 
     fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
-        Ok(Box::new(self.with_canonical(canonical_cloud(self, reduction))))
+        let model = self.with_canonical(canonical_cloud(self, reduction));
+        Ok(Box::new(match reduction.field {
+            Precision::Exact => model,
+            Precision::Half => model.rounded()?,
+        }))
+    }
+
+    fn can_round_field(&self) -> Result<bool> {
+        is_floating(&self.paths().deformation)
     }
 
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
@@ -123,7 +133,7 @@ impl Family for ModelFolder {
                 let folder = path.join("point_cloud").join(format!("iteration_{}", paths.iteration));
                 fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
                 copy(&paths.cfg_args, &path.join("cfg_args"))?;
-                copy(&paths.deformation, &folder.join("deformation.pth"))?;
+                self.write_field(reduction.field, &folder.join("deformation.pth"))?;
                 self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
                 if paths.deformation_table.is_some() || paths.deformation_accum.is_some() {
                     notes.push(
@@ -142,6 +152,18 @@ impl Family for ModelFolder {
 }
 
 impl ModelFolder {
+    /// Writes the field's state dict.
+    fn write_field(&self, precision: Precision, path: &Path) -> Result<()> {
+        let own = &self.paths().deformation;
+        match precision {
+            Precision::Exact => copy(own, path),
+            Precision::Half => {
+                let from_zero = self.info().times.iter().all(|&time| time >= 0.0);
+                write_state_dict(path, &small_field::stored(&read_state_dict(own)?, from_zero))
+            }
+        }
+    }
+
     /// Writes the canonical cloud of what is left with the properties and comments that the model's has.
     fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);

@@ -20,6 +20,7 @@ use crate::stream::{BLOCK, Parts, gather};
 
 use super::cfg_args::ModelConfig;
 use super::pth::read_state_dict;
+use super::small_field::rounded;
 use crate::ingest::digest::hash_file;
 use crate::ingest::ply::Ply;
 
@@ -110,6 +111,7 @@ pub struct ModelFolder {
     config: ModelConfig,
     canonical: Arc<Gaussians>,
     field: Arc<Field>,
+    tensor_bytes: u64,
     info: SequenceInfo,
     states: Count,
 }
@@ -120,10 +122,12 @@ impl ModelFolder {
     pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
         let tensors = read_state_dict(&paths.deformation)?;
+        let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
+        let tensor_bytes = (values * size_of::<f32>()) as u64;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
         let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
         let (canonical, field, states) = (Arc::new(canonical), Arc::new(field), Count::default());
-        Ok(ModelFolder { paths, config, canonical, field, info, states })
+        Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states })
     }
 
     /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
@@ -139,6 +143,16 @@ impl ModelFolder {
     pub fn with_canonical(&self, canonical: Gaussians) -> Self {
         let info = SequenceInfo { count: canonical.len(), ..self.info.clone() };
         ModelFolder { canonical: Arc::new(canonical), info, ..self.clone() }
+    }
+
+    /// The same model with the field that it has once that is stored in half precision.
+    ///
+    /// # Errors
+    /// A field that cannot be read any more.
+    pub(super) fn rounded(self) -> Result<Self> {
+        let (path, degree) = (&self.paths.deformation, self.info.sh_degree);
+        let field = Field::new(&rounded(read_state_dict(path)?), self.config.field(), degree, path)?;
+        Ok(ModelFolder { field: Arc::new(field), ..self })
     }
 
     /// The same model with frames at `times`.
@@ -179,6 +193,11 @@ impl ModelFolder {
     /// The deformation field.
     pub fn field(&self) -> &Field {
         &self.field
+    }
+
+    /// Bytes of the values of the field's tensors in single precision.
+    pub(super) fn tensor_bytes(&self) -> u64 {
+        self.tensor_bytes
     }
 
     fn time_of(&self, frame: usize) -> Result<f64> {

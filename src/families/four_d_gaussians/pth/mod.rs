@@ -1,18 +1,22 @@
-//! PyTorch state dicts (`.pth`): the file's tensors as f32. The pickle inside is read as data by
-//! `pytorch-reader`; nothing in it is executed.
+//! PyTorch state dicts (`.pth`): the file's tensors as f32, and files of such tensors. The pickle inside is read as data
+//! by `pytorch-reader`; nothing in it is executed.
+
+mod write;
 
 use std::fs;
 use std::io;
 use std::path::Path;
 
+use half::f16;
 use pytorch_reader::{DType, PytorchError, PytorchReader};
 
 use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result};
+pub(in crate::families) use write::{Stored, Values, write_state_dict};
 
 /// A view may repeat its storage (stride 0), so a small file can declare any number of values. No
 /// trained state dict stores less than a quarter of what it means.
-const MAX_EXPANSION: u64 = 4;
+pub(super) const MAX_EXPANSION: u64 = 4;
 
 /// Reads every floating-point tensor of the state dict at `path`, widened or rounded to f32. Integer and
 /// boolean tensors are left out.
@@ -23,11 +27,7 @@ const MAX_EXPANSION: u64 = 4;
 /// A file that is no state dict, is cut short or damaged, or declares more values than it can hold.
 pub(super) fn read_state_dict(path: &Path) -> Result<Tensors> {
     let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
-    let reader = PytorchReader::new(path).map_err(|error| match error {
-        PytorchError::Io(source) if is_system(&source) => Error::io("read", path)(source),
-        error => Error::input(path, "", "a state dict written by torch.save", error.to_string())
-            .hint("is the file complete? save the model again with torch.save(model.state_dict(), path)"),
-    })?;
+    let reader = open(path)?;
     let declared = reader.tensors().values().fold(0u64, |sum, tensor| sum.saturating_add(tensor.byte_len() as u64));
     if declared > file_bytes.saturating_mul(MAX_EXPANSION) {
         return Err(Error::input(
@@ -53,6 +53,22 @@ pub(super) fn read_state_dict(path: &Path) -> Result<Tensors> {
     Ok(tensors)
 }
 
+/// Whether every tensor of the state dict at `path` is one that [`read_state_dict`] reads.
+///
+/// # Errors
+/// A file that is no state dict.
+pub(super) fn is_floating(path: &Path) -> Result<bool> {
+    Ok(open(path)?.tensors().values().all(|tensor| decoder(tensor.dtype()).is_some()))
+}
+
+fn open(path: &Path) -> Result<PytorchReader> {
+    PytorchReader::new(path).map_err(|error| match error {
+        PytorchError::Io(source) if is_system(&source) => Error::io("read", path)(source),
+        error => Error::input(path, "", "a state dict written by torch.save", error.to_string())
+            .hint("is the file complete? save the model again with torch.save(model.state_dict(), path)"),
+    })
+}
+
 /// Whether the failure is the system's rather than the file's contents'.
 fn is_system(error: &io::Error) -> bool {
     !matches!(error.kind(), io::ErrorKind::InvalidData | io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidInput)
@@ -69,22 +85,9 @@ fn decoder(dtype: DType) -> Option<Decode> {
     match dtype {
         DType::F64 => Some(|bytes| each(bytes, |b| f64::from_ne_bytes(b) as f32)),
         DType::F32 => Some(|bytes| each(bytes, f32::from_ne_bytes)),
-        DType::F16 => Some(|bytes| each(bytes, |b| half_to_f32(u16::from_ne_bytes(b)))),
+        DType::F16 => Some(|bytes| each(bytes, |b| f16::from_ne_bytes(b).to_f32())),
         DType::BF16 => Some(|bytes| each(bytes, |b| f32::from_bits(u32::from(u16::from_ne_bytes(b)) << 16))),
         _ => None,
-    }
-}
-
-/// IEEE 754 binary16 to binary32, exactly.
-fn half_to_f32(half: u16) -> f32 {
-    let sign = if half >> 15 == 1 { -1.0 } else { 1.0 };
-    let exponent = i32::from(half >> 10 & 31);
-    let mantissa = f32::from(half & 1023);
-    sign * match exponent {
-        0 => mantissa * 2f32.powi(-24),
-        31 if mantissa == 0.0 => f32::INFINITY,
-        31 => f32::NAN,
-        _ => (1024.0 + mantissa) * 2f32.powi(exponent - 25),
     }
 }
 
