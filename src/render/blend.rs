@@ -79,6 +79,8 @@ fn samples(start: u32, size: u32, stride: u32) -> ([f32; SIDE], usize) {
 pub(super) struct Stroke<V> {
     /// Cut at 0.99.
     pub(super) alpha: V,
+    /// Mask of the pixels where it is blended.
+    pub(super) blended: V,
     /// alpha · transmittance; 0 where it is not blended.
     pub(super) weight: V,
     /// Transmittance behind it, never 0; where the weight is 0, it may be negative.
@@ -260,7 +262,7 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
             if left.signs() == (1 << LANES) - 1 {
                 live &= !(1 << group);
             }
-            let stroke = Stroke { alpha, weight, left, across: dx, down: downs[group % SIDE] };
+            let stroke = Stroke { alpha, blended, weight, left, across: dx, down: downs[group % SIDE] };
             drop = ink.add::<V>(drop, group, stroke);
         }
         ink.end::<V>(drop, pair);

@@ -154,6 +154,10 @@ impl Block {
         let mut parts = [[0.0f32; BLOCK]; 11];
         let Block { p, first, second, .. } = self;
         for i in 0..n {
+            // Invisible or hidden: in f64 and one by one, this is the dearest part of a Gaussian's gradient.
+            if [p[i], first[0][i], first[1][i], second[0][i], second[1][i], second[2][i]] == [0.0; 6] {
+                continue;
+            }
             let taken = Taken::new(
                 [position[0][i], position[1][i], position[2][i]],
                 [rotation[0][i], rotation[1][i], rotation[2][i], rotation[3][i]],

@@ -12,6 +12,9 @@ use super::super::lanes::{LANES, Lanes};
 use super::super::project::Splat;
 use super::super::renderer::Image;
 
+/// The largest alpha that was not cut.
+const UNCUT: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
+
 /// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
 ///
 /// With p = alpha · ∂L/∂alpha and a pixel's offset (s, t) in standard deviations: t along v from the splat's centre, s
@@ -102,7 +105,7 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
     }
     #[inline(always)]
     fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Stroke<V>) -> Walked<V> {
-        let Stroke { alpha, weight, left, across, down } = stroke;
+        let Stroke { alpha, blended, weight, across, down, .. } = stroke;
         let pixel: [V; 3] = std::array::from_fn(|c| V::load(&self.pull.pixel[c][group]));
         for (taken, pixel) in walked.taken.iter_mut().zip(pixel) {
             *taken = taken.add(weight.mul(pixel));
@@ -115,9 +118,11 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
         let own = weight.mul(own);
         let rest = V::load(&self.pull.rest[group]).sub(own);
         rest.store(&mut self.pull.rest[group]);
-        // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing.
-        let p = own.sub(weight.div(left).mul(rest));
-        let p = alpha.at_least(V::splat(MAX_ALPHA)).select(V::splat(0.0), p);
+        // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing. The division waits
+        // for alpha alone.
+        let odds = alpha.div(V::splat(1.0).sub(alpha));
+        let moves = blended.and(V::splat(UNCUT).at_least(alpha));
+        let p = own.sub(odds.mul(rest)).and(moves);
         let down = V::splat(down);
         let (px, py) = (p.mul(across), p.mul(down));
         walked.p = walked.p.add(p);
