@@ -40,16 +40,26 @@ def peak(summary):
     return max(stage["peak_memory_bytes"] or 0 for stage in summary["stages"]) / 2**20
 
 
+def sizes(before, after):
+    """Megabytes, and the part that is left."""
+    return f"{before / 1e6:.1f} → {after / 1e6:.1f} ({100 * after / before:.0f}%)" if before else f"{after / 1e6:.1f}"
+
+
 def row(binary, model, preset, output):
     summary = run(binary, "compress", model, "--cameras", model, "--preset", preset, "-o", output, "--json")
     quality = evaluated(binary, model, output, model)
     before, after = summary["input"]["gaussians"], summary["gaussians"]
-    size = f"{summary['input']['bytes'] / 1e6:.1f} → {summary['output_bytes'] / 1e6:.1f} MB"
+    whole = sizes(summary["input"]["bytes"], summary["output_bytes"])
+    parts = [
+        f"{part} {sizes(summary['input']['size'][part], summary['output_size'][part])}"
+        for part in ("cloud", "field", "frames")
+        if summary["input"]["size"][part] or summary["output_size"][part]
+    ]
     seconds = sum(stage["seconds"] for stage in summary["stages"])
     photos = photographs(quality)
     photos = f"{photos[0]:.2f} → {photos[1]:.2f}" if photos else "–"
     return (
-        f"| {model.name} | {preset} | {before} → {after} ({100 * after / before:.0f}%) | {size} "
+        f"| {model.name} | {preset} | {before} → {after} ({100 * after / before:.0f}%) | {whole} | {', '.join(parts)} "
         f"| {quality['psnr']:.1f} / {quality['ssim']:.4f} | {photos} | {seconds:.1f} s | {peak(summary):.0f} MiB |"
     )
 
@@ -60,8 +70,8 @@ def main():
         sys.exit(2)
     binary, data = sys.argv[1], Path(sys.argv[2])
     presets = sys.argv[3:] or ["default", "paper", "gentle", "strong"]
-    print("| model | preset | Gaussians | whole model | PSNR dB / SSIM to the original | PSNR dB to photographs | time | peak memory |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| model | preset | Gaussians | whole model, MB | of it | PSNR dB / SSIM to the original | PSNR dB to photographs | time | peak memory |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for model in sorted(path.parent for path in data.glob("*/cfg_args")):
         for preset in presets:
             with tempfile.TemporaryDirectory() as folder:

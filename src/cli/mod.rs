@@ -123,11 +123,12 @@ fn run(cli: Cli) -> Result<()> {
             let packed = container::pack(&input, &args.output, compression, args.earlier.replace())?;
             notes(&packed.notes);
             print(&format!(
-                "{}: {} Gaussians x {} frames in {} bytes\n",
+                "{}: {} Gaussians x {} frames in {} bytes\n{}",
                 args.output.display(),
                 packed.gaussians,
                 packed.frames,
-                packed.bytes
+                packed.bytes,
+                packed.larger.map_or(String::new(), |why| format!("  {why}\n"))
             ))
         }
         Verb::Info(args) => {

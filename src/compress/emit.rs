@@ -14,7 +14,7 @@ use crate::emit::container::FRAME_BLOCK;
 use crate::emit::index_map::write_index_map;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
-use crate::families::Family;
+use crate::families::{Family, Size};
 use crate::limits::Limits;
 use crate::model::Columns;
 use crate::reduction::Reduction;
@@ -135,11 +135,11 @@ impl Emit {
         }
         scene.input.write(reduction, self.kind, &path, &scene.limits)?;
         let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
-        Ok(bytes_below(&path)? + beside)
+        Ok(scene.input.size_written(self.kind, &path)?.whole() + beside)
     }
 
     /// Writes the result and what goes beside it; everything appears under its name at the end, a file
-    /// before its companions and the summary, which says that all is there, last. `summarise` is told the bytes of the
+    /// before its companions and the summary, which says that all is there, last. `summarise` is told the size of the
     /// result.
     ///
     /// # Errors
@@ -150,23 +150,24 @@ impl Emit {
         reduction: &Reduction,
         recipe: &str,
         mut journal: Journal,
-        summarise: impl FnOnce(Journal, u64) -> Summary,
+        summarise: impl FnOnce(Journal, Size) -> Summary,
     ) -> Result<Summary> {
         let map = reduction.index_map(scene.source().info().count);
-        let mut write = |path: &Path| -> Result<u64> {
+        let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, reduction.len(), scene.source(), |journal| {
                 let notes = scene.input.write(reduction, self.kind, path, &scene.limits)?;
-                journal.notes.extend(notes);
-                Ok((bytes_below(path)?, reduction.len()))
+                let size = scene.input.size_written(self.kind, path)?;
+                journal.notes.extend(notes.into_iter().chain(size.why_larger_than(&scene.input.size()?)));
+                Ok((size, reduction.len()))
             })
         };
         let target = self.output.as_path();
         if self.kind.is_folder() {
             let staged = StagedFolder::new(target, self.overwrite)?;
-            let bytes = write(staged.path())?;
+            let size = write(staged.path())?;
             write_text(&staged.path().join(RECIPE), recipe)?;
             write_index_map(&map, &staged.path().join(INDEX_MAP))?;
-            let summary = summarise(journal, bytes);
+            let summary = summarise(journal, size);
             write_text(&staged.path().join(MARKER), &summary.json())?;
             staged.commit()?;
             return Ok(summary);
@@ -174,10 +175,10 @@ impl Emit {
         let staged = StagedFile::new(target, self.overwrite)?;
         let companion = |name| StagedFile::new(&beside(target, false, name), self.overwrite);
         let (recipe_file, index_map, marker) = (companion(RECIPE)?, companion(INDEX_MAP)?, companion(MARKER)?);
-        let bytes = write(staged.path())?;
+        let size = write(staged.path())?;
         write_text(recipe_file.path(), recipe)?;
         write_index_map(&map, index_map.path())?;
-        let summary = summarise(journal, bytes);
+        let summary = summarise(journal, size);
         write_text(marker.path(), &summary.json())?;
         commit_files(&[staged, recipe_file, index_map, marker])?;
         Ok(summary)
@@ -193,21 +194,11 @@ pub fn write_alone(input: &dyn Family, reduction: &Reduction, kind: OutputKind, 
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
     input.write(reduction, kind, path, &Limits::NONE)?;
-    bytes_below(path)
+    Ok(input.size_written(kind, path)?.whole())
 }
 
 fn write_text(path: &Path, text: &str) -> Result<()> {
     fs::write(path, text).map_err(Error::io("write", path))
-}
-
-/// Bytes of a file, or of all files below a folder.
-fn bytes_below(path: &Path) -> Result<u64> {
-    let found = fs::metadata(path).map_err(Error::io("read", path))?;
-    if !found.is_dir() {
-        return Ok(found.len());
-    }
-    let entries = fs::read_dir(path).map_err(Error::io("list", path))?;
-    entries.map(|entry| bytes_below(&entry.map_err(Error::io("list", path))?.path())).sum()
 }
 
 #[cfg(test)]
@@ -219,15 +210,5 @@ mod tests {
         assert_eq!(beside(Path::new("a/small"), true, "summary.json"), Path::new("a/small/summary.json"));
         assert_eq!(beside(Path::new("a/small.ply"), false, "summary.json"), Path::new("a/small.ply.summary.json"));
         assert_eq!(beside(Path::new("small.gseq"), false, "summary.json"), Path::new("small.gseq.summary.json"));
-    }
-
-    #[test]
-    fn the_bytes_of_a_folder_are_those_of_all_its_files() {
-        let folder = tempfile::tempdir().unwrap();
-        fs::create_dir(folder.path().join("a")).unwrap();
-        fs::write(folder.path().join("a/b"), [0; 7]).unwrap();
-        fs::write(folder.path().join("c"), [0; 5]).unwrap();
-        assert_eq!(bytes_below(folder.path()).unwrap(), 12);
-        assert_eq!(bytes_below(&folder.path().join("c")).unwrap(), 5);
     }
 }

@@ -31,6 +31,7 @@ pub use request::{Goal, Only, Quality, Request, Target};
 use crate::TOOL;
 use crate::budget::{Workload, seconds};
 use crate::error::Result;
+use crate::families::Size;
 use crate::recipe::{Precision, Recipe};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
@@ -145,13 +146,14 @@ fn reduce(
     job.write_down(request, &mut journal);
 
     let map = reduction.index_map(scene.source().info().count);
-    let summarise = |journal: Journal, output_bytes: Option<u64>| Summary {
+    let summarise = |journal: Journal, output: Option<Size>| Summary {
         schema: summary::SCHEMA,
         files: Vec::new(),
         tool: TOOL.to_owned(),
         cameras: CameraSummary::of(scene),
         gaussians: reduction.len(),
-        output_bytes,
+        output_bytes: output.map(|size| size.whole()),
+        output_size: output,
         selection: scored.selection.counts,
         terms: scored.term_summaries(),
         flags: scored.flags.clone(),
@@ -168,7 +170,7 @@ fn reduce(
         journal.notes.push("dry run: nothing was written".to_owned());
         return Ok((summarise(journal, None), map));
     }
-    let written = |journal, bytes| summarise(journal, Some(bytes));
+    let written = |journal, size| summarise(journal, Some(size));
     Ok((job.emit.run(scene, &reduction, &recipe, journal, written)?, map))
 }
 

@@ -10,7 +10,8 @@ use std::path::Path;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::error::Result;
-use crate::families::Family;
+use crate::families::size::of;
+use crate::families::{Family, Size};
 use crate::merge::PassCounts;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
@@ -85,8 +86,11 @@ pub struct InputSummary {
     pub sh_degree: usize,
     /// Columns that differ between frames.
     pub varying: Vec<String>,
-    /// Bytes of everything the model consists of, or that arrived of a stream.
+    /// Bytes of everything that a renderer opens of the model, or that arrived of a stream.
     pub bytes: u64,
+    /// The same by part.
+    #[serde(default)]
+    pub size: Option<Size>,
 }
 
 impl InputSummary {
@@ -105,6 +109,7 @@ impl InputSummary {
             sh_degree: info.sh_degree,
             varying: info.varying.iter().map(|column| column.name().to_owned()).collect(),
             bytes: input.bytes()?,
+            size: Some(input.size()?),
         })
     }
 }
@@ -222,7 +227,7 @@ impl FieldSummary {
 }
 
 /// Version of the schema: grows when a field changes its meaning or goes.
-pub const SCHEMA: u32 = 2;
+pub const SCHEMA: u32 = 3;
 
 /// A run from input to output.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -237,8 +242,11 @@ pub struct Summary {
     pub cameras: CameraSummary,
     /// Gaussians in the output.
     pub gaussians: usize,
-    /// Bytes of everything the output's model consists of; none for a dry run.
+    /// Bytes of everything that a renderer opens of the output; none for a dry run.
     pub output_bytes: Option<u64>,
+    /// The same by part.
+    #[serde(default)]
+    pub output_size: Option<Size>,
     /// Stages 1 and 2.
     pub selection: Counts,
     /// Full reads of the input that the plan named at most; none where nothing was planned.
@@ -325,12 +333,10 @@ impl Summary {
         let percent = 100.0 * self.gaussians as f64 / input.gaussians.max(1) as f64;
         let _ = write!(out, "{} of {} Gaussians ({percent:.1}%)", self.gaussians, input.gaussians);
         if let Some(bytes) = self.output_bytes {
-            let _ = write!(
-                out,
-                ", {bytes} of {} bytes ({:.1}%)",
-                input.bytes,
-                100.0 * bytes as f64 / input.bytes.max(1) as f64
-            );
+            let _ = write!(out, "; bytes: {}", of(bytes, input.bytes));
+        }
+        if let (Some(after), Some(before)) = (&self.output_size, &input.size) {
+            let _ = write!(out, ": {}", after.parts_of(before));
         }
         out.push('\n');
         out

@@ -2,7 +2,8 @@
 
 use gseq::{Encoding, Reader, TileId};
 
-use super::family::{ColumnInfo, Entry, Family, Residence, Timing, bytes_of};
+use super::family::{ColumnInfo, Entry, Family, Residence, Timing};
+use super::size::bytes_of;
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::source::FrameSource;

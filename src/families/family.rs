@@ -1,10 +1,10 @@
 //! What a kind of input can do.
 
-use std::fs;
 use std::path::Path;
 
 use serde::Serialize;
 
+use super::size::{Size, bytes_below};
 use super::trajectories::{OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
@@ -32,11 +32,28 @@ pub trait Family: Send + Sync {
     /// A file that cannot be read.
     fn digest(&self) -> Result<String>;
 
-    /// Bytes of everything the model consists of; of a stream, those that arrived.
+    /// Bytes of everything that a renderer opens of the model; of a stream, those that arrived.
     ///
     /// # Errors
     /// A file that is not there any more.
     fn bytes(&self) -> Result<u64>;
+
+    /// The same by part.
+    ///
+    /// # Errors
+    /// Those of [`Family::bytes`].
+    fn size(&self) -> Result<Size> {
+        Ok(Size::of_frames(self.bytes()?))
+    }
+
+    /// Bytes, by part, of what [`Family::write`] wrote to `path` as a result of `kind`, with nothing beside it yet.
+    ///
+    /// # Errors
+    /// A file that is not there any more.
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        let _ = kind;
+        Ok(Size::of_frames(bytes_below(path)?))
+    }
 
     /// Bytes of the files that its frames are read from.
     ///
@@ -259,9 +276,4 @@ impl OpenOptions {
             None => Ok(()),
         }
     }
-}
-
-/// Sum of the sizes of files, bytes.
-pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
-    paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
 }

@@ -6,6 +6,7 @@ mod container;
 mod family;
 mod four_d_gaussians;
 mod ply_sequence;
+pub mod size;
 pub mod stream;
 pub mod trajectories;
 
@@ -15,6 +16,7 @@ use std::path::Path;
 
 pub use family::{ColumnInfo, Family, OpenOptions, Residence, Timing};
 pub use four_d_gaussians::ModelFolder;
+pub use size::Size;
 
 use crate::error::{Error, Result};
 use family::{Entry, Found};

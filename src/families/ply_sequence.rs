@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use super::family::{Entry, Family, OpenOptions, Residence, Timing, bytes_of};
+use super::family::{Entry, Family, OpenOptions, Residence, Timing};
+use super::size::bytes_of;
 use super::trajectories::{merged, state_bytes, write_trajectories};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;

@@ -10,7 +10,8 @@ use super::run::Run;
 use super::shown::Shown;
 use super::trade_off;
 use crate::compress::summary::{Stage, Summary};
-use crate::verbs::evaluation::{Comparison, FrameMeans, Means, ViewMeans};
+use crate::families::Size;
+use crate::verbs::evaluation::{Both, Comparison, FrameMeans, Means, ViewMeans};
 
 /// What moves the slider.
 const SCRIPT: &str = include_str!("page.js");
@@ -68,6 +69,9 @@ fn header(report: &Report) -> String {
         bytes(sizes.compressed),
         from(bytes(sizes.original), sizes.compressed as f64, sizes.original as f64),
     );
+    for (part, before, after) in size_parts(&found.size) {
+        out += &card(part, bytes(after), from(bytes(before), after as f64, before as f64));
+    }
     let mean = found.loss.overall;
     out += &card("PSNR to the original", db(mean.psnr), format!("worst frame {}", db(worst(|m| m.psnr))));
     out += &card("SSIM to the original", format!("{:.4}", mean.ssim), format!("worst frame {:.4}", worst(|m| m.ssim)));
@@ -290,6 +294,14 @@ fn stages(run: &Run) -> String {
     let mib = |stage: &Stage| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
     out += &figure_of("Largest memory up to the end of each stage", &stage_bars(summary, "MiB", mib));
     out + "</div>\n"
+}
+
+/// Parts that both models have, if they have several: name, bytes before, bytes after.
+fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
+    let parts = size.original.named().into_iter().zip(size.compressed.named());
+    let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
+    let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > 0).collect();
+    if both.len() > 1 { both } else { Vec::new() }
 }
 
 fn stage_bars(summary: &Summary, label: &str, value: impl Fn(&Stage) -> Option<f64>) -> String {

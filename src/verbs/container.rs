@@ -19,7 +19,7 @@ use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::families::stream::pack_stream;
 use crate::families::trajectories::write_sequence;
-use crate::families::{self, ColumnInfo, Family, OpenOptions, Timing};
+use crate::families::{self, ColumnInfo, Family, OpenOptions, Size, Timing};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::Limits;
@@ -37,6 +37,8 @@ pub struct Packed {
     pub frames: usize,
     /// Size of the container.
     pub bytes: u64,
+    /// Why that is more than its input has, if it is; of a stream nobody knows.
+    pub larger: Option<String>,
     /// Things a person should know.
     pub notes: Vec<String>,
 }
@@ -54,7 +56,7 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
         let (gaussians, frames) = (container.info().count, container.info().times.len());
         let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
         staged.commit()?;
-        return Ok(Packed { gaussians, frames, bytes, notes: Vec::new() });
+        return Ok(Packed { gaussians, frames, bytes, larger: None, notes: Vec::new() });
     }
     let opened = open_input(input)?;
     let source = opened.input.source();
@@ -68,7 +70,8 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let info = opened.input.source().info();
-    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, notes: opened.notes })
+    let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
+    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, larger, notes: opened.notes })
 }
 
 /// Writes any input as a frame stream; gives the input.
@@ -182,7 +185,7 @@ impl Info {
     pub fn text(&self) -> String {
         let input = &self.input;
         let mut out = format!(
-            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes, digest {}\n",
+            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes{}, digest {}\n",
             input.path,
             input.kind,
             input.gaussians,
@@ -196,6 +199,7 @@ impl Info {
             },
             if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
             input.bytes,
+            input.size.map_or(String::new(), |size| format!(": {}", size.parts())),
             input.digest,
         );
         for column in &self.columns {

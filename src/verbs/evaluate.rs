@@ -161,11 +161,13 @@ impl SideBySide {
         let count = |input: &dyn Family| input.source().info().count;
         let path =
             Both { original: scene.path.display().to_string(), compressed: self.compressed_path.display().to_string() };
+        let size = Both { original: scene.input.size()?, compressed: self.compressed.size()? };
         let evaluation = Evaluation {
             tool: TOOL.to_owned(),
             path,
             count: Both { original: count(&*scene.input), compressed: count(&*self.compressed) },
-            bytes: Both { original: scene.input.bytes()?, compressed: self.compressed.bytes()? },
+            bytes: Both { original: size.original.whole(), compressed: size.compressed.whole() },
+            size,
             cameras: CameraSummary {
                 origin: scene.rig.origin.clone(),
                 cameras: self.pictures.iter().map(|picture| picture.camera).collect::<HashSet<_>>().len(),
@@ -174,7 +176,7 @@ impl SideBySide {
             background: self.background,
             loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
             ground_truth,
-            notes: scene.notes.clone(),
+            notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             pictures: scores,
         };
         Ok((evaluation, observed))

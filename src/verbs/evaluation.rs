@@ -10,6 +10,8 @@ use serde::Serialize;
 
 use super::csv::{known, table};
 use crate::compress::summary::CameraSummary;
+use crate::families::Size;
+use crate::families::size::of;
 
 /// One value for the model before compression and one for the model after it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -120,8 +122,10 @@ pub struct Evaluation {
     pub path: Both<String>,
     /// Gaussians.
     pub count: Both<usize>,
-    /// Bytes of everything a model consists of.
+    /// Bytes of everything that a renderer opens of a model.
     pub bytes: Both<u64>,
+    /// The same by part.
+    pub size: Both<Size>,
     /// From where they were looked at.
     pub cameras: CameraSummary,
     /// Red, green, blue behind the scene.
@@ -188,11 +192,15 @@ impl Evaluation {
         let Both { original, compressed } = self.count;
         let percent = 100.0 * compressed as f64 / original.max(1) as f64;
         // Writing to a String cannot fail.
-        let _ = writeln!(out, "{}: {original} Gaussians in {} bytes", self.path.original, self.bytes.original);
+        let (before, after) = (self.size.original, self.size.compressed);
+        let _ =
+            writeln!(out, "{}: {original} Gaussians; {} bytes: {}", self.path.original, before.whole(), before.parts());
         let _ = writeln!(
             out,
-            "{}: {compressed} Gaussians ({percent:.1}%) in {} bytes",
-            self.path.compressed, self.bytes.compressed
+            "{}: {compressed} Gaussians ({percent:.1}%); bytes: {}: {}",
+            self.path.compressed,
+            of(after.whole(), before.whole()),
+            after.parts_of(&before)
         );
         let frames = self.loss.per_frame.len();
         let _ = writeln!(out, "{} pictures of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
@@ -277,6 +285,7 @@ mod tests {
             path: Both { original: String::new(), compressed: String::new() },
             count: Both { original: 0, compressed: 0 },
             bytes: Both { original: 0, compressed: 0 },
+            size: Both { original: Size::default(), compressed: Size::default() },
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
             loss: Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap(),

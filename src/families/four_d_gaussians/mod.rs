@@ -14,7 +14,8 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use super::family::{Entry, Family, Residence, Timing, bytes_of};
+use super::family::{Entry, Family, Residence, Timing};
+use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
@@ -52,10 +53,24 @@ impl Family for ModelFolder {
     }
 
     fn bytes(&self) -> Result<u64> {
+        Ok(self.size()?.whole())
+    }
+
+    /// Without `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no result has them.
+    fn size(&self) -> Result<Size> {
         let paths = self.paths();
-        let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
-        let all = [&paths.point_cloud, &paths.deformation, &paths.cfg_args].into_iter().chain(training);
-        bytes_of(all.map(PathBuf::as_path))
+        size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind {
+            OutputKind::Model => {
+                let folder = iteration_folder(path, self.paths().iteration);
+                size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
+            }
+            OutputKind::Ply => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            OutputKind::Gseq | OutputKind::PlySequence => Ok(Size::of_frames(bytes_below(path)?)),
+        }
     }
 
     fn residence(&self) -> Residence {
@@ -130,16 +145,18 @@ impl Family for ModelFolder {
         let paths = self.paths();
         match kind {
             OutputKind::Model => {
-                let folder = path.join("point_cloud").join(format!("iteration_{}", paths.iteration));
+                let folder = iteration_folder(path, paths.iteration);
                 fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
                 copy(&paths.cfg_args, &path.join("cfg_args"))?;
                 self.write_field(reduction.field, &folder.join("deformation.pth"))?;
                 self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
-                if paths.deformation_table.is_some() || paths.deformation_accum.is_some() {
-                    notes.push(
-                        "deformation_table.pth and deformation_accum.pth, which only training reads, were left out"
-                            .to_owned(),
-                    );
+                let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
+                let bytes = bytes_of(training.map(PathBuf::as_path))?;
+                if bytes > 0 {
+                    notes.push(format!(
+                        "deformation_table.pth and deformation_accum.pth, {bytes} bytes that only training reads, were \
+                         left out, and count on neither side"
+                    ));
                 }
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
@@ -170,6 +187,17 @@ impl ModelFolder {
         let proxies = reduction.proxies.raw.as_ref().unwrap_or(&none);
         write_like(&Ply::open(&self.paths().point_cloud)?, &out_rows(reduction), proxies, &reduction.change, path)
     }
+}
+
+/// The folder of a training iteration in the model at `root`.
+fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
+    root.join("point_cloud").join(format!("iteration_{iteration}"))
+}
+
+/// Of a model's files.
+fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
+    let (cloud, field, rest) = (bytes_of([cloud])?, bytes_of([field])?, bytes_of([configuration])?);
+    Ok(Size { cloud, field, rest, ..Size::default() })
 }
 
 /// The canonical cloud of what is left, changed: what the field adds to it stays as it is.

@@ -1,0 +1,127 @@
+//! How large a model is on disk, by part.
+
+use std::fs;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result};
+
+/// Bytes of everything that a renderer opens of a model, by part. What only training reads is no part of it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Size {
+    /// Gaussians from which frames follow.
+    pub cloud: u64,
+    /// What deforms them.
+    pub field: u64,
+    /// States of Gaussians, frame by frame.
+    pub frames: u64,
+    /// Everything else.
+    pub rest: u64,
+}
+
+impl Size {
+    /// Of frames and nothing else.
+    pub fn of_frames(frames: u64) -> Size {
+        Size { frames, ..Size::default() }
+    }
+
+    /// All parts together.
+    pub fn whole(&self) -> u64 {
+        self.cloud + self.field + self.frames + self.rest
+    }
+
+    /// Parts with a name each.
+    pub fn named(&self) -> [(&'static str, u64); 4] {
+        [("cloud", self.cloud), ("field", self.field), ("frames", self.frames), ("rest", self.rest)]
+    }
+
+    /// The parts, for a person: `cloud 248, field 1000`.
+    pub fn parts(&self) -> String {
+        let parts = self.named().into_iter().filter(|part| part.1 > 0);
+        parts.map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(", ")
+    }
+
+    /// The parts as parts of those of `before`, for a person: `cloud 248 of 2480 (10.0%)`. A part that one of both lacks
+    /// is compared with nothing.
+    pub fn parts_of(&self, before: &Size) -> String {
+        let part = |((name, after), (_, before)): ((_, u64), (_, u64))| match (after, before) {
+            (0, 0) => None,
+            (0, before) => Some(format!("{name} none of {before}")),
+            (after, 0) => Some(format!("{name} {after} of none")),
+            (after, before) => Some(format!("{name} {}", of(after, before))),
+        };
+        self.named().into_iter().zip(before.named()).filter_map(part).collect::<Vec<_>>().join(", ")
+    }
+
+    /// Why this, made of what takes `before`, takes more bytes; none if it does not.
+    pub fn why_larger_than(&self, before: &Size) -> Option<String> {
+        let (after, whole) = (self.whole(), before.whole());
+        let why = match (self.frames > 0, before.frames > 0) {
+            (true, false) => "it holds the states of every frame, the input what all frames follow from",
+            _ => "the input holds its values in fewer bytes than this kind of result does",
+        };
+        (after > whole).then(|| format!("the result is larger than its input, {after} bytes of {whole}: {why}"))
+    }
+}
+
+/// So many bytes of so many, with what part that is.
+pub fn of(after: u64, before: u64) -> String {
+    format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
+}
+
+/// Sum of the sizes of files, bytes.
+pub(super) fn bytes_of<'a>(paths: impl IntoIterator<Item = &'a Path>) -> Result<u64> {
+    paths.into_iter().map(|path| Ok(fs::metadata(path).map_err(Error::io("read", path))?.len())).sum()
+}
+
+/// Bytes of a file, or of all files below a folder.
+pub(super) fn bytes_below(path: &Path) -> Result<u64> {
+    let found = fs::metadata(path).map_err(Error::io("read", path))?;
+    if !found.is_dir() {
+        return Ok(found.len());
+    }
+    let entries = fs::read_dir(path).map_err(Error::io("list", path))?;
+    entries.map(|entry| bytes_below(&entry.map_err(Error::io("list", path))?.path())).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bytes_of_a_folder_are_those_of_all_its_files() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir(folder.path().join("a")).unwrap();
+        fs::write(folder.path().join("a/b"), [0; 7]).unwrap();
+        fs::write(folder.path().join("c"), [0; 5]).unwrap();
+        assert_eq!(bytes_below(folder.path()).unwrap(), 12);
+        assert_eq!(bytes_below(&folder.path().join("c")).unwrap(), 5);
+    }
+
+    #[test]
+    fn parts_are_compared_with_parts_of_their_own_kind() {
+        let model = Size { cloud: 1000, field: 4000, rest: 10, ..Size::default() };
+        let small = Size { cloud: 100, field: 2000, rest: 10, ..Size::default() };
+        assert_eq!(small.whole(), 2110);
+        assert_eq!(small.parts(), "cloud 100, field 2000, rest 10");
+        assert_eq!(
+            small.parts_of(&model),
+            "cloud 100 of 1000 (10.0%), field 2000 of 4000 (50.0%), rest 10 of 10 (100.0%)"
+        );
+        assert_eq!(
+            Size::of_frames(9).parts_of(&model),
+            "cloud none of 1000, field none of 4000, frames 9 of none, rest none of 10"
+        );
+    }
+
+    #[test]
+    fn only_what_is_larger_has_a_reason_and_it_is_that_of_its_parts() {
+        let model = Size { cloud: 1000, field: 4000, ..Size::default() };
+        assert_eq!(Size::of_frames(5000).why_larger_than(&model), None);
+        let why = Size::of_frames(5001).why_larger_than(&model).unwrap();
+        assert!(why.contains("5001 bytes of 5000") && why.contains("every frame"), "{why}");
+        let why = Size::of_frames(3).why_larger_than(&Size::of_frames(2)).unwrap();
+        assert!(why.contains("fewer bytes"), "{why}");
+    }
+}
