@@ -12,7 +12,7 @@ use pytorch_reader::{DType, PytorchError, PytorchReader};
 
 use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result};
-pub(in crate::families) use write::{Stored, Values, write_state_dict};
+pub(crate) use write::{Stored, Values, write_state_dict};
 
 /// A view may repeat its storage (stride 0), so a small file can declare any number of values. No
 /// trained state dict stores less than a quarter of what it means.

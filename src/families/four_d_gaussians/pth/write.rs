@@ -22,22 +22,22 @@ const ALIGNMENT: u16 = 64;
 /// A tensor as a file stores it: element `i` of its `shape` is value `offset + Σ i·stride` of its storage. Strides may
 /// be 0 and elements may share values.
 #[derive(Debug, Clone, PartialEq)]
-pub(in crate::families) struct Stored {
+pub(crate) struct Stored {
     /// Its dotted name.
-    pub(in crate::families) name: String,
+    pub(crate) name: String,
     /// Its values.
-    pub(in crate::families) values: Values,
+    pub(crate) values: Values,
     /// Place of its first element.
-    pub(in crate::families) offset: usize,
+    pub(crate) offset: usize,
     /// Extents, outermost first; empty for a scalar.
-    pub(in crate::families) shape: Vec<usize>,
+    pub(crate) shape: Vec<usize>,
     /// Values from an element to the next, along each extent.
-    pub(in crate::families) stride: Vec<usize>,
+    pub(crate) stride: Vec<usize>,
 }
 
 /// The values of a tensor.
 #[derive(Debug, Clone, PartialEq)]
-pub(in crate::families) enum Values {
+pub(crate) enum Values {
     /// IEEE 754 binary32.
     F32(Vec<f32>),
     /// IEEE 754 binary16.
@@ -46,7 +46,7 @@ pub(in crate::families) enum Values {
 
 impl Values {
     /// How many there are.
-    pub(in crate::families) fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         match self {
             Values::F32(values) => values.len(),
             Values::F16(values) => values.len(),
@@ -54,7 +54,7 @@ impl Values {
     }
 
     /// Bytes of each.
-    pub(in crate::families) fn width(&self) -> usize {
+    pub(crate) fn width(&self) -> usize {
         match self {
             Values::F32(_) => size_of::<f32>(),
             Values::F16(_) => size_of::<f16>(),
@@ -80,7 +80,7 @@ impl Values {
 
 impl Stored {
     /// `values` one after the other, the last extent fastest.
-    pub(in crate::families) fn dense(name: String, shape: Vec<usize>, values: Values) -> Stored {
+    pub(crate) fn dense(name: String, shape: Vec<usize>, values: Values) -> Stored {
         let mut stride = vec![1; shape.len()];
         for axis in (1..shape.len()).rev() {
             stride[axis - 1] = stride[axis] * shape[axis].max(1);
@@ -93,7 +93,7 @@ impl Stored {
 ///
 /// # Errors
 /// A failed write.
-pub(in crate::families) fn write_state_dict(path: &Path, tensors: &[Stored]) -> Result<()> {
+pub(crate) fn write_state_dict(path: &Path, tensors: &[Stored]) -> Result<()> {
     let write = || {
         let mut archive = ZipWriter::new(BufWriter::new(File::create(path)?));
         // The pickle first, and all in one folder: by its name readers know the others.
