@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
 //! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
-//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`] | pure mathematics: slices in, values out |
+//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`], [`archive`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`families`], [`demo`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
@@ -16,6 +16,7 @@
 /// Program and version, by which results name what made them.
 pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
 
+pub mod archive;
 pub mod budget;
 pub mod cli;
 pub mod compress;

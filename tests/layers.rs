@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// Modules of each layer, from the vocabulary up.
 const LAYERS: [&[&str]; 5] = [
     &["error", "machine", "model", "limits", "recipe", "reduction", "source"],
-    &["deform", "stats", "score", "select", "merge", "render", "refine", "metrics"],
+    &["deform", "stats", "score", "select", "merge", "render", "refine", "metrics", "archive"],
     &["ingest", "stream", "emit", "families", "demo"],
     &["budget", "scene", "compress", "verbs", "report"],
     &["cli"],

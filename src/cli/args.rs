@@ -14,6 +14,8 @@ Examples:
   splatsieve compress model --cameras data -o small      a trained 4DGaussians model, drop-in result
   splatsieve compress model --cameras data -o small --target-ratio 0.3
   splatsieve compress model --cameras data -o small --min-psnr 35dB
+  splatsieve compress model --cameras data -o small.gsz  the smallest, to store and to send
+  splatsieve unpack small.gsz -o small                   the model folder in it
   splatsieve compress frames/ -o small.gseq --preset paper
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
@@ -60,7 +62,7 @@ pub(super) enum Verb {
     Info(Info),
     /// Check every byte of a .gseq container
     Verify(Verify),
-    /// Write an input's frames as a folder of PLY files, or as a frame stream
+    /// Write the model that an archive holds; of other inputs the frames, as a folder of PLY files or as a frame stream
     Unpack(Unpack),
     /// Save the complete frames of a .gseq container that was cut short
     Recover(Recover),
@@ -92,7 +94,7 @@ impl Verb {
 /// What to read.
 #[derive(Debug, Args)]
 pub(super) struct Input {
-    /// 4DGaussians model folder, folder of PLY frames, one .ply, .gseq, or - for a frame stream on standard
+    /// 4DGaussians model folder, folder of PLY frames, one .ply, .gsz, .gseq, or - for a frame stream on standard
     /// input
     pub(super) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
@@ -183,12 +185,16 @@ pub(super) struct Compress {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Where to write: a folder, NAME.gseq or NAME.ply
+    /// Where to write: a folder, NAME.gsz, NAME.gseq or NAME.ply
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     /// What to write [default: by the output's name; a folder is of the input's own kind]
     #[arg(long = "as", value_enum, value_name = "KIND")]
     pub(super) kind: Option<OutputKind>,
+    /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
+    /// grids: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50 at most]
+    #[arg(long, value_name = "DB", value_parser = parse_decibels)]
+    pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
     pub(super) size: OutputSize,
     /// Prune, do not merge
@@ -261,6 +267,8 @@ pub(super) enum OutputKind {
     PlySequence,
     /// One PLY: the canonical cloud of a model, or a sequence of one frame
     Ply,
+    /// Archive of a model or of one PLY, the smallest: to store and to send
+    Archive,
 }
 
 /// `score`
@@ -476,8 +484,8 @@ pub(super) struct Unpack {
     pub(super) input: Input,
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Folder to write frame_NNNNN.ply into
-    #[arg(short, long, value_name = "FOLDER", required_unless_present = "stream", conflicts_with = "stream")]
+    /// Folder to write frame_NNNNN.ply into; of an archive (.gsz) the model folder, or the name of its PLY
+    #[arg(short, long, value_name = "PATH", required_unless_present = "stream", conflicts_with = "stream")]
     pub(super) output: Option<PathBuf>,
     /// Write a frame stream to standard output instead, for another program to read (format/STREAM.md)
     #[arg(long)]

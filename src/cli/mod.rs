@@ -28,7 +28,7 @@ use crate::verbs::evaluate::EvaluateOptions;
 use crate::verbs::method::Method;
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::SweepOptions;
-use crate::verbs::{container, demo, evaluate, render, score, sweep};
+use crate::verbs::{archive, container, demo, evaluate, render, score, sweep};
 use args::{
     CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, OutputSize, Render, SideBySide, SplitArg, Sweep, Verb,
 };
@@ -158,6 +158,16 @@ fn run(cli: Cli) -> Result<()> {
                 notes(&container::unpack_stream(&input, stdout)?.notes);
                 return Ok(());
             };
+            if archive::is_archive(&input.path)? {
+                let unpacked = archive::unpack_archive(&input.path, &output, args.earlier.replace())?;
+                return print(&format!(
+                    "{}: {} Gaussians, {} bytes of values from {}\n",
+                    output.display(),
+                    unpacked.gaussians,
+                    unpacked.bytes,
+                    unpacked.parts.total()
+                ));
+            }
             let opened = container::unpack(&input, &output, args.earlier.replace())?;
             notes(&opened.notes);
             let frames = opened.input.source().info().times.len();
@@ -200,6 +210,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
         args::OutputKind::Gseq => OutputKind::Gseq,
         args::OutputKind::PlySequence => OutputKind::PlySequence,
         args::OutputKind::Ply => OutputKind::Ply,
+        args::OutputKind::Archive => OutputKind::Archive,
     });
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
@@ -234,6 +245,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
         output: args.output,
         kind: kind.or(run.output),
         recipe,
+        archive_psnr: args.archive_psnr.or(run.archive_psnr),
         made_for: record.provenance.map(|from| from.input_digest),
         only: match (args.prune_only, args.merge_only) {
             (true, _) => Only::Prune,

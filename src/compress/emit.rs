@@ -8,6 +8,7 @@ use super::journal::Journal;
 use super::request::Request;
 use super::score::scored;
 use super::summary::Summary;
+use crate::archive::Encoded;
 use crate::budget::{Need, Workload};
 use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFile, StagedFolder, check_target, commit_files};
 use crate::emit::container::FRAME_BLOCK;
@@ -148,16 +149,22 @@ impl Emit {
         &self,
         scene: &Scene,
         reduction: &Reduction,
+        (map, archive): (&[Option<u32>], Option<&Encoded>),
         recipe: &str,
         mut journal: Journal,
         summarise: impl FnOnce(Journal, Size) -> Summary,
     ) -> Result<Summary> {
-        let map = reduction.index_map(scene.source().info().count);
         let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, reduction.len(), scene.source(), |journal| {
-                let notes = scene.input.write(reduction, self.kind, path, &scene.limits)?;
-                let size = scene.input.size_written(self.kind, path)?;
-                journal.notes.extend(notes.into_iter().chain(size.why_larger_than(&scene.input.size()?)));
+                match archive {
+                    Some(archive) => fs::write(path, &archive.bytes).map_err(Error::io("write", path))?,
+                    None => journal.notes.extend(scene.input.write(reduction, self.kind, path, &scene.limits)?),
+                }
+                let size = match archive {
+                    Some(archive) => archive.parts.into(),
+                    None => scene.input.size_written(self.kind, path)?,
+                };
+                journal.notes.extend(size.why_larger_than(&scene.input.size()?));
                 Ok((size, reduction.len()))
             })
         };
@@ -166,7 +173,7 @@ impl Emit {
             let staged = StagedFolder::new(target, self.overwrite)?;
             let size = write(staged.path())?;
             write_text(&staged.path().join(RECIPE), recipe)?;
-            write_index_map(&map, &staged.path().join(INDEX_MAP))?;
+            write_index_map(map, &staged.path().join(INDEX_MAP))?;
             let summary = summarise(journal, size);
             write_text(&staged.path().join(MARKER), &summary.json())?;
             staged.commit()?;
@@ -177,7 +184,7 @@ impl Emit {
         let (recipe_file, index_map, marker) = (companion(RECIPE)?, companion(INDEX_MAP)?, companion(MARKER)?);
         let size = write(staged.path())?;
         write_text(recipe_file.path(), recipe)?;
-        write_index_map(&map, index_map.path())?;
+        write_index_map(map, index_map.path())?;
         let summary = summarise(journal, size);
         write_text(marker.path(), &summary.json())?;
         commit_files(&[staged, recipe_file, index_map, marker])?;

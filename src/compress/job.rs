@@ -1,5 +1,6 @@
 //! What a run does: which stages, with which parameters, and what is left out and why. Made once, before any work.
 
+use super::archive::{Archive, LEFT_BY_SEARCH};
 use super::choose::Choose;
 use super::emit::Emit;
 use super::field::Field;
@@ -9,11 +10,12 @@ use super::measure::{Measure, Outlook, Stages};
 use super::merge::Merge;
 use super::prune::Prune;
 use super::refine::Refine;
-use super::request::{Goal, Only, Request};
+use super::request::{Goal, Only, Quality, Request};
 use super::rounds::Rounds;
 use super::score::UserOverrides;
 use super::search::Search;
 use crate::budget::{Need, Plan, Workload};
+use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::recipe::Coverage;
@@ -37,6 +39,8 @@ pub struct Job {
     pub field: Option<Field>,
     /// Finds the size, instead of the five before it.
     pub search: Option<Search>,
+    /// Says on which grids an archive's values lie.
+    pub archive: Option<Archive>,
     /// Writes.
     pub emit: Emit,
     has_cameras: bool,
@@ -120,6 +124,23 @@ impl Job {
             Spared::Refining { .. } => None,
         };
         // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
+        let kind = OutputKind::of(&request.output, request.kind, outlook.own_output);
+        let is_archive = kind == OutputKind::Archive;
+        if request.archive_psnr.is_some() && !is_archive {
+            return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));
+        }
+        let goal = match &request.goal {
+            Some(Goal::Quality(Quality::Psnr(least))) if is_archive => {
+                Some(Goal::Quality(Quality::Psnr(least + LEFT_BY_SEARCH)))
+            }
+            Some(_) if is_archive => {
+                return Err(Error::usage(
+                    "the size of an archive is found by --target-ratio, --target-count or --min-psnr\n  \
+                     give one of these, or write a model folder",
+                ));
+            }
+            goal => goal.clone(),
+        };
         let searches = matches!(request.goal, Some(Goal::Quality(_)));
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
@@ -134,7 +155,7 @@ impl Job {
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
             choose: (looks && prunes && !cuts && !searches && recipe.select.choose_by_views).then(choose),
-            search: match &request.goal {
+            search: match &goal {
                 Some(Goal::Quality(quality)) => {
                     let (quality, rule) = (quality.clone(), recipe.merge.clone());
                     Some(Search { quality, refine: refine.clone(), field: field.clone(), rule })
@@ -143,6 +164,7 @@ impl Job {
             },
             refine: refine.filter(|_| !searches),
             field: field.filter(|_| !searches),
+            archive: is_archive.then_some(Archive { psnr: request.archive_psnr }),
             emit,
             measure,
             has_cameras: outlook.has_cameras,
@@ -209,6 +231,7 @@ impl Stages for Job {
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.archive.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits));
         needs
     }
@@ -219,7 +242,6 @@ mod tests {
     use super::*;
     use crate::budget::Budget;
     use crate::compress::tests::work;
-    use crate::emit::kind::OutputKind;
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 

@@ -1,6 +1,7 @@
 //! The main job: scan, score, rank, prune, merge, refine, emit. Types flow scene → statistics → ranking → reduction →
 //! files; the order of the passes stands in [`reduce`].
 
+pub mod archive;
 mod arrival;
 mod choose;
 pub mod emit;
@@ -36,6 +37,7 @@ use crate::recipe::{Precision, Recipe};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 use crate::stream::begin_run;
+use archive::LEFT_BY_SEARCH;
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
@@ -145,7 +147,28 @@ fn reduce(
     };
     job.write_down(request, &mut journal);
 
-    let map = reduction.index_map(scene.source().info().count);
+    let mut goal = goal;
+    let archived = match job.archive.as_ref().filter(|_| !request.dry_run) {
+        Some(archive) => {
+            let spare = goal.as_ref().map(|goal| goal.searched + LEFT_BY_SEARCH - goal.asked);
+            Some(archive.run(scene, &reduction, spare, &mut journal)?)
+        }
+        None => None,
+    };
+    let (encoded, archive) = archived.map_or((None, None), |(encoded, summary)| (Some(encoded), Some(summary)));
+    if let (Some(goal), Some(archive)) = (&mut goal, &archive) {
+        goal.asked -= LEFT_BY_SEARCH;
+        (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
+        journal.notes.push(format!(
+            "{LEFT_BY_SEARCH} dB of what was searched for were left for the archive, which takes {:.2}: at least {} dB asked \
+             for, {:.2} dB by the pictures searched on, {:.2} dB by those held back",
+            archive.loss, goal.asked, goal.searched, goal.held
+        ));
+    }
+    let mut map = reduction.index_map(scene.source().info().count);
+    if let Some(encoded) = &encoded {
+        follow(&mut map, &encoded.order);
+    }
     let summarise = |journal: Journal, output: Option<Size>| Summary {
         schema: summary::SCHEMA,
         files: Vec::new(),
@@ -160,6 +183,7 @@ fn reduce(
         merge,
         goal,
         field: journal.field,
+        archive,
         left_out: journal.left_out,
         notes: journal.notes,
         planned_reads: scene.planned_reads,
@@ -171,7 +195,14 @@ fn reduce(
         return Ok((summarise(journal, None), map));
     }
     let written = |journal, size| summarise(journal, Some(size));
-    Ok((job.emit.run(scene, &reduction, &recipe, journal, written)?, map))
+    Ok((job.emit.run(scene, &reduction, (&map, encoded.as_ref()), &recipe, journal, written)?, map))
+}
+
+/// Has places follow those of an archive, whose Gaussian `i` was at `order[i]`.
+fn follow(map: &mut [Option<u32>], order: &[u32]) {
+    let mut places = vec![0; order.len()];
+    order.iter().zip(0..).for_each(|(&before, now)| places[before as usize] = now);
+    map.iter_mut().flatten().for_each(|place| *place = places[*place as usize]);
 }
 
 /// What is left where its size is known before, or is the recipe's own. `recipe`: bytes of its text.

@@ -40,6 +40,8 @@ pub struct Run {
     pub ground_truth: Option<PathBuf>,
     /// Most bytes of everything that is written.
     pub target_size: Option<u64>,
+    /// PSNR of an archive's pictures against those of the result before, dB.
+    pub archive_psnr: Option<f64>,
     /// Ids to keep, as a list with ranges.
     pub keep_ids: Option<String>,
     /// Ids to drop, as a list with ranges.
@@ -127,6 +129,7 @@ impl Record {
             mode: request.only,
             target_count,
             target_ratio,
+            archive_psnr: request.archive_psnr,
             keep_ids: ids(&user.keep),
             drop_ids: ids(&user.drop),
             keep_box: request.keep_box,

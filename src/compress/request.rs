@@ -68,6 +68,8 @@ pub struct Request {
     pub recipe: Recipe,
     /// Digest of the input that the recipe was written beside, if it was: another input is noted.
     pub made_for: Option<String>,
+    /// PSNR of an archive's pictures against those of the result before, dB; none: by the result's own level.
+    pub archive_psnr: Option<f64>,
     /// Which stages to run.
     pub only: Only,
     /// Exact size of the output, if asked for.
@@ -95,6 +97,7 @@ impl Request {
             kind: None,
             recipe,
             made_for: None,
+            archive_psnr: None,
             only: Only::Both,
             target: None,
             goal: None,

@@ -4,11 +4,13 @@
 //! These types are the one schema of `summary.json`: `compress` writes it by them and `report` reads it by them. What
 //! its fields mean to other programs stands in `format/SUMMARY.md`.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::archive::Parts;
 use crate::error::Result;
 use crate::families::size::of;
 use crate::families::{Family, Size};
@@ -67,6 +69,26 @@ pub struct GoalSummary {
     /// Every size that was tried, and what it has by what was searched on.
     #[serde(deserialize_with = "sizes")]
     pub tried: Vec<(usize, f64)>,
+}
+
+/// What an archive is made of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ArchiveSummary {
+    /// PSNR of its pictures against those of the result before it was put on grids, dB: asked for.
+    pub asked: f64,
+    /// The same, found.
+    pub psnr: f64,
+    /// PSNR of the result's pictures against the original's on the same pictures, dB.
+    pub level: f64,
+    /// How much less the archive's pictures have against the original's, dB.
+    pub loss: f64,
+    /// Bytes of its parts.
+    pub parts: Parts,
+    /// Bits of every attribute and tensor, by name.
+    pub bits: BTreeMap<String, f64>,
+    /// Of every attribute and tensor its name, log2 of a step, the squared error that this step alone adds to pictures,
+    /// and the bits that it then takes: where the steps were found from.
+    pub measured: Vec<(String, f64, f64, f64)>,
 }
 
 /// The input, as the summary names it.
@@ -265,6 +287,9 @@ pub struct Summary {
     /// What half precision does to the field that is written; none where it was not asked for.
     #[serde(default)]
     pub field: Option<FieldSummary>,
+    /// What an archive is made of, if one was written.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub archive: Option<ArchiveSummary>,
     /// What the scene did not need.
     pub left_out: Vec<LeftOut>,
     /// Things a person should know.
@@ -339,6 +364,17 @@ impl Summary {
             let _ = write!(out, ": {}", after.parts_of(before));
         }
         out.push('\n');
+        if let Some(archive) = &self.archive {
+            let Parts { cloud, field, rest } = archive.parts;
+            let _ = writeln!(
+                out,
+                "archive: {} bytes (cloud {cloud}, field {field}, rest {rest}); its pictures are {:.2} dB from those of the \
+                 result before, and lose {:.2} dB against the original's",
+                archive.parts.total(),
+                archive.psnr,
+                archive.loss
+            );
+        }
         out
     }
 }

@@ -42,22 +42,46 @@ pub(super) struct Level {
 /// The time planes of a level at one time, by axis: `[size_a, channels]` each.
 pub(super) type Lines = [Vec<f32>; 3];
 
-/// The planes of all levels and the box they cover.
-#[derive(Debug, Clone)]
-pub(super) struct Planes {
+/// The box that planes cover.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Box3 {
     /// Corner mapped to −1, by axis; the model stores the MAX corner here.
     pub(super) origin: [f32; 3],
     /// 2 / (other corner − origin).
     pub(super) factor: [f32; 3],
+}
+
+impl Box3 {
+    /// Between two corners, of the values of `deformation_net.grid.aabb`; none unless they differ along every axis.
+    pub fn new(corners: &[f32]) -> Option<Box3> {
+        let &[x0, y0, z0, x1, y1, z1] = corners else { return None };
+        let origin = [x0, y0, z0];
+        let factor = [x1 - x0, y1 - y0, z1 - z0].map(|size| 2.0 / size);
+        factor.iter().all(|f: &f32| f.is_finite()).then_some(Box3 { origin, factor })
+    }
+
+    /// Where `p` lies, −1 to 1 inside the box.
+    pub fn normalised(&self, p: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
+    }
+}
+
+/// The planes of all levels and the box they cover.
+#[derive(Debug, Clone)]
+pub(super) struct Planes {
+    pub(super) space: Box3,
     pub(super) levels: Vec<Level>,
 }
 
 /// Where a coordinate falls between texels `low` and `high`; `fraction` is the weight of `high`.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Tap {
-    pub(super) low: u32,
-    pub(super) high: u32,
-    pub(super) fraction: f32,
+pub struct Tap {
+    /// The texel at or below.
+    pub low: u32,
+    /// The one above it, or itself if it is the last.
+    pub high: u32,
+    /// Weight of `high`.
+    pub fraction: f32,
 }
 
 /// What of the features of a block does not depend on time.
@@ -108,7 +132,7 @@ impl Plane {
 
 /// The tap of normalised coordinate `u` on `size` texels: align_corners, border padding.
 /// A NaN coordinate gives a NaN fraction, hence NaN features.
-pub(super) fn tap(u: f32, size: usize) -> Tap {
+pub fn tap(u: f32, size: usize) -> Tap {
     let last = (size - 1) as f32;
     let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
     let low = x.floor();
@@ -137,11 +161,9 @@ impl Planes {
     pub(super) fn load(lookup: Lookup<'_>) -> Result<Self> {
         const AABB: &str = "deformation_net.grid.aabb";
         let aabb = &lookup.get_shaped(AABB, &[Some(2), Some(3)], "the two corners of the field's box")?.data;
-        let origin = [aabb[0], aabb[1], aabb[2]];
-        let factor = std::array::from_fn(|axis| 2.0 / (aabb[3 + axis] - aabb[axis]));
-        if factor.iter().any(|f: &f32| !f.is_finite()) {
+        let Some(space) = Box3::new(aabb) else {
             return Err(lookup.mismatch(AABB, "two corners that differ along every axis", format!("{aabb:?}")));
-        }
+        };
         let name = |level: usize, plane: usize| format!("{GRIDS}{level}.{plane}");
         let mut levels = Vec::new();
         while levels.is_empty() || lookup.has(&name(levels.len(), 0)) {
@@ -154,7 +176,7 @@ impl Planes {
                 temporal: [load(TEMPORAL[0])?, load(TEMPORAL[1])?, load(TEMPORAL[2])?],
             });
         }
-        Ok(Planes { origin, factor, levels })
+        Ok(Planes { space, levels })
     }
 
     /// Features per Gaussian: the channels of all levels.
@@ -169,7 +191,8 @@ impl Planes {
 
     /// The box, as (corner mapped to −1, corner mapped to +1).
     pub(super) fn corners(&self) -> ([f32; 3], [f32; 3]) {
-        (self.origin, std::array::from_fn(|axis| self.origin[axis] + 2.0 / self.factor[axis]))
+        let Box3 { origin, factor } = self.space;
+        (origin, std::array::from_fn(|axis| origin[axis] + 2.0 / factor[axis]))
     }
 
     pub(super) fn prepare(&self, position: &Column) -> PreparedPlanes {
@@ -179,8 +202,7 @@ impl Planes {
             PreparedPlanes { product: vec![1.0; rows * width], taps: Vec::with_capacity(rows * 3 * self.levels.len()) };
         let mut sample = vec![0.0; width];
         for (i, row) in prepared.product.chunks_exact_mut(width).enumerate() {
-            let p: [f32; 3] = position.row(i);
-            let u: [f32; 3] = std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0);
+            let u = self.space.normalised(position.row(i));
             let mut rest = row;
             for level in &self.levels {
                 let out;

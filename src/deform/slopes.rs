@@ -105,7 +105,7 @@ impl Planes {
             out.resize(width, Lanes([0.0; LANES]));
         }
         for (lane, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
-            let normalised = |axis: usize, p: f32| (p - self.origin[axis]) * self.factor[axis] - 1.0;
+            let normalised = |axis: usize, p: f32| (p - self.space.origin[axis]) * self.space.factor[axis] - 1.0;
             let u = [normalised(0, x), normalised(1, y), normalised(2, z)];
             let mut before = 0;
             for (level, lines) in self.levels.iter().zip(lines) {
@@ -136,7 +136,7 @@ impl Planes {
                     let place = before + first..before + n.min(first + CHUNK);
                     for (axis, out) in slopes.iter_mut().enumerate() {
                         for (out, found) in out[place.clone()].iter_mut().zip(found[axis]) {
-                            out.0[lane] = self.factor[axis] * found;
+                            out.0[lane] = self.space.factor[axis] * found;
                         }
                     }
                     for (out, found) in features[place].iter_mut().zip(found[3]) {

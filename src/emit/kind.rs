@@ -16,6 +16,8 @@ pub enum OutputKind {
     PlySequence,
     /// One PLY: the canonical cloud of a model, or a sequence of one frame.
     Ply,
+    /// An archive: to store and to send.
+    Archive,
 }
 
 impl OutputKind {
@@ -28,6 +30,7 @@ impl OutputKind {
         match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
             "gseq" => Some(OutputKind::Gseq),
             "ply" => Some(OutputKind::Ply),
+            "gsz" => Some(OutputKind::Archive),
             _ => None,
         }
     }

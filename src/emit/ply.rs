@@ -5,10 +5,11 @@
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
+use std::ops::Range;
 use std::path::Path;
 
 use crate::error::{Error, Result};
-use crate::ingest::ply::{Encoding, Plane, Ply, Property, Scalar, read_plane};
+use crate::ingest::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, read_plane};
 use crate::model::{Columns, Gaussians, sh_coefficients};
 use crate::reduction::{Change, Reduction};
 
@@ -54,7 +55,8 @@ pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: 
             changed.clear();
             changed.extend_from_slice(source);
             if let Some(proxy) = row.proxy {
-                replace(&mut changed, template, proxies, proxy as usize);
+                let big_endian = template.header().encoding == Encoding::BigEndian;
+                replace(&mut changed, template.layout(), big_endian, proxies, proxy as usize);
             }
             add(&mut changed, template, change, place);
             out.write_all(&changed)?;
@@ -110,6 +112,68 @@ fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
     header + "end_header\n"
 }
 
+/// What of the rows of `template` is no attribute of a Gaussian, of each of `rows` one after the other.
+pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
+    let ranges = ranges_beside(template.properties(), template.layout());
+    rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
+        .collect()
+}
+
+/// Writes a PLY with `header`, read from `from`, `cloud` as its rows with what is `beside` each, and what is before and
+/// after them.
+///
+/// # Errors
+/// A header that is of no such rows; a failed write.
+pub(crate) fn write_rows(
+    from: &Path,
+    header: &Header,
+    [lead, tail]: [&[u8]; 2],
+    beside: &[u8],
+    cloud: &Gaussians,
+    path: &Path,
+) -> Result<()> {
+    let mismatch = |expected: String| Error::input(from, "header of the PLY", expected, "others");
+    let Some(vertex) = header.vertex().filter(|vertex| vertex.count == cloud.len() as u64) else {
+        return Err(mismatch(format!("{} rows", cloud.len())));
+    };
+    let layout = Layout::of(from, vertex)?;
+    let ranges = ranges_beside(&vertex.properties, &layout);
+    let width: usize = ranges.iter().map(|range| range.len()).sum();
+    if layout.planes(Columns::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
+        return Err(mismatch("the properties of the rows".to_owned()));
+    }
+    let big_endian = header.encoding == Encoding::BigEndian;
+    create(path, |out| {
+        out.write_all(&header.text)?;
+        out.write_all(lead)?;
+        let mut row = vec![0; vertex.stride];
+        for i in 0..cloud.len() {
+            let mut rest = &beside[i * width..(i + 1) * width];
+            for range in &ranges {
+                let (own, after) = rest.split_at(range.len());
+                row[range.clone()].copy_from_slice(own);
+                rest = after;
+            }
+            replace(&mut row, &layout, big_endian, cloud, i);
+            out.write_all(&row)?;
+        }
+        out.write_all(tail)
+    })
+}
+
+/// Where a row holds what is no attribute of a Gaussian.
+fn ranges_beside(properties: &[Property], layout: &Layout) -> Vec<Range<usize>> {
+    let mut used: Vec<usize> = Vec::new();
+    for column in Columns::all().iter() {
+        used.extend(layout.planes(column).iter().filter_map(|plane| match plane {
+            Plane::Property(property) => Some(property.offset),
+            Plane::Thin => None,
+        }));
+    }
+    let beside = properties.iter().filter(|property| !used.contains(&property.offset));
+    beside.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
+}
+
 /// Creates the file at `path` and lets `fill` write it.
 fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
     let mut out = BufWriter::with_capacity(1 << 18, File::create(path).map_err(Error::io("create", path))?);
@@ -144,11 +208,10 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Cha
     Ok(())
 }
 
-/// Replaces what a proxy changes in the bytes of its leader's row.
-fn replace(row: &mut [u8], template: &Ply, proxies: &Gaussians, proxy: usize) {
-    let big_endian = template.header().encoding == Encoding::BigEndian;
+/// Replaces the attributes in the bytes of a row by those of a proxy.
+fn replace(row: &mut [u8], layout: &Layout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Columns::all().iter() {
-        for (c, plane) in template.layout().planes(column).iter().enumerate() {
+        for (c, plane) in layout.planes(column).iter().enumerate() {
             if let Plane::Property(property) = plane {
                 put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);
             }

@@ -1,11 +1,12 @@
 //! What a kind of input can do.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
 use super::size::{Size, bytes_below};
 use super::trajectories::{OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
+use crate::archive::Content;
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -132,6 +133,24 @@ pub trait Family: Send + Sync {
         Ok(false)
     }
 
+    /// What an archive of what `reduction` leaves holds.
+    ///
+    /// # Errors
+    /// An input that no archive holds; files that cannot be read.
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        let _ = reduction;
+        Err(Error::usage(NO_ARCHIVE))
+    }
+
+    /// The frames of `content`, of this input or of what is left of it, at this input's times.
+    ///
+    /// # Errors
+    /// A content of another kind.
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        let _ = content;
+        Err(Error::usage(NO_ARCHIVE))
+    }
+
     /// The frames of what `reduction` leaves, as they will be once it is written.
     ///
     /// # Errors
@@ -150,6 +169,10 @@ pub trait Family: Send + Sync {
         Ok(Vec::new())
     }
 }
+
+/// Why most inputs cannot become an archive.
+pub(super) const NO_ARCHIVE: &str =
+    "only a trained model or a single PLY can be written as an archive\n  write a .gseq or --as ply-sequence";
 
 /// Where frames get their times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -262,10 +285,12 @@ impl Found<'_> {
 }
 
 /// What a user may say about an input beside its path.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct OpenOptions {
     /// Training iteration of a model folder; none: the largest.
     pub iteration: Option<u32>,
+    /// Folder for what an archive decodes to, while it is open; none: the system's for such files.
+    pub scratch: Option<PathBuf>,
 }
 
 impl OpenOptions {

@@ -2,6 +2,7 @@
 //!
 //! A family is one module here and one line of `FAMILIES`; outside its module nobody asks which one it is.
 
+pub mod archive;
 mod container;
 mod family;
 mod four_d_gaussians;
@@ -22,7 +23,8 @@ use crate::error::{Error, Result};
 use family::{Entry, Found};
 
 /// Every family that lies in files; the first that recognises a path opens it.
-const FAMILIES: [Entry; 4] = [four_d_gaussians::ENTRY, ply_sequence::FOLDER, ply_sequence::FILE, container::ENTRY];
+const FAMILIES: [Entry; 5] =
+    [four_d_gaussians::ENTRY, ply_sequence::FOLDER, ply_sequence::FILE, container::ENTRY, archive::ENTRY];
 
 /// Opens a path by what is there. Frames of a family that is continuous in time are still to be chosen.
 ///

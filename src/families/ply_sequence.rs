@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+use super::archive::files::add_cloud;
 use super::family::{Entry, Family, OpenOptions, Residence, Timing};
 use super::size::bytes_of;
-use super::trajectories::{merged, state_bytes, write_trajectories};
+use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
+use crate::archive::Content;
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
@@ -18,7 +20,7 @@ use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
 use crate::reduction::Reduction;
 use crate::source::{FrameSource, Ids};
-use crate::stream::Progress;
+use crate::stream::{HeldFrames, Progress, gather_all};
 
 /// A folder with one PLY per frame.
 pub(super) const FOLDER: Entry = Entry {
@@ -81,6 +83,27 @@ impl Family for PlySequence {
 
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
         Ok(Box::new(PlySequence::with_times(*self, times)?))
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Archive if self.paths().len() == 1 => Ok(()),
+            _ => check_output(self.paths().len(), kind, path),
+        }
+    }
+
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        let mut content = Content { times: [0.0, 1.0], ..Content::default() };
+        content.cloud = gather_all(&*self.reduced(reduction)?, 0, Columns::all())?;
+        add_cloud(&mut content, &self.frame(0)?, reduction.kept.iter().copied())?;
+        Ok(content)
+    }
+
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        let (count, degree) = (content.cloud.len(), self.info().sh_degree);
+        let mut frames = HeldFrames::new(count, degree, Columns::empty(), content.cloud.clone());
+        self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));
+        Ok(Box::new(frames))
     }
 
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
+use crate::archive::Parts;
 use crate::error::{Error, Result};
 
 /// Bytes of everything that a renderer opens of a model, by part. What only training reads is no part of it.
@@ -18,6 +19,12 @@ pub struct Size {
     pub frames: u64,
     /// Everything else.
     pub rest: u64,
+}
+
+impl From<Parts> for Size {
+    fn from(Parts { cloud, field, rest }: Parts) -> Size {
+        Size { cloud, field, rest, ..Size::default() }
+    }
 }
 
 impl Size {

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use gseq::Compression;
 
+use super::family::NO_ARCHIVE;
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::write_inria;
@@ -52,6 +53,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
             "{}: {frames} frames do not fit one .ply\n  write a .gseq or --as ply-sequence",
             path.display()
         ))),
+        OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         _ => Ok(()),
     }
 }

@@ -25,7 +25,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
     }
     let path = &options.path;
     let mut notes = Vec::new();
-    let input = families::open(path, &OpenOptions { iteration: options.iteration })?;
+    let input = families::open(path, &OpenOptions { iteration: options.iteration, scratch: options.scratch.clone() })?;
     let rig = load_cameras(options, camera_path(options, &*input).as_deref())?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {

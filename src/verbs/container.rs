@@ -150,7 +150,10 @@ pub struct Info {
 pub fn info(options: &InputOptions) -> Result<Info> {
     let input: Box<dyn Family> = match options.is_stream() {
         true => open_input(options)?.input,
-        false => families::open(&options.path, &OpenOptions { iteration: options.iteration })?,
+        false => families::open(
+            &options.path,
+            &OpenOptions { iteration: options.iteration, scratch: options.scratch.clone() },
+        )?,
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));

@@ -1,5 +1,6 @@
 //! What each verb beside `compress` does from input to output.
 
+pub mod archive;
 pub mod baseline;
 pub mod container;
 pub(crate) mod csv;

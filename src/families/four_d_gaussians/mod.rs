@@ -14,9 +14,12 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
 use super::family::{Entry, Family, Residence, Timing};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{state_bytes, write_sequence};
+use crate::archive::{Content, Role};
+use crate::deform::{Field, FieldConfig, Tensors};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
@@ -28,7 +31,7 @@ use crate::recipe::{Merge, Precision};
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
 pub use model_folder::ModelFolder;
-use pth::{is_floating, read_state_dict, write_state_dict};
+use pth::{Stored, Values, is_floating, read_state_dict, write_state_dict};
 
 /// A model folder.
 pub(super) const ENTRY: Entry = Entry {
@@ -69,7 +72,8 @@ impl Family for ModelFolder {
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
             OutputKind::Ply => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
-            OutputKind::Gseq | OutputKind::PlySequence => Ok(Size::of_frames(bytes_below(path)?)),
+            // No archive is written here.
+            OutputKind::Gseq | OutputKind::PlySequence | OutputKind::Archive => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }
 
@@ -128,6 +132,32 @@ impl Family for ModelFolder {
         proxies::solve(self, clusters, reference, rule)
     }
 
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        let paths = self.paths();
+        let tensors = read_state_dict(&paths.deformation)?;
+        let role = |name: &String| (name.clone(), role(self.config().field(), name));
+        let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
+        let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
+        let cfg_args = fs::read(&paths.cfg_args).map_err(Error::io("read", &paths.cfg_args))?;
+        let mut content = Content {
+            cloud: canonical_cloud(self, reduction),
+            field: tensors.keys().map(role).collect(),
+            tensors,
+            times: [first as f32, last as f32],
+            ..Content::default()
+        };
+        add_cloud(&mut content, &Ply::open(&paths.point_cloud)?, reduction.kept.iter().copied())?;
+        content.files.insert(CFG_ARGS.to_owned(), cfg_args);
+        content.files.insert(ITERATION.to_owned(), paths.iteration.to_string().into_bytes());
+        Ok(content)
+    }
+
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        let field =
+            Field::new(&content.tensors, self.config().field(), self.info().sh_degree, &self.paths().deformation)?;
+        Ok(Box::new(self.with_canonical(content.cloud.clone()).with_field(field)))
+    }
+
     fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
         let model = self.with_canonical(canonical_cloud(self, reduction));
         Ok(Box::new(match reduction.field {
@@ -160,6 +190,7 @@ impl Family for ModelFolder {
                 }
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
+            OutputKind::Archive => return Err(Error::usage("an archive is made of a content")),
             OutputKind::Gseq | OutputKind::PlySequence => {
                 write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?
             }
@@ -214,6 +245,43 @@ fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
     }
     reduction.change.add_to(&mut cloud, Columns::all());
     cloud
+}
+
+/// What a tensor is to the evaluation of a field.
+fn role(config: FieldConfig, name: &str) -> Role {
+    let Some(name) = name.strip_prefix("deformation_net.") else { return Role::Unread };
+    let part = name.split('.').next().unwrap_or_default();
+    let reads = |is_read: bool, as_what: Role| if is_read { as_what } else { Role::Unread };
+    match part {
+        "grid" if config.no_grid => Role::Unread,
+        "grid" => match name.rsplit('.').next() {
+            Some("0") => Role::Plane([0, 1]),
+            Some("1") => Role::Plane([0, 2]),
+            Some("2") => Role::TimePlane(0),
+            Some("3") => Role::Plane([1, 2]),
+            Some("4") => Role::TimePlane(1),
+            Some("5") => Role::TimePlane(2),
+            _ => Role::Exact,
+        },
+        "feature_out" => Role::Weights,
+        "pos_deform" => reads(config.active.contains(Columns::POSITION), Role::Weights),
+        "scales_deform" => reads(config.active.contains(Columns::LOG_SCALE), Role::Weights),
+        "rotations_deform" => reads(config.active.contains(Columns::ROTATION), Role::Weights),
+        "opacity_deform" => reads(config.active.contains(Columns::OPACITY), Role::Weights),
+        "shs_deform" => reads(config.active.contains(Columns::SH), Role::Weights),
+        "static_mlp" => reads(config.static_mlp, Role::Weights),
+        "empty_voxel" => reads(config.empty_voxel, Role::Exact),
+        // Of a version that this one does not know.
+        _ => Role::Exact,
+    }
+}
+
+/// Writes the tensors of a field as the file that they are read from.
+pub(super) fn write_field(tensors: &Tensors, path: &Path) -> Result<()> {
+    let stored = tensors
+        .iter()
+        .map(|(name, tensor)| Stored::dense(name.clone(), tensor.shape.clone(), Values::F32(tensor.data.clone())));
+    write_state_dict(path, &stored.collect::<Vec<_>>())
 }
 
 /// Copies the bytes, not the permissions: a result of a read-only model can be replaced.

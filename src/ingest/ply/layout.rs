@@ -34,7 +34,7 @@ impl Layout {
     ///
     /// # Errors
     /// A missing property, or a number of `f_rest` that belongs to no degree.
-    pub(super) fn of(path: &Path, vertex: &Element) -> Result<Layout> {
+    pub(crate) fn of(path: &Path, vertex: &Element) -> Result<Layout> {
         let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
         let need = |name: &str| match find(name) {
             Some(property) => Ok(Plane::Property(property.clone())),

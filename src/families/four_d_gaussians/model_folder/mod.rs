@@ -155,6 +155,11 @@ impl ModelFolder {
         Ok(ModelFolder { field: Arc::new(field), ..self })
     }
 
+    /// The same model with another field, of the same configuration.
+    pub fn with_field(self, field: Field) -> Self {
+        ModelFolder { field: Arc::new(field), ..self }
+    }
+
     /// The same model with frames at `times`.
     ///
     /// # Errors

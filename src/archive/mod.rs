@@ -1,0 +1,236 @@
+//! The archive of a model: what it is drawn from, on grids as coarse as its pictures allow, entropy coded.
+//!
+//! In: [`Content`] and [`Steps`]. Out: bytes, as `format/ARCHIVE.md` specifies them, and back. Memory: the content twice.
+//! Every value comes back within half a step of its grid, every other byte as it was; texels that no Gaussian reads and
+//! tensors that nothing reads come back as what is nearest or as zeros.
+
+mod cloud;
+mod entropy;
+mod field;
+mod file;
+mod importance;
+mod lattice;
+mod predict;
+mod residual;
+mod step;
+#[cfg(test)]
+mod tests;
+mod texels;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+pub use cloud::{ATTRIBUTES, CloudSteps};
+pub use field::{FieldSteps, Role, TensorSteps, rounded};
+pub use file::{MAGIC, Parts, VERSION};
+pub use importance::offsets;
+pub use step::{STEPS, nearest, step};
+
+use crate::deform::{Box3, Tensor, Tensors};
+use crate::error::{Error, Result};
+use crate::model::{Columns, Gaussians};
+use field::{Entry, Readers};
+use file::{Damage, Sections};
+
+/// Name of the tensor that holds the box that planes cover.
+pub const BOX: &str = "deformation_net.grid.aabb";
+
+/// What an archive holds.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Content {
+    /// The canonical cloud.
+    pub cloud: Gaussians,
+    /// The deformation field, if there is one, each tensor with what it is to those that read it.
+    pub field: BTreeMap<String, Role>,
+    /// The tensors of the field.
+    pub tensors: Tensors,
+    /// First and last time at which the field is read.
+    pub times: [f32; 2],
+    /// What else there is of every Gaussian, as many bytes of each, one Gaussian after the other.
+    pub beside: Vec<u8>,
+    /// Files and other bytes, by name.
+    pub files: BTreeMap<String, Vec<u8>>,
+}
+
+/// How finely a content is stored.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Steps {
+    /// Of the cloud.
+    pub cloud: CloudSteps,
+    /// Of the field.
+    pub field: FieldSteps,
+}
+
+/// An archive, encoded.
+#[derive(Debug)]
+pub struct Encoded {
+    /// The file.
+    pub bytes: Vec<u8>,
+    /// How many of them are for what.
+    pub parts: Parts,
+    /// For every Gaussian of the archive its place in the content.
+    pub order: Vec<u32>,
+    /// Bits of each attribute and of each tensor that has a grid, by name, about.
+    pub bits: BTreeMap<String, f64>,
+}
+
+/// The table of an archive: everything about it but symbols and blobs.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Table {
+    cloud: cloud::Shape,
+    /// Bits of the first and the last time, which a text would round.
+    times: [u32; 2],
+    tensors: Vec<Entry>,
+    /// Bytes beside the attributes of each Gaussian.
+    beside: usize,
+    /// Names and lengths of files.
+    files: Vec<(String, usize)>,
+}
+
+/// Encodes `content`.
+///
+/// # Errors
+/// A value that is not finite, or too large for its grid; the error names it.
+pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
+    check(content, steps)?;
+    let mut bits = BTreeMap::new();
+    let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
+    // The positions that a reader will have.
+    let stored = cloud::decode(&shape, &cloud).ok_or_else(|| Error::usage("a cloud does not come back"))?;
+    let readers = Readers { position: &stored.position, space: space(content), times: content.times };
+    let entry = |(name, tensor): (&String, &Tensor)| {
+        let role = content.field.get(name).copied().unwrap_or(Role::Unread);
+        Entry::new(name, tensor, role, steps.field.0.get(name))
+    };
+    let mut entries: Vec<Entry> = content.tensors.iter().map(entry).collect();
+    let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
+    let width = content.beside.len() / content.cloud.len().max(1);
+    let table = Table {
+        cloud: shape,
+        times: content.times.map(f32::to_bits),
+        tensors: entries,
+        beside: width,
+        files: content.files.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect(),
+    };
+    let mut blobs: Vec<u8> = exact.iter().flat_map(|value| value.to_le_bytes()).collect();
+    // By place in the row: what is alike lies together.
+    for at in 0..width {
+        blobs.extend(order.iter().map(|&id| content.beside[id as usize * width + at]));
+    }
+    content.files.values().for_each(|bytes| blobs.extend(bytes));
+    let table = serde_json::to_vec(&table).map_err(|error| Error::usage(error.to_string()))?;
+    let (bytes, parts) = file::write(&Sections { table, cloud, field, blobs })?;
+    Ok(Encoded { bytes, parts, order, bits })
+}
+
+/// Decodes the archive `bytes`, read from `path`.
+///
+/// # Errors
+/// Bytes that are no archive, are cut short or damaged, of a later version, or that declare more than they can hold.
+/// Nothing is allocated by what they declare before it is checked.
+pub fn decode(bytes: &[u8], path: &Path) -> Result<(Content, Parts)> {
+    decoded(bytes).map_err(|damage| damage.of(path))
+}
+
+fn decoded(bytes: &[u8]) -> std::result::Result<(Content, Parts), Damage> {
+    let (Sections { table, cloud, field, blobs }, parts) = file::read(bytes)?;
+    let table: Table = serde_json::from_slice(&table)
+        .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
+    let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
+    if !table.cloud.is_sound() {
+        return Err(unsound("table of the cloud"));
+    }
+    if let Some(entry) = table.tensors.iter().find(|entry| !entry.is_sound()) {
+        return Err(unsound(&format!("tensor {}", entry.name)));
+    }
+    let values = table
+        .tensors
+        .iter()
+        .try_fold(table.cloud.values(), |sum, entry| Some(sum.and_then(|sum| sum.checked_add(entry.values()?))));
+    file::check_size(values.flatten().and_then(|values| values.checked_mul(4)), bytes.len())?;
+    let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("cloud"))?;
+
+    let count = |entry: &&Entry| entry.role == Role::Exact;
+    let exact = table.tensors.iter().filter(count).filter_map(Entry::values).sum::<usize>() * 4;
+    let beside = table.beside.checked_mul(cloud.len());
+    let files = table.files.iter().try_fold(0usize, |sum, &(_, length)| sum.checked_add(length));
+    let all = beside.zip(files).and_then(|(beside, files)| beside.checked_add(files)?.checked_add(exact));
+    if all != Some(blobs.len()) {
+        return Err(unsound("blobs"));
+    }
+    let (exact, rest) = blobs.split_at(exact);
+    let (planes, mut rest) = rest.split_at(beside.unwrap_or(0));
+    let exact: Vec<f32> = exact.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect();
+    let mut content = Content { times: table.times.map(f32::from_bits), ..Content::default() };
+    if !content.times.iter().all(|time| time.is_finite()) {
+        return Err(unsound("times"));
+    }
+    content.beside = vec![0; planes.len()];
+    for (at, plane) in planes.chunks_exact(cloud.len().max(1)).enumerate() {
+        for (i, &byte) in plane.iter().enumerate() {
+            content.beside[i * table.beside + at] = byte;
+        }
+    }
+    for (name, length) in table.files {
+        let (own, after) = rest.split_at(length);
+        content.files.insert(name, own.to_vec());
+        rest = after;
+    }
+    // The box is among what is exact; planes need it before they are read.
+    let before = table.tensors.iter().take_while(|entry| entry.name != BOX).filter(count);
+    let start: usize = before.filter_map(Entry::values).sum();
+    let has_box = table.tensors.iter().any(|entry| entry.name == BOX && entry.role == Role::Exact);
+    let space = exact.get(start..).filter(|_| has_box).and_then(|values| Box3::new(values.get(..6)?));
+    if space.is_none() && table.tensors.iter().any(|entry| matches!(entry.role, Role::Plane(_) | Role::TimePlane(_))) {
+        return Err(unsound("box of the field"));
+    }
+    let readers = Readers { position: &cloud.position, space, times: content.times };
+    content.tensors = field::decode(&table.tensors, &field, &exact, &readers).ok_or_else(|| unsound("field"))?;
+    content.field = table.tensors.into_iter().map(|entry| (entry.name, entry.role)).collect();
+    content.cloud = cloud;
+    Ok((content, parts))
+}
+
+/// The box that planes cover.
+pub fn space(content: &Content) -> Option<Box3> {
+    content.tensors.get(BOX).and_then(|tensor| Box3::new(&tensor.data))
+}
+
+/// What a content comes back as, its order aside.
+pub fn round_cloud(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usize]) {
+    cloud::round(cloud, steps, attributes);
+}
+
+/// The values of the attribute [`ATTRIBUTES`]`[k]`.
+pub fn attribute(cloud: &Gaussians, k: usize) -> impl Iterator<Item = f32> {
+    cloud::values(cloud, k)
+}
+
+/// Confirms that every value has a place on its grid.
+fn check(content: &Content, steps: &Steps) -> Result<()> {
+    for column in Columns::all().iter() {
+        let values = content.cloud.column(column);
+        if let Some(at) = values.planes().iter().position(|value| !value.is_finite()) {
+            let (id, value) = (at % values.len(), values.planes()[at]);
+            return Err(Error::usage(format!(
+                "an archive holds finite values: {} of Gaussian {id} of the result is {value}\n  drop it with --drop-ids",
+                column.name()
+            )));
+        }
+    }
+    for (name, tensor) in &content.tensors {
+        if let Some(value) = tensor.data.iter().find(|value| !value.is_finite()) {
+            return Err(Error::usage(format!("an archive holds finite values: tensor {name} has {value}")));
+        }
+    }
+    let coarse = steps.cloud.iter().chain(steps.field.0.values().map(|steps| &steps.step));
+    match coarse.into_iter().find(|step| !STEPS.contains(step)) {
+        Some(step) => {
+            Err(Error::usage(format!("an archive has steps from {} to {}: {step}", STEPS.start(), STEPS.end())))
+        }
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,103 @@
+//! What is expected of a value: its plane's mean, and parts of what others that are known already differ from theirs.
+
+/// Parts are whole multiples of `1 / PARTS`.
+const PARTS: f32 = 64.0;
+
+/// Parts of `N` differences, each in 64ths from −2 to 127/64.
+pub(super) type Parts<const N: usize> = [i8; N];
+
+/// Parts in the form that is calculated with.
+pub(super) fn factors<const N: usize>(parts: &Parts<N>) -> [f32; N] {
+    parts.map(|part| f32::from(part) / PARTS)
+}
+
+/// The sum of all parts, in order.
+#[inline(always)]
+pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], differences: &[f32; N]) -> f32 {
+    let mut sum = mean;
+    for (factor, difference) in factors.iter().zip(differences) {
+        sum += factor * difference;
+    }
+    sum
+}
+
+/// Finds the parts whose squared error is least.
+#[derive(Debug)]
+pub(super) struct Fit<const N: usize> {
+    products: [[f64; N]; N],
+    with_value: [f64; N],
+}
+
+impl<const N: usize> Fit<N> {
+    pub(super) fn new() -> Self {
+        Fit { products: [[0.0; N]; N], with_value: [0.0; N] }
+    }
+
+    /// Learns that `value`, less its mean, stood beside `differences`.
+    #[inline(always)]
+    pub(super) fn add(&mut self, differences: &[f32; N], value: f32) {
+        for i in 0..N {
+            for j in 0..=i {
+                self.products[i][j] += f64::from(differences[i]) * f64::from(differences[j]);
+            }
+            self.with_value[i] += f64::from(differences[i]) * f64::from(value);
+        }
+    }
+
+    /// The parts: normal equations, with as much of a ridge as makes them solvable (R. Cholesky).
+    pub(super) fn parts(mut self) -> Parts<N> {
+        let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
+        if !(trace.is_finite() && trace > 0.0) {
+            return [0; N];
+        }
+        for i in 0..N {
+            self.products[i][i] += 1e-4 * trace / N as f64;
+        }
+        let mut root = [[0.0; N]; N];
+        for i in 0..N {
+            for j in 0..=i {
+                let known: f64 = (0..j).map(|k| root[i][k] * root[j][k]).sum();
+                let left = self.products[i][j] - known;
+                root[i][j] = if i == j { left.max(f64::MIN_POSITIVE).sqrt() } else { left / root[j][j] };
+            }
+        }
+        let mut found = self.with_value;
+        for i in 0..N {
+            let known: f64 = (0..i).map(|k| root[i][k] * found[k]).sum();
+            found[i] = (found[i] - known) / root[i][i];
+        }
+        for i in (0..N).rev() {
+            let known: f64 = (i + 1..N).map(|k| root[k][i] * found[k]).sum();
+            found[i] = (found[i] - known) / root[i][i];
+        }
+        // `as` saturates and turns NaN into 0.
+        found.map(|part| (part * f64::from(PARTS)).round() as i8)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_a_sum_of_parts_is_found_as_such() {
+        let mut fit = Fit::new();
+        for i in 0..400 {
+            let x = [(i as f32 * 0.7).sin(), (i as f32 * 1.3).cos(), (i as f32 * 0.11).sin()];
+            fit.add(&x, 0.75 * x[0] - 1.25 * x[1] + 0.5 * x[2]);
+        }
+        let parts = fit.parts();
+        assert_eq!(parts, [48, -80, 32]);
+        assert_eq!(expected(2.0, &factors(&parts), &[1.0, 1.0, 2.0]), 2.5);
+    }
+
+    #[test]
+    fn where_nothing_differs_nothing_is_expected() {
+        let mut fit = Fit::<4>::new();
+        fit.add(&[0.0; 4], 1.0);
+        assert_eq!(fit.parts(), [0; 4]);
+        let mut fit = Fit::<2>::new();
+        fit.add(&[f32::NAN; 2], 1.0);
+        assert_eq!(fit.parts(), [0; 2]);
+    }
+}

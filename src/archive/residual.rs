@@ -1,0 +1,100 @@
+//! Differences from what was expected, coded by how large those around them were.
+//!
+//! The magnitude of a difference falls into one of sixteen classes, which is a symbol; where in the class it lies, and
+//! its sign, are bits as they are: within a class the likelihoods hardly differ.
+
+use super::entropy::{Decoder, Encoder, Model, SYMBOLS};
+
+/// First magnitude and bits of each class but the last, which has no end.
+const CLASSES: [(u64, u32); SYMBOLS] = [
+    (0, 0),
+    (1, 0),
+    (2, 0),
+    (3, 0),
+    (4, 0),
+    (5, 0),
+    (6, 0),
+    (7, 0),
+    (8, 1),
+    (10, 1),
+    (12, 2),
+    (16, 3),
+    (24, 3),
+    (32, 5),
+    (64, 6),
+    (128, 0),
+];
+
+/// Half octaves of the size that is expected, from a quarter of a step.
+const CONTEXTS: usize = 16;
+
+/// The models of a group of planes that behave alike.
+#[derive(Debug, Clone)]
+pub(super) struct Residuals([Model; CONTEXTS]);
+
+impl Residuals {
+    pub(super) fn new() -> Residuals {
+        Residuals([Model::NEW; CONTEXTS])
+    }
+
+    /// By the mean magnitude of what lies around, in steps; told by exponent and first bit of the mantissa.
+    #[inline(always)]
+    fn around(&mut self, size: f32) -> &mut Model {
+        let half_octaves = (size.abs().to_bits() >> 22) as i32 - ((127 - 2) << 1);
+        &mut self.0[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
+    }
+
+    pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut Encoder) {
+        let magnitude = residual.unsigned_abs();
+        let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
+        to.symbol(self.around(size), class);
+        let above = magnitude - CLASSES[class].0;
+        if class == SYMBOLS - 1 {
+            to.number(above);
+        } else {
+            to.bits(above, CLASSES[class].1);
+        }
+        if magnitude > 0 {
+            to.bits(u64::from(residual < 0), 1);
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn decode(&mut self, size: f32, from: &mut Decoder<'_>) -> i64 {
+        let class = from.symbol(self.around(size));
+        if class == 0 {
+            return 0;
+        }
+        let (first, bits) = CLASSES[class];
+        let above = if class == SYMBOLS - 1 { from.number() } else { from.bits(bits) };
+        let magnitude = first.wrapping_add(above) as i64;
+        if from.bits(1) == 1 { magnitude.wrapping_neg() } else { magnitude }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_magnitude_has_one_class() {
+        for pair in CLASSES.windows(2) {
+            assert_eq!(pair[0].0 + (1 << pair[0].1), pair[1].0);
+        }
+    }
+
+    #[test]
+    fn differences_come_back_whatever_was_around() {
+        let values: Vec<i64> = (-300..300).chain([1 << 40, -(1 << 50), i64::from(i32::MAX)]).collect();
+        for size in [0.0, 0.3, 1.0, 50.0, f32::INFINITY, f32::NAN] {
+            let (mut models, mut encoder) = (Residuals::new(), Encoder::default());
+            values.iter().for_each(|&value| models.encode(value, size, &mut encoder));
+            let bytes = encoder.finish();
+            let (mut models, mut decoder) = (Residuals::new(), Decoder::new(&bytes).unwrap());
+            for &value in &values {
+                assert_eq!(models.decode(size, &mut decoder), value);
+            }
+            assert!(decoder.is_finished());
+        }
+    }
+}

@@ -1,0 +1,113 @@
+//! Steps of uniform grids, by whole numbers so that every machine makes the same of them.
+//!
+//! Step `k` is 2^(k/8). A value `v` on the grid of a step `s` is the multiple `round(v / s)`; it comes back as the
+//! nearest f32 of that multiple, so that |v' − v| ≤ s/2 but for half a unit in the last place of an f32.
+
+/// 2^(i/8).
+const EIGHTHS: [f64; 8] = [
+    1.0,
+    1.090_507_732_665_257_7,
+    1.189_207_115_002_721,
+    1.296_839_554_651_009_6,
+    std::f64::consts::SQRT_2,
+    1.542_210_825_407_940_7,
+    1.681_792_830_507_429,
+    1.834_008_086_409_342_4,
+];
+
+/// Steps are within 2^±40.
+pub const STEPS: std::ops::RangeInclusive<i32> = -320..=320;
+
+/// Multiples stay exact in an f64, with room for sums.
+const LARGEST: f64 = (1u64 << 50) as f64;
+
+/// Added and taken away again it leaves the nearest whole number, halves to even; |x| < 2^51.
+const ROUNDING: f64 = 6_755_399_441_055_744.0;
+
+/// The step `k`.
+pub fn step(k: i32) -> f64 {
+    let whole = k.div_euclid(8).clamp(-1000, 1000);
+    EIGHTHS[k.rem_euclid(8) as usize] * f64::from_bits(((1023 + whole) as u64) << 52)
+}
+
+/// The `k` whose step comes closest to `size`, positive, in octaves; within [`STEPS`].
+pub fn nearest(size: f64) -> i32 {
+    ((8.0 * size.log2()).round() as i32).clamp(*STEPS.start(), *STEPS.end())
+}
+
+/// A grid to put values on.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Grid {
+    step: f64,
+    inverse: f64,
+}
+
+impl Grid {
+    pub(super) fn new(k: i32) -> Grid {
+        let step = step(k);
+        Grid { step, inverse: 1.0 / step }
+    }
+
+    /// The multiple nearest to `value`.
+    #[inline(always)]
+    pub(super) fn multiple(self, value: f32) -> i64 {
+        self.nearest(f64::from(value))
+    }
+
+    /// The multiple nearest to `value`, at most [`LARGEST`]; of what is no number 0.
+    #[inline(always)]
+    pub(super) fn nearest(self, value: f64) -> i64 {
+        let x = (value * self.inverse).clamp(-LARGEST, LARGEST);
+        (x + ROUNDING - ROUNDING) as i64
+    }
+
+    #[inline(always)]
+    pub(super) fn value(self, multiple: i64) -> f32 {
+        (multiple as f64 * self.step) as f32
+    }
+
+    /// `size` in steps.
+    #[inline(always)]
+    pub(super) fn in_steps(self, size: f32) -> f32 {
+        size * self.inverse as f32
+    }
+
+    #[inline(always)]
+    pub(super) fn size(self) -> f32 {
+        self.step as f32
+    }
+
+    pub(super) fn round(self, value: f32) -> f32 {
+        self.value(self.multiple(value))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn eight_steps_are_an_octave() {
+        for k in STEPS {
+            let expected = (f64::from(k) / 8.0).exp2();
+            assert!((step(k) / expected - 1.0).abs() < 1e-14, "{k}: {} of {expected}", step(k));
+            assert_eq!(nearest(step(k)), k);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_value_comes_back_within_half_a_step(value in -1e6f32..1e6, k in -100i32..60) {
+            let back = Grid::new(k).round(value);
+            let bound = step(k) / 2.0 + f64::from(value.abs()) * f64::from(f32::EPSILON);
+            prop_assert!((f64::from(back) - f64::from(value)).abs() <= bound, "{value} {back} {bound}");
+        }
+
+        #[test]
+        fn what_is_on_the_grid_stays(multiple in -(1i64 << 20)..1 << 20, k in -100i32..60) {
+            let grid = Grid::new(k);
+            prop_assert_eq!(grid.multiple(grid.value(multiple)), multiple);
+        }
+    }
+}

@@ -1,0 +1,243 @@
+//! What comes back of an archive, and what becomes of a damaged one.
+
+use std::path::Path;
+
+use proptest::prelude::*;
+use xxhash_rust::xxh3::xxh3_64;
+
+use super::*;
+use crate::deform::{Tensor, tap};
+
+/// Numbers that look random, the same for the same seed.
+struct Dice(u64);
+
+impl Dice {
+    fn next(&mut self) -> f32 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
+    }
+}
+
+fn tensor(dice: &mut Dice, shape: &[usize]) -> Tensor {
+    let data = (0..shape.iter().product()).map(|_| dice.next()).collect();
+    Tensor { shape: shape.to_vec(), data }
+}
+
+/// A model of `count` Gaussians with every role of tensors.
+fn content(seed: u64, count: usize, sh_degree: usize) -> Content {
+    let mut dice = Dice(seed);
+    let mut cloud = Gaussians::zeros(count, sh_degree);
+    for column in cloud.columns_mut(Columns::all()) {
+        column.planes_mut().iter_mut().for_each(|value| *value = 3.0 * dice.next());
+    }
+    let mut content = Content { cloud, times: [0.0, 1.0], ..Content::default() };
+    let plane = [1, 3, 7, 9];
+    let line = [1, 3, 6, 9];
+    for (name, shape, role) in [
+        ("a.plane.xy", &plane[..], Role::Plane([0, 1])),
+        ("a.plane.yz", &plane, Role::Plane([1, 2])),
+        ("a.plane.xt", &line, Role::TimePlane(0)),
+        ("a.plane.zt", &line, Role::TimePlane(2)),
+        ("a.matrix", &[5, 8], Role::Weights),
+        ("a.vector", &[8], Role::Weights),
+        ("a.scalar", &[], Role::Weights),
+        ("a.exact", &[2, 2, 2], Role::Exact),
+        ("a.unread", &[4, 4], Role::Unread),
+    ] {
+        content.tensors.insert(name.to_owned(), tensor(&mut dice, shape));
+        content.field.insert(name.to_owned(), role);
+    }
+    let corners = Tensor { shape: vec![2, 3], data: vec![2.5, 2.0, 3.5, -2.5, -3.0, -2.0] };
+    content.tensors.insert(BOX.to_owned(), corners);
+    content.field.insert(BOX.to_owned(), Role::Exact);
+    content.beside = (0..3 * count).map(|i| (i * 7) as u8).collect();
+    content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
+    content.files.insert("empty".to_owned(), Vec::new());
+    content
+}
+
+fn some_steps(content: &Content, octave: i32) -> Steps {
+    let of = |k: i32| TensorSteps { step: 8 * octave + k, channels: Vec::new() };
+    let tensors = content.field.keys().zip(0..).map(|(name, k)| (name.clone(), of(k)));
+    let mut steps = Steps { cloud: [0; 8], field: FieldSteps(tensors.collect()) };
+    steps.cloud.iter_mut().zip(0..).for_each(|(step, k)| *step = 8 * octave - k);
+    steps
+}
+
+fn near(a: f32, b: f32, step: f64) -> bool {
+    f64::from(a - b).abs() <= 0.5 * step + 1e-6 * f64::from(a.abs())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(40))]
+
+    #[test]
+    fn values_come_back_within_half_a_step_and_bytes_as_they_were(
+        seed in any::<u64>(), count in 0usize..60, degree in 0usize..4, octave in -8i32..2
+    ) {
+        let content = content(seed, count, degree);
+        let steps = some_steps(&content, octave);
+        let Encoded { bytes, parts, order, .. } = encode(&content, &steps).unwrap();
+        prop_assert_eq!(parts.total(), bytes.len() as u64);
+        let (back, read) = decode(&bytes, Path::new("a.gsz")).unwrap();
+        prop_assert_eq!(read, parts);
+        prop_assert_eq!(&encode(&content, &steps).unwrap().bytes, &bytes);
+
+        let mut sorted = order.clone();
+        sorted.sort_unstable();
+        prop_assert_eq!(sorted, (0..count as u32).collect::<Vec<_>>());
+        let expected = content.cloud.pick(&order);
+        for (k, name) in ATTRIBUTES.iter().enumerate().take(4 + degree + 1) {
+            let step = step(steps.cloud[k]);
+            for (a, b) in attribute(&expected, k).zip(attribute(&back.cloud, k)) {
+                prop_assert!(near(a, b, step), "{name}: {a} {b} of step {step}");
+            }
+        }
+        for (i, &id) in order.iter().enumerate() {
+            prop_assert_eq!(&back.beside[3 * i..3 * i + 3], &content.beside[3 * id as usize..][..3]);
+        }
+        prop_assert_eq!(&back.files, &content.files);
+        prop_assert_eq!(&back.field, &content.field);
+        for (name, role) in &content.field {
+            let (a, b) = (&content.tensors[name], &back.tensors[name]);
+            prop_assert_eq!(&a.shape, &b.shape);
+            match role {
+                Role::Exact => prop_assert_eq!(a, b),
+                Role::Unread => prop_assert!(b.data.iter().all(|&value| value == 0.0)),
+                Role::Weights => {
+                    let step = step(steps.field.0[name].step);
+                    prop_assert!(a.data.iter().zip(&b.data).all(|(&a, &b)| near(a, b, step)), "{name}");
+                }
+                Role::Plane(_) | Role::TimePlane(_) => (),
+            }
+        }
+        // What a Gaussian samples of a plane is off by no more than half a step at the coarsest weight it may have.
+        let space = space(&content).unwrap();
+        for (name, axes) in [("a.plane.xy", [0, 1]), ("a.plane.yz", [1, 2])] {
+            let [rows, columns] = [7usize, 9];
+            for i in 0..count {
+                let u = space.normalised(back.cloud.position.row(i));
+                let (p, q) = (tap(u[axes[0]], columns), tap(u[axes[1]], rows));
+                for (row, b) in [(q.low, 1.0 - q.fraction), (q.high, q.fraction)] {
+                    for (column, a) in [(p.low, 1.0 - p.fraction), (p.high, p.fraction)] {
+                        let weight = f64::from(a * b);
+                        for c in 0..3 {
+                            let at = (c * rows + row as usize) * columns + column as usize;
+                            let off = f64::from(content.tensors[name].data[at] - back.tensors[name].data[at]).abs();
+                            let step = step(steps.field.0[name].step);
+                            // An octave less is read of a texel: its step is half an octave more, and the class is whole.
+                            prop_assert!(off * weight <= 0.75 * step + 1e-4 * weight, "{name} {off} x {weight} of {step}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn damage_under_right_checksums_is_an_error_or_another_content_but_never_a_panic(
+        seed in any::<u64>(), places in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..6)
+    ) {
+        let content = content(seed, 20, 1);
+        let mut bytes = encode(&content, &some_steps(&content, -4)).unwrap().bytes;
+        for (place, value) in places {
+            let at = place.index(bytes.len());
+            bytes[at] ^= value;
+        }
+        reseal(&mut bytes);
+        let _ = decode(&bytes, Path::new("a.gsz"));
+    }
+}
+
+/// Makes the checksums of an archive those of its bytes, as far as its lengths can be followed.
+fn reseal(bytes: &mut [u8]) {
+    let long = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
+    let head: usize = 12 + 4 * 24 + 8;
+    let mut start = head;
+    for k in 0..4 {
+        let end = start.saturating_add(long(bytes, 12 + 24 * k)).min(bytes.len());
+        let sum = xxh3_64(&bytes[start..end]).to_le_bytes();
+        bytes[12 + 24 * k + 16..][..8].copy_from_slice(&sum);
+        start = end;
+    }
+    let sum = xxh3_64(&bytes[..head - 8]).to_le_bytes();
+    bytes[head - 8..head].copy_from_slice(&sum);
+}
+
+#[test]
+fn an_archive_cut_short_anywhere_is_an_error_that_names_it() {
+    let content = content(3, 12, 0);
+    let bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+    for length in 0..bytes.len() {
+        let message = decode(&bytes[..length], Path::new("a.gsz")).unwrap_err().to_string();
+        assert!(message.contains("a.gsz"), "{length}: {message}");
+    }
+    let longer = [&bytes[..], &[0]].concat();
+    assert!(decode(&longer, Path::new("a.gsz")).unwrap_err().to_string().contains("after the last section"));
+}
+
+#[test]
+fn any_bit_that_flips_is_seen() {
+    let content = content(4, 12, 0);
+    let bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+    for bit in 0..8 * bytes.len() {
+        let mut damaged = bytes.clone();
+        damaged[bit / 8] ^= 1 << (bit % 8);
+        assert!(decode(&damaged, Path::new("a.gsz")).is_err(), "bit {bit}");
+    }
+}
+
+#[test]
+fn lengths_that_no_file_of_its_size_has_are_refused_before_anything_is_allocated() {
+    let content = content(5, 12, 0);
+    let sound = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+    for place in [0, 8] {
+        let mut bytes = sound.clone();
+        bytes[12 + place..][..8].copy_from_slice(&(1u64 << 50).to_le_bytes());
+        reseal(&mut bytes);
+        assert!(decode(&bytes, Path::new("a.gsz")).is_err());
+    }
+    // So many Gaussians, of a table that is sound.
+    let (Sections { table, cloud, field, blobs }, _) = file::read(&sound).unwrap();
+    let table = String::from_utf8(table).unwrap().replace("\"gaussians\":12", "\"gaussians\":4000000000");
+    let bytes = file::write(&Sections { table: table.into_bytes(), cloud, field, blobs }).unwrap().0;
+    let message = decode(&bytes, Path::new("a.gsz")).unwrap_err().to_string();
+    assert!(message.contains("bytes of content"), "{message}");
+}
+
+#[test]
+fn a_later_version_is_named() {
+    let content = content(6, 2, 0);
+    let mut bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+    bytes[8] = 2;
+    let message = decode(&bytes, Path::new("a.gsz")).unwrap_err().to_string();
+    assert!(message.contains("version 1") && message.contains("version 2"), "{message}");
+}
+
+#[test]
+fn values_that_are_not_finite_are_refused_by_name() {
+    let mut bad = content(7, 3, 0);
+    bad.cloud.opacity_logit.set_row(1, [f32::NAN]);
+    let message = encode(&bad, &some_steps(&bad, -3)).unwrap_err().to_string();
+    assert!(message.contains("opacity_logit of Gaussian 1"), "{message}");
+    let mut bad = content(7, 3, 0);
+    bad.tensors.get_mut("a.matrix").unwrap().data[4] = f32::INFINITY;
+    assert!(encode(&bad, &some_steps(&bad, -3)).unwrap_err().to_string().contains("a.matrix"));
+}
+
+#[test]
+fn texels_that_nobody_reads_take_nothing() {
+    let all = content(8, 40, 0);
+    let mut far = all.clone();
+    // All in one place: four texels of each plane.
+    for i in 0..far.cloud.len() {
+        far.cloud.position.set_row(i, [0.1, 0.2, 0.3]);
+    }
+    let bits = |content: &Content, name: &str| encode(content, &some_steps(content, -6)).unwrap().bits[name];
+    assert!(bits(&far, "a.plane.xy") < 0.25 * bits(&all, "a.plane.xy"));
+    // Nor are rows of times before the first: of six at -1 to 1 the first two.
+    let mut never = all.clone();
+    let row = never.tensors.get_mut("a.plane.xt").unwrap();
+    row.data.iter_mut().enumerate().filter(|(i, _)| (i / 9) % 6 < 2).for_each(|(_, value)| *value = 1e4);
+    assert_eq!(bits(&all, "a.plane.xt"), bits(&never, "a.plane.xt"));
+}

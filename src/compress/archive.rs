@@ -1,0 +1,357 @@
+//! Stage `archive`: on which grids the values of an archive lie.
+//!
+//! Noise adds up: each attribute and tensor, a group, put on its grid alone adds a squared error to the pictures that
+//! goes with the square of its step, and takes bits that go down by about one a value with every octave of it. Bits are
+//! fewest for an error where every group's error goes by how many bits an octave saves there (reverse water-filling;
+//! Cover & Thomas, "Elements of Information Theory", 10.3.3). Both are measured, the errors on pictures; then all steps
+//! together are as coarse as the pictures of the archive itself allow.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+
+use super::journal::Journal;
+use super::summary::ArchiveSummary;
+use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::metrics::psnr;
+use crate::model::{Columns, Picture};
+use crate::reduction::Reduction;
+use crate::render::{self, Image, render};
+use crate::scene::Scene;
+use crate::source::FrameSource;
+use crate::stream::{Batch, Subject, show, spread};
+
+/// What the stage is called.
+const NAME: &str = "archive";
+/// Pictures that are looked at.
+const PICTURES: usize = 12;
+/// What an archive may cost against the original's pictures where nothing is asked for, dB.
+const LOSS: f64 = 0.5;
+/// Of a result whose pictures are closer to the original's than this, dB, nothing was lost that noise could hide behind:
+/// then the archive's are to be as close to the result's.
+const ENOUGH: f64 = 50.0;
+/// What a search for a quality leaves for the archive, dB: a third of the pruning's squared error. Where both are traded
+/// off best, errors go by how fast bytes fall with them: about three times as fast with the number of Gaussians.
+pub const LEFT_BY_SEARCH: f64 = 1.2;
+/// Times that errors and bits are measured.
+const ROUNDS: usize = 2;
+/// Octaves by which a step follows one measurement, at most.
+const FURTHEST: f64 = 2.5;
+/// Steps are at most so many deviations of their values: beyond that nothing is left of these.
+const COARSEST: f64 = 4.0;
+/// Errors are not told apart below this.
+const LEAST_ERROR: f64 = 1e-14;
+/// Octaves by which all steps become coarser in the end: the least and the most that is thought of, ...
+const ADDED: [f64; 2] = [-2.0, 2.0];
+/// ... and how often that range is halved.
+const HALVINGS: usize = 6;
+
+/// The making of an archive.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Archive {
+    /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
+    pub psnr: Option<f64>,
+}
+
+/// What an archive's pictures are to be.
+#[derive(Debug, Clone, Copy)]
+enum Aim {
+    /// So close to the result's, dB.
+    Close(f64),
+    /// No more than so much further from the original's than the result's are, dB.
+    Loss(f64),
+}
+
+impl Aim {
+    /// PSNR against the result's pictures, dB, that comes to where these are `level` from the original's.
+    fn close(self, level: f64) -> f64 {
+        match self {
+            Aim::Close(psnr) => psnr,
+            // Squared errors add.
+            Aim::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
+        }
+    }
+}
+
+/// A group of values with one step.
+#[derive(Debug, Clone)]
+enum Group {
+    Attribute(usize),
+    Tensor(String),
+}
+
+impl Group {
+    fn name(&self) -> &str {
+        match self {
+            Group::Attribute(k) => ATTRIBUTES[*k],
+            Group::Tensor(name) => name,
+        }
+    }
+
+    /// Steps that a deviation of its values is at first: about right at 45 dB.
+    fn first(&self) -> f64 {
+        match self {
+            Group::Attribute(0) => 512.0,
+            Group::Attribute(_) => 24.0,
+            Group::Tensor(name) if name.ends_with("bias") => 64.0,
+            Group::Tensor(_) => 16.0,
+        }
+    }
+}
+
+/// Pictures of the result, which others are compared with.
+struct Looks<'a> {
+    scene: &'a Scene,
+    pictures: Vec<Picture>,
+    images: Vec<Image>,
+}
+
+impl Looks<'_> {
+    fn of<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<Looks<'a>> {
+        let mut looks = Looks { scene, pictures: spread(&scene.schedule, PICTURES, 1), images: Vec::new() };
+        looks.images = looks.render(source, |_, image| image)?;
+        Ok(looks)
+    }
+
+    fn render<T: Send>(&self, source: &dyn FrameSource, of: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
+        let mut made = Vec::with_capacity(self.pictures.len());
+        let batch = Batch::of_frame(&self.scene.limits);
+        show([Subject::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
+            let first = made.len();
+            let view = |(k, view): (usize, &crate::stream::View<'_, 1>)| {
+                of(first + k, render(view.states[0], view.camera, self.scene.background))
+            };
+            made.par_extend(views.par_iter().enumerate().map(view));
+            Ok(())
+        })?;
+        Ok(made)
+    }
+
+    /// Mean PSNR, dB.
+    fn psnr(&self, source: &dyn FrameSource) -> Result<f64> {
+        let found = self.render(source, |k, image| psnr(&image, &self.images[k]))?;
+        Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
+    }
+
+    /// Mean squared error.
+    fn error(&self, source: &dyn FrameSource) -> Result<f64> {
+        let found = self.render(source, |k, image| 10f64.powf(-0.1 * psnr(&image, &self.images[k])))?;
+        Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
+    }
+}
+
+impl Archive {
+    /// What is left, its pictures, the archive and what it decodes to.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let whole = work.state(Columns::all());
+        let pictures = PICTURES as f64 * (2.0 + ROUNDS as f64 * 40.0);
+        Need {
+            stage: NAME,
+            reads: 1.0,
+            seconds: work.picturing(pictures, 0.3 * work.count(), RENDER),
+            per_gaussian: vec![
+                ("states", whole),
+                ("readers", work.input.reader),
+                ("held", work.held(limits, Columns::all())),
+                ("pictures", PICTURE_ON_ALL_THREADS),
+                ("contents", 4 * whole),
+            ],
+            fixed: vec![
+                ("pictures", 12 * (2 * PICTURES as u64 + work.threads) * work.pixels),
+                ("strips", work.threads * render::STRIP_BYTES as u64),
+                ("fields", 4 * work.input.fixed),
+            ],
+        }
+    }
+
+    /// Encodes `reduction`, of which pictures may lose so much to `spare`, dB.
+    ///
+    /// # Errors
+    /// An input that no archive holds, values that are not finite, frames that cannot be read.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        reduction: &Reduction,
+        spare: Option<f64>,
+        journal: &mut Journal,
+    ) -> Result<(Encoded, ArchiveSummary)> {
+        journal.stage(NAME, reduction.len(), scene.source(), |_| {
+            let made = self.make(scene, reduction, spare)?;
+            Ok((made, reduction.len()))
+        })
+    }
+
+    fn make(&self, scene: &Scene, reduction: &Reduction, spare: Option<f64>) -> Result<(Encoded, ArchiveSummary)> {
+        let mut content = scene.input.content(reduction)?;
+        let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
+        let original = Looks::of(scene, scene.source())?;
+        let level = looks.psnr(scene.source())?;
+        let aim = match (self.psnr, spare.unwrap_or(LOSS)) {
+            (Some(psnr), _) => Aim::Close(psnr),
+            (None, loss) if level < ENOUGH && loss > 0.0 => Aim::Loss(loss),
+            _ => Aim::Close(ENOUGH),
+        };
+        let asked = aim.close(level);
+        let mut grids = Grids::of(&content);
+        let mut measured = Vec::new();
+        for _ in 0..ROUNDS {
+            measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
+        }
+        let try_at = |added: f64| -> Result<(bool, Encoded, [f64; 2])> {
+            let encoded = archive::encode(&content, &grids.steps(added))?;
+            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path)?;
+            let shown = scene.input.showing(&decoded)?;
+            let (psnr, loss) = (looks.psnr(&*shown)?, level - original.psnr(&*shown)?);
+            let does = match aim {
+                Aim::Close(least) => psnr >= least,
+                Aim::Loss(most) => loss <= most,
+            };
+            Ok((does, encoded, [psnr, loss]))
+        };
+        let [mut low, mut high] = ADDED;
+        let mut best = None;
+        for _ in 0..HALVINGS {
+            let added = 0.5 * (low + high);
+            let found = try_at(added)?;
+            if found.0 {
+                (low, best) = (added, Some(found));
+            } else {
+                high = added;
+            }
+        }
+        let (_, encoded, [psnr, loss]) = match best {
+            Some(best) => best,
+            None => try_at(low)?,
+        };
+        let (parts, bits) = (encoded.parts, encoded.bits.clone());
+        Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts, bits, measured }))
+    }
+}
+
+/// The grids of all groups of a content.
+struct Grids {
+    groups: Vec<Group>,
+    /// Standard deviation of each group's values.
+    deviations: Vec<f64>,
+    /// Log2 of each group's step.
+    octaves: Vec<f64>,
+    /// What is added to steps within each tensor, by name.
+    offsets: BTreeMap<String, Vec<i8>>,
+}
+
+impl Grids {
+    fn of(content: &Content) -> Grids {
+        let groups = groups(content);
+        let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
+        let first = |(group, deviation): (&Group, &f64)| (deviation / group.first()).log2();
+        let octaves = groups.iter().zip(&deviations).map(first).collect();
+        let space = archive::space(content);
+        let offsets = archive::offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
+        Grids { groups, deviations, octaves, offsets }
+    }
+
+    /// The steps, all so many octaves coarser.
+    fn steps(&self, added: f64) -> Steps {
+        let mut steps = Steps::default();
+        for (group, octave) in self.groups.iter().zip(&self.octaves) {
+            match group {
+                Group::Attribute(k) => steps.cloud[*k] = eighths(octave + added),
+                Group::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
+            }
+        }
+        steps
+    }
+
+    fn tensor(&self, name: &str, octave: f64) -> TensorSteps {
+        TensorSteps { step: eighths(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
+    }
+
+    /// Measures every group's squared error and bits, and has the errors go by what an octave saves, `error` all together.
+    /// Gives what was measured: name, log2 of the step, error, bits.
+    fn balance(
+        &mut self,
+        scene: &Scene,
+        looks: &Looks<'_>,
+        content: &mut Content,
+        error: f64,
+    ) -> Result<Vec<(String, f64, f64, f64)>> {
+        let errors = self.errors(scene, looks, content)?;
+        let fine = archive::encode(content, &self.steps(0.0))?.bits;
+        let coarse = archive::encode(content, &self.steps(0.5))?.bits;
+        let bits = |of: &BTreeMap<String, f64>, group: &Group| of.get(group.name()).copied().unwrap_or(0.0);
+        // Never nothing: a group that has no bits left could become coarser without end.
+        let saved =
+            |group: &Group| (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group));
+        let saved: Vec<f64> = self.groups.iter().map(saved).collect();
+        let all: f64 = saved.iter().sum();
+        let mut measured = Vec::with_capacity(self.groups.len());
+        for (g, group) in self.groups.iter().enumerate() {
+            measured.push((group.name().to_owned(), self.octaves[g], errors[g], bits(&fine, group)));
+            let by = 0.5 * (error * saved[g] / all / errors[g].max(LEAST_ERROR)).log2();
+            let coarsest = (COARSEST * self.deviations[g]).log2();
+            self.octaves[g] = (self.octaves[g] + by.clamp(-FURTHEST, FURTHEST)).min(coarsest);
+        }
+        Ok(measured)
+    }
+
+    /// Squared errors of pictures where one group lies on its grid and all others do not. `content` is as it was after.
+    fn errors(&self, scene: &Scene, looks: &Looks<'_>, content: &mut Content) -> Result<Vec<f64>> {
+        let space = archive::space(content);
+        let one = |(group, &octave): (&Group, &f64)| -> Result<f64> {
+            match group {
+                Group::Attribute(k) => {
+                    let before = content.cloud.clone();
+                    let mut steps = [0; ATTRIBUTES.len()];
+                    steps[*k] = eighths(octave);
+                    archive::round_cloud(&mut content.cloud, &steps, &[*k]);
+                    let found = looks.error(&*scene.input.showing(content)?);
+                    content.cloud = before;
+                    found
+                }
+                Group::Tensor(name) => {
+                    let (before, role) = (content.tensors[name].clone(), content.field[name]);
+                    let steps = self.tensor(name, octave);
+                    let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
+                    content.tensors.insert(name.clone(), rounded);
+                    let found = looks.error(&*scene.input.showing(content)?);
+                    content.tensors.insert(name.clone(), before);
+                    found
+                }
+            }
+        };
+        self.groups.iter().zip(&self.octaves).map(one).collect()
+    }
+}
+
+fn groups(content: &Content) -> Vec<Group> {
+    let attributes = 4 + content.cloud.sh_degree() + 1;
+    let tensors = content.field.iter().filter(|(_, role)| !matches!(role, Role::Exact | Role::Unread));
+    (0..attributes).map(Group::Attribute).chain(tensors.map(|(name, _)| Group::Tensor(name.clone()))).collect()
+}
+
+/// Standard deviation of a group's values.
+fn deviation(content: &Content, group: &Group) -> f64 {
+    let of = |values: &mut dyn Iterator<Item = f32>| {
+        let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
+        values.for_each(|value| {
+            let value = f64::from(value);
+            count += 1.0;
+            sum += value;
+            squares += value * value;
+        });
+        (squares / f64::max(count, 1.0) - (sum / f64::max(count, 1.0)).powi(2)).max(0.0).sqrt()
+    };
+    let found = match group {
+        Group::Tensor(name) => of(&mut content.tensors[name].data.iter().copied()),
+        Group::Attribute(k) => of(&mut archive::attribute(&content.cloud, *k)),
+    };
+    found.max(1e-9)
+}
+
+/// The grid whose step is nearest.
+fn eighths(octave: f64) -> i32 {
+    ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
+}

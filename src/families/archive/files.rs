@@ -1,0 +1,45 @@
+//! The parts of an archive beside symbols, by name, and the PLY among them.
+
+use std::path::Path;
+
+use crate::archive::Content;
+use crate::emit::ply::{beside, write_rows};
+use crate::error::{Error, Result};
+use crate::ingest::ply::{Header, Ply};
+
+/// Names of what an archive holds of a PLY beside its rows.
+pub(in crate::families) const HEADER: &str = "ply.header";
+const LEAD: &str = "ply.lead";
+const TAIL: &str = "ply.tail";
+/// Name of a model folder's configuration in an archive; without one it is a single PLY.
+pub(in crate::families) const CFG_ARGS: &str = "cfg_args";
+/// Name of the number of a model folder's training iteration, as text.
+pub(in crate::families) const ITERATION: &str = "iteration";
+
+/// Adds what is left of `template` beside the attributes: of `rows` what else they have, and what is around them.
+///
+/// # Errors
+/// A template cut short since it was opened.
+pub(in crate::families) fn add_cloud(
+    content: &mut Content,
+    template: &Ply,
+    rows: impl Iterator<Item = u32>,
+) -> Result<()> {
+    template.check_unshrunk()?;
+    content.beside = beside(template, rows);
+    let header = template.header().text_for(content.cloud.len());
+    for (name, bytes) in [(HEADER, &header[..]), (LEAD, template.lead()), (TAIL, template.tail())] {
+        content.files.insert(name.to_owned(), bytes.to_vec());
+    }
+    Ok(())
+}
+
+/// Writes the PLY of an archive, read from `path`, to `to`.
+pub(super) fn write_cloud(content: &Content, path: &Path, to: &Path) -> Result<()> {
+    let part = |name: &str| {
+        let missing = || Error::input(path, "blobs", format!("a part named {name}"), "none");
+        content.files.get(name).ok_or_else(missing)
+    };
+    let header = Header::parse(path, part(HEADER)?)?;
+    write_rows(path, &header, [part(LEAD)?, part(TAIL)?], &content.beside, &content.cloud, to)
+}

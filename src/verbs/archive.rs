@@ -1,0 +1,62 @@
+//! The verb `unpack` of an archive: the model that it holds, as files that its renderer opens.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::Path;
+
+use crate::TOOL;
+use crate::archive::{MAGIC, Parts};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::error::{Error, Result};
+use crate::families::archive::{is_folder, read_archive, unpack};
+
+/// What was unpacked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Unpacked {
+    /// N.
+    pub gaussians: usize,
+    /// Bytes of the archive.
+    pub parts: Parts,
+    /// Bytes of the field's tensors and the cloud's attributes, as f32.
+    pub bytes: u64,
+}
+
+/// Whether the file at `path` begins as an archive does.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn is_archive(path: &Path) -> Result<bool> {
+    if fs::metadata(path).map_err(Error::io("open", path))?.is_dir() {
+        return Ok(false);
+    }
+    let file = File::open(path).map_err(Error::io("open", path))?;
+    let mut head = Vec::new();
+    file.take(MAGIC.len() as u64).read_to_end(&mut head).map_err(Error::io("read", path))?;
+    Ok(head == MAGIC)
+}
+
+/// Writes what the archive at `path` holds to `output`: a model folder, or a PLY where it is of one.
+///
+/// # Errors
+/// An archive that is damaged; an output that is there already, or that cannot be written.
+pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace) -> Result<Unpacked> {
+    let (content, parts) = read_archive(path)?;
+    let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
+    let attributes = content.cloud.len() * crate::model::Columns::all().width(content.cloud.sh_degree());
+    let unpacked = Unpacked { gaussians: content.cloud.len(), parts, bytes: 4 * (values + attributes) as u64 };
+    if !is_folder(&content) {
+        check_target(output, Kind::File, &[path], overwrite)?;
+        let staged = StagedFile::new(output, overwrite)?;
+        unpack(&content, path, staged.path())?;
+        staged.commit()?;
+        return Ok(unpacked);
+    }
+    check_target(output, Kind::Folder, &[path], overwrite)?;
+    let staged = StagedFolder::new(output, overwrite)?;
+    unpack(&content, path, staged.path())?;
+    let marker = staged.path().join(MARKER);
+    let text = serde_json::json!({ "tool": TOOL, "input": { "path": path.display().to_string() } });
+    fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
+    staged.commit()?;
+    Ok(unpacked)
+}
