@@ -26,8 +26,10 @@ use crate::stream::{Batch, Subject, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "archive";
-/// Pictures that are looked at.
-const PICTURES: usize = 12;
+/// Fewest and most pictures that are looked at: fewer of large ones, ...
+const PICTURES: [u64; 2] = [4, 12];
+/// ... so that those of the result and of the original take so many bytes.
+const PICTURE_BYTES: u64 = 128 << 20;
 /// What an archive may cost against the original's pictures where nothing is asked for, dB.
 const LOSS: f64 = 0.5;
 /// Of a result whose pictures are closer to the original's than this, dB, nothing was lost that noise could hide behind:
@@ -36,6 +38,8 @@ const ENOUGH: f64 = 50.0;
 /// What a search for a quality leaves for the archive, dB: a third of the pruning's squared error. Where both are traded
 /// off best, errors go by how fast bytes fall with them: about three times as fast with the number of Gaussians.
 pub const LEFT_BY_SEARCH: f64 = 1.2;
+/// Bytes of a pixel.
+const PIXEL: u64 = 3 * size_of::<f32>() as u64;
 /// Times that errors and bits are measured.
 const ROUNDS: usize = 2;
 /// Octaves by which a step follows one measurement, at most.
@@ -48,6 +52,12 @@ const LEAST_ERROR: f64 = 1e-14;
 const ADDED: [f64; 2] = [-2.0, 2.0];
 /// ... and how often that range is halved.
 const HALVINGS: usize = 6;
+
+/// How many pictures of so many pixels are looked at.
+fn pictures(pixels: u64) -> u64 {
+    let [fewest, most] = PICTURES;
+    (PICTURE_BYTES / (2 * PIXEL * pixels.max(1))).clamp(fewest, most)
+}
 
 /// The making of an archive.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,7 +121,8 @@ struct Looks<'a> {
 
 impl Looks<'_> {
     fn of<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<Looks<'a>> {
-        let mut looks = Looks { scene, pictures: spread(&scene.schedule, PICTURES, 1), images: Vec::new() };
+        let count = pictures(scene.workload().pixels) as usize;
+        let mut looks = Looks { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
         looks.images = looks.render(source, |_, image| image)?;
         Ok(looks)
     }
@@ -147,11 +158,13 @@ impl Archive {
     /// What is left, its pictures, the archive and what it decodes to.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let whole = work.state(Columns::all());
-        let pictures = PICTURES as f64 * (2.0 + ROUNDS as f64 * 40.0);
+        let count = pictures(work.pixels);
+        // Of some forty groups in every round, and of all together.
+        let looked = count as f64 * (2.0 * HALVINGS as f64 + ROUNDS as f64 * 40.0);
         Need {
             stage: NAME,
             reads: 1.0,
-            seconds: work.picturing(pictures, 0.3 * work.count(), RENDER),
+            seconds: work.picturing(looked, 0.3 * work.count(), RENDER),
             per_gaussian: vec![
                 ("states", whole),
                 ("readers", work.input.reader),
@@ -160,7 +173,7 @@ impl Archive {
                 ("contents", 4 * whole),
             ],
             fixed: vec![
-                ("pictures", 12 * (2 * PICTURES as u64 + work.threads) * work.pixels),
+                ("pictures", PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
             ],

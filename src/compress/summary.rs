@@ -15,6 +15,7 @@ use crate::error::Result;
 use crate::families::size::of;
 use crate::families::{Family, Size};
 use crate::merge::PassCounts;
+use crate::metrics::PSNR_CAP_DB;
 use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 use crate::select::Counts;
@@ -365,15 +366,12 @@ impl Summary {
         }
         out.push('\n');
         if let Some(archive) = &self.archive {
-            let Parts { cloud, field, rest } = archive.parts;
-            let _ = writeln!(
-                out,
-                "archive: {} bytes (cloud {cloud}, field {field}, rest {rest}); its pictures are {:.2} dB from those of the \
-                 result before, and lose {:.2} dB against the original's",
-                archive.parts.total(),
-                archive.psnr,
-                archive.loss
-            );
+            let _ = write!(out, "archive: its pictures are {:.2} dB from those of the result before", archive.psnr);
+            // Of a result that is the original, nothing can be lost that is not counted already.
+            if archive.level < PSNR_CAP_DB {
+                let _ = write!(out, ", and lose {:.2} dB against the original's", archive.loss);
+            }
+            out.push('\n');
         }
         out
     }

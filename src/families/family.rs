@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::size::{Size, bytes_below};
-use super::trajectories::{OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
+use super::trajectories::{NO_ARCHIVE, OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
 use crate::archive::Content;
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
@@ -169,10 +169,6 @@ pub trait Family: Send + Sync {
         Ok(Vec::new())
     }
 }
-
-/// Why most inputs cannot become an archive.
-pub(super) const NO_ARCHIVE: &str =
-    "only a trained model or a single PLY can be written as an archive\n  write a .gseq or --as ply-sequence";
 
 /// Where frames get their times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

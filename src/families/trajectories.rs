@@ -7,7 +7,6 @@ use std::path::Path;
 
 use gseq::Compression;
 
-use super::family::NO_ARCHIVE;
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::write_inria;
@@ -23,6 +22,10 @@ const LEVEL: i32 = 1;
 
 /// The kind of a result of explicit trajectories to which nothing else gives one.
 pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
+
+/// Why most inputs cannot become an archive.
+pub(super) const NO_ARCHIVE: &str =
+    "only a trained model or a single PLY can be written as an archive\n  write a .gseq or --as ply-sequence";
 
 /// Bytes of the columns `of` of one Gaussian at one frame.
 pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {
