@@ -8,19 +8,19 @@ use crate::error::{Error, Result};
 use crate::ingest::ply::{Header, Ply};
 
 /// Names of what an archive holds of a PLY beside its rows.
-pub(in crate::families) const HEADER: &str = "ply.header";
+pub(crate) const HEADER: &str = "ply.header";
 const LEAD: &str = "ply.lead";
 const TAIL: &str = "ply.tail";
 /// Name of a model folder's configuration in an archive; without one it is a single PLY.
-pub(in crate::families) const CFG_ARGS: &str = "cfg_args";
+pub(crate) const CFG_ARGS: &str = "cfg_args";
 /// Name of the number of a model folder's training iteration, as text.
-pub(in crate::families) const ITERATION: &str = "iteration";
+pub(crate) const ITERATION: &str = "iteration";
 
 /// Adds what is left of `template` beside the attributes: of `rows` what else they have, and what is around them.
 ///
 /// # Errors
 /// A template cut short since it was opened.
-pub(in crate::families) fn add_cloud(
+pub(crate) fn add_cloud(
     content: &mut Content,
     template: &Ply,
     rows: impl Iterator<Item = u32>,
