@@ -1,79 +1,95 @@
 #!/usr/bin/env python3
-"""Quality against bytes: archives at several ratios, beside pruned folders packed by a general compressor.
+"""Quality against bytes: archives at several ratios, beside what pruning alone leaves, packed, and beside peers.
 
-    python3 scripts/size_curve.py target/release/splatsieve DATA [MODEL ...] [--ratios 0.2,0.1,0.05]
+    cargo build --release
+    python3 scripts/size_curve.py target/release/splatsieve DATA [MODEL ...] [--ratios 0.2,0.1,0.05] [--peer COMMAND]
 
-Prints, for every model of DATA, the part of the Gaussians that was kept, the mean PSNR of held-out pictures against the
-original's own, and bytes as a part of cfg_args + point_cloud.ply + deformation.pth of the original: of the archive
-(.gsz, default preset), and of the folder that pruning alone leaves (--no-refine --prune-only --field exact), packed by
-`zstd -19` if that program is there, else by xz of Python's own library, which packs about as tightly.
-Needs nothing but Python.
+DATA/<name>/ is a 4DGaussians model folder with its cameras inside; DATA/static/<name>.ply is a model without cameras, for
+which an orbit is made as refine_table.py does. Prints for each, by the part of the Gaussians that was kept, the mean PSNR
+of held-out pictures against the original's own, and bytes as a part of the original's files that a renderer opens: of the
+archive (.gsz, preset default); of what pruning alone leaves (--no-refine --prune-only --field exact), packed by
+`zstd -19` if that program is there, else by xz of Python's own library, which packs about as tightly; and of static models
+what COMMAND, a splat-transform of PlayCanvas, makes of as many (.sog and .spz, decimated by itself). Standard library only.
 """
 
 import argparse
-import json
 import lzma
+import shlex
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-MODELS = ["deform2", "room2_dynerf", "room2_big"]
-
-
-def run(*words):
-    return subprocess.run([str(word) for word in words], check=True, capture_output=True, text=True).stdout
+from models_table import evaluated, run
+from refine_table import orbit
 
 
 def files(model):
-    """The three files that make up a model."""
+    """What a renderer opens of a model."""
+    if model.is_file():
+        return [model]
     clouds = sorted(model.glob("point_cloud/iteration_*"), key=lambda path: int(path.name.split("_")[1]))
     return [model / "cfg_args", clouds[-1] / "point_cloud.ply", clouds[-1] / "deformation.pth"]
 
 
-def packed(model):
-    """Bytes of a folder's files, each packed."""
+def size(paths):
+    return sum(path.stat().st_size for path in paths)
+
+
+def packed(path):
+    """Bytes of a file, packed."""
     if shutil.which("zstd"):
-        pack = lambda path: len(subprocess.run(["zstd", "-19", "-c", "-q", path], check=True, capture_output=True).stdout)
-    else:
-        pack = lambda path: len(lzma.compress(path.read_bytes(), preset=6))
-    return sum(pack(path) for path in files(model))
+        return len(subprocess.run(["zstd", "-19", "-c", "-q", path], check=True, capture_output=True).stdout)
+    return len(lzma.compress(path.read_bytes(), preset=6))
 
 
-def psnr(tool, original, result):
-    found = json.loads(run(tool, "--quiet", "evaluate", original, result, "--cameras", original, "--max-frames", 15, "--json"))
-    return found["psnr"]
+def ours(binary, model, cameras, ratio, folder):
+    """Method, what to compare, and bytes: of the archive, and of pruning alone."""
+    archive, pruned = folder / "small.gsz", folder / f"pruned{model.suffix}"
+    common = ["compress", model, "--cameras", cameras, "--target-ratio", ratio, "--json", "-o"]
+    run(binary, *common, archive)
+    yield "archive (.gsz)", archive, size([archive])
+    run(binary, *common, pruned, "--no-refine", "--prune-only", "--field", "exact")
+    packer = "zstd -19" if shutil.which("zstd") else "xz"
+    yield f"pruned alone, {packer}", pruned, sum(map(packed, files(pruned)))
+
+
+def peers(command, model, ratio, folder):
+    """The same of splat-transform."""
+    for kind in ["sog", "spz"]:
+        small, back = folder / f"peer.{kind}", folder / f"peer_{kind}.ply"
+        decimated = [model, "--decimate", f"{100 * float(ratio):g}%", small]
+        for words in [decimated, [small, back]]:
+            words = [*shlex.split(command), "-q", "-w", "-g", "cpu", *words]
+            subprocess.run([str(word) for word in words], check=True, capture_output=True)
+        yield f"splat-transform .{kind}", back, size([small])
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("tool", type=Path)
+    parser.add_argument("binary")
     parser.add_argument("data", type=Path)
-    parser.add_argument("models", nargs="*", default=MODELS)
+    parser.add_argument("models", nargs="*")
     parser.add_argument("--ratios", default="0.2,0.1,0.05")
-    options = parser.parse_args()
-    packer = "zstd -19" if shutil.which("zstd") else "xz (zstd is not here)"
-    print(f"| model | kept | archive: dB | bytes | of the original | pruned alone: dB | bytes, {packer} | of the original |")
-    print("|---|---|---|---|---|---|---|---|")
-    for name in options.models:
-        original = options.data / name
-        whole = sum(path.stat().st_size for path in files(original))
-        for ratio in options.ratios.split(","):
-            with tempfile.TemporaryDirectory() as folder:
-                archive, pruned = Path(folder) / "a.gsz", Path(folder) / "pruned"
-                common = [tool_path(options.tool), "--quiet", "compress", original, "--cameras", original]
-                run(*common, "--target-ratio", ratio, "-o", archive)
-                run(*common, "--target-ratio", ratio, "-o", pruned, "--no-refine", "--prune-only", "--field", "exact")
-                ours, theirs = archive.stat().st_size, packed(pruned)
-                print(
-                    f"| {name} | {float(ratio):.0%} | {psnr(options.tool, original, archive):.1f} | {ours} | {ours / whole:.1%} "
-                    f"| {psnr(options.tool, original, pruned):.1f} | {theirs} | {theirs / whole:.1%} |",
-                    flush=True,
-                )
-
-
-def tool_path(tool):
-    return tool.resolve()
+    parser.add_argument("--peer")
+    args = parser.parse_args()
+    found = [path.parent for path in sorted(args.data.glob("*/cfg_args"))] + sorted(args.data.glob("static/*.ply"))
+    print("| model | kept | | PSNR dB to the original | bytes | of the original |")
+    print("|---|---|---|---|---|---|")
+    for model in found:
+        if args.models and model.stem not in args.models:
+            continue
+        for ratio in args.ratios.split(","):
+            with tempfile.TemporaryDirectory() as scratch:
+                folder = Path(scratch)
+                cameras = model if model.is_dir() else orbit(model, folder / "orbit.json")
+                made = list(ours(args.binary, model, cameras, ratio, folder))
+                if args.peer and model.is_file():
+                    made += peers(args.peer, model, ratio, folder)
+                for method, result, count in made:
+                    quality = evaluated(args.binary, model, result, cameras)["psnr"]
+                    part = f"{100 * count / size(files(model)):.1f}%"
+                    print(f"| {model.stem} | {float(ratio):.0%} | {method} | {quality:.1f} | {count:,} | {part} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -145,8 +145,8 @@ fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
     workplace.refused(2, "compress demo/scene.gseq --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
     workplace.refused(
         2,
-        "compress {tiny} --cameras {tiny} --target-size 1MB -o a.gsz",
-        &["--target-ratio", "--min-psnr"],
+        "compress {tiny} --cameras {tiny} --target-size 1MB --archive-psnr 45 -o a.gsz",
+        &["--target-size", "--archive-psnr", "one of them"],
     );
 }
 
@@ -161,4 +161,22 @@ fn a_quality_that_is_asked_for_counts_what_the_archive_loses() {
     assert_eq!(number("asked"), least);
     assert!(number("searched") >= least - 0.01, "{}", summary["goal"]);
     assert!(summary["archive"]["loss"].as_f64().unwrap() > 0.0, "{}", summary["archive"]);
+}
+
+#[test]
+fn bytes_asked_for_are_filled_by_count_and_bits_together() {
+    let workplace = Workplace::new();
+    let how = "{tiny} --cameras {tiny} --no-refine --overwrite -o small.gsz --target-size";
+    let mut before = (0, 0.0);
+    for most in [5_000, 8_000] {
+        let summary = workplace.summary(&format!("{how} {most}"));
+        let bytes = fs::metadata(workplace.path("small.gsz")).unwrap().len();
+        let told = workplace.done("evaluate {tiny} small.gsz --cameras {tiny} --json");
+        let psnr = serde_json::from_str::<serde_json::Value>(&told).unwrap()["psnr"].as_f64().unwrap();
+        assert!((0.97 * most as f64..=most as f64).contains(&(bytes as f64)), "{most}: {bytes} bytes");
+        let count = summary["gaussians"].as_u64().unwrap();
+        assert!(count > before.0 && psnr > before.1 + 1.0, "{most}: {count} Gaussians at {psnr} dB, {before:?} before");
+        before = (count, psnr);
+    }
+    workplace.refused(2, &format!("compress {how} 1000"), &["--target-size", "expected at least"]);
 }

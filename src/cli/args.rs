@@ -233,7 +233,7 @@ pub(super) struct OutputSize {
     /// The smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
     #[arg(long, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
     pub(super) max_loss: Option<f64>,
-    /// The best output that is at most this large with everything written beside it, such as 5MB
+    /// The best output that is at most this large with everything written beside it, such as 5MB; an archive without
     #[arg(long, value_name = "SIZE", group = "size_of_output", value_parser = parse_bytes)]
     pub(super) target_size: Option<u64>,
     /// Folder of photographs of the held-out cameras for --max-loss: tNNN_vNN.png, or named as the cameras name them. A

@@ -14,7 +14,7 @@ use super::journal::Journal;
 use super::summary::ArchiveSummary;
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::metrics::psnr;
 use crate::model::{Columns, Picture};
@@ -52,6 +52,13 @@ const LEAST_ERROR: f64 = 1e-14;
 const ADDED: [f64; 2] = [-2.0, 2.0];
 /// ... and how often that range is halved.
 const HALVINGS: usize = 6;
+/// The same where so many bytes are asked for.
+const BYTES_ADDED: [f64; 2] = [-4.0, 4.0];
+/// See [`BYTES_ADDED`].
+const BYTES_HALVINGS: usize = 10;
+/// Octaves by which grids that no picture was looked at for are taken to be coarser in the end: with this the count that
+/// fits leaves .5 and 1.2 dB to the grids of two trained models.
+const GUESSED: f64 = 3.3;
 
 /// How many pictures of so many pixels are looked at.
 fn pictures(pixels: u64) -> u64 {
@@ -66,13 +73,26 @@ pub struct Archive {
     pub psnr: Option<f64>,
 }
 
-/// What an archive's pictures are to be.
+/// What an archive is asked for, beside what its own flag says.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Asked {
+    /// Nothing.
+    Nothing,
+    /// To cost no more than this against the original's pictures, dB.
+    Loss(f64),
+    /// To take no more bytes than this.
+    Bytes(u64),
+}
+
+/// What an archive is to be.
 #[derive(Debug, Clone, Copy)]
 enum Aim {
     /// So close to the result's, dB.
     Close(f64),
     /// No more than so much further from the original's than the result's are, dB.
     Loss(f64),
+    /// No more than so many bytes.
+    Bytes(u64),
 }
 
 impl Aim {
@@ -82,6 +102,7 @@ impl Aim {
             Aim::Close(psnr) => psnr,
             // Squared errors add.
             Aim::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
+            Aim::Bytes(_) => Aim::Loss(LEFT_BY_SEARCH).close(level.min(ENOUGH)),
         }
     }
 }
@@ -180,31 +201,33 @@ impl Archive {
         }
     }
 
-    /// Encodes `reduction`, of which pictures may lose so much to `spare`, dB.
+    /// Encodes `reduction` so that it is what it is `asked` for.
     ///
     /// # Errors
-    /// An input that no archive holds, values that are not finite, frames that cannot be read.
+    /// An input that no archive holds, values that are not finite, frames that cannot be read, too few bytes.
     pub fn run(
         &self,
         scene: &Scene,
         reduction: &Reduction,
-        spare: Option<f64>,
+        asked: Asked,
         journal: &mut Journal,
     ) -> Result<(Encoded, ArchiveSummary)> {
         journal.stage(NAME, reduction.len(), scene.source(), |_| {
-            let made = self.make(scene, reduction, spare)?;
+            let made = self.make(scene, reduction, asked)?;
             Ok((made, reduction.len()))
         })
     }
 
-    fn make(&self, scene: &Scene, reduction: &Reduction, spare: Option<f64>) -> Result<(Encoded, ArchiveSummary)> {
+    fn make(&self, scene: &Scene, reduction: &Reduction, asked: Asked) -> Result<(Encoded, ArchiveSummary)> {
         let mut content = scene.input.content(reduction)?;
         let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
         let original = Looks::of(scene, scene.source())?;
         let level = looks.psnr(scene.source())?;
-        let aim = match (self.psnr, spare.unwrap_or(LOSS)) {
+        let loss = if let Asked::Loss(loss) = asked { loss } else { LOSS };
+        let aim = match (self.psnr, asked) {
+            (_, Asked::Bytes(most)) => Aim::Bytes(most),
             (Some(psnr), _) => Aim::Close(psnr),
-            (None, loss) if level < ENOUGH && loss > 0.0 => Aim::Loss(loss),
+            (None, _) if level < ENOUGH && loss > 0.0 => Aim::Loss(loss),
             _ => Aim::Close(ENOUGH),
         };
         let asked = aim.close(level);
@@ -213,35 +236,72 @@ impl Archive {
         for _ in 0..ROUNDS {
             measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
         }
-        let try_at = |added: f64| -> Result<(bool, Encoded, [f64; 2])> {
-            let encoded = archive::encode(&content, &grids.steps(added))?;
+        let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
+        let looked_at = |encoded: &Encoded| -> Result<[f64; 2]> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path)?;
             let shown = scene.input.showing(&decoded)?;
-            let (psnr, loss) = (looks.psnr(&*shown)?, level - original.psnr(&*shown)?);
-            let does = match aim {
-                Aim::Close(least) => psnr >= least,
-                Aim::Loss(most) => loss <= most,
-            };
-            Ok((does, encoded, [psnr, loss]))
+            Ok([looks.psnr(&*shown)?, level - original.psnr(&*shown)?])
         };
-        let [mut low, mut high] = ADDED;
-        let mut best = None;
-        for _ in 0..HALVINGS {
-            let added = 0.5 * (low + high);
-            let found = try_at(added)?;
-            if found.0 {
-                (low, best) = (added, Some(found));
-            } else {
-                high = added;
+        let best = match aim {
+            Aim::Bytes(most) => {
+                // The finest that fits.
+                let fits = |added: f64| Ok(Some(encoded(added)?).filter(|found| found.bytes.len() as u64 <= most));
+                bisected([-BYTES_ADDED[1], -BYTES_ADDED[0]], BYTES_HALVINGS, |finer| fits(-finer))?
             }
-        }
-        let (_, encoded, [psnr, loss]) = match best {
-            Some(best) => best,
-            None => try_at(low)?,
+            _ => bisected(ADDED, HALVINGS, |added| {
+                let found = encoded(added)?;
+                let [psnr, loss] = looked_at(&found)?;
+                let does = match aim {
+                    Aim::Close(least) => psnr >= least,
+                    Aim::Loss(most) => loss <= most,
+                    Aim::Bytes(_) => true,
+                };
+                Ok(does.then_some(found))
+            })?,
         };
+        let encoded = match (best, aim) {
+            (Some(best), _) => best,
+            (None, Aim::Bytes(most)) => {
+                let least = encoded(BYTES_ADDED[1])?.bytes.len();
+                return Err(Error::usage(format!(
+                    "--target-size: an archive of {} Gaussians has {least} bytes on the coarsest grids; expected at least that, \
+                     found {most}",
+                    reduction.len()
+                )));
+            }
+            (None, _) => encoded(ADDED[0])?,
+        };
+        let [psnr, loss] = looked_at(&encoded)?;
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
         Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts, bits, measured }))
     }
+}
+
+/// Bytes of an archive of `reduction`, about: on grids as they are before any picture is looked at.
+///
+/// # Errors
+/// An input that no archive holds, values that are not finite.
+pub fn bytes(scene: &Scene, reduction: &Reduction) -> Result<u64> {
+    let content = scene.input.content(reduction)?;
+    Ok(archive::encode(&content, &Grids::of(&content).steps(GUESSED))?.bytes.len() as u64)
+}
+
+/// What `of` finds at the largest number between two, as far as halving their distance so often tells, that it finds
+/// something at.
+fn bisected<T>(
+    [mut low, mut high]: [f64; 2],
+    halvings: usize,
+    of: impl Fn(f64) -> Result<Option<T>>,
+) -> Result<Option<T>> {
+    let mut best = None;
+    for _ in 0..halvings {
+        let middle = 0.5 * (low + high);
+        match of(middle)? {
+            Some(found) => (low, best) = (middle, Some(found)),
+            None => high = middle,
+        }
+    }
+    Ok(best)
 }
 
 /// The grids of all groups of a content.

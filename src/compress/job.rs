@@ -133,11 +133,14 @@ impl Job {
             Some(Goal::Quality(Quality::Psnr(least))) if is_archive => {
                 Some(Goal::Quality(Quality::Psnr(least + LEFT_BY_SEARCH)))
             }
-            Some(_) if is_archive => {
+            Some(Goal::Quality(Quality::Loss { .. })) if is_archive => {
                 return Err(Error::usage(
-                    "the size of an archive is found by --target-ratio, --target-count or --min-psnr\n  \
+                    "the size of an archive is found by --target-ratio, --target-count, --min-psnr or --target-size\n  \
                      give one of these, or write a model folder",
                 ));
+            }
+            Some(Goal::Bytes(_)) if request.archive_psnr.is_some() => {
+                return Err(Error::usage("--archive-psnr and --target-size both say how coarse: expected one of them"));
             }
             goal => goal.clone(),
         };

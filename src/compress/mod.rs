@@ -37,7 +37,7 @@ use crate::recipe::{Precision, Recipe};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 use crate::stream::begin_run;
-use archive::LEFT_BY_SEARCH;
+use archive::{Asked, LEFT_BY_SEARCH};
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
@@ -150,8 +150,12 @@ fn reduce(
     let mut goal = goal;
     let archived = match job.archive.as_ref().filter(|_| !request.dry_run) {
         Some(archive) => {
-            let spare = goal.as_ref().map(|goal| goal.searched + LEFT_BY_SEARCH - goal.asked);
-            Some(archive.run(scene, &reduction, spare, &mut journal)?)
+            let asked = match (&goal, &request.goal) {
+                (Some(goal), _) => Asked::Loss(goal.searched + LEFT_BY_SEARCH - goal.asked),
+                (None, Some(Goal::Bytes(most))) => Asked::Bytes(*most),
+                _ => Asked::Nothing,
+            };
+            Some(archive.run(scene, &reduction, asked, &mut journal)?)
         }
         None => None,
     };
@@ -235,8 +239,9 @@ fn of_size(
     if let Some(field) = &job.field {
         outcome.reduction = field.run(scene, outcome.reduction, journal)?;
     }
-    if let Some(Goal::Bytes(most)) = request.goal {
-        let of = Space { emit: &job.emit, most, recipe };
+    // An archive of any of them fits on some grids.
+    if let Some(Goal::Bytes(most)) = request.goal.as_ref().filter(|_| job.archive.is_none()) {
+        let of = Space { emit: &job.emit, most: *most, recipe };
         outcome.reduction = of.shrink(scene, scored, outcome.reduction, journal)?;
     }
     Ok(outcome)

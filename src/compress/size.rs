@@ -1,8 +1,10 @@
 //! As many Gaussians as so many bytes hold.
 
+use super::archive;
 use super::emit::Emit;
 use super::journal::Journal;
 use super::score::Scored;
+use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
@@ -13,7 +15,7 @@ const NAME: &str = "size";
 /// Part of the bytes that may stay free.
 const FREE: f64 = 0.01;
 /// Sizes that are written at most, to see their bytes.
-const MOST_TRIED: usize = 6;
+const MOST_TRIED: usize = 8;
 /// Pictures that say who goes, where the values of the best turn out larger than those of any.
 const PICTURES: usize = 48;
 
@@ -37,7 +39,12 @@ impl Space<'_> {
         journal.stage(NAME, all, scene.source(), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| (k * all / count) as u32).collect();
-                self.emit.bytes(scene, &Reduction { kept, ..like.clone() }, self.recipe)
+                let some = Reduction { kept, ..like.clone() };
+                match self.emit.kind {
+                    // What lies beside it is neither stored nor sent.
+                    OutputKind::Archive => archive::bytes(scene, &some),
+                    _ => self.emit.bytes(scene, &some, self.recipe),
+                }
             };
             let one = 1.min(all);
             let least = bytes(one)?;
@@ -49,19 +56,21 @@ impl Space<'_> {
             }
             // Sizes and their bytes: the largest that fits, and the smallest that does not.
             let (mut fits, mut over) = ((one, least), None);
-            let mut next = all;
+            let (mut next, mut overs) = (all, 0);
             for _ in 0..MOST_TRIED {
                 let found = bytes(next)?;
                 if found <= most {
-                    fits = (next, found);
+                    (fits, overs) = ((next, found), 0);
                 } else {
-                    over = Some((next, found));
+                    (over, overs) = (Some((next, found)), overs + 1);
                 }
                 let Some(over) = over.filter(|over: &(usize, u64)| over.0 - fits.0 > 1) else { break };
                 if most - fits.1 <= (FREE * most as f64) as u64 {
                     break;
                 }
                 let part = (most - fits.1) as f64 / (over.1 - fits.1).max(1) as f64;
+                // A line between both leads no further where the first few take most bytes, as those of an archive do.
+                let part = if overs > 1 { part.min(0.5) } else { part };
                 next = fits.0 + ((0.998 * part * (over.0 - fits.0) as f64) as usize).clamp(1, over.0 - fits.0 - 1);
             }
             Ok((fits.0, fits.0))

@@ -29,7 +29,7 @@ use crate::scene::between::Dice;
 use crate::source::FrameSource;
 use crate::stream::Progress;
 use loss::Loss;
-use moving::Moving;
+use moving::{Manner, Moving};
 use targets::{Parted, Targets};
 
 /// What the stage is called.
@@ -95,6 +95,10 @@ impl Refine {
     /// The same, but that colours' change with direction stays.
     pub fn without_bands(self) -> Refine {
         Refine { sh_degree: 0, ..self }
+    }
+
+    fn manner(&self) -> Manner {
+        Manner { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
     /// Whether what is wanted is so few that cuts lead there.
@@ -285,7 +289,7 @@ impl<'a> Walk<'a> {
         'a: 'b,
     {
         let fixed = reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect();
-        Moving::new(self.scene, result, self.targets, self.refine, fixed)
+        Moving::new(self.scene, result, self.targets, self.refine.manner(), fixed)
     }
 
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
@@ -488,7 +492,7 @@ mod tests {
             let result = scene.input.reduced(&reduction).unwrap();
             let refine = Refine::of(&Recipe::preset("default").unwrap(), None, false).unwrap();
             let fixed = vec![false; reduction.len()];
-            let mut moving = Moving::new(&scene, &*result, &targets, &refine, fixed).unwrap();
+            let mut moving = Moving::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
             let (of, schedule) = ([0, 7, 20], Schedule::new(20, 1.0, 1.0));
             let start = moving.closeness(&of).unwrap().psnr;
             let nowhere = moving.change();
@@ -514,7 +518,7 @@ mod tests {
             let thinned = Reduction { change: whole.pick(&some), ..reduction.pick(&some) };
             let result = scene.input.reduced(&thinned).unwrap();
             let fixed = vec![false; some.len()];
-            let anew = Moving::new(&scene, &*result, &targets, &refine, fixed).unwrap();
+            let anew = Moving::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
             let expected = anew.closeness(&of).unwrap().psnr;
             assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
         }

@@ -2,7 +2,6 @@
 
 use rayon::prelude::*;
 
-use super::Refine;
 use super::local::{Local, Locals};
 use super::loss::{Closeness, Loss};
 use super::targets::Targets;
@@ -14,6 +13,17 @@ use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
 use crate::source::{Deformation, FrameSource, Wanted};
 use crate::stream::States;
+
+/// How what is left moves.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Manner {
+    /// What moves.
+    pub(super) columns: Columns,
+    /// Up to which harmonics.
+    pub(super) sh_degree: usize,
+    /// What is made small.
+    pub(super) loss: Loss,
+}
 
 /// Steps after which states are found anew, where they follow from what is stored by more than a sum.
 pub(super) const FOUND_EVERY: usize = 200;
@@ -53,7 +63,7 @@ pub(super) struct Moving<'a> {
 }
 
 impl<'a> Moving<'a> {
-    /// What `result` shows of `targets`, to move as `refine` has it but for those `fixed`.
+    /// What `result` shows of `targets`, to move in that manner but for those `fixed`.
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
@@ -61,15 +71,15 @@ impl<'a> Moving<'a> {
         scene: &'a Scene,
         result: &'a dyn FrameSource,
         targets: &'a Targets,
-        refine: &Refine,
+        Manner { columns, sh_degree, loss }: Manner,
         fixed: Vec<bool>,
     ) -> Result<Moving<'a>> {
         let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
         let SequenceInfo { varying, sh_degree: of_state, .. } = *result.info();
-        let sh_degree = refine.sh_degree.min(of_state);
-        let columns = refine.columns & deformation.map_or(Columns::all(), Deformation::movable);
+        let sh_degree = sh_degree.min(of_state);
+        let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
         let nothing = Gaussians::zeros(0, of_state);
         let mut moving = Moving {
             scene,
@@ -88,7 +98,7 @@ impl<'a> Moving<'a> {
             fixed,
             columns,
             sh_degree,
-            loss: refine.loss,
+            loss,
         };
         if deformation.is_some() {
             moving.find()?;

@@ -20,11 +20,7 @@ pub(crate) const ITERATION: &str = "iteration";
 ///
 /// # Errors
 /// A template cut short since it was opened.
-pub(crate) fn add_cloud(
-    content: &mut Content,
-    template: &Ply,
-    rows: impl Iterator<Item = u32>,
-) -> Result<()> {
+pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
     content.beside = beside(template, rows);
     let header = template.header().text_for(content.cloud.len());
