@@ -64,7 +64,7 @@ impl Model {
     /// Parts keep at least `FLOOR`: two starts move toward places that are so far apart, by the same share of the way.
     fn learn(&mut self, symbol: usize) {
         let rate = (FIRST_RATE + self.seen / 8).min(LAST_RATE);
-        self.seen += 1;
+        self.seen = self.seen.saturating_add(1);
         for (start, known) in self.starts.iter_mut().zip(&KNOWN[symbol]) {
             *start += (known - *start) >> rate;
         }
@@ -121,7 +121,7 @@ impl Encoder {
         self.bits(value >> 32, count - low);
     }
 
-    /// The words of the symbols and the bits, each with its length in front.
+    /// The words of the symbols with their length in front, and the bits.
     pub(super) fn finish(mut self) -> Vec<u8> {
         if self.waiting_bits > 0 {
             self.bits.push(self.waiting as u8);
@@ -146,7 +146,7 @@ impl Encoder {
     }
 }
 
-/// Reads what [`Encoder`] wrote. Bytes that are no such thing give other symbols, and a [`Decoder::finish`] that fails.
+/// Reads what [`Encoder`] wrote. Bytes that are no such thing give other symbols, and a [`Decoder::is_finished`] that is false.
 #[derive(Debug)]
 pub(super) struct Decoder<'a> {
     state: u64,

@@ -108,7 +108,11 @@ impl Entry {
     /// Whether shape, role and grids go together, whatever an archive says.
     pub(super) fn is_sound(&self) -> bool {
         let plane = |axes: &[usize]| {
-            self.shape.len() == 4 && self.shape[0] == 1 && axes.iter().all(|&axis| axis < 3) && !self.shape.contains(&0)
+            self.shape.len() == 4
+                && self.shape[0] == 1
+                && axes.iter().all(|&axis| axis < 3)
+                // Up to there f32 holds every whole number.
+                && self.shape.iter().all(|extent| (1..=1 << 24).contains(extent))
         };
         let fits = match self.role {
             Role::Plane(axes) => plane(&axes),

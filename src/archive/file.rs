@@ -21,7 +21,7 @@ const NAMES: [&str; SECTIONS] = ["table", "cloud", "field", "blobs"];
 const HEAD: usize = 12 + SECTIONS * 24 + 8;
 /// Level of zstd for what is small.
 const LEVEL: i32 = 19;
-/// A byte never stands for more: symbols take at least 1/200 of a bit each.
+/// Values' bytes that a byte may stand for: symbols take at least 1/200 of a bit each, and what nobody reads none.
 const MOST_PER_BYTE: u64 = 8192;
 /// What may be allocated whatever the file's length.
 const ALWAYS: u64 = 64 << 20;

@@ -38,10 +38,10 @@ pub fn offsets(
         return found;
     }
     // Forward: the mean square of what every layer reads.
-    let mut reads: Vec<(&str, Layer<'_>, Vec<f64>)> = Vec::new();
+    let mut reads: Vec<(Layer<'_>, Vec<f64>)> = Vec::new();
     let mut now = samples.features.clone();
     for layer in &trunk {
-        reads.push(("", layer.clone(), mean_squares(&now, layer.inputs())));
+        reads.push((layer.clone(), mean_squares(&now, layer.inputs())));
         now = layer.run(&now);
         now.iter_mut().for_each(|x| *x = x.max(0.0));
     }
@@ -65,13 +65,10 @@ pub fn offsets(
         add(&mut found, &output, &of_output, &mean_squares(&inside, output.inputs()));
     }
     // Back through the trunk.
-    for (k, (_, layer, read)) in reads.iter().enumerate().rev() {
+    for (layer, read) in reads.iter().rev() {
         add(&mut found, layer, &leaving, read);
         let ones = vec![1.0; layer.inputs()];
         leaving = layer.back(&leaving, &ones);
-        if k == 0 {
-            break;
-        }
     }
     for (name, first, squares) in &samples.beside {
         let by_channel: Vec<f64> = squares.iter().zip(&leaving[*first..]).map(|(a, b)| a * b).collect();

@@ -106,6 +106,10 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
         Entry::new(name, tensor, role, steps.field.0.get(name))
     };
     let mut entries: Vec<Entry> = content.tensors.iter().map(entry).collect();
+    if let Some(entry) = entries.iter().find(|entry| !entry.is_sound()) {
+        let Entry { name, shape, .. } = entry;
+        return Err(Error::usage(format!("an archive holds no tensor such as {name} of shape {shape:?}")));
+    }
     let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
     let width = content.beside.len() / content.cloud.len().max(1);
     let table = Table {
@@ -222,6 +226,9 @@ fn check(content: &Content, steps: &Steps) -> Result<()> {
         }
     }
     for (name, tensor) in &content.tensors {
+        if matches!(content.field.get(name), Some(Role::Exact | Role::Unread)) {
+            continue;
+        }
         if let Some(value) = tensor.data.iter().find(|value| !value.is_finite()) {
             return Err(Error::usage(format!("an archive holds finite values: tensor {name} has {value}")));
         }

@@ -241,3 +241,20 @@ fn texels_that_nobody_reads_take_nothing() {
     row.data.iter_mut().enumerate().filter(|(i, _)| (i / 9) % 6 < 2).for_each(|(_, value)| *value = 1e4);
     assert_eq!(bits(&all, "a.plane.xt"), bits(&never, "a.plane.xt"));
 }
+
+#[test]
+fn tensors_that_fit_no_role_are_refused_by_name_and_what_is_kept_to_the_bit_may_be_anything() {
+    let whole = content(5, 20, 0);
+    let steps = some_steps(&whole, -4);
+    for shape in [&[7][..], &[2, 1, 4, 4], &[1, 1, 0, 4]] {
+        let mut odd = whole.clone();
+        odd.tensors.insert("a.plane.xy".to_owned(), tensor(&mut Dice(1), shape));
+        let message = encode(&odd, &steps).map(|_| ()).unwrap_err().to_string();
+        assert!(message.contains("a.plane.xy") && message.contains(&format!("{shape:?}")), "{message}");
+    }
+    let mut odd = whole.clone();
+    odd.tensors.get_mut("a.exact").unwrap().data[3] = f32::INFINITY;
+    let encoded = encode(&odd, &steps).unwrap();
+    let (back, _) = decode(&encoded.bytes, Path::new("a.gsz")).unwrap();
+    assert_eq!(back.tensors["a.exact"].data, odd.tensors["a.exact"].data);
+}

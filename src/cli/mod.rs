@@ -158,7 +158,7 @@ fn run(cli: Cli) -> Result<()> {
                 notes(&container::unpack_stream(&input, stdout)?.notes);
                 return Ok(());
             };
-            if archive::is_archive(&input.path)? {
+            if !input.is_stream() && archive::is_archive(&input.path)? {
                 let unpacked = archive::unpack_archive(&input.path, &output, args.earlier.replace())?;
                 return print(&format!(
                     "{}: {} Gaussians, {} bytes of values from {}\n",

@@ -223,11 +223,11 @@ impl Archive {
         let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
         let original = Looks::of(scene, scene.source())?;
         let level = looks.psnr(scene.source())?;
-        let loss = if let Asked::Loss(loss) = asked { loss } else { LOSS };
         let aim = match (self.psnr, asked) {
             (_, Asked::Bytes(most)) => Aim::Bytes(most),
             (Some(psnr), _) => Aim::Close(psnr),
-            (None, _) if level < ENOUGH && loss > 0.0 => Aim::Loss(loss),
+            (None, Asked::Loss(loss)) if loss > 0.0 => Aim::Loss(loss),
+            (None, Asked::Nothing) if level < ENOUGH => Aim::Loss(LOSS),
             _ => Aim::Close(ENOUGH),
         };
         let asked = aim.close(level);
@@ -262,12 +262,16 @@ impl Archive {
         let encoded = match (best, aim) {
             (Some(best), _) => best,
             (None, Aim::Bytes(most)) => {
-                let least = encoded(BYTES_ADDED[1])?.bytes.len();
-                return Err(Error::usage(format!(
-                    "--target-size: an archive of {} Gaussians has {least} bytes on the coarsest grids; expected at least that, \
-                     found {most}",
-                    reduction.len()
-                )));
+                let coarsest = encoded(BYTES_ADDED[1])?;
+                let least = coarsest.bytes.len();
+                if least as u64 > most {
+                    return Err(Error::usage(format!(
+                        "--target-size: an archive of {} Gaussians has {least} bytes on the coarsest grids; expected at least \
+                         that, found {most}",
+                        reduction.len()
+                    )));
+                }
+                coarsest
             }
             (None, _) => encoded(ADDED[0])?,
         };

@@ -69,15 +69,15 @@ impl Field {
     /// # Errors
     /// Frames that cannot be read.
     pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
-        if !scene.input.can_round_field()? {
-            return Ok(reduction);
-        }
         let count = reduction.len();
         journal.stage(NAME, count, scene.source(), |journal| Ok((self.round(scene, reduction, journal)?, count)))
     }
 
     /// [`Field::run`] of an input that can, as a part of another stage.
     pub fn round(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        if !scene.input.can_round_field()? {
+            return Ok(reduction);
+        }
         let what = "half precision of the field";
         let pictures = spread(&scene.schedule, PICTURES, 1);
         if reduction.is_empty() || pictures.is_empty() {

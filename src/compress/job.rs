@@ -129,6 +129,9 @@ impl Job {
         if request.archive_psnr.is_some() && !is_archive {
             return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));
         }
+        if let Some(odd) = request.archive_psnr.filter(|psnr| !(*psnr > 0.0 && *psnr <= 100.0)) {
+            return Err(Error::usage(format!("archive_psnr: expected decibels above 0 and at most 100, found {odd}")));
+        }
         let goal = match &request.goal {
             Some(Goal::Quality(Quality::Psnr(least))) if is_archive => {
                 Some(Goal::Quality(Quality::Psnr(least + LEFT_BY_SEARCH)))

@@ -148,10 +148,14 @@ fn reduce(
     job.write_down(request, &mut journal);
 
     let mut goal = goal;
+    // What the search was given was more.
+    if let (Some(goal), Some(Goal::Quality(Quality::Psnr(least)))) = (&mut goal, &request.goal) {
+        goal.asked = *least;
+    }
     let archived = match job.archive.as_ref().filter(|_| !request.dry_run) {
         Some(archive) => {
             let asked = match (&goal, &request.goal) {
-                (Some(goal), _) => Asked::Loss(goal.searched + LEFT_BY_SEARCH - goal.asked),
+                (Some(goal), _) => Asked::Loss(goal.searched - goal.asked),
                 (None, Some(Goal::Bytes(most))) => Asked::Bytes(*most),
                 _ => Asked::Nothing,
             };
@@ -161,7 +165,6 @@ fn reduce(
     };
     let (encoded, archive) = archived.map_or((None, None), |(encoded, summary)| (Some(encoded), Some(summary)));
     if let (Some(goal), Some(archive)) = (&mut goal, &archive) {
-        goal.asked -= LEFT_BY_SEARCH;
         (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
         journal.notes.push(format!(
             "{LEFT_BY_SEARCH} dB of what was searched for were left for the archive, which takes {:.2}: at least {} dB asked \

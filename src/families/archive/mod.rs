@@ -41,7 +41,7 @@ pub fn read_archive(path: &Path) -> Result<(Content, Parts)> {
 }
 
 /// Writes what an archive, read from `path`, holds, as it was: into the folder `to` the files of a model, or a single
-/// PLY to the new file `to`. Gives whether it is a folder.
+/// PLY to the new file `to`.
 ///
 /// # Errors
 /// Contents that make up no model; a failed write.
@@ -169,6 +169,10 @@ impl Family for Archive {
 
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
         self.inner.write(reduction, kind, path, limits)
+    }
+
+    fn can_round_field(&self) -> Result<bool> {
+        self.inner.can_round_field()
     }
 
     fn content(&self, reduction: &Reduction) -> Result<Content> {

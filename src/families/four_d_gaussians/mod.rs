@@ -19,7 +19,7 @@ use super::family::{Entry, Family, Residence, Timing};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::{Content, Role};
-use crate::deform::{Field, FieldConfig, Tensors};
+use crate::deform::{Field, FieldConfig, Tensor, Tensors};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
@@ -134,14 +134,27 @@ impl Family for ModelFolder {
 
     fn content(&self, reduction: &Reduction) -> Result<Content> {
         let paths = self.paths();
+        if !self.can_round_field()? {
+            return Err(Error::usage(format!(
+                "an archive holds tensors of 32-bit and 16-bit floating-point numbers: {} has others",
+                paths.deformation.display()
+            )));
+        }
         let tensors = read_state_dict(&paths.deformation)?;
-        let role = |name: &String| (name.clone(), role(self.config().field(), name));
+        let role = |(name, tensor): (&String, &Tensor)| {
+            let role = match role(self.config().field(), name) {
+                // No level that is read.
+                Role::Plane(_) | Role::TimePlane(_) if !matches!(tensor.shape[..], [1, _, _, _]) => Role::Exact,
+                role => role,
+            };
+            (name.clone(), role)
+        };
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
         let cfg_args = fs::read(&paths.cfg_args).map_err(Error::io("read", &paths.cfg_args))?;
         let mut content = Content {
             cloud: canonical_cloud(self, reduction),
-            field: tensors.keys().map(role).collect(),
+            field: tensors.iter().map(role).collect(),
             tensors,
             times: [first as f32, last as f32],
             ..Content::default()
