@@ -132,8 +132,8 @@ impl Earlier {
 /// How much memory to take.
 #[derive(Debug, Args)]
 pub(super) struct Memory {
-    /// Most memory to take, such as 512MiB or 4GB; the result does not depend on it [default: a quarter of the
-    /// machine's]
+    /// Most memory to take, such as 512MiB or 4GB; the result does not depend on it, but that nothing is refined where
+    /// that takes more, which the summary says [default: a quarter of the machine's]
     #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
     pub(super) memory: Option<u64>,
     /// Print, before any work, what takes how much memory and how often the frames are read; at the end, what was
@@ -192,7 +192,8 @@ pub(super) struct Compress {
     #[arg(long = "as", value_enum, value_name = "KIND")]
     pub(super) kind: Option<OutputKind>,
     /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
-    /// grids: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50 at most]
+    /// grids: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50dB
+    /// where that is closer]
     #[arg(long, value_name = "DB", value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
