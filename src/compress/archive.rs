@@ -52,8 +52,8 @@ const LEAST_ERROR: f64 = 1e-14;
 const ADDED: [f64; 2] = [-2.0, 2.0];
 /// ... and how often that range is halved.
 const HALVINGS: usize = 6;
-/// The same where so many bytes are asked for.
-const BYTES_ADDED: [f64; 2] = [-4.0, 4.0];
+/// The same where so many bytes are asked for, the most first.
+const BYTES_ADDED: [f64; 2] = [4.0, -4.0];
 /// See [`BYTES_ADDED`].
 const BYTES_HALVINGS: usize = 10;
 /// Octaves by which grids that no picture was looked at for are taken to be coarser in the end: with this the count that
@@ -122,7 +122,7 @@ impl Group {
         }
     }
 
-    /// Steps that a deviation of its values is at first: about right at 45 dB.
+    /// Steps that a deviation of its values is at first, finer than most end: where measuring begins.
     fn first(&self) -> f64 {
         match self {
             Group::Attribute(0) => 512.0,
@@ -237,45 +237,31 @@ impl Archive {
             measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
         }
         let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
-        let looked_at = |encoded: &Encoded| -> Result<[f64; 2]> {
+        let looked_at = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path)?;
             let shown = scene.input.showing(&decoded)?;
-            Ok([looks.psnr(&*shown)?, level - original.psnr(&*shown)?])
+            Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
         };
-        let best = match aim {
+        let (encoded, [psnr, loss]) = match aim {
             Aim::Bytes(most) => {
                 // The finest that fits.
-                let fits = |added: f64| Ok(Some(encoded(added)?).filter(|found| found.bytes.len() as u64 <= most));
-                bisected([-BYTES_ADDED[1], -BYTES_ADDED[0]], BYTES_HALVINGS, |finer| fits(-finer))?
+                let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
+                looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
+                    Some(best) => best,
+                    None => coarsest(encoded(BYTES_ADDED[0])?, most, reduction.len())?,
+                })?
             }
-            _ => bisected(ADDED, HALVINGS, |added| {
-                let found = encoded(added)?;
-                let [psnr, loss] = looked_at(&found)?;
-                let does = match aim {
-                    Aim::Close(least) => psnr >= least,
+            Aim::Close(_) | Aim::Loss(_) => {
+                let does = |[psnr, loss]: [f64; 2]| match aim {
                     Aim::Loss(most) => loss <= most,
-                    Aim::Bytes(_) => true,
+                    _ => psnr >= asked,
                 };
-                Ok(does.then_some(found))
-            })?,
-        };
-        let encoded = match (best, aim) {
-            (Some(best), _) => best,
-            (None, Aim::Bytes(most)) => {
-                let coarsest = encoded(BYTES_ADDED[1])?;
-                let least = coarsest.bytes.len();
-                if least as u64 > most {
-                    return Err(Error::usage(format!(
-                        "--target-size: an archive of {} Gaussians has {least} bytes on the coarsest grids; expected at least \
-                         that, found {most}",
-                        reduction.len()
-                    )));
-                }
-                coarsest
+                let best = bisected(ADDED, HALVINGS, |added| {
+                    Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| does(found)))
+                })?;
+                best.map_or_else(|| looked_at(encoded(ADDED[0])?), Ok)?
             }
-            (None, _) => encoded(ADDED[0])?,
         };
-        let [psnr, loss] = looked_at(&encoded)?;
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
         Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts, bits, measured }))
     }
@@ -288,6 +274,18 @@ impl Archive {
 pub fn bytes(scene: &Scene, reduction: &Reduction) -> Result<u64> {
     let content = scene.input.content(reduction)?;
     Ok(archive::encode(&content, &Grids::of(&content).steps(GUESSED))?.bytes.len() as u64)
+}
+
+/// The coarsest archive of `gaussians` Gaussians, if it has no more than `most` bytes.
+fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
+    let least = encoded.bytes.len();
+    if least as u64 > most {
+        return Err(Error::usage(format!(
+            "--target-size: an archive of {gaussians} Gaussians has {least} bytes on the coarsest grids; expected at least \
+             that, found {most}"
+        )));
+    }
+    Ok(encoded)
 }
 
 /// What `of` finds at the largest number between two, as far as halving their distance so often tells, that it finds

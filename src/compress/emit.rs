@@ -131,12 +131,9 @@ impl Emit {
     pub fn bytes(&self, scene: &Scene, reduction: &Reduction, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
-        if self.kind.is_folder() {
-            fs::create_dir(&path).map_err(Error::io("create", &path))?;
-        }
-        scene.input.write(reduction, self.kind, &path, &scene.limits)?;
+        let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits)?;
         let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
-        Ok(scene.input.size_written(self.kind, &path)?.whole() + beside)
+        Ok(written + beside)
     }
 
     /// Writes the result and what goes beside it; everything appears under its name at the end, a file
@@ -156,13 +153,15 @@ impl Emit {
     ) -> Result<Summary> {
         let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, reduction.len(), scene.source(), |journal| {
-                match archive {
-                    Some(archive) => fs::write(path, &archive.bytes).map_err(Error::io("write", path))?,
-                    None => journal.notes.extend(scene.input.write(reduction, self.kind, path, &scene.limits)?),
-                }
                 let size = match archive {
-                    Some(archive) => archive.parts.into(),
-                    None => scene.input.size_written(self.kind, path)?,
+                    Some(archive) => {
+                        fs::write(path, &archive.bytes).map_err(Error::io("write", path))?;
+                        archive.parts.into()
+                    }
+                    None => {
+                        journal.notes.extend(scene.input.write(reduction, self.kind, path, &scene.limits)?);
+                        scene.input.size_written(self.kind, path)?
+                    }
                 };
                 journal.notes.extend(size.why_larger_than(&scene.input.size()?));
                 Ok((size, reduction.len()))
@@ -196,11 +195,17 @@ impl Emit {
 ///
 /// # Errors
 /// Frames that cannot be read, a failed write.
-pub fn write_alone(input: &dyn Family, reduction: &Reduction, kind: OutputKind, path: &Path) -> Result<u64> {
+pub fn write_alone(
+    input: &dyn Family,
+    reduction: &Reduction,
+    kind: OutputKind,
+    path: &Path,
+    limits: &Limits,
+) -> Result<u64> {
     if kind.is_folder() {
         fs::create_dir(path).map_err(Error::io("create", path))?;
     }
-    input.write(reduction, kind, path, &Limits::NONE)?;
+    input.write(reduction, kind, path, limits)?;
     Ok(input.size_written(kind, path)?.whole())
 }
 

@@ -3,6 +3,7 @@
 //! Memory: two states of one frame, and two pictures.
 
 use super::journal::Journal;
+use super::refine::CLOSE_ENOUGH;
 use super::request::Request;
 use super::score::scored;
 use super::summary::FieldSummary;
@@ -23,8 +24,6 @@ use crate::stream::{Batch, Progress, Subject, show, spread};
 const NAME: &str = "field";
 /// Scoring pictures that are compared.
 const PICTURES: usize = 12;
-/// Decibels beyond which nothing is to be gained: less than a quarter of a step of 8 bits.
-const CLOSE_ENOUGH: f64 = 60.0;
 
 /// The precision of a result's field.
 #[derive(Debug, Clone)]

@@ -10,7 +10,7 @@ use super::measure::{Measure, Outlook, Stages};
 use super::merge::Merge;
 use super::prune::Prune;
 use super::refine::Refine;
-use super::request::{Goal, Only, Quality, Request};
+use super::request::{Goal, Only, Quality, Request, decibels};
 use super::rounds::Rounds;
 use super::score::UserOverrides;
 use super::search::Search;
@@ -49,7 +49,7 @@ pub struct Job {
 
 /// What of refining a budget of memory is too small for, and what there would have to be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Spared {
+enum Spared {
     /// Nothing.
     #[default]
     Nothing,
@@ -71,8 +71,13 @@ impl Job {
     /// # Errors
     /// A recipe out of range; a target or ids that such an input does not have.
     pub fn new(request: &Request, outlook: Outlook) -> Result<Job> {
+        Job::sparing(request, outlook, Spared::Nothing)
+    }
+
+    /// [`Job::new`] without what is `spared`.
+    fn sparing(request: &Request, outlook: Outlook, spared: Spared) -> Result<Job> {
         let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
-        Job::down_to(request, outlook, target, Spared::Nothing)
+        Job::down_to(request, outlook, target, spared)
     }
 
     /// [`Job::new`] within the request's budget of memory: harmonics above the first stay as they are, else nothing is
@@ -82,8 +87,7 @@ impl Job {
     /// # Errors
     /// Those of [`Job::new`].
     pub fn within(request: &Request, outlook: Outlook, work: &Workload) -> Result<Job> {
-        let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
-        let of = |spared| Job::down_to(request, outlook, target, spared);
+        let of = |spared| Job::sparing(request, outlook, spared);
         let budget = request.input.memory;
         let asked = of(Spared::Nothing)?;
         if !asked.refines() || Plan::fits(*work, budget, |work, limits| asked.needs(work, limits)) {
@@ -98,11 +102,8 @@ impl Job {
         Ok(if Plan::fits(*work, budget, |work, limits| none.needs(work, limits)) { none } else { asked })
     }
 
-    /// [`Job::new`] down to `target` Gaussians, whatever the request's own target, without what is `spared`.
-    ///
-    /// # Errors
-    /// Those of [`Job::new`].
-    pub fn down_to(request: &Request, outlook: Outlook, target: Option<usize>, spared: Spared) -> Result<Job> {
+    /// [`Job::sparing`] down to `target` Gaussians, whatever the request's own target.
+    fn down_to(request: &Request, outlook: Outlook, target: Option<usize>, spared: Spared) -> Result<Job> {
         let Request { recipe, only, .. } = request;
         recipe.validate().map_err(Error::usage)?;
         if request.goal.is_some() && (*only == Only::Merge || request.target.is_some()) {
@@ -123,14 +124,13 @@ impl Job {
             Spared::Bands { .. } => Refine::of(recipe, part, looks && prunes).map(Refine::without_bands),
             Spared::Refining { .. } => None,
         };
-        // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
         let kind = OutputKind::of(&request.output, request.kind, outlook.own_output);
         let is_archive = kind == OutputKind::Archive;
         if request.archive_psnr.is_some() && !is_archive {
             return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));
         }
-        if let Some(odd) = request.archive_psnr.filter(|psnr| !(*psnr > 0.0 && *psnr <= 100.0)) {
-            return Err(Error::usage(format!("archive_psnr: expected decibels above 0 and at most 100, found {odd}")));
+        if let Some(psnr) = request.archive_psnr {
+            decibels("archive_psnr", psnr).map_err(Error::usage)?;
         }
         let goal = match &request.goal {
             Some(Goal::Quality(Quality::Psnr(least))) if is_archive => {
@@ -148,6 +148,7 @@ impl Job {
             goal => goal.clone(),
         };
         let searches = matches!(request.goal, Some(Goal::Quality(_)));
+        // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
         let cuts = refine.as_ref().is_some_and(Refine::will_cut);

@@ -134,7 +134,7 @@ fn reduce(
             job.search.as_ref().map_or(job.before_cuts(fewest, scored.count()), |search| search.fewest(scored.count()));
         ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
     }
-    let (reduction, merge, goal) = match &job.search {
+    let (reduction, merge, mut goal) = match &job.search {
         Some(search) => {
             let (reduction, goal) = search.run(scene, &scored, &ranked, &mut journal)?;
             (reduction, None, Some(goal))
@@ -147,7 +147,6 @@ fn reduce(
     };
     job.write_down(request, &mut journal);
 
-    let mut goal = goal;
     // What the search was given was more.
     if let (Some(goal), Some(Goal::Quality(Quality::Psnr(least)))) = (&mut goal, &request.goal) {
         goal.asked = *least;
@@ -163,7 +162,7 @@ fn reduce(
         }
         None => None,
     };
-    let (encoded, archive) = archived.map_or((None, None), |(encoded, summary)| (Some(encoded), Some(summary)));
+    let (encoded, archive) = archived.unzip();
     if let (Some(goal), Some(archive)) = (&mut goal, &archive) {
         (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
         journal.notes.push(format!(

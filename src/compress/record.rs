@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::request::{Goal, Only, Quality, Request, Target};
+use super::request::{Goal, Only, Quality, Request, Target, decibels};
 use super::score::UserOverrides;
 use crate::TOOL;
 use crate::emit::kind::OutputKind;
@@ -84,10 +84,6 @@ impl Run {
     /// # Errors
     /// Several, a part of one, or decibels that no goal has, in words.
     pub fn goal(&self) -> std::result::Result<Option<Goal>, String> {
-        let decibels = |name: &str, value: f64| match value > 0.0 && value <= 100.0 {
-            true => Ok(value),
-            false => Err(format!("{name}: expected decibels above 0 and at most 100, found {value}")),
-        };
         match (self.target(), self.min_psnr, self.max_loss, &self.ground_truth, self.target_size) {
             (_, None, None, None, None) => Ok(None),
             (None, Some(least), None, None, None) => {

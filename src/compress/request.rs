@@ -55,6 +55,17 @@ pub enum Quality {
     },
 }
 
+/// `value` of the parameter `name`, if it is one of a quality.
+///
+/// # Errors
+/// One that is not, in words.
+pub(super) fn decibels(name: &str, value: f64) -> std::result::Result<f64, String> {
+    match value > 0.0 && value <= 100.0 {
+        true => Ok(value),
+        false => Err(format!("{name}: expected decibels above 0 and at most 100, found {value}")),
+    }
+}
+
 /// Everything a compression is asked for.
 #[derive(Debug, Clone)]
 pub struct Request {

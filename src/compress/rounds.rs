@@ -86,7 +86,7 @@ impl Rounds {
         let floor = self.contrast_floor as f32;
         let source = scene.source();
         let protected = &scored.protected;
-        let is_free = |id: &u32| protected.binary_search(id).is_err();
+        let is_free = |id: &u32| !scored.is_protected(*id);
         let mut free: Vec<u32> = before.ranking.order().iter().copied().filter(is_free).collect();
         // Worst last.
         let mut gone: Vec<u32> = Vec::new();

@@ -251,6 +251,11 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
+    /// Whether Gaussian `id` is to stay as it is.
+    pub fn is_protected(&self, id: u32) -> bool {
+        self.protected.binary_search(&id).is_ok()
+    }
+
     /// Statistics of every Gaussian.
     ///
     /// # Errors

@@ -118,15 +118,10 @@ impl Space<'_> {
     /// Places of the `count` that are protected or that pictures would lose most with.
     fn best(&self, scene: &Scene, scored: &Scored, reduction: &Reduction, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(reduction)?;
-        let mut places: Vec<u32> = (0..reduction.len() as u32).collect();
+        let places: Vec<u32> = (0..reduction.len() as u32).collect();
         let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
-        let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits)?.sum;
-        let is_protected = |place: usize| scored.protected.binary_search(&reduction.kept[place]).is_ok();
-        // Stable: ties by id.
-        places.sort_by_key(|&place| std::cmp::Reverse((is_protected(place as usize), errors[place as usize])));
-        places.truncate(count);
-        places.sort_unstable();
-        Ok(places)
+        let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits)?;
+        Ok(errors.most_missed(count, |place| scored.is_protected(reduction.kept[place])))
     }
 }

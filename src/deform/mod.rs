@@ -15,6 +15,5 @@ mod voxel;
 
 pub use deltas::Deltas;
 pub use field::{Field, FieldConfig, Prepared, Scratch};
-pub use planes::rows_before_zero;
-pub use planes::{Box3, Tap, tap};
+pub use planes::{Box3, Tap, rows_before_zero, tap};
 pub use tensors::{Tensor, Tensors};

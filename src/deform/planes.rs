@@ -61,6 +61,7 @@ impl Box3 {
     }
 
     /// Where `p` lies, −1 to 1 inside the box.
+    #[inline(always)]
     pub fn normalised(&self, p: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
     }

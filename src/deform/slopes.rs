@@ -105,8 +105,7 @@ impl Planes {
             out.resize(width, Lanes([0.0; LANES]));
         }
         for (lane, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
-            let normalised = |axis: usize, p: f32| (p - self.space.origin[axis]) * self.space.factor[axis] - 1.0;
-            let u = [normalised(0, x), normalised(1, y), normalised(2, z)];
+            let u = self.space.normalised([x, y, z]);
             let mut before = 0;
             for (level, lines) in self.levels.iter().zip(lines) {
                 let n = level.channels;

@@ -39,22 +39,20 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     total / (3 * count) as f64
 }
 
-/// [`ssim`] of `a` and `b`, and how it changes with each value of `a`, `[H, W, 3]`; 0 where a screen shows no change.
+/// How [`ssim`] of `a` and `b` changes with each value of `a`, `[H, W, 3]`; 0 where a screen shows no change.
 ///
 /// With S = (A₁A₂)/(B₁B₂) of windowed moments, the chain rule back through them: a window is its own adjoint.
 ///
 /// # Panics
 /// If the sizes differ.
-pub fn ssim_slope(a: &Image, b: &Image) -> (f64, Image) {
+pub fn ssim_slope(a: &Image, b: &Image) -> Image {
     assert_same_size(a, b);
     let (width, count) = (a.width as usize, a.data.len() / 3);
     let of_channel = |channel: usize| {
-        let (mut moments, mut total) = (Moments::new(count), 0.0);
+        let mut moments = Moments::new(count);
         moments.window_of(a, b, channel);
         for i in 0..count {
-            let terms = Terms::of(moments.at(i));
-            total += terms.similarity();
-            let slopes = terms.slopes();
+            let slopes = Terms::of(moments.at(i)).slopes();
             // What they were is not needed any more.
             moments.sums.iter_mut().zip(slopes).for_each(|(sum, slope)| sum[i] = slope);
         }
@@ -67,15 +65,14 @@ pub fn ssim_slope(a: &Image, b: &Image) -> (f64, Image) {
             let slope = by_mean[i] + 2.0 * clamped(a) * by_squares[i] + clamped(b) * by_products[i];
             if clamped(a) == f64::from(a) { slope / (3 * count) as f64 } else { 0.0 }
         };
-        (total, values.map(of_value).collect::<Vec<f64>>())
+        values.map(of_value).collect()
     };
-    let channels: Vec<(f64, Vec<f64>)> = (0..3).into_par_iter().map(of_channel).collect();
+    let channels: Vec<Vec<f64>> = (0..3).into_par_iter().map(of_channel).collect();
     let mut slope = Image { data: vec![0.0; a.data.len()], ..*a };
-    for (channel, (_, slopes)) in channels.iter().enumerate() {
+    for (channel, slopes) in channels.iter().enumerate() {
         slope.data.iter_mut().skip(channel).step_by(3).zip(slopes).for_each(|(to, &of)| *to = of as f32);
     }
-    let total: f64 = channels.iter().map(|(total, _)| total).sum();
-    (if count == 0 { 1.0 } else { total / (3 * count) as f64 }, slope)
+    slope
 }
 
 /// Windowed sums of one channel of two pictures.

@@ -42,6 +42,17 @@ impl RemovalError {
         self.sum.is_empty()
     }
 
+    /// The `count` Gaussians, increasing, that are `fixed` or else that pictures would lose most with; of equals the
+    /// first ones.
+    pub fn most_missed(&self, count: usize, fixed: impl Fn(usize) -> bool) -> Vec<u32> {
+        let mut places: Vec<u32> = (0..self.len() as u32).collect();
+        // Stable: ties by place.
+        places.sort_by_key(|&place| std::cmp::Reverse((fixed(place as usize), self.sum[place as usize])));
+        places.truncate(count);
+        places.sort_unstable();
+        places
+    }
+
     /// Adds what `other` found of the same Gaussians in other pictures.
     ///
     /// # Panics

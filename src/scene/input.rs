@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
 use crate::error::Result;
-use crate::families::Family;
+use crate::families::{Family, OpenOptions};
 use crate::ingest::cameras::{self, CameraOptions};
 use crate::model::{Rig, Split};
 
@@ -34,6 +34,11 @@ impl InputOptions {
     /// Whether the input is the stream on standard input.
     pub fn is_stream(&self) -> bool {
         self.path == Path::new("-")
+    }
+
+    /// What is said of the input beside its path.
+    pub fn opening(&self) -> OpenOptions {
+        OpenOptions { iteration: self.iteration, scratch: self.scratch.clone() }
     }
 
     /// Where scratch files go.

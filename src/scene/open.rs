@@ -8,7 +8,7 @@ use super::Scene;
 use super::input::{InputOptions, Opened, load_cameras};
 use super::stream::open_arriving;
 use crate::error::{Error, Result};
-use crate::families::{self, Family, OpenOptions, Timing};
+use crate::families::{self, Family, Timing};
 use crate::ingest::cameras;
 use crate::model::{Columns, Rig};
 use crate::source::FrameSource;
@@ -25,7 +25,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
     }
     let path = &options.path;
     let mut notes = Vec::new();
-    let input = families::open(path, &OpenOptions { iteration: options.iteration, scratch: options.scratch.clone() })?;
+    let input = families::open(path, &options.opening())?;
     let rig = load_cameras(options, camera_path(options, &*input).as_deref())?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {

@@ -24,21 +24,29 @@ impl Photographs {
     /// A folder that cannot be read; a picture without a photograph, or that shares one with another.
     pub fn find(folder: &Path, rig: &Rig, times: &[f64], pictures: &[Picture]) -> Result<Photographs> {
         check_folder(folder)?;
-        let mut files = HashMap::new();
-        let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
-        for &picture in pictures {
-            let place = || format!("frame {}, view {}", picture.frame, picture.view);
+        let file = |&picture: &Picture| {
             let named = rig.image(picture, times);
             let file = file_of(folder, named, picture).ok_or_else(|| {
                 let named = named.and_then(Path::file_name).map(|name| format!(" or {}", name.display()));
                 let expected = format!("{}.png{}", picture.name(), named.unwrap_or_default());
-                Error::input(folder, place(), expected, "no such file")
+                Error::input(folder, place(picture), expected, "no such file")
                     .hint("--max-frames compares fewer frames, --split other pictures")
             })?;
+            Ok((picture, file))
+        };
+        Photographs::at(folder, pictures.iter().map(file))
+    }
+
+    /// Of pictures with the file of each, inside `folder`.
+    fn at(folder: &Path, found: impl Iterator<Item = Result<(Picture, PathBuf)>>) -> Result<Photographs> {
+        let mut files = HashMap::new();
+        let mut takers: HashMap<PathBuf, Picture> = HashMap::new();
+        for found in found {
+            let (picture, file) = found?;
             // The names that a time-stamped rig gives its files are shared by all of its cameras.
             if let Some(other) = takers.insert(file.clone(), picture) {
                 let found = format!("{}, as for frame {}, view {}", file.display(), other.frame, other.view);
-                return Err(Error::input(folder, place(), "a picture of its own", found)
+                return Err(Error::input(folder, place(picture), "a picture of its own", found)
                     .hint("give the folder that the cameras' file paths start from"));
             }
             files.insert((picture.frame, picture.view), file);
@@ -54,12 +62,13 @@ impl Photographs {
         folder: &Path,
         rig: &Rig,
         times: &[f64],
-        mut pictures: Vec<Picture>,
+        pictures: Vec<Picture>,
     ) -> Result<(Vec<Picture>, Photographs)> {
         check_folder(folder)?;
-        pictures.retain(|&picture| file_of(folder, rig.image(picture, times), picture).is_some());
-        let found = Photographs::find(folder, rig, times, &pictures)?;
-        Ok((pictures, found))
+        let file = |picture: Picture| Some((picture, file_of(folder, rig.image(picture, times), picture)?));
+        let found: Vec<(Picture, PathBuf)> = pictures.into_iter().filter_map(file).collect();
+        let pictures = found.iter().map(|(picture, _)| *picture).collect();
+        Ok((pictures, Photographs::at(folder, found.into_iter().map(Ok))?))
     }
 
     /// The photograph of `picture`, which `camera` takes, before `background` where it has transparency.
@@ -71,6 +80,10 @@ impl Photographs {
         let file = file.ok_or_else(|| Error::usage(format!("no photograph is known of {}", picture.name())))?;
         read_png(file, (camera.width, camera.height), background)
     }
+}
+
+fn place(picture: Picture) -> String {
+    format!("frame {}, view {}", picture.frame, picture.view)
 }
 
 fn check_folder(folder: &Path) -> Result<()> {

@@ -9,6 +9,7 @@ use crate::archive::{MAGIC, Parts};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::error::{Error, Result};
 use crate::families::archive::{is_folder, read_archive, unpack};
+use crate::model::Columns;
 
 /// What was unpacked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,7 +43,7 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace) -> Result<Unpacked> {
     let (content, parts) = read_archive(path)?;
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
-    let attributes = content.cloud.len() * crate::model::Columns::all().width(content.cloud.sh_degree());
+    let attributes = content.cloud.len() * Columns::all().width(content.cloud.sh_degree());
     let unpacked = Unpacked { gaussians: content.cloud.len(), parts, bytes: 4 * (values + attributes) as u64 };
     if !is_folder(&content) {
         check_target(output, Kind::File, &[path], overwrite)?;

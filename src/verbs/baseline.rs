@@ -7,6 +7,7 @@ use crate::compress::Target;
 use crate::compress::emit::write_alone;
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
+use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
 use crate::recipe::Recipe;
 use crate::reduction::Reduction;
@@ -45,7 +46,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     let kind = OutputKind::of(output, None, scene.input.own_output());
     scene.input.check_output(kind, output)?;
     let reduction = Reduction::pruned(kept, &Recipe::preset("default")?.merge);
-    write_alone(&*scene.input, &reduction, kind, output)
+    write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE)
 }
 
 /// The `wanted` best of `ids`, increasing.

@@ -19,7 +19,7 @@ use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::families::stream::pack_stream;
 use crate::families::trajectories::write_sequence;
-use crate::families::{self, ColumnInfo, Family, OpenOptions, Size, Timing};
+use crate::families::{self, ColumnInfo, Family, Size, Timing};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::Limits;
@@ -150,10 +150,7 @@ pub struct Info {
 pub fn info(options: &InputOptions) -> Result<Info> {
     let input: Box<dyn Family> = match options.is_stream() {
         true => open_input(options)?.input,
-        false => families::open(
-            &options.path,
-            &OpenOptions { iteration: options.iteration, scratch: options.scratch.clone() },
-        )?,
+        false => families::open(&options.path, &options.opening())?,
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));

@@ -37,7 +37,7 @@ impl Loss {
         if self.ssim > 0.0 {
             let count = target.len() as f64;
             let factors = [(1.0 - self.ssim) * SQUARED, self.ssim * count].map(|factor| factor as f32);
-            let (_, like) = ssim_slope(picture, &image(picture, target));
+            let like = ssim_slope(picture, &image(picture, target));
             slope.data.iter_mut().zip(&like.data).for_each(|(to, like)| *to = factors[0] * *to - factors[1] * like);
         }
         slope

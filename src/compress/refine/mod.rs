@@ -38,7 +38,7 @@ const NAME: &str = "refine";
 /// Steps between two looks at the pictures kept apart: a third of all, within these.
 const JUDGE_EVERY: [usize; 2] = [100, 500];
 /// Decibels beyond which nothing is to be gained: less than a quarter of a step of 8 bits.
-const CLOSE_ENOUGH: f64 = 60.0;
+pub(super) const CLOSE_ENOUGH: f64 = 60.0;
 /// Part of the rates to go on with, where they led away from the pictures kept apart.
 const TOO_FAST: f32 = 0.3;
 /// Part of the Gaussians that ranking alone leaves, before the first steps of a stronger reduction.
@@ -288,7 +288,7 @@ impl<'a> Walk<'a> {
     where
         'a: 'b,
     {
-        let fixed = reduction.kept.iter().map(|id| self.scored.protected.binary_search(id).is_ok()).collect();
+        let fixed = reduction.kept.iter().map(|id| self.scored.is_protected(*id)).collect();
         Moving::new(self.scene, result, self.targets, self.refine.manner(), fixed)
     }
 
@@ -332,12 +332,8 @@ impl<'a> Walk<'a> {
             self.step(moving, &schedule)?;
         }
         let of: Vec<usize> = (0..RANKED_ON).map(|_| self.turns.next()).collect();
-        let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?.sum;
-        let mut left: Vec<u32> = (0..errors.len() as u32).collect();
-        // Stable: ties by id.
-        left.sort_by_key(|&place| std::cmp::Reverse((moving.fixed()[place as usize], errors[place as usize])));
-        left.truncate(size);
-        left.sort_unstable();
+        let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?;
+        let left = errors.most_missed(size, |place| moving.fixed()[place]);
         moving.pick(&left)?;
         Ok(left)
     }

@@ -49,10 +49,8 @@ pub(super) struct Moving<'a> {
     /// What was added to what is stored before that.
     before: Change,
     fixed: Vec<bool>,
-    columns: Columns,
-    /// Up to which harmonics move.
-    sh_degree: usize,
-    loss: Loss,
+    /// Of what the states have.
+    manner: Manner,
     descent: Descent,
     gradients: Gradients,
     /// What the picture in the making shows.
@@ -96,9 +94,7 @@ impl<'a> Moving<'a> {
             frames,
             varying,
             fixed,
-            columns,
-            sh_degree,
-            loss,
+            manner: Manner { columns, sh_degree, loss },
         };
         if deformation.is_some() {
             moving.find()?;
@@ -118,8 +114,9 @@ impl<'a> Moving<'a> {
     /// Begins to descend from here.
     fn begin(&mut self) {
         let Some(Local { state, .. }) = self.locals.first() else { return };
-        self.descent = Descent::new(state, self.columns, self.sh_degree, &self.fixed);
-        self.gradients = Gradients::new(state.len(), self.columns, self.sh_degree);
+        let Manner { columns, sh_degree, .. } = self.manner;
+        self.descent = Descent::new(state, columns, sh_degree, &self.fixed);
+        self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
 
     /// Which Gaussians stay as they are.
@@ -144,7 +141,7 @@ impl<'a> Moving<'a> {
         for &frame in &self.frames {
             let want = if locals.first().is_none() { Columns::all() } else { self.varying };
             deformation.state(frame, &self.stored, want, &mut self.now.state)?;
-            self.now.jacobian = deformation.jacobian(frame, &self.stored, self.columns)?;
+            self.now.jacobian = deformation.jacobian(frame, &self.stored, self.manner.columns)?;
             locals.push(&mut self.now)?;
         }
         self.locals = locals.finish()?;
@@ -220,7 +217,7 @@ impl<'a> Moving<'a> {
         let mut now = std::mem::take(&mut self.now);
         self.show(self.place(k), &mut now)?;
         self.gradients.clear();
-        let pull = |picture: &_| (0.0, self.loss.slope(picture, &target));
+        let pull = |picture: &_| (0.0, self.manner.loss.slope(picture, &target));
         let camera = self.targets.camera(k);
         self.renderer.gradient(&now.state, camera, self.scene.background, pull, &mut self.gradients);
         now.jacobian.pull_back(&mut self.gradients);
@@ -237,7 +234,7 @@ impl<'a> Moving<'a> {
         let lost = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
             self.show(self.place(k), now)?;
             let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
-            Ok(self.loss.of(&picture, &self.targets.values(k)?))
+            Ok(self.manner.loss.of(&picture, &self.targets.values(k)?))
         };
         let losses: Vec<[f64; 2]> = of.par_iter().map_init(|| self.worker(), lost).collect::<Result<_>>()?;
         Ok(Closeness::of(&losses))

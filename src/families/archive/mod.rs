@@ -51,7 +51,7 @@ pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
     let Some(iteration) = number else {
         return Err(Error::input(path, ITERATION, "the number of a training iteration", "none"));
     };
-    let folder = to.join("point_cloud").join(format!("iteration_{iteration}"));
+    let folder = four_d_gaussians::iteration_folder(to, iteration);
     fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
     let config = to.join(CFG_ARGS);
     fs::write(&config, cfg_args).map_err(Error::io("write", &config))?;

@@ -234,7 +234,7 @@ impl ModelFolder {
 }
 
 /// The folder of a training iteration in the model at `root`.
-fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
+pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
     root.join("point_cloud").join(format!("iteration_{iteration}"))
 }
 
