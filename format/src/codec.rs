@@ -22,16 +22,25 @@
 use xxhash_rust::xxh3::xxh3_64;
 use zstd::bulk::Decompressor;
 
+use crate::bounded::{self, Tracks};
 use crate::error::{Error, Result};
 use crate::layout::MAX_TILE_BYTES;
 
 /// How [`encode_tile`] stores values that are not better left raw.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Compression {
     /// As they are: read in place from the map.
     Raw,
     /// Filtered and compressed by zstd at this level; a tile that does not shrink is stored raw.
     Zstd(i32),
+    /// At most `max_error` off what they were, and compressed by zstd at this level; a tile that does not shrink by that,
+    /// or whose values hold too few of those that can be, is filtered.
+    Bounded {
+        /// See [`crate::ColumnSpec::max_error`]; above 0.
+        max_error: f64,
+        /// Of zstd.
+        level: i32,
+    },
 }
 
 /// How the stored bytes of a tile are to be read.
@@ -42,6 +51,11 @@ pub enum Encoding {
     /// Predicted from `order` frames before, shuffled, zstd.
     Filtered {
         /// 0, 1 or 2 frames.
+        order: u8,
+    },
+    /// Multiples of a step, predicted from `order` frames before, shuffled track by track, zstd.
+    Bounded {
+        /// 1 or 2 frames.
         order: u8,
     },
 }
@@ -65,6 +79,8 @@ pub struct EncodedTile {
     pub(crate) len: u32,
     pub(crate) constant: bool,
     pub(crate) encoding: Encoding,
+    /// How far values are off, at most.
+    pub(crate) max_error: f64,
     pub(crate) stats: Stats,
     pub(crate) checksum: u64,
     pub(crate) bytes: Vec<u8>,
@@ -91,11 +107,11 @@ impl EncodedTile {
 /// Encodes `values`, laid out `[frames][width][len]`: `width` components of `len` Gaussians.
 ///
 /// Pure and deterministic; call it from as many threads as you like. Needs about twice the size of
-/// `values` while it runs. A tile with the same bits in every frame keeps one; to encode a column that
+/// `values` while it runs, three times with a bound. A tile with the same bits in every frame keeps one; to encode a column that
 /// never changes, pass its one frame with `frames` 1 and write the result to every frame block.
 ///
 /// Errors: `values` is not of this shape or empty, or larger than [`MAX_TILE_BYTES`]; zstd does not
-/// know the level.
+/// know the level; no column may have that bound.
 pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compression: Compression) -> Result<EncodedTile> {
     let count = [frames, width, len].into_iter().try_fold(1u64, |product, n| product.checked_mul(n.into()));
     if values.is_empty() || count != Some(values.len() as u64) || 4 * values.len() as u64 > MAX_TILE_BYTES {
@@ -106,68 +122,102 @@ pub fn encode_tile(values: &[f32], frames: u32, width: u32, len: u32, compressio
             values.len()
         )));
     }
-    let bits: &[u32] = bytemuck::cast_slice(values);
     let plane = width as usize * len as usize;
+    let failed = |level: i32, error: std::io::Error| Error::usage(format!("zstd level {level} failed: {error}"));
+    if let Compression::Bounded { level, .. } | Compression::Zstd(level) = compression {
+        let range = zstd::compression_level_range();
+        if !range.contains(&level) {
+            let message = format!("zstd levels go from {} to {}, not {level}", range.start(), range.end());
+            return Err(Error::usage(message));
+        }
+    }
+    let compression = match compression {
+        Compression::Bounded { max_error, level } => {
+            if !bounded::BOUNDS.contains(&max_error) {
+                return Err(Error::usage(format!("a bound is a normal f32 above 0, not {max_error}")));
+            }
+            let found = bounded::encode(values, plane, max_error, level).map_err(|error| failed(level, error))?;
+            if let Some(bounded::Bounded { order, constant, stats, bytes }) = found {
+                let (encoding, checksum) = (Encoding::Bounded { order }, xxh3_64(&bytes));
+                return Ok(EncodedTile { frames, width, len, constant, encoding, max_error, stats, checksum, bytes });
+            }
+            Compression::Zstd(level)
+        }
+        exact => exact,
+    };
+    let bits: &[u32] = bytemuck::cast_slice(values);
     let (first, rest) = bits.split_at(plane);
     let constant = rest.chunks_exact(plane).all(|frame| frame == first);
     let bits = if constant { first } else { bits };
     let (encoding, bytes) = match compression {
-        Compression::Raw => (Encoding::Raw, raw_bytes(bits)),
         Compression::Zstd(level) => {
-            if !zstd::compression_level_range().contains(&level) {
-                let range = zstd::compression_level_range();
-                return Err(Error::usage(format!(
-                    "zstd levels go from {} to {}, not {level}",
-                    range.start(),
-                    range.end()
-                )));
-            }
             let order = best_order(bits, plane);
             let shuffled = filter(bits, plane, order);
             match zstd::bulk::compress(&shuffled, level) {
                 Ok(bytes) if bytes.len() < shuffled.len() => (Encoding::Filtered { order }, bytes),
                 Ok(_) => (Encoding::Raw, raw_bytes(bits)),
-                Err(error) => return Err(Error::usage(format!("zstd level {level} failed: {error}"))),
+                Err(error) => return Err(failed(level, error)),
             }
         }
+        _ => (Encoding::Raw, raw_bytes(bits)),
     };
     let checksum = xxh3_64(&bytes);
-    Ok(EncodedTile { frames, width, len, constant, encoding, stats: stats(bits), checksum, bytes })
+    Ok(EncodedTile { frames, width, len, constant, encoding, max_error: 0.0, stats: stats(bits), checksum, bytes })
 }
 
 /// The frames of one stored tile, decoded one after the other.
 ///
-/// Memory: of a filtered tile its values shuffled, as large as the values themselves, and two frames; of a raw one
+/// Memory: of a filtered tile its values shuffled, as large as the values themselves, and two frames; of a bounded one an
+/// eighth of a byte per value of a frame more, and half a byte per value where every sixteenth is an exception; of a raw one
 /// nothing.
 #[derive(Debug, Default)]
 pub(crate) struct Unfilter {
     order: u8,
-    /// Four planes of bytes, each with one byte of every value.
+    /// Four planes of bytes, each with one byte of every value; of a bounded tile what SPEC.md says.
     shuffled: Vec<u8>,
-    /// The frame before `next` and the one before that, as [`ordered`] integers.
+    /// The frame before `next` and the one before that, as [`ordered`] integers, or as multiples.
     recent: [Vec<u32>; 2],
     next: usize,
+    bounded: bool,
+    tracks: Tracks,
+}
+
+/// What a tile's stored bytes are to be decoded as.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Stored<'a> {
+    pub(crate) bytes: &'a [u8],
+    pub(crate) encoding: Encoding,
+    pub(crate) frames: usize,
+    /// Values of a frame.
+    pub(crate) plane: usize,
+    /// Bound of the column.
+    pub(crate) max_error: f64,
 }
 
 impl Unfilter {
-    /// Takes over a filtered tile of `frames` frames of `plane` values. The error says what was found instead of that
-    /// many values.
-    pub(crate) fn load(
-        &mut self,
-        stored: &[u8],
-        order: u8,
-        frames: usize,
-        plane: usize,
-        zstd: &mut Decompressor<'_>,
-    ) -> std::result::Result<(), String> {
-        let expected = 4 * frames * plane;
-        self.order = order;
+    /// Takes over a tile that is not raw. The error says what was found instead of its values.
+    pub(crate) fn load(&mut self, stored: Stored<'_>, zstd: &mut Decompressor<'_>) -> std::result::Result<(), String> {
+        let Stored { bytes, encoding, frames, plane, max_error } = stored;
         self.next = 0;
-        self.shuffled.resize(expected, 0);
         self.recent.iter_mut().for_each(|frame| frame.resize(plane, 0));
+        self.bounded = matches!(encoding, Encoding::Bounded { .. });
+        let (packed, most) = match encoding {
+            Encoding::Bounded { order } => {
+                self.order = order;
+                let packed = self.tracks.read_head(bytes, frames, plane, max_error)?;
+                (packed, self.tracks.most_bytes())
+            }
+            Encoding::Filtered { order } => {
+                self.order = order;
+                (bytes, 4 * frames * plane)
+            }
+            Encoding::Raw => return Err("raw values".to_owned()),
+        };
+        self.shuffled.resize(most, 0);
         // The target has a fixed size: a frame that wants more is refused, whatever it claims.
-        match zstd.decompress_to_buffer(stored, self.shuffled.as_mut_slice()) {
-            Ok(len) if len == expected => Ok(()),
+        match zstd.decompress_to_buffer(packed, self.shuffled.as_mut_slice()) {
+            Ok(len) if self.bounded => self.tracks.read_mask(&self.shuffled[..len]),
+            Ok(len) if len == most => Ok(()),
             Ok(len) => Err(format!("{len} bytes after decompression")),
             Err(error) => Err(format!("a zstd frame that does not decompress to them ({error})")),
         }
@@ -180,18 +230,25 @@ impl Unfilter {
             self.next = if self.order == 0 { frame } else { 0 };
         }
         while self.next <= frame {
-            self.step(out);
+            if self.bounded {
+                self.step_multiples();
+            } else {
+                self.step(out);
+            }
             self.next += 1;
+        }
+        if self.bounded {
+            self.tracks.values(&self.shuffled, frame, &self.recent[0], out);
         }
     }
 
     /// Bytes it holds.
     pub(crate) fn memory(&self) -> usize {
         let [a, b] = &self.recent;
-        self.shuffled.capacity() + 4 * (a.capacity() + b.capacity())
+        self.shuffled.capacity() + 4 * (a.capacity() + b.capacity()) + self.tracks.memory()
     }
 
-    /// Decodes frame `next`.
+    /// Decodes frame `next` of a filtered tile.
     fn step(&mut self, out: &mut [u32]) {
         let plane = out.len();
         let [b0, b1, b2, b3]: [&[u8]; 4] = std::array::from_fn(|weight| {
@@ -226,10 +283,31 @@ impl Unfilter {
             }
         }
     }
+
+    /// Decodes the multiples of frame `next` of a bounded tile; those of tracks that stand still stay as they are.
+    fn step_multiples(&mut self) {
+        let [before, before_that] = &mut self.recent;
+        if self.next == 0 {
+            self.tracks.first(&self.shuffled).zip(&mut *before).for_each(|(first, before)| *before = unzigzag(first));
+            return;
+        }
+        let order = order_at(self.order, self.next);
+        for (track, residual) in self.tracks.residuals(&self.shuffled, self.next) {
+            let multiple = unzigzag(residual).wrapping_add(predict(order, before[track], before_that[track]));
+            before_that[track] = std::mem::replace(&mut before[track], multiple);
+        }
+    }
 }
 
 fn raw_bytes(bits: &[u32]) -> Vec<u8> {
     bits.iter().flat_map(|bits| bits.to_le_bytes()).collect()
+}
+
+/// Appends four planes of bytes, each with one byte of every value, lowest first.
+pub(crate) fn shuffle_into(values: &[u32], out: &mut Vec<u8>) {
+    for weight in 0..4 {
+        out.extend(values.iter().map(|value| (value >> (8 * weight)) as u8));
+    }
 }
 
 /// Bits of an f32 as an integer that grows with the value. A bijection on all bit patterns.
@@ -243,7 +321,7 @@ fn unordered(rank: u32) -> u32 {
 }
 
 /// Small differences of either sign become small numbers, so that their high bytes are all zero.
-fn zigzag(difference: u32) -> u32 {
+pub(crate) fn zigzag(difference: u32) -> u32 {
     (difference << 1) ^ ((difference as i32) >> 31) as u32
 }
 
@@ -254,7 +332,7 @@ fn unzigzag(code: u32) -> u32 {
 
 /// What the frames before say a value will be: the last one, or the straight line through two. All are
 /// [`ordered`] integers.
-fn predict(order: u8, before: u32, before_that: u32) -> u32 {
+pub(crate) fn predict(order: u8, before: u32, before_that: u32) -> u32 {
     match order {
         1 => before,
         _ => before.wrapping_mul(2).wrapping_sub(before_that),
@@ -262,7 +340,7 @@ fn predict(order: u8, before: u32, before_that: u32) -> u32 {
 }
 
 /// How many frames before `frame` predict it.
-fn order_at(order: u8, frame: usize) -> u8 {
+pub(crate) fn order_at(order: u8, frame: usize) -> u8 {
     order.min(frame.min(2) as u8)
 }
 
@@ -356,9 +434,10 @@ mod tests {
         let plane = tile.width as usize * tile.len as usize;
         let once: Vec<u32> = match tile.encoding {
             Encoding::Raw => tile.bytes.as_chunks().0.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect(),
-            Encoding::Filtered { order } => {
+            encoding => {
                 let mut unfilter = Unfilter::default();
-                unfilter.load(&tile.bytes, order, frames, plane, &mut Decompressor::new().unwrap()).unwrap();
+                let stored = Stored { bytes: &tile.bytes, encoding, frames, plane, max_error: tile.max_error };
+                unfilter.load(stored, &mut Decompressor::new().unwrap()).unwrap();
                 decode_frames(&mut unfilter, plane, 0..frames)
             }
         };
@@ -376,7 +455,8 @@ mod tests {
     }
 
     fn loaded(values: &[u32], plane: usize, order: u8) -> Unfilter {
-        Unfilter { order, shuffled: filter(values, plane, order), recent: [vec![0; plane], vec![0; plane]], next: 0 }
+        let shuffled = filter(values, plane, order);
+        Unfilter { order, shuffled, recent: [vec![0; plane], vec![0; plane]], ..Unfilter::default() }
     }
 
     proptest! {
@@ -458,7 +538,14 @@ mod tests {
         let mut unfilter = Unfilter::default();
         for len in [0usize, 39, 41, 1 << 24] {
             let bomb = zstd::bulk::compress(&vec![0; len], 1).unwrap();
-            let got = unfilter.load(&bomb, 0, 1, 10, &mut Decompressor::new().unwrap());
+            let stored = Stored {
+                bytes: &bomb,
+                encoding: Encoding::Filtered { order: 0 },
+                frames: 1,
+                plane: 10,
+                max_error: 0.0,
+            };
+            let got = unfilter.load(stored, &mut Decompressor::new().unwrap());
             assert!(got.is_err(), "{len} bytes passed for 40");
         }
         assert!(unfilter.shuffled.capacity() <= 40);

@@ -134,7 +134,8 @@ mod tests {
     /// Writes 2 blocks of 2 Gaussians over 3 frame blocks, the frame blocks of `order` one after the other; column 0
     /// always moves, column 1 stands still, moves and stands where it stood.
     fn open(path: &std::path::Path, order: [u32; 3]) -> Reader {
-        let columns = ["moving", "pausing"].map(|name| ColumnSpec { name: name.into(), width: 1 }).into();
+        let columns =
+            ["moving", "pausing"].map(|name| ColumnSpec { name: name.into(), width: 1, max_error: 0.0 }).into();
         let layout =
             Layout { gaussians: 4, gaussian_block: 2, frame_block: 2, columns, attributes: Default::default() };
         let mut writer = Writer::create(path, layout).unwrap();

@@ -6,13 +6,14 @@ use std::ops::Range;
 
 use xxhash_rust::xxh3::xxh3_64;
 
+use crate::bounded::BOUNDS;
 use crate::error::{Error, Fault, Result};
 
 /// First bytes of every container. A high bit, a line ending and a control byte, so that transfers
 /// which rewrite text are noticed at once.
 pub const MAGIC: [u8; 8] = *b"\x89GSEQ\r\n\x1a";
-/// The one version of the format this crate reads and writes.
-pub(crate) const VERSION: u32 = 1;
+/// The version of the format this crate writes where every value keeps its bits, and the one where a column has a bound.
+pub(crate) const VERSIONS: [u32; 2] = [1, 2];
 /// Bytes before the first column: magic, version, header length, the four sizes and two counts.
 pub(crate) const FIXED_HEADER: usize = 40;
 
@@ -31,16 +32,18 @@ const MAX_VALUE_BYTES: usize = 1 << 20;
 const MAX_TILES_PER_FRAME_BLOCK: u64 = 1 << 24;
 
 /// One attribute of every Gaussian.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ColumnSpec {
     /// `[a-z][a-z0-9_]*`, at most 64 bytes, unique in its container. SPEC.md lists well-known names.
     pub name: String,
     /// f32 components per Gaussian, at least 1.
     pub width: u32,
+    /// How far a value may be off the one that was packed, in the column's unit; 0: not one bit.
+    pub max_error: f64,
 }
 
 /// The shape of a container; everything but the number of frames, which may not be known ahead.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Layout {
     /// N, Gaussians in every frame; 0 to 2³².
     pub gaussians: u64,
@@ -136,7 +139,7 @@ impl Layout {
         within("frame_block", self.frame_block.into(), 1..=MAX_FRAME_BLOCK.into())?;
         within("number of columns", self.columns.len() as u64, 1..=MAX_COLUMNS as u64)?;
         let mut names = BTreeSet::new();
-        for ColumnSpec { name, width } in &self.columns {
+        for ColumnSpec { name, width, max_error } in &self.columns {
             if !is_column_name(name) {
                 return Err(format!("column names of 1 to {MAX_NAME_BYTES} bytes [a-z][a-z0-9_]*, not {name:?}"));
             }
@@ -150,6 +153,9 @@ impl Layout {
                 (*width).into(),
                 1..=most,
             )?;
+            if *max_error != 0.0 && !BOUNDS.contains(max_error) {
+                return Err(format!("a bound of column {name:?} that is 0 or a normal f32 above, not {max_error}"));
+            }
         }
         let blocks = self.gaussians.div_ceil(self.gaussian_block.into());
         within("tiles per frame block", blocks * self.columns.len() as u64, 0..=MAX_TILES_PER_FRAME_BLOCK)?;
@@ -161,8 +167,14 @@ impl Layout {
         within("bytes in the header", self.header_len() as u64, 0..=MAX_HEADER_BYTES as u64)
     }
 
+    /// Of the format that a file of this layout has.
+    fn version(&self) -> u32 {
+        VERSIONS[usize::from(self.columns.iter().any(|column| column.max_error != 0.0))]
+    }
+
     fn header_len(&self) -> usize {
-        let columns: usize = self.columns.iter().map(|column| 6 + column.name.len()).sum();
+        let fields = if self.version() == VERSIONS[0] { 6 } else { 14 };
+        let columns: usize = self.columns.iter().map(|column| fields + column.name.len()).sum();
         let attributes: usize = self.attributes.iter().map(|(key, value)| 6 + key.len() + value.len()).sum();
         FIXED_HEADER + columns + attributes + 8
     }
@@ -172,17 +184,21 @@ impl Layout {
         self.check().map_err(|limit| Error::usage(format!("a container's layout must have {limit}")))?;
         let mut out = Vec::with_capacity(self.header_len());
         out.extend(MAGIC);
-        out.extend(VERSION.to_le_bytes());
+        let version = self.version();
+        out.extend(version.to_le_bytes());
         out.extend((self.header_len() as u32).to_le_bytes());
         out.extend(self.gaussians.to_le_bytes());
         out.extend(self.gaussian_block.to_le_bytes());
         out.extend(self.frame_block.to_le_bytes());
         out.extend((self.columns.len() as u32).to_le_bytes());
         out.extend((self.attributes.len() as u32).to_le_bytes());
-        for ColumnSpec { name, width } in &self.columns {
+        for ColumnSpec { name, width, max_error } in &self.columns {
             out.extend(width.to_le_bytes());
             out.extend((name.len() as u16).to_le_bytes());
             out.extend(name.as_bytes());
+            if version != VERSIONS[0] {
+                out.extend(max_error.to_le_bytes());
+            }
         }
         for (key, value) in &self.attributes {
             out.extend((key.len() as u16).to_le_bytes());
@@ -203,8 +219,9 @@ impl Layout {
             return Err(Fault::new(0, "the gseq magic 89 'GSEQ' 0d 0a 1a", format!("{:02x?}", magic)));
         }
         let version = fields.u32()?;
-        if version != VERSION {
-            let fault = Fault::new(8, format!("format version {VERSION}"), format!("version {version}"));
+        if !VERSIONS.contains(&version) {
+            let [exact, bounded] = VERSIONS;
+            let fault = Fault::new(8, format!("format version {exact} or {bounded}"), format!("version {version}"));
             return Err(fault.hint("a newer release of this program may read it"));
         }
         let len = fields.u32()? as usize;
@@ -227,7 +244,9 @@ impl Layout {
         if stored != computed {
             return Err(Fault::new(body as u64, format!("header checksum {computed:016x}"), format!("{stored:016x}")));
         }
-        let mut fields = Fields { bytes: &bytes[..body], at: 16 };
+        let mut fields = Fields { bytes: &bytes[..body], at: 8 };
+        let version = fields.u32()?;
+        fields.at = 16;
         let gaussians = fields.u64()?;
         let gaussian_block = fields.u32()?;
         let frame_block = fields.u32()?;
@@ -237,7 +256,9 @@ impl Layout {
         for _ in 0..column_count {
             let width = fields.u32()?;
             let len = fields.u16()?;
-            columns.push(ColumnSpec { name: fields.text(len.into())?, width });
+            let name = fields.text(len.into())?;
+            let max_error = if version == VERSIONS[0] { 0.0 } else { f64::from_le_bytes(fields.array()?) };
+            columns.push(ColumnSpec { name, width, max_error });
         }
         let mut attributes = BTreeMap::new();
         for _ in 0..attribute_count {
@@ -264,6 +285,9 @@ impl Layout {
         }
         let layout = Layout { gaussians, gaussian_block, frame_block, columns, attributes };
         layout.check().map_err(|limit| Fault::new(16, limit, "a header outside this limit"))?;
+        if layout.version() != version {
+            return Err(Fault::new(8, format!("version {} of a header without a bound", VERSIONS[0]), version));
+        }
         Ok(layout)
     }
 }
@@ -328,8 +352,8 @@ mod tests {
             gaussian_block: 32,
             frame_block: 4,
             columns: vec![
-                ColumnSpec { name: "position".into(), width: 3 },
-                ColumnSpec { name: "sh".into(), width: 48 },
+                ColumnSpec { name: "position".into(), width: 3, max_error: 0.0 },
+                ColumnSpec { name: "sh".into(), width: 48, max_error: 0.0 },
             ],
             attributes: BTreeMap::from([("a".into(), "1".into()), ("b".into(), String::new())]),
         }

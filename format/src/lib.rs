@@ -4,7 +4,8 @@
 //! per Gaussian), a time stamp per frame, and string attributes. It is cut into *tiles*, one per
 //! (column, Gaussian block, frame block); inside a tile the values lie as
 //! `[frame][component][gaussian]`, so that every (frame, component) plane is one contiguous slice.
-//! Every value comes back with the bits it went in with, NaN payloads and −0 included.
+//! Every value comes back with the bits it went in with, NaN payloads and −0 included; or, in columns that have a bound
+//! ([`ColumnSpec::max_error`]), at most so far off.
 //!
 //! ```
 //! # fn main() -> Result<(), gseq::Error> {
@@ -16,7 +17,7 @@
 //!     gaussians: 2,
 //!     gaussian_block: 4096,
 //!     frame_block: 16,
-//!     columns: vec![ColumnSpec { name: "position".into(), width: 3 }],
+//!     columns: vec![ColumnSpec { name: "position".into(), width: 3, max_error: 0.0 }],
 //!     attributes: Default::default(),
 //! };
 //! let mut writer = Writer::create(&path, layout)?;
@@ -35,6 +36,7 @@
 //!
 //! The bytes are specified in `SPEC.md`; [`recover`] saves what a killed writer left behind.
 
+mod bounded;
 mod codec;
 mod error;
 mod file;

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 use zstd::bulk::Decompressor;
 
-use crate::codec::{Encoding, Stats, Unfilter};
+use crate::codec::{Encoding, Stats, Stored, Unfilter};
 use crate::error::{Error, Fault, Result};
 use crate::file::MappedFile;
 use crate::index::Index;
@@ -348,7 +348,7 @@ impl Reader {
                     frames.counted = Counted::Tile;
                 }
             }
-            (Encoding::Filtered { order }, mapped) => {
+            (Encoding::Filtered { .. } | Encoding::Bounded { .. }, mapped) => {
                 let TileBuffer { stored, zstd, .. } = buffer;
                 let stored = match mapped {
                     Some(bytes) => {
@@ -361,7 +361,7 @@ impl Reader {
                     }
                 };
                 self.count(1, stored.len());
-                unfilter(&self.file, &self.layout, &tile, order, stored, zstd, &mut frames.unfilter)?;
+                unfilter(&self.file, &self.layout, &tile, stored, zstd, &mut frames.unfilter)?;
             }
         }
         frames.tile = Some(tile);
@@ -388,7 +388,9 @@ impl Reader {
                 }
                 out.iter_mut().for_each(|value| *value = f32::from_bits(u32::from_le(value.to_bits())));
             }
-            Encoding::Filtered { .. } => frames.unfilter.frame(frame, bytemuck::cast_slice_mut(out)),
+            Encoding::Filtered { .. } | Encoding::Bounded { .. } => {
+                frames.unfilter.frame(frame, bytemuck::cast_slice_mut(out));
+            }
         }
         Ok(())
     }
@@ -614,8 +616,8 @@ pub(crate) fn read_tile(file: &MappedFile, layout: &Layout, tile: &TileRecord, b
                 *value = f32::from_le_bytes(*bytes);
             }
         }
-        Encoding::Filtered { order } => {
-            unfilter(file, layout, tile, order, stored, zstd, frames)?;
+        Encoding::Filtered { .. } | Encoding::Bounded { .. } => {
+            unfilter(file, layout, tile, stored, zstd, frames)?;
             for (frame, out) in values.chunks_exact_mut(plane_of(layout, tile)).enumerate() {
                 frames.frame(frame, bytemuck::cast_slice_mut(out));
             }
@@ -631,12 +633,11 @@ fn read_stored(file: &MappedFile, tile: &TileRecord, stored: &mut Vec<u8>) -> Re
     check_payload(tile, xxh3_64(stored)).map_err(|fault| fault.at(file.path()))
 }
 
-/// Decompresses the stored bytes of a filtered tile.
+/// Decompresses the stored bytes of a tile that is not raw.
 fn unfilter(
     file: &MappedFile,
     layout: &Layout,
     tile: &TileRecord,
-    order: u8,
     stored: &[u8],
     zstd: &mut Option<Decompressor<'static>>,
     frames: &mut Unfilter,
@@ -647,7 +648,9 @@ fn unfilter(
     };
     let plane = plane_of(layout, tile);
     let values = tile.values(layout);
-    frames.load(stored, order, values / plane, plane, zstd).map_err(|found| {
+    let max_error = layout.columns[tile.id.column as usize].max_error;
+    let stored = Stored { bytes: stored, encoding: tile.encoding, frames: values / plane, plane, max_error };
+    frames.load(stored, zstd).map_err(|found| {
         Fault::new(tile.offset, format!("{} bytes of {:?}", 4 * values, tile.id), found).at(file.path())
     })
 }

@@ -73,6 +73,7 @@ impl Record {
                 let (encoding, order) = match tile.encoding {
                     Encoding::Raw => (0, 0),
                     Encoding::Filtered { order } => (1, order),
+                    Encoding::Bounded { order } => (2, order),
                 };
                 out[..4].copy_from_slice(b"TILE");
                 out[4..8].copy_from_slice(&tile.id.column.to_le_bytes());
@@ -120,10 +121,11 @@ impl Record {
                 let encoding = match (bytes[16], bytes[17]) {
                     (0, 0) => Encoding::Raw,
                     (1, order @ 0..=2) => Encoding::Filtered { order },
+                    (2, order @ 1..=2) => Encoding::Bounded { order },
                     other => {
                         return Err(Fault::new(
                             offset + 16,
-                            "encoding 0 order 0, or encoding 1 order 0 to 2",
+                            "encoding 0 order 0, encoding 1 order 0 to 2, or encoding 2 order 1 or 2",
                             format!("{other:?}"),
                         ));
                     }
@@ -186,8 +188,13 @@ impl TileRecord {
         let stored = u64::from(self.stored_bytes);
         let legal = match self.encoding {
             Encoding::Raw => stored == raw,
-            Encoding::Filtered { .. } => (1..raw).contains(&stored),
+            Encoding::Filtered { .. } | Encoding::Bounded { .. } => (1..raw).contains(&stored),
         };
+        let exact = layout.columns[self.id.column as usize].max_error == 0.0;
+        if exact && matches!(self.encoding, Encoding::Bounded { .. }) {
+            let expected = "an encoding that keeps every bit, as the column has no bound";
+            return Err(Fault::new(place + 16, expected, format!("{:?}", self.encoding)));
+        }
         if !legal {
             let expected = format!("{raw} stored bytes, or fewer if compressed");
             return Err(Fault::new(place + 40, expected, format!("{stored} ({:?})", self.encoding)));

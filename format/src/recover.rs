@@ -77,9 +77,11 @@ pub fn recover(src: impl AsRef<Path>, dst: impl AsRef<Path>) -> Result<RecoverRe
 
 /// A stored tile as the writer takes it, without encoding it again.
 fn encoded(tile: &TileRecord, layout: &Layout, stored: &[u8]) -> EncodedTile {
+    let column = &layout.columns[tile.id.column as usize];
     EncodedTile {
         frames: tile.frames,
-        width: layout.columns[tile.id.column as usize].width,
+        width: column.width,
+        max_error: column.max_error,
         len: layout.block_len(tile.id.gaussian_block),
         constant: tile.constant,
         encoding: tile.encoding,

@@ -10,7 +10,7 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 use crate::codec::EncodedTile;
 use crate::error::{Error, Result};
 use crate::file::PIECE;
-use crate::layout::{Layout, TileId};
+use crate::layout::{ColumnSpec, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
 
 /// Writes a container: time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
@@ -122,10 +122,10 @@ impl Writer {
     }
 
     /// Writes one tile. Errors: there is no such tile, its time stamps have not been appended, it was written
-    /// already, or `tile` has another shape.
+    /// already, or `tile` has another shape or may be further off than its column.
     pub fn write_tile(&mut self, at: TileId, tile: &EncodedTile) -> Result<()> {
         let (index, frames) = self.free_slot(at)?;
-        let width = self.layout.columns[at.column as usize].width;
+        let &ColumnSpec { width, max_error, .. } = &self.layout.columns[at.column as usize];
         let len = self.layout.block_len(at.gaussian_block);
         let shape = |frames, width, len| format!("{frames} frames × {width} components × {len} Gaussians");
         if (tile.width, tile.len) != (width, len) || (tile.frames != frames && !tile.constant) {
@@ -133,6 +133,12 @@ impl Writer {
                 "{at:?} holds {}, not {}",
                 shape(frames, width, len),
                 shape(tile.frames, tile.width, tile.len)
+            )));
+        }
+        if tile.max_error > max_error {
+            let found = tile.max_error;
+            return Err(Error::usage(format!(
+                "{at:?} may be off by {max_error}, the bound of its column, not {found}"
             )));
         }
         let mut record = TileRecord {

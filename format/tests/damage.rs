@@ -26,13 +26,22 @@ fn small_scene() -> Scene {
     Scene::new(layout(3, 2, 2, &[2, 1, 1]), 5, 11)
 }
 
+/// With tiles of some bytes, so that a bound pays, though not in all of them; and what comes back of it.
+fn bounded_scene(path: &Path) -> (Scene, Scene) {
+    Scene::new(layout(40, 24, 4, &[2, 1, 1, 1]), 9, 11).bounded(1e-2, path)
+}
+
 #[test]
 fn a_flipped_bit_anywhere_is_an_error_and_never_wrong_data() {
     let folder = scene::folder();
     let path = folder.path().join("a");
-    let scene = small_scene();
-    for compression in [Compression::Raw, Compression::Zstd(1)] {
-        scene.write(&path, compression, |_| ());
+    let scenes = [
+        ((small_scene(), small_scene()), Compression::Raw),
+        ((small_scene(), small_scene()), Compression::Zstd(1)),
+        (bounded_scene(&path), Compression::Zstd(1)),
+    ];
+    for ((written, scene), compression) in scenes {
+        written.write(&path, compression, |_| ());
         let good = fs::read(&path).unwrap();
         check(&scene, &path, good.len() as u64).unwrap();
         for at in 0..good.len() {
@@ -88,22 +97,25 @@ fn a_file_cut_anywhere_is_an_error_and_recover_saves_its_complete_frame_blocks()
 fn recover_of_a_flipped_bit_saves_what_comes_before_it() {
     let folder = scene::folder();
     let [path, saved] = ["a", "saved"].map(|name| folder.path().join(name));
-    let scene = small_scene();
-    scene.write(&path, Compression::Zstd(1), |_| ());
-    let good = fs::read(&path).unwrap();
-    for at in (192..good.len()).step_by(3) {
-        let mut bad = good.clone();
-        bad[at] ^= 0x10;
-        fs::write(&path, &bad).unwrap();
+    for (written, scene) in [(small_scene(), small_scene()), bounded_scene(&path)] {
+        written.write(&path, Compression::Zstd(1), |_| ());
+        let good = fs::read(&path).unwrap();
+        // Behind the header and the zeros after it.
+        for at in (256..good.len()).step_by(3) {
+            let mut bad = good.clone();
+            bad[at] ^= 0x10;
+            fs::write(&path, &bad).unwrap();
+            let report = recover(&path, &saved).unwrap();
+            let reader = Reader::open(&saved).unwrap();
+            reader.verify().unwrap();
+            scene.compare(&reader, report.frames as usize).unwrap();
+        }
+        fs::write(&path, &good).unwrap();
         let report = recover(&path, &saved).unwrap();
-        let reader = Reader::open(&saved).unwrap();
-        reader.verify().unwrap();
-        scene.compare(&reader, report.frames as usize).unwrap();
+        let whole = (scene.times.len() as u64, scene.tiles().len() as u64, 0);
+        assert_eq!((report.frames, report.tiles_saved, report.bytes_skipped), whole);
+        assert_eq!(fs::read(&saved).unwrap(), good, "recovering a whole file copies it");
     }
-    fs::write(&path, &good).unwrap();
-    let report = recover(&path, &saved).unwrap();
-    assert_eq!((report.frames, report.tiles_saved, report.bytes_skipped), (5, scene.tiles().len() as u64, 0));
-    assert_eq!(fs::read(&saved).unwrap(), good, "recovering a whole file copies it");
 }
 
 #[test]
@@ -203,7 +215,7 @@ fn a_file_that_shrinks_under_the_map_ends_in_an_error() {
             let next = match compression {
                 Compression::Raw => reader.read_frame(&mut frames, 1, &mut vec![0.0; 15_000]),
                 // The tile that was loaded is in memory.
-                Compression::Zstd(_) => reader.load(at, &mut buffer, &mut frames, in_place.then_some(&mut touched)),
+                _ => reader.load(at, &mut buffer, &mut frames, in_place.then_some(&mut touched)),
             };
             assert!(matches!(next, Err(Error::Malformed { .. })), "in place {in_place}: {next:?}");
         }

@@ -35,6 +35,54 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// What comes back lies within the bound, every way of reading gives the same, and bounds are declared in the file.
+    #[test]
+    fn columns_with_a_bound_come_back_within_it(
+        gaussians in 1u64..90, frames in 1usize..12, gaussian_block in 1u32..70, frame_block in 1u32..6,
+        widths in prop::collection::vec(1u32..4, 2..4), seed: u64, max_error in 1e-4f64..1.0,
+    ) {
+        let folder = scene::folder();
+        let path = folder.path().join("a.gseq");
+        let layout = layout(gaussians, gaussian_block, frame_block, &widths);
+        let (exact, back) = Scene::new(layout, frames, seed).bounded(max_error, &path);
+        let reader = Reader::open(&path).unwrap();
+        back.compare(&reader, frames).unwrap();
+        reader.verify().unwrap();
+        for ((column, before), after) in reader.layout().columns.iter().zip(&exact.bits).zip(&back.bits) {
+            prop_assert_eq!(before.len(), after.len());
+            for (&before, &after) in before.iter().zip(after) {
+                let [value, found] = [before, after].map(|bits| f64::from(f32::from_bits(bits)));
+                let within = before == after || (value - found).abs() <= column.max_error;
+                prop_assert!(within, "{}: {} is {}", &column.name, value, found);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_tile_further_off_than_its_column_is_refused() {
+    let folder = scene::folder();
+    let mut layout = layout(500, 500, 2, &[1]);
+    layout.columns[0].max_error = 1e-3;
+    let values: Vec<f32> = (0..1000).map(|i| (i as f32).sin()).collect();
+    let tile = |max_error| encode_tile(&values, 2, 1, 500, Compression::Bounded { max_error, level: 1 }).unwrap();
+    let mut writer = Writer::create(folder.path().join("a"), layout).unwrap();
+    writer.append_times(&[0.0, 1.0]).unwrap();
+    let error = writer.write_tile(AT, &tile(2e-3)).unwrap_err().to_string();
+    assert!(error.contains("may be off by 0.001"), "{error}");
+    writer.write_tile(AT, &tile(5e-4)).unwrap();
+    writer.finish().unwrap();
+    let encoding = Reader::open(folder.path().join("a")).unwrap().tile_info(AT).unwrap().encoding;
+    assert!(matches!(encoding, Encoding::Bounded { .. }), "{encoding:?}");
+    for max_error in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-320] {
+        let refused = encode_tile(&values, 2, 1, 500, Compression::Bounded { max_error, level: 1 });
+        assert!(refused.is_err(), "a bound of {max_error} passed");
+    }
+}
+
 #[test]
 fn digest_ignores_the_order_of_writing_and_bytes_follow_it() {
     let folder = scene::folder();

@@ -20,8 +20,11 @@ pub(crate) struct Scene {
 }
 
 pub(crate) fn layout(gaussians: u64, gaussian_block: u32, frame_block: u32, widths: &[u32]) -> Layout {
-    let columns =
-        widths.iter().enumerate().map(|(i, &width)| ColumnSpec { name: format!("column_{i}"), width }).collect();
+    let columns = widths
+        .iter()
+        .enumerate()
+        .map(|(i, &width)| ColumnSpec { name: format!("column_{i}"), width, max_error: 0.0 })
+        .collect();
     let attributes = BTreeMap::from([("origin".into(), "a test".into()), ("unit".into(), "Ångström".into())]);
     Layout { gaussians, gaussian_block, frame_block, columns, attributes }
 }
@@ -87,6 +90,29 @@ impl Scene {
         (out, (frames.end - frames.start) as u32, width as u32, (gaussians.end - gaussians.start) as u32)
     }
 
+    /// This with a bound on every column but the last, and what comes back of that, written to `path`.
+    #[allow(dead_code, reason = "not every test has bounds")]
+    pub(crate) fn bounded(mut self, max_error: f64, path: &Path) -> (Scene, Scene) {
+        let columns = self.layout.columns.len();
+        self.layout.columns[..columns - 1].iter_mut().for_each(|column| column.max_error = max_error);
+        self.write(path, Compression::Zstd(1), |_| ());
+        let reader = Reader::open(path).unwrap();
+        let mut buffer = TileBuffer::default();
+        let n = self.layout.gaussians as usize;
+        let mut back = Scene { layout: self.layout.clone(), times: self.times.clone(), bits: self.bits.clone() };
+        for id in self.tiles() {
+            let tile = reader.read_tile(id, &mut buffer).unwrap();
+            let gaussians = self.layout.gaussian_range(id.gaussian_block);
+            let first = id.frame_block as usize * self.layout.frame_block as usize;
+            for (frame, component) in (0..tile.frames()).flat_map(|f| (0..tile.width()).map(move |c| (f, c))) {
+                let at = ((first + frame) * tile.width() + component) * n + gaussians.start as usize;
+                let plane = tile.plane(frame, component).iter().map(|value| value.to_bits());
+                back.bits[id.column as usize].splice(at..at + tile.len(), plane).for_each(drop);
+            }
+        }
+        (self, back)
+    }
+
     /// Writes time stamps block by block, each followed by its tiles in the order that `shuffle` gives them.
     pub(crate) fn write(&self, path: &Path, compression: Compression, shuffle: impl Fn(&mut Vec<TileId>)) -> u64 {
         let mut writer = Writer::create(path, self.layout.clone()).unwrap();
@@ -111,6 +137,10 @@ impl Scene {
             }
             let (bits, frames, width, len) = self.tile(id);
             let values: Vec<f32> = bits.into_iter().map(f32::from_bits).collect();
+            let compression = match self.layout.columns[id.column as usize].max_error {
+                0.0 => compression,
+                max_error => Compression::Bounded { max_error, level: 1 },
+            };
             writer.write_tile(id, &encode_tile(&values, frames, width, len, compression).unwrap()).unwrap();
         }
     }
