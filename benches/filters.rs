@@ -5,6 +5,10 @@
 //! the better order of each tile, shuffled, at the level asked for; its choices rest on this. Sizes in percent of the raw
 //! bytes are printed as a Markdown table, a row for every model and column; times are taken over all models.
 //!
+//! A second table is of what a bound leaves: multiples of twice the bound, differences to the frame before, all of them or
+//! those of tracks that do not stand still, frame by frame or track by track; and as `gseq` stores them, which also has
+//! half the step for tracks that stand still where that is smaller. Times raw bytes over stored ones.
+//!
 //! `cargo bench --bench filters`; `-- decode/position` measures one column only.
 
 mod trajectories;
@@ -12,6 +16,7 @@ mod trajectories;
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use gseq::{Compression, encode_tile};
 use splatsieve::model::Columns;
 use splatsieve::source::FrameSource;
 
@@ -100,17 +105,74 @@ fn predictors(before: &[u32], frame: usize, plane: usize, order: usize) -> (&[u3
     (back(1), back(order.min(frame)))
 }
 
-/// Tiles of one column of all models: bits, and the values of one frame.
-type Tiles = Vec<(Vec<u32>, usize)>;
+/// Bound of a column in the second table.
+fn bound(column: Columns) -> f64 {
+    match column {
+        Columns::POSITION => 1e-3,
+        Columns::ROTATION => 5e-3,
+        Columns::OPACITY => 2e-2,
+        _ => 1e-2,
+    }
+}
+
+/// Gathered bytes of the multiples of twice `bound`: a bit for each track, the first frame, differences.
+fn multiples(bits: &[u32], plane: usize, bound: f64, apart: bool, by_track: bool) -> Vec<u8> {
+    let multiple = |&bits: &u32| (f64::from(f32::from_bits(bits)) / (2.0 * bound)).round() as i32;
+    let values: Vec<i32> = bits.iter().map(multiple).collect();
+    let frames = bits.len() / plane;
+    let moves = |track: usize| (1..frames).any(|frame| values[frame * plane + track] != values[track]);
+    let moving: Vec<usize> = (0..plane).filter(|&track| !apart || moves(track)).collect();
+    let zigzag = |difference: i32| (difference << 1 ^ difference >> 31) as u32;
+    let difference = |(frame, track)| zigzag(values[frame * plane + track] - values[(frame - 1) * plane + track]);
+    let differences: Vec<u32> = if by_track {
+        moving.iter().flat_map(|&track| (1..frames).map(move |frame| (frame, track))).map(difference).collect()
+    } else {
+        (1..frames).flat_map(|frame| moving.iter().map(move |&track| (frame, track))).map(difference).collect()
+    };
+    let first: Vec<u32> = values[..plane].iter().map(|&value| zigzag(value)).collect();
+    let mut out = vec![0u8; plane.div_ceil(8)];
+    moving.iter().for_each(|track| out[track / 8] |= 1 << (track % 8));
+    for part in [first, differences] {
+        (0..4).for_each(|weight| out.extend(part.iter().map(|value| (value >> (8 * weight)) as u8)));
+    }
+    out
+}
+
+/// Bits of a tile, and the values of one frame.
+type TileBits = (Vec<u32>, usize);
+
+/// The second table: a row of each column.
+fn within_bounds(name: &str, column: Columns, tiles: &[TileBits]) -> String {
+    let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
+    let times =
+        |size: &dyn Fn(&TileBits) -> usize| format!("{:.0}", raw as f64 / tiles.iter().map(size).sum::<usize>() as f64);
+    let mut row = format!("| {name} | {} | {} | ", column.name(), bound(column));
+    for (apart, by_track) in [(false, false), (false, true), (true, false), (true, true)] {
+        row += &times(&|(bits, plane)| {
+            zstd::bulk::compress(&multiples(bits, *plane, bound(column), apart, by_track), 15).unwrap().len()
+        });
+        row += " | ";
+    }
+    for level in [1, 15, 19] {
+        let compression = Compression::Bounded { max_error: bound(column), level };
+        row += &times(&|(bits, plane)| {
+            let frames = (bits.len() / plane) as u32;
+            encode_tile(bytemuck::cast_slice(bits), frames, 1, *plane as u32, compression).unwrap().stored_bytes()
+        });
+        row += " | ";
+    }
+    row
+}
 
 fn benches(criterion: &mut Criterion) {
-    let mut columns: Vec<(Columns, Tiles)> = Columns::all().iter().map(|column| (column, Vec::new())).collect();
+    let mut columns: Vec<(Columns, Vec<TileBits>)> = Columns::all().iter().map(|column| (column, Vec::new())).collect();
     let names: Vec<String> = filters().map(|filter| filter.name()).collect();
     eprintln!("| scene | column | {} |\n|---|---|{}", names.join(" | "), "---|".repeat(names.len()));
+    let mut within = Vec::new();
     for (name, scene) in trajectories::scenes() {
         for (column, all) in columns.iter_mut().filter(|(column, _)| scene.info().varying.contains(*column)) {
             let tiles = trajectories::tiles(&scene, *column).into_iter();
-            let tiles: Tiles =
+            let tiles: Vec<TileBits> =
                 tiles.map(|tile| (bytemuck::cast_slice(&tile).to_vec(), tile.len() / scene.len())).collect();
             let raw: usize = tiles.iter().map(|(bits, _)| 4 * bits.len()).sum();
             let percent = |filter: Filter| {
@@ -119,12 +181,17 @@ fn benches(criterion: &mut Criterion) {
             };
             let sizes: Vec<String> = filters().map(percent).collect();
             eprintln!("| {name} | {} | {} |", column.name(), sizes.join(" | "));
+            within.push(within_bounds(name, *column, &tiles));
             // Curves with noise say nothing about what models give.
             if name != "curves" {
                 all.extend(tiles);
             }
         }
     }
+    eprintln!(
+        "| scene | column | bound | all, by frame | all, by track | moving, by frame | moving, by track | gseq 1 | 15 | 19 |"
+    );
+    eprintln!("|---|---|---|---|---|---|---|---|---|---|\n{}", within.join("\n"));
     for (column, tiles) in columns.iter().filter(|(_, tiles)| !tiles.is_empty()) {
         let values = tiles.iter().map(|(bits, _)| bits.len()).sum::<usize>();
         let most = tiles.iter().map(|(bits, _)| bits.len()).max().unwrap_or(0);

@@ -3,8 +3,9 @@
 //! On made-up curves and on what the trained models give (skipped where they are absent), all columns that vary. The
 //! rivals in each group: zstd at the same level on the same bytes without a filter, and copying them. `encode/tile` is
 //! the codec alone, `encode/container` all of packing: states gathered into tiles, encoded, written, synced.
-//! `decode/tile` reads, verifies and decodes from the page cache, `decode/raw` copies raw tiles from there. The
-//! stored sizes are printed before each scene.
+//! `decode/tile` reads, verifies and decodes from the page cache, `decode/raw` copies raw tiles from there; `bounded` is
+//! the same of tiles within a bound of .001 in every column, by zstd at the level that `pack` has for them. The stored
+//! sizes are printed before each scene.
 //!
 //! `cargo bench --bench pack`; invert the throughput for the time per (Gaussian, frame).
 
@@ -16,12 +17,14 @@ use std::path::Path;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
-use splatsieve::emit::container::{GAUSSIAN_BLOCK, write_container};
+use splatsieve::emit::bounds::{Bounds, MaxError};
+use splatsieve::emit::container::{GAUSSIAN_BLOCK, Packing, write_container};
 use splatsieve::model::Columns;
 use splatsieve::source::FrameSource;
 use splatsieve::stream::HeldFrames;
 
 const LEVEL: i32 = 1;
+const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };
 
 /// Every tile of the varying columns, with its width.
 fn tiles_of(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
@@ -32,8 +35,8 @@ fn tiles_of(scene: &HeldFrames) -> Vec<(u32, Vec<f32>)> {
     info.varying.iter().flat_map(of).collect()
 }
 
-fn write(scene: &HeldFrames, path: &Path, compression: Compression) {
-    write_container(scene, path, compression, BTreeMap::new(), |_| ()).unwrap();
+fn write(scene: &HeldFrames, path: &Path, packing: impl Into<Packing>) {
+    write_container(scene, path, packing, BTreeMap::new(), |_| ()).unwrap();
 }
 
 fn decode_all(reader: &Reader, varying: Columns, buffer: &mut TileBuffer) {
@@ -56,20 +59,25 @@ fn benches(criterion: &mut Criterion) {
         let bytes = |(_, tile): &(u32, Vec<f32>)| bytemuck::cast_slice::<f32, u8>(tile).to_vec();
         let raw: Vec<Vec<u8>> = tiles.iter().map(bytes).collect();
         let plain: Vec<Vec<u8>> = raw.iter().map(|raw| zstd::bulk::compress(raw, LEVEL).unwrap()).collect();
-        let encode = |(width, tile): &(u32, Vec<f32>)| {
-            encode_tile(tile, frames, *width, GAUSSIAN_BLOCK as u32, Compression::Zstd(LEVEL)).unwrap()
+        let encode_as = |(width, tile): &(u32, Vec<f32>), compression| {
+            encode_tile(tile, frames, *width, GAUSSIAN_BLOCK as u32, compression).unwrap()
         };
+        let encode = |tile| encode_as(tile, Compression::Zstd(LEVEL));
         let percent = |stored: usize| 100.0 * stored as f64 / raw.iter().map(Vec::len).sum::<usize>() as f64;
         eprintln!(
-            "{name}: tiles take {:.1}% of their raw bytes, plain zstd {:.1}%",
+            "{name}: tiles take {:.1}% of their raw bytes, within a bound {:.1}%, plain zstd {:.1}%",
             percent(tiles.iter().map(|tile| encode(tile).stored_bytes()).sum()),
+            percent(tiles.iter().map(|tile| encode_as(tile, WITHIN).stored_bytes()).sum()),
             percent(plain.iter().map(Vec::len).sum())
         );
         let path = folder.path().join("scene.gseq");
-        let raw_path = folder.path().join("raw.gseq");
+        let [raw_path, within_path] = ["raw.gseq", "within.gseq"].map(|name| folder.path().join(name));
         write(&scene, &path, Compression::Zstd(LEVEL));
         write(&scene, &raw_path, Compression::Raw);
-        let (reader, raw_reader) = (Reader::open(&path).unwrap(), Reader::open(&raw_path).unwrap());
+        let bounds: Vec<MaxError> =
+            Columns::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
+        write(&scene, &within_path, Packing::within(Bounds::of(&bounds, || Ok(1.0)).unwrap(), 15));
+        let [reader, raw_reader, within] = [&path, &raw_path, &within_path].map(|path| Reader::open(path).unwrap());
         let most = raw.iter().map(Vec::len).max().unwrap_or(0);
         let (mut copy, mut buffer) = (vec![0; most], TileBuffer::default());
         let mut group = |verb: &str, rival: &str, work: &mut dyn FnMut()| {
@@ -78,6 +86,7 @@ fn benches(criterion: &mut Criterion) {
             group.bench_function(BenchmarkId::new(rival, name), |bencher| bencher.iter(&mut *work));
         };
         group("encode", "tile", &mut || tiles.iter().for_each(|tile| _ = black_box(encode(tile))));
+        group("encode", "bounded", &mut || tiles.iter().for_each(|tile| _ = black_box(encode_as(tile, WITHIN))));
         group("encode", "container", &mut || {
             one_thread.install(|| write(&scene, &folder.path().join("again.gseq"), Compression::Zstd(LEVEL)));
         });
@@ -88,6 +97,7 @@ fn benches(criterion: &mut Criterion) {
             raw.iter().for_each(|raw| black_box(&mut copy)[..raw.len()].copy_from_slice(raw));
         });
         group("decode", "tile", &mut || decode_all(&reader, varying, &mut buffer));
+        group("decode", "bounded", &mut || decode_all(&within, varying, &mut buffer));
         group("decode", "raw", &mut || decode_all(&raw_reader, varying, &mut buffer));
         group("decode", "plain_zstd", &mut || {
             for stored in &plain {

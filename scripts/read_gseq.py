@@ -32,13 +32,14 @@ class Gseq:
         version, _, self.count, self.gaussian_block, self.frame_block, columns, _ = struct.unpack_from(
             "<IIQIIII", self.bytes, 8
         )
-        if version != 1:
-            raise ValueError(f"{path}: version {version}, not 1")
+        if version not in (1, 2):
+            raise ValueError(f"{path}: version {version}, not 1 or 2")
         self.widths, at = {}, 40
         for _ in range(columns):
             width, length = struct.unpack_from("<IH", self.bytes, at)
             self.widths[self.bytes[at + 6 : at + 6 + length].decode()] = width
-            at += 6 + length
+            # Version 2 goes on with the column's bound, which decoding does not need.
+            at += 6 + length + (8 if version == 2 else 0)
         (footer,) = struct.unpack_from("<Q", self.bytes, len(self.bytes) - 32)
         frames, _ = struct.unpack_from("<QQ", self.bytes, footer + 8)
         self.times = np.frombuffer(self.bytes, "<f8", frames, footer + RECORD)
@@ -66,6 +67,8 @@ class Gseq:
         stored = self.bytes[offset : offset + length]
         if encoding == 0:
             return np.frombuffer(stored, "<f4").reshape(shape)
+        if encoding == 2:
+            return within_bound(stored, shape, order)
         planes = zstandard.ZstdDecompressor().decompress(stored, max_output_size=4 * int(np.prod(shape)))
         planes = np.frombuffer(planes, np.uint8).reshape(4, -1)
         return unpredict(np.ascontiguousarray(planes.T).view("<u4").reshape(shape), order)
@@ -83,6 +86,39 @@ def unpredict(residuals, order):
         predicted = ranks[t - 1] if k == 1 else 2 * ranks[t - 1] - ranks[t - 2]
         ranks[t] = predicted + difference
     return (ranks ^ np.where(ranks >> 31, np.uint32(0x80000000), np.uint32(0xFFFFFFFF))).view("<f4")
+
+
+def within_bound(stored, shape, order):
+    """A bounded tile: multiples of a step, of tracks that move with residuals over time."""
+    step, exceptions, halvings = struct.unpack_from("<dII", stored)
+    frames, tracks = shape[0], shape[1] * shape[2]
+    most = -(-tracks // 8) + 4 * frames * tracks
+    body = zstandard.ZstdDecompressor().decompress(stored[16 + 8 * exceptions :], max_output_size=most)
+    body = np.frombuffer(body, np.uint8)
+    mask, body = np.split(body, [-(-tracks // 8)])
+    moves = np.unpackbits(mask, bitorder="little")[:tracks].astype(bool)
+    multiples = np.empty((frames, tracks), "<i4")
+    first, rest = np.split(body, [4 * tracks])
+    multiples[:] = unzigzag(unshuffle(first))
+    residuals = unzigzag(unshuffle(rest)).reshape(moves.sum(), frames - 1)
+    for t in range(1, frames):
+        before, before_that = multiples[t - 1, moves], multiples[t - min(order, t), moves]
+        predicted = before if min(order, t) == 1 else 2 * before - before_that
+        multiples[t, moves] = predicted + residuals[:, t - 1]
+    steps = np.where(moves, step, step / 2**halvings)
+    values = (multiples * steps).astype("<f4")
+    places, bits = np.frombuffer(stored, "<u4", 2 * exceptions, 16).reshape(-1, 2).T
+    values.view("<u4").reshape(-1)[places] = bits
+    return values.reshape(shape)
+
+
+def unshuffle(planes):
+    """Numbers whose bytes of equal weight are gathered, lowest first."""
+    return np.ascontiguousarray(planes.reshape(4, -1).T).view("<u4").reshape(-1)
+
+
+def unzigzag(codes):
+    return ((codes >> 1) ^ (-(codes & 1).astype(np.int32)).view(np.uint32)).view("<i4")
 
 
 def main():

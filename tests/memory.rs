@@ -139,6 +139,8 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
         "evaluate packed.gseq small.gseq --cameras cameras.json --max-frames 2".to_owned(),
         "report packed.gseq small.gseq --cameras cameras.json --max-frames 2 -o page".to_owned(),
         "pack packed.gseq -o again.gseq".to_owned(),
+        "pack packed.gseq -o small_again.gseq --level 19".to_owned(),
+        "pack packed.gseq -o within.gseq --max-error position=0.1%,rotation=1e-2,log_scale=1e-2,sh=1e-2".to_owned(),
         "unpack packed.gseq -o plys".to_owned(),
     ] {
         let least = least(&workplace, &arguments);

@@ -120,7 +120,15 @@ fn the_container_reader_gives_every_bit_of_every_column() {
     workplace.done("pack {tiny} -o zstd.gseq");
     workplace.done("pack {tiny} -o raw.gseq --raw");
     workplace.done("demo --gaussians 2500 --frames 70 -o demo");
-    for (path, frames) in [("zstd.gseq", vec![0, 9]), ("raw.gseq", vec![3]), ("demo/scene.gseq", vec![0, 1, 33, 69])] {
+    workplace.done("pack {tiny} -o tiny.gseq --max-error position=1e-2,rotation=1e-2,log_scale=1e-2,sh=1e-2");
+    workplace.done("pack demo/scene.gseq -o demo.gseq --max-error position=0.05%,rotation=1e-3,opacity_logit=0.1");
+    for (path, frames) in [
+        ("zstd.gseq", vec![0, 9]),
+        ("raw.gseq", vec![3]),
+        ("demo/scene.gseq", vec![0, 1, 33, 69]),
+        ("tiny.gseq", vec![0, 5]),
+        ("demo.gseq", vec![0, 1, 2, 40, 69]),
+    ] {
         let scene = Container::open(&workplace.path(path)).unwrap();
         for frame in frames {
             write_columns(&workplace, &scene, frame);

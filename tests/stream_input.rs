@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use gseq::{Reader, TileId};
 use scene::{Workplace, files, lasting_files, state, tiny};
 use splatsieve::ingest::container::Container;
 use splatsieve::source::FrameSource;
@@ -81,6 +82,25 @@ fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
         }
     }
     assert!(left_over(&workplace.path("")).is_empty());
+}
+
+#[test]
+fn a_stream_is_packed_within_bounds_like_a_file() {
+    let workplace = Workplace::new();
+    let stream = streamed(&workplace);
+    let bounds = "--max-error position=2e-3,sh=1e-2";
+    done(piped(&workplace, &format!("pack - -o stream.gseq {bounds}"), &stream));
+    workplace.done(&format!("pack {{tiny}} -o file.gseq {bounds}"));
+    let [stream_of, file] =
+        ["stream", "file"].map(|name| Reader::open(workplace.path(&format!("{name}.gseq"))).unwrap());
+    for column in 0..5 {
+        let at = TileId { column, gaussian_block: 0, frame_block: 0 };
+        assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
+    }
+    let refused = piped(&workplace, "pack - -o x.gseq --max-error position=1%", &stream);
+    let message = String::from_utf8_lossy(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && message.contains("expected scene units"), "{message}");
+    assert!(!workplace.path("x.gseq").exists());
 }
 
 #[test]

@@ -6,6 +6,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::RecipeFlags;
 use crate::emit::atomic::Replace;
+use crate::emit::bounds::MaxError;
 use crate::verbs::method::Method;
 
 const EXAMPLES: &str = "\
@@ -448,12 +449,17 @@ pub(super) struct Pack {
     /// Container to write
     #[arg(short, long, value_name = "FILE.gseq")]
     pub(super) output: PathBuf,
+    /// Let values of columns be so far off: `position=1e-3` in the column's unit (scene units, components of
+    /// quaternions, logs of scales, logits, harmonics), or `position=0.01%` of the scene's extent; columns that are not named
+    /// keep every bit. Each value is checked as it is written, and the file says its bounds
+    #[arg(long, value_name = "COLUMN=BOUND", value_delimiter = ',', conflicts_with = "raw")]
+    pub(super) max_error: Vec<MaxError>,
     /// Store tiles as they are, to be used in place
     #[arg(long, conflicts_with = "level")]
     pub(super) raw: bool,
-    /// zstd level
-    #[arg(long, value_name = "1-19", default_value_t = 1, value_parser = clap::value_parser!(i32).range(1..=19))]
-    pub(super) level: i32,
+    /// zstd level [default: 1, with --max-error 15]
+    #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
+    pub(super) level: Option<i32>,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }

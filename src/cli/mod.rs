@@ -24,6 +24,7 @@ use crate::report::{self, ReportOptions, trade_off};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, scratch_beside};
 use crate::stream::{Mode, Progress};
+use crate::verbs::container::Storing;
 use crate::verbs::evaluate::EvaluateOptions;
 use crate::verbs::method::Method;
 use crate::verbs::render::{RenderOptions, Wanted};
@@ -118,9 +119,13 @@ fn run(cli: Cli) -> Result<()> {
             print(&format!("{}\n{}\n", found.verdict, page.display()))
         }
         Verb::Pack(args) => {
-            let compression = if args.raw { Compression::Raw } else { Compression::Zstd(args.level) };
+            let storing = match (args.raw, args.max_error) {
+                (true, _) => Storing::Exact(Compression::Raw),
+                (_, asked) if asked.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
+                (_, asked) => Storing::Within(asked, args.level.unwrap_or(15)),
+            };
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
-            let packed = container::pack(&input, &args.output, compression, args.earlier.replace())?;
+            let packed = container::pack(&input, &args.output, &storing, args.earlier.replace())?;
             notes(&packed.notes);
             print(&format!(
                 "{}: {} Gaussians x {} frames in {} bytes\n{}",

@@ -1,7 +1,7 @@
 //! Any sequence into a container, frame block by frame block, tile by tile.
 //!
 //! Memory: for every thread one tile of every column, [`GAUSSIAN_BLOCK`] × frames of a block values of
-//! each of its components, and as much again while it is encoded; 80 bytes per column and block of Gaussians,
+//! each of its components, and as much again while it is encoded (of a column with a bound, four times its tile); 80 bytes per column and block of Gaussians,
 //! 16 per frame.
 
 use std::collections::BTreeMap;
@@ -11,6 +11,7 @@ use std::path::Path;
 use gseq::{ColumnSpec, Compression, EncodedTile, Layout, TileId, Writer, encode_tile};
 use rayon::prelude::*;
 
+use super::bounds::Bounds;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::source::{FrameSource, Ids};
@@ -21,17 +22,46 @@ pub const GAUSSIAN_BLOCK: usize = 1024;
 /// Frames per tile, but for streams whose frames are large.
 pub const FRAME_BLOCK: usize = 32;
 
+/// How a container stores its values.
+#[derive(Debug, Clone, Copy)]
+pub struct Packing {
+    compression: Compression,
+    bounds: Bounds,
+}
+
+impl From<Compression> for Packing {
+    /// Every bit of every value.
+    fn from(compression: Compression) -> Packing {
+        Packing { compression, bounds: Bounds::default() }
+    }
+}
+
+impl Packing {
+    /// Values within `bounds`, by zstd at `level`.
+    pub fn within(bounds: Bounds, level: i32) -> Packing {
+        Packing { compression: Compression::Zstd(level), bounds }
+    }
+
+    /// How a column is encoded.
+    fn column(&self, column: Columns) -> Compression {
+        match (self.compression, self.bounds.column(column)) {
+            (Compression::Zstd(level), max_error) if max_error != 0.0 => Compression::Bounded { max_error, level },
+            (compression, _) => compression,
+        }
+    }
+}
+
 /// Writes `source` to the container `path`, which appears complete or not at all. `advance` is told
 /// the number of Gaussian frames done.
 pub fn write_container(
     source: &dyn FrameSource,
     path: &Path,
-    compression: Compression,
+    packing: impl Into<Packing>,
     attributes: BTreeMap<String, String>,
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     let info = source.info();
-    let mut writer = ContainerWriter::create(path, info.count, info.sh_degree, FRAME_BLOCK, compression, attributes)?;
+    let mut writer = ContainerWriter::create(path, info.count, info.sh_degree, FRAME_BLOCK, packing, attributes)?;
     for start in (0..info.times.len()).step_by(FRAME_BLOCK) {
         let end = info.times.len().min(start + FRAME_BLOCK);
         writer.append(source, start..end, &advance)?;
@@ -42,7 +72,7 @@ pub fn write_container(
 /// A container that grows by one frame block at a time. Dropped unfinished, it leaves nothing.
 pub struct ContainerWriter {
     writer: Writer,
-    compression: Compression,
+    packing: Packing,
     frame_blocks: usize,
 }
 
@@ -53,11 +83,15 @@ impl ContainerWriter {
         count: usize,
         sh_degree: usize,
         frame_block: usize,
-        compression: Compression,
+        packing: impl Into<Packing>,
         attributes: BTreeMap<String, String>,
     ) -> Result<ContainerWriter> {
-        let column =
-            |column: Columns| ColumnSpec { name: column.name().to_owned(), width: column.width(sh_degree) as u32 };
+        let packing = packing.into();
+        let column = |column: Columns| ColumnSpec {
+            name: column.name().to_owned(),
+            width: column.width(sh_degree) as u32,
+            max_error: packing.bounds.column(column),
+        };
         let layout = Layout {
             gaussians: count as u64,
             gaussian_block: GAUSSIAN_BLOCK as u32,
@@ -65,7 +99,7 @@ impl ContainerWriter {
             columns: Columns::all().iter().map(column).collect(),
             attributes,
         };
-        Ok(ContainerWriter { writer: Writer::create(path, layout)?, compression, frame_blocks: 0 })
+        Ok(ContainerWriter { writer: Writer::create(path, layout)?, packing, frame_blocks: 0 })
     }
 
     /// Adds the next frame block: `frames` of `source`, as many as a block has; fewer end the sequence.
@@ -109,7 +143,7 @@ impl ContainerWriter {
                 .map(|&block| {
                     let start = block as usize * GAUSSIAN_BLOCK;
                     let end = (start + GAUSSIAN_BLOCK).min(info.count);
-                    let tiles = encode_block(source, start..end, frames.clone(), columns, self.compression);
+                    let tiles = encode_block(source, start..end, frames.clone(), columns, &self.packing);
                     advance(((end - start) * frames.len()) as u64);
                     tiles
                 })
@@ -140,7 +174,7 @@ fn encode_block(
     gaussians: Range<usize>,
     frames: Range<usize>,
     columns: Columns,
-    compression: Compression,
+    packing: &Packing,
 ) -> Result<Vec<Option<EncodedTile>>> {
     let info = source.info();
     let len = gaussians.len();
@@ -163,7 +197,7 @@ fn encode_block(
         }
         let width = column.width(info.sh_degree) as u32;
         let stored = if info.varying.contains(column) { frames.len() } else { 1 };
-        Ok(Some(encode_tile(values, stored as u32, width, len as u32, compression)?))
+        Ok(Some(encode_tile(values, stored as u32, width, len as u32, packing.column(column))?))
     };
     values.iter().zip(Columns::all().iter()).map(encode).collect()
 }

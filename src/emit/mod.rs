@@ -4,6 +4,7 @@
 //! moves what was written to where the user asked for it.
 
 pub mod atomic;
+pub mod bounds;
 pub mod container;
 pub mod frame_stream;
 pub mod image;

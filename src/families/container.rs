@@ -71,6 +71,7 @@ fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
         let mut found = ColumnInfo {
             name: spec.name.clone(),
             width: spec.width,
+            max_error: spec.max_error,
             tiles: 0,
             constant_tiles: 0,
             raw_tiles: 0,

@@ -238,6 +238,8 @@ pub struct ColumnInfo {
     pub name: String,
     /// f32 components per Gaussian.
     pub width: u32,
+    /// How far values may be off those that were packed, in the column's unit; 0: not one bit.
+    pub max_error: f64,
     /// Number of tiles.
     pub tiles: usize,
     /// Of those, tiles that hold one frame for all.

@@ -13,7 +13,7 @@ use gseq::Compression;
 
 use super::family::{Family, Residence, Timing};
 use crate::emit::atomic::ScratchFile;
-use crate::emit::container::{ContainerWriter, FRAME_BLOCK};
+use crate::emit::container::{ContainerWriter, FRAME_BLOCK, Packing};
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
@@ -98,12 +98,12 @@ impl Family for Streamed {
 pub fn pack_stream(
     mut stream: FrameStream<impl Read + Send + 'static>,
     path: &Path,
-    compression: Compression,
+    packing: impl Into<Packing>,
     mut take: impl FnMut(&HeldFrames) -> Result<()>,
 ) -> Result<u64> {
     let StreamHeader { count, sh_degree, varying } = *stream.header();
     let block = frame_block(stream.header());
-    let mut writer = ContainerWriter::create(path, count, sh_degree, block, compression, BTreeMap::new())?;
+    let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
     let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());
     let progress = Progress::counting("receive", "frames");
     let mut put = |held: &mut HeldFrames| -> Result<Vec<Gaussians>> {

@@ -17,7 +17,7 @@ use crate::model::{Rig, Schedule, Split};
 use crate::source::{FrameSource, Reads};
 
 pub use input::{InputOptions, Opened, load_cameras};
-pub use open::{open_input, open_scene, scene_of, scratch_beside};
+pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
 pub use stream::{check_memory, open_stream, receiving};
 
 /// An input with the cameras that look at it.

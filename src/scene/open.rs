@@ -121,12 +121,19 @@ fn camera_path(options: &InputOptions, input: &dyn Family) -> Option<PathBuf> {
 
 /// A rig around the robust middle of the first frame.
 fn virtual_rig(source: &dyn FrameSource) -> Result<Rig> {
+    let (middle, extent) = first_box(source)?.map_or((DVec3::ZERO, 1.0), |found| (found.middle, found.extent()));
+    Ok(cameras::virtual_rig(middle, extent))
+}
+
+/// The robust box of the first frame; none without frames. Memory: 16 bytes a Gaussian.
+///
+/// # Errors
+/// A frame that cannot be read.
+pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     if source.info().times.is_empty() {
-        return Ok(cameras::virtual_rig(DVec3::ZERO, 1.0));
+        return Ok(None);
     }
-    let state = gather_all(source, 0, Columns::POSITION)?;
-    let bounds = RobustBox::of(&state.position);
-    Ok(cameras::virtual_rig(bounds.middle, bounds.extent()))
+    Ok(Some(RobustBox::of(&gather_all(source, 0, Columns::POSITION)?.position)))
 }
 
 /// Folder for scratch files of a run that writes `output`: where the result goes there is room for its input.

@@ -13,7 +13,8 @@ use crate::budget::{Need, Plan, Workload};
 use crate::compress::emit::ENCODING;
 use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
-use crate::emit::container::write_container;
+use crate::emit::bounds::{Bounds, MaxError};
+use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, write_container};
 use crate::emit::frame_stream::StreamWriter;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -24,7 +25,7 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::Limits;
 use crate::model::Columns;
-use crate::scene::{InputOptions, Opened, check_memory, open_input, open_stream};
+use crate::scene::{InputOptions, Opened, check_memory, first_box, open_input, open_stream};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
 
@@ -43,15 +44,42 @@ pub struct Packed {
     pub notes: Vec<String>,
 }
 
+/// How `pack` stores values.
+#[derive(Debug, Clone)]
+pub enum Storing {
+    /// Every bit of them.
+    Exact(Compression),
+    /// Those of these columns within a bound, by zstd at a level.
+    Within(Vec<MaxError>, i32),
+}
+
+impl Storing {
+    /// In a scene whose extent is asked for where a bound is of it.
+    fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
+        match self {
+            Storing::Exact(compression) => Ok((*compression).into()),
+            Storing::Within(asked, level) => Ok(Packing::within(Bounds::of(asked, extent)?, *level)),
+        }
+    }
+}
+
 /// Packs any input into a container. That of a stream names no digest of its source, which is known only
 /// when the container's header has long been written.
-pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overwrite: Replace) -> Result<Packed> {
+///
+/// # Errors
+/// What is wrong with the input; a bound of the extent of a stream, which is known at its end alone.
+pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     if input.is_stream() {
+        let packing = storing.packing(|| {
+            let message =
+                "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
+            Err(Error::usage(message))
+        })?;
         let staged = StagedFile::new(output, overwrite)?;
         let stream = open_stream(input)?;
         check_memory(input, stream.header())?;
-        pack_stream(stream, staged.path(), compression, |_| Ok(()))?;
+        pack_stream(stream, staged.path(), packing, |_| Ok(()))?;
         let container = Container::open(staged.path())?;
         let (gaussians, frames) = (container.info().count, container.info().times.len());
         let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
@@ -60,12 +88,13 @@ pub fn pack(input: &InputOptions, output: &Path, compression: Compression, overw
     }
     let opened = open_input(input)?;
     let source = opened.input.source();
-    Plan::fit(workload(&*opened.input), input.memory, packing)?;
+    Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?;
+    let packing = storing.packing(|| Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent())))?;
     let staged = StagedFile::new(output, overwrite)?;
     let work = source.info().count as u64 * source.info().times.len() as u64;
     let progress = Progress::new("pack", "Gaussian frames", work);
     let attributes = BTreeMap::from([("source_digest".to_owned(), opened.input.digest()?)]);
-    write_container(source, staged.path(), compression, attributes, |done| progress.advance(done))?;
+    write_container(source, staged.path(), packing, attributes, |done| progress.advance(done))?;
     drop(progress);
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
@@ -167,9 +196,34 @@ fn workload(input: &dyn Family) -> Workload {
 }
 
 /// What it takes to write every frame as a container.
-fn packing(work: &Workload, _: &Limits) -> Vec<Need> {
+fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
     let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
-    vec![Need { stage: "pack", reads: 1.0, seconds, per_gaussian: Vec::new(), fixed: work.writing() }]
+    let level = match storing {
+        Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
+        Storing::Exact(_) => 0,
+    };
+    let widest = Columns::all().iter().map(|column| work.state(column)).max().unwrap_or(0);
+    let tables = zstd_tables(level, (GAUSSIAN_BLOCK * FRAME_BLOCK) as u64 * widest);
+    // The first frame is read for its extent.
+    let positions = match storing {
+        Storing::Within(..) => 16,
+        Storing::Exact(_) => 0,
+    };
+    let per_gaussian = vec![("positions", positions)];
+    let fixed = [work.writing(), vec![("zstd", work.threads * tables)]].concat();
+    vec![Need { stage: "pack", reads: 1.0, seconds, per_gaussian, fixed }]
+}
+
+/// Bytes of the tables by which zstd, at a level, finds matches in `bytes` bytes: at most those of each level's group, and
+/// 4 for each entry of two tables that have no more than twice as many entries as there are bytes.
+fn zstd_tables(level: i32, bytes: u64) -> u64 {
+    let most_mebibytes = match level {
+        ..=3 => 1,
+        4..=9 => 12,
+        10..=15 => 64,
+        _ => 80,
+    };
+    (16 * bytes.next_power_of_two()).min(most_mebibytes << 20)
 }
 
 /// What it takes to write every frame by itself.
@@ -208,14 +262,18 @@ impl Info {
                 _ => "no finite value".to_owned(),
             };
             out += &format!(
-                "  {:<14} x{:<3} {:>6} tiles ({} constant, {} raw)  {:>12} bytes of {:>12}  {range}\n",
+                "  {:<14} x{:<3} {:>6} tiles ({} constant, {} raw)  {:>12} bytes of {:>12}  {range}{}\n",
                 column.name,
                 column.width,
                 column.tiles,
                 column.constant_tiles,
                 column.raw_tiles,
                 column.stored_bytes,
-                column.raw_bytes
+                column.raw_bytes,
+                match column.max_error {
+                    0.0 => String::new(),
+                    bound => format!(", at most {bound} off"),
+                }
             );
         }
         out
