@@ -187,7 +187,12 @@ impl Workload {
 
     /// Buffers of a container, or of a frame's file, in the making.
     pub fn writing(&self) -> Vec<Part> {
-        let varying = FRAME_BLOCK as u64 * self.state(self.varying);
+        self.writing_together(FRAME_BLOCK)
+    }
+
+    /// Buffers of a container of `frames` frames per tile in the making.
+    pub fn writing_together(&self, frames: usize) -> Vec<Part> {
+        let varying = frames as u64 * self.state(self.varying);
         let block = GAUSSIAN_BLOCK as u64 * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }

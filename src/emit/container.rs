@@ -21,6 +21,8 @@ use crate::source::{FrameSource, Ids};
 pub const GAUSSIAN_BLOCK: usize = 1024;
 /// Frames per tile, but for streams whose frames are large.
 pub const FRAME_BLOCK: usize = 32;
+/// Frames per tile within bounds, of which the first takes as much as all others together.
+pub const BOUNDED_FRAME_BLOCK: usize = 64;
 
 /// How a container stores its values.
 #[derive(Debug, Clone, Copy)]
@@ -42,6 +44,11 @@ impl Packing {
         Packing { compression: Compression::Zstd(level), bounds }
     }
 
+    /// Frames per tile.
+    pub fn frame_block(&self) -> usize {
+        if self.bounds == Bounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
+    }
+
     /// How a column is encoded.
     fn column(&self, column: Columns) -> Compression {
         match (self.compression, self.bounds.column(column)) {
@@ -60,10 +67,11 @@ pub fn write_container(
     attributes: BTreeMap<String, String>,
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
-    let info = source.info();
-    let mut writer = ContainerWriter::create(path, info.count, info.sh_degree, FRAME_BLOCK, packing, attributes)?;
-    for start in (0..info.times.len()).step_by(FRAME_BLOCK) {
-        let end = info.times.len().min(start + FRAME_BLOCK);
+    let (info, packing) = (source.info(), packing.into());
+    let together = packing.frame_block();
+    let mut writer = ContainerWriter::create(path, info.count, info.sh_degree, together, packing, attributes)?;
+    for start in (0..info.times.len()).step_by(together) {
+        let end = info.times.len().min(start + together);
         writer.append(source, start..end, &advance)?;
     }
     writer.finish()

@@ -14,7 +14,7 @@ use crate::compress::emit::ENCODING;
 use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::bounds::{Bounds, MaxError};
-use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, write_container};
+use crate::emit::container::{BOUNDED_FRAME_BLOCK, FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, write_container};
 use crate::emit::frame_stream::StreamWriter;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -202,15 +202,15 @@ fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
         Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
         Storing::Exact(_) => 0,
     };
-    let widest = Columns::all().iter().map(|column| work.state(column)).max().unwrap_or(0);
-    let tables = zstd_tables(level, (GAUSSIAN_BLOCK * FRAME_BLOCK) as u64 * widest);
     // The first frame is read for its extent.
-    let positions = match storing {
-        Storing::Within(..) => 16,
-        Storing::Exact(_) => 0,
+    let (together, positions) = match storing {
+        Storing::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
+        Storing::Exact(_) => (FRAME_BLOCK, 0),
     };
+    let widest = Columns::all().iter().map(|column| work.state(column)).max().unwrap_or(0);
+    let tables = zstd_tables(level, (GAUSSIAN_BLOCK * together) as u64 * widest);
     let per_gaussian = vec![("positions", positions)];
-    let fixed = [work.writing(), vec![("zstd", work.threads * tables)]].concat();
+    let fixed = [work.writing_together(together), vec![("zstd", work.threads * tables)]].concat();
     vec![Need { stage: "pack", reads: 1.0, seconds, per_gaussian, fixed }]
 }
 
