@@ -11,7 +11,8 @@
 //! original rasteriser, measured elsewhere: 26, 14 and 12 ms for `room2_big`, `room2_dynerf`, `deform2`.
 //!
 //! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 2.6 times the
-//! picture alone; before each group the ratio is printed. `picture/demo` is a view of the demo scene.
+//! picture alone; before each group the ratio is printed, of medians of pictures and derivatives taken by turns. What
+//! the loss takes to subtract two pictures counts. `picture/demo` is a view of the demo scene.
 //!
 //! Times are wall-clock: on a busy machine they are several times the cost. Criterion arguments filter:
 //! `cargo bench --bench render -- picture`.
@@ -32,7 +33,7 @@ use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
 use splatsieve::source::{FrameSource, Ids};
 
-/// Pictures whose median time gives the rates.
+/// Pictures, without and with their derivative, whose median times give the rates and the ratio.
 const PICTURES: usize = 21;
 
 /// Renders and scores one view.
@@ -41,16 +42,23 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     let (count, pixels) = (state.len(), u64::from(camera.width) * u64::from(camera.height));
     let mut renderer = Renderer::new();
     let target = renderer.render(state, camera, [0.5; 3]);
+    // The derivative of half the squared error; nobody reads its value.
     let squared_error = |picture: &Image| {
         let pull: Vec<f32> = picture.data.iter().zip(&target.data).map(|(a, b)| a - b).collect();
-        let error = pull.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>();
-        (0.5 * error, Image { data: pull, ..*picture })
+        (0.0, Image { data: pull, ..*picture })
     };
     let mut gradients = Gradients::new(count, Columns::all(), state.sh_degree());
-    let seconds = median(|| drop(black_box(renderer.render(state, camera, [0.0; 3]))));
-    let differentiated = median(|| {
+    // By turns, so that what else the machine does slows both.
+    let (mut pictures, mut derivatives) = (Vec::new(), Vec::new());
+    for _ in 0..PICTURES {
+        let start = Instant::now();
+        drop(black_box(renderer.render(state, camera, [0.0; 3])));
+        pictures.push(start.elapsed().as_secs_f64());
+        let start = Instant::now();
         black_box(renderer.gradient(state, camera, [0.0; 3], squared_error, &mut gradients));
-    });
+        derivatives.push(start.elapsed().as_secs_f64());
+    }
+    let (seconds, differentiated) = (median(pictures), median(derivatives));
     let rate = |amount: f64| amount / seconds / 1e6;
     eprintln!(
         "{group} {name}: {count} Gaussians, {pixels} pixels, {events} blend events in {:.1} ms: {:.1}, {:.1} and {:.0} million a second; with its derivative {:.2} times as long",
@@ -77,17 +85,10 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
     group.finish();
 }
 
-/// Median time of some runs, seconds.
-fn median(mut run: impl FnMut()) -> f64 {
-    let mut seconds: Vec<f64> = (0..PICTURES)
-        .map(|_| {
-            let start = Instant::now();
-            run();
-            start.elapsed().as_secs_f64()
-        })
-        .collect();
-    seconds.sort_by(f64::total_cmp);
-    seconds[PICTURES / 2]
+/// The middle one of an odd number of values.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }
 
 fn pictures(criterion: &mut Criterion) {

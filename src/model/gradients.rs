@@ -114,8 +114,8 @@ impl<'a> GradientSpan<'a> {
         let start = first - self.ids.start;
         let Some(plane) = self.planes(column).get_mut(component) else { return };
         for (sum, part) in plane[start..].iter_mut().zip(parts) {
-            let next = *sum + part;
-            *sum = if next.is_finite() { next } else { *sum };
+            // Added either way: a store that depends on a condition is slow.
+            *sum += if (*sum + part).is_finite() { part } else { 0.0 };
         }
     }
 }

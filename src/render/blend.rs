@@ -153,16 +153,8 @@ impl Ink for Weights<'_> {
     fn end<V: Lanes>(&mut self, [sum, max]: [V; 2], pair: usize) {
         let mut maxima = [0.0; LANES];
         max.store(&mut maxima);
-        self.pairs[pair] = Weight { sum: lane_sum(sum), max: maxima.into_iter().fold(0.0, f32::max) };
+        self.pairs[pair] = Weight { sum: sum.sum(), max: maxima.into_iter().fold(0.0, f32::max) };
     }
-}
-
-/// Sum of all lanes, in a fixed order.
-#[inline(always)]
-pub(super) fn lane_sum<V: Lanes>(lanes: V) -> f32 {
-    let mut x = [0.0; LANES];
-    lanes.store(&mut x);
-    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 
 /// The instructions to blend with; all give the same bits.

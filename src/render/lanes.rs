@@ -40,8 +40,20 @@ pub(super) trait Lanes: Copy {
     fn select(self, yes: Self, no: Self) -> Self;
     /// One bit per lane: its sign (for a mask: whether it is set).
     fn signs(self) -> u32;
+    /// Sums of all lanes of each, as [`Lanes::sum`] of each.
+    fn sums(of: [Self; LANES]) -> [f32; LANES] {
+        of.map(Self::sum)
+    }
     /// `self · 2ⁿ` with n the low bits of `rounded`, as left there by adding [`ROUND`].
     fn scale_exponent(self, rounded: Self) -> Self;
+
+    /// Sum of all lanes, in a fixed order.
+    #[inline(always)]
+    fn sum(self) -> f32 {
+        let mut x = [0.0; LANES];
+        self.store(&mut x);
+        ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
+    }
 
     /// 2^self for `self ≤ 0`; relative error below 1.6e-7 down to 2⁻¹²⁶, where it stays below.
     #[inline(always)]
@@ -216,6 +228,21 @@ mod avx2 {
         #[inline(always)]
         fn signs(self) -> u32 {
             avx2!(_mm256_movemask_ps(self.0)) as u32
+        }
+        /// Halves the number of registers with each addition, so that eight sums cost little more than two.
+        #[inline(always)]
+        fn sums(of: [Self; LANES]) -> [f32; LANES] {
+            let halves = |a: Self, b: Self| {
+                avx2!(_mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a.0, b.0), _mm256_permute2f128_ps::<0x31>(a.0, b.0)))
+            };
+            let quarters = |a, b| avx2!(_mm256_add_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b)));
+            let [a, b, c, d, e, f, g, h] = of;
+            let (ab, cd) = (quarters(halves(a, e), halves(b, f)), quarters(halves(c, g), halves(d, h)));
+            // Pairs of lanes (a, b) and (c, d) of the first sums, then of the second.
+            let sums = avx2!(_mm256_add_ps(_mm256_shuffle_ps::<0x44>(ab, cd), _mm256_shuffle_ps::<0xee>(ab, cd)));
+            let mut out = [0.0; LANES];
+            Avx2(sums).store(&mut out);
+            out
         }
         #[inline(always)]
         fn scale_exponent(self, rounded: Self) -> Self {

@@ -300,7 +300,11 @@ impl Shape {
         let (kx, ky) = (limit(slopes[0], view.slope_limit[0]), limit(slopes[1], view.slope_limit[1]));
         let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
         let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
-        let spread = [to_u, to_v].map(|to| [dot(to, axes[0]) * s[0], dot(to, axes[1]) * s[1], dot(to, axes[2]) * s[2]]);
+        // Not `array::map`: it may be compiled apart, and a loop that calls it does not run in vectors.
+        let spread = [
+            [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]],
+            [dot(to_v, axes[0]) * s[0], dot(to_v, axes[1]) * s[1], dot(to_v, axes[2]) * s[2]],
+        ];
         Shape { depth: z, slopes, to: [to_u, to_v], axes, scale: s, spread }
     }
 

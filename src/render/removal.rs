@@ -5,7 +5,7 @@
 //! nothing however much it covers. Of N removals at once the changes add up, with b changing too; hence
 //! the floor under c − b, and ranking in rounds.
 
-use super::blend::{Ink, Plane, Stroke, lane_sum};
+use super::blend::{Ink, Plane, Stroke};
 use super::lanes::Lanes;
 use super::project::Splat;
 
@@ -103,7 +103,7 @@ impl Ink for Removal<'_> {
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, (_, sum): ([V; 3], V), pair: usize) {
-        self.pairs[pair] = lane_sum(sum);
+        self.pairs[pair] = sum.sum();
     }
 }
 

@@ -34,20 +34,16 @@ pub struct Image {
 }
 
 impl Image {
-    /// The pixels of one tile, 0 beyond the picture's edge.
-    pub(super) fn planes(&self, tile: [u32; 2]) -> [Plane; 3] {
-        let mut planes = [[[0.0; LANES]; GROUPS]; 3];
-        let [x0, y0] = tile.map(|t| t * TILE);
-        for v in 0..TILE.min(self.height - y0) {
-            for u in 0..TILE.min(self.width - x0) {
-                let pixel = ((y0 + v) as usize * self.width as usize + (x0 + u) as usize) * 3;
-                let (group, lane) = (v as usize + u as usize / LANES * TILE as usize, u as usize % LANES);
-                for (c, plane) in planes.iter_mut().enumerate() {
-                    plane[group][lane] = self.data[pixel + c];
-                }
-            }
+    /// The pixels of one tile, row by row, 0 beyond the picture's edge.
+    pub(super) fn tile(&self, tile: [u32; 2]) -> [[[f32; 3]; TILE as usize]; TILE as usize] {
+        let mut pixels = [[[0.0; 3]; TILE as usize]; TILE as usize];
+        let [x, y] = tile.map(|t| (t * TILE) as usize);
+        let columns = x..(x + TILE as usize).min(self.width as usize);
+        let rows = self.data.as_chunks().0.chunks_exact(self.width as usize);
+        for (pixels, row) in pixels.iter_mut().zip(rows.skip(y)) {
+            pixels[..columns.len()].copy_from_slice(&row[columns.clone()]);
         }
-        planes
+        pixels
     }
 }
 

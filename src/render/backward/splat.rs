@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use super::super::colour;
 use super::super::convention::BLOCK;
-use super::super::project::{Covariance, LOGARITHM_LIMIT, Shape, Splat, View, cross, dot, opacity};
+use super::super::project::{LOGARITHM_LIMIT, Shape, Splat, View, cross, dot, opacity};
 use super::tile::Sums;
 use crate::model::{Columns, Gaussians, GradientSpan, sh_coefficients};
 
@@ -119,8 +119,8 @@ impl Block {
         for (k, by_value) in by_value.iter_mut().enumerate().take(colour::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
             for i in 0..n {
-                let [red, green, blue] = [0, 1, 2].map(|c| sh[c][i] * self.colour[c][i]);
-                by_value[i] = red + green + blue;
+                by_value[i] =
+                    sh[0][i] * self.colour[0][i] + sh[1][i] * self.colour[1][i] + sh[2][i] * self.colour[2][i];
             }
         }
         let mut parts = [[0.0f32; BLOCK]; 3];
@@ -154,13 +154,9 @@ impl Block {
         let mut parts = [[0.0f32; BLOCK]; 11];
         let Block { p, first, second, .. } = self;
         for i in 0..n {
-            // Invisible or hidden: in f64 and one by one, this is the dearest part of a Gaussian's gradient.
-            if [p[i], first[0][i], first[1][i], second[0][i], second[1][i], second[2][i]] == [0.0; 6] {
-                continue;
-            }
             let taken = Taken::new(
-                [position[0][i], position[1][i], position[2][i]],
-                [rotation[0][i], rotation[1][i], rotation[2][i], rotation[3][i]],
+                [position[0][i].into(), position[1][i].into(), position[2][i].into()],
+                [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()],
                 [log_scale[0][i], log_scale[1][i], log_scale[2][i]],
                 [first[0][i], first[1][i]],
                 [second[0][i], second[1][i], second[2][i]],
@@ -200,20 +196,21 @@ impl Taken {
     /// `first` and `second` are those of [`Sums`].
     #[inline(always)]
     fn new(
-        position: [f32; 3],
-        rotation: [f32; 4],
+        position: [f64; 3],
+        q: [f64; 4],
         log_scale: [f32; 3],
-        [s, t]: [f64; 2],
-        [ss, st, tt]: [f64; 3],
+        [x, y]: [f64; 2],
+        [xx, xy, yy]: [f64; 3],
         view: &View,
     ) -> Self {
-        let q = rotation.map(f64::from);
-        let shape = Shape::new(position.map(f64::from), q, log_scale, view);
-        let Covariance { xy, yy, det, .. } = shape.covariance();
+        let shape = Shape::new(position, q, log_scale, view);
+        let seen = shape.covariance();
         let [a, b] = shape.spread;
 
         // Offsets in standard deviations: s = (x − slope·y)·per_s, t = y·per_t.
-        let (slope, per_s, per_t) = (xy / yy, (yy / det).sqrt(), (1.0 / yy).sqrt());
+        let (slope, per_s, per_t) = (seen.xy / seen.yy, (seen.yy / seen.det).sqrt(), (1.0 / seen.yy).sqrt());
+        let (s, t) = (per_s * x, per_t * y);
+        let (ss, st, tt) = (per_s * per_s * xx, per_s * per_t * xy, per_t * per_t * yy);
         // By each of the Gaussian's axes: ∂L/∂ log scale, ∂L/∂a and ∂L/∂b.
         let by_axis = |j: usize| {
             // The axis as s and t see it.

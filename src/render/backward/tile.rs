@@ -4,10 +4,8 @@
 //! takes its own part away, and what is left is what lies behind it (method.md, section 8.1). Data in: the tile's
 //! splats, ∂L/∂ pixel, and the pixels. Data out: nine sums per pair of a splat and the tile.
 
-use std::f64::consts::LN_2;
-
-use super::super::blend::{GROUPS, Ink, Plane, Stroke, lane_sum};
-use super::super::convention::MAX_ALPHA;
+use super::super::blend::{GROUPS, Ink, Plane, Stroke};
+use super::super::convention::{MAX_ALPHA, TILE};
 use super::super::lanes::{LANES, Lanes};
 use super::super::project::Splat;
 use super::super::renderer::Image;
@@ -17,15 +15,15 @@ const UNCUT: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 
 /// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
 ///
-/// With p = alpha · ∂L/∂alpha and a pixel's offset (s, t) in standard deviations: t along v from the splat's centre, s
-/// along u from the middle of the row. s² + t² is at most 2·ln 255, so no size of a splat makes a sum large.
+/// With p = alpha · ∂L/∂alpha and a pixel's offset (x, y), pixels: y along v from the splat's centre, x along u from the
+/// middle of the row.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Sums<T> {
     /// Σ p.
     pub(super) p: T,
-    /// Σ p·s and Σ p·t.
+    /// Σ p·x and Σ p·y.
     pub(super) first: [T; 2],
-    /// Σ p·s², Σ p·s·t and Σ p·t².
+    /// Σ p·x², Σ p·x·y and Σ p·y².
     pub(super) second: [T; 3],
     /// Σ weight · ∂L/∂ pixel, by channel.
     pub(super) colour: [T; 3],
@@ -52,15 +50,18 @@ pub(super) struct Pull {
 impl Pull {
     /// Of tile `tile` of `picture`. A pixel that is not finite, itself or in `pull`, takes nothing.
     pub(super) fn new(picture: &Image, pull: &Image, tile: [u32; 2]) -> Self {
-        let (colour, mut pixel) = (picture.planes(tile), pull.planes(tile));
-        let mut rest = [[0.0; LANES]; GROUPS];
+        // Copied first: the copies wait for memory together, one pixel after the other would wait alone.
+        let (colours, pulls) = (picture.tile(tile), pull.tile(tile));
+        let zero = [[0.0; LANES]; GROUPS];
+        let (mut pixel, mut rest) = ([zero; 3], zero);
         for group in 0..GROUPS {
+            let (v, first) = (group % TILE as usize, group / TILE as usize * LANES);
             for lane in 0..LANES {
-                let product: f32 = (0..3).map(|c| pixel[c][group][lane] * colour[c][group][lane]).sum();
+                let (colour, pull) = (colours[v][first + lane], pulls[v][first + lane]);
+                let product = colour[0] * pull[0] + colour[1] * pull[1] + colour[2] * pull[2];
                 if product.is_finite() {
                     rest[group][lane] = product;
-                } else {
-                    (0..3).for_each(|c| pixel[c][group][lane] = 0.0);
+                    (0..3).for_each(|c| pixel[c][group][lane] = pull[c]);
                 }
             }
         }
@@ -79,8 +80,6 @@ pub(super) struct Pulled<'a, const SHAPE: bool> {
 #[derive(Clone, Copy)]
 pub(super) struct Walked<V> {
     colour: [V; 3],
-    /// Standard deviations per pixel, along u and along v.
-    per_pixel: [f32; 2],
     p: V,
     first: [V; 2],
     second: [V; 3],
@@ -92,30 +91,20 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> Walked<V> {
         let zero = V::splat(0.0);
-        // Exponents are in powers of two: half the square of an offset is ln 2 times one.
-        let per_pixel = |exponent: f32| (exponent * 2.0 * LN_2 as f32).sqrt();
-        Walked {
-            colour: splat.colour.map(V::splat),
-            per_pixel: [per_pixel(splat.narrow), per_pixel(splat.fall)],
-            p: zero,
-            first: [zero; 2],
-            second: [zero; 3],
-            taken: [zero; 3],
-        }
+        Walked { colour: splat.colour.map(V::splat), p: zero, first: [zero; 2], second: [zero; 3], taken: [zero; 3] }
     }
     #[inline(always)]
     fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Stroke<V>) -> Walked<V> {
         let Stroke { alpha, blended, weight, across, down, .. } = stroke;
-        let pixel: [V; 3] = std::array::from_fn(|c| V::load(&self.pull.pixel[c][group]));
-        for (taken, pixel) in walked.taken.iter_mut().zip(pixel) {
-            *taken = taken.add(weight.mul(pixel));
+        let by_colour: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c][group])));
+        for (taken, by_colour) in walked.taken.iter_mut().zip(by_colour) {
+            *taken = taken.add(by_colour);
         }
         if !SHAPE {
             return walked;
         }
         let [red, green, blue] = walked.colour;
-        let own = red.mul(pixel[0]).add(green.mul(pixel[1])).add(blue.mul(pixel[2]));
-        let own = weight.mul(own);
+        let own = red.mul(by_colour[0]).add(green.mul(by_colour[1])).add(blue.mul(by_colour[2]));
         let rest = V::load(&self.pull.rest[group]).sub(own);
         rest.store(&mut self.pull.rest[group]);
         // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing. The division waits
@@ -133,18 +122,12 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, walked: Walked<V>, pair: usize) {
-        let colour = walked.taken.map(lane_sum);
         self.pairs[pair] = if SHAPE {
-            let [per_x, per_y] = walked.per_pixel;
-            let ([x, y], [xx, xy, yy]) = (walked.first.map(lane_sum), walked.second.map(lane_sum));
-            Sums {
-                p: lane_sum(walked.p),
-                first: [x * per_x, y * per_y],
-                second: [xx * per_x * per_x, xy * per_x * per_y, yy * per_y * per_y],
-                colour,
-            }
+            let ([x, y], [xx, xy, yy], [red, green, blue]) = (walked.first, walked.second, walked.taken);
+            let [x, y, xx, xy, yy, red, green, blue] = V::sums([x, y, xx, xy, yy, red, green, blue]);
+            Sums { p: walked.p.sum(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
         } else {
-            Sums { colour, ..Sums::default() }
+            Sums { colour: walked.taken.map(V::sum), ..Sums::default() }
         };
     }
 }
