@@ -32,6 +32,23 @@ pub(crate) fn shared(name: &str) -> Option<PathBuf> {
     None
 }
 
+/// Copies the model at `from` to the new folder `to`, but that nothing deforms its colours.
+pub(crate) fn without_sh_head(from: &Path, to: &Path) {
+    for (name, bytes) in files(from) {
+        let path = to.join(&name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        match name.to_str().unwrap() {
+            "cfg_args" => {
+                let text = String::from_utf8(bytes).unwrap();
+                assert!(text.contains("no_dshs=False"));
+                fs::write(path, text.replace("no_dshs=False", "no_dshs=True")).unwrap();
+            }
+            _ if from.join(&name).is_dir() => fs::create_dir_all(path).unwrap(),
+            _ => fs::write(path, bytes).unwrap(),
+        }
+    }
+}
+
 /// The scene of a model folder that holds its cameras, all pictures.
 pub(crate) fn scene(model: &Path) -> Scene {
     let options = InputOptions { path: model.to_owned(), cameras: Some(model.to_owned()), ..InputOptions::default() };
