@@ -5,8 +5,10 @@
 
 Standard library only. Where PyTorch or plyfile is installed, the loader's own calls are tried as well; where not, that
 is said. Checked, in the terms of the original loader (`GaussianModel.load_ply`, `load_model`):
-  - cfg_args is the original's, byte for byte
-  - the point cloud has the original's properties: names, order, types; as many f_rest as the SH degree asks
+  - cfg_args is the original's, byte for byte, or but for a lower sh_degree
+  - the point cloud has the original's properties: names, order, types; as many f_rest as that SH degree asks, and in rows
+    that nothing else was changed of the original's coefficients of every channel
+  - a lower SH degree is that of a model whose colours no head deforms
   - every value is finite and the count is not larger than the original's
   - deformation.pth holds the original's tensors: names and shapes, so that it loads strictly into a network made by
     cfg_args, which copies half precision into its own parameters; values are finite and, but for rows of time planes
@@ -17,6 +19,7 @@ Exits 1 at the first thing that does not hold; prints the bytes of the folder by
 """
 
 import array
+import ast
 import collections
 import itertools
 import math
@@ -51,8 +54,75 @@ def iteration_folder(model):
     return max(folders, key=lambda f: int(f.name.split("_")[1]))
 
 
+def read_config(path):
+    """Arguments of the Namespace that the loader evaluates, by name, and the SH degree among them."""
+    try:
+        call = ast.parse(path.read_text().strip(), mode="eval").body
+        keys = {key.arg: key.value for key in call.keywords}
+        degree = ast.literal_eval(keys["sh_degree"]) if "sh_degree" in keys else 3
+    except (SyntaxError, AttributeError, ValueError) as error:
+        fail(f"{path}: the loader cannot evaluate it: {error}")
+    return {name: ast.dump(value) for name, value in keys.items() if name != "sh_degree"}, degree
+
+
+def check_config(before, after):
+    """The cfg_args at `after` against that at `before`; gives the SH degrees of both."""
+    (keys_before, degree_before), (keys, degree) = read_config(before), read_config(after)
+    if degree == degree_before:
+        hold(after.read_bytes() == before.read_bytes(), "cfg_args is unchanged")
+        return degree_before, degree
+    hold(keys == keys_before, "cfg_args is unchanged but for sh_degree")
+    hold(degree in range(degree_before), f"SH degree {degree} of {degree_before}")
+    hold(keys.get("no_dshs") in (None, ast.dump(ast.parse("True").body[0].value)), "no SH head deforms colours")
+    return degree_before, degree
+
+
+def rest_of(degree):
+    """Number of f_rest that `load_ply` asserts."""
+    return 3 * (degree + 1) ** 2 - 3
+
+
+def without_bands(names, degree_before, degree):
+    """What is left of the names of properties at a lower SH degree: pairs of the name then and the name before."""
+    had, left = rest_of(degree_before) // 3, rest_of(degree) // 3
+    pairs = []
+    for name in names:
+        if not name.startswith("f_rest_"):
+            pairs.append((name, name))
+            continue
+        # Of one channel after the other.
+        channel, coefficient = divmod(int(name[len("f_rest_"):]), max(had, 1))
+        if coefficient < left:
+            pairs.append((f"f_rest_{channel * left + coefficient}", name))
+    return pairs
+
+
+def check_cloud(before, after, degree_before, degree):
+    """The point cloud at `after` against that at `before`; gives its properties and rows."""
+    properties_before, rows_before = read_ply(before)
+    properties, rows = read_ply(after)
+    names_before, names = ([name for _, name in of] for of in (properties_before, properties))
+    pairs = without_bands(names_before, degree_before, degree)
+    kinds = dict((name, kind) for kind, name in properties_before)
+    expected = [(kinds[was], name) for name, was in pairs]
+    rest = [name for name in names if name.startswith("f_rest_")]
+    hold(len(rest) == rest_of(degree), f"{len(rest)} f_rest for SH degree {degree}")
+    hold(properties == expected, f"{len(properties)} properties with the original's names, order and types")
+    hold(0 < len(rows) <= len(rows_before), f"{len(rows)} of {len(rows_before)} Gaussians")
+    hold(all(math.isfinite(x) for row in rows for x in row), "every value is finite")
+    own = [place for place, name in enumerate(names) if name not in rest]
+    own_before = [names_before.index(names[place]) for place in own]
+    kept = [names_before.index(was) for _, was in pairs]
+    found = collections.defaultdict(list)
+    for row in rows_before:
+        found[tuple(row[place] for place in own_before)].append(tuple(row[place] for place in kept))
+    same = [(row, found[key]) for row in rows for key in [tuple(row[place] for place in own)] if key in found]
+    hold(all(row in of for row, of in same), f"{len(same)} rows that nothing was changed of have the original's f_rest")
+    return properties, rows
+
+
 def read_ply(path):
-    """Properties, number of rows, and whether every value is finite."""
+    """Properties and rows."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     lines = data[:end].decode("ascii").splitlines()
@@ -64,8 +134,7 @@ def read_ply(path):
     row = struct.Struct("<" + "".join(codes[kind] for kind, _ in properties))
     if len(data) - end != count * row.size:
         fail(f"{path}: header says {count} vertices, the body has {(len(data) - end) / row.size}")
-    finite = all(all(map(math.isfinite, values)) for values in row.iter_unpack(memoryview(data)[end:]))
-    return properties, count, finite
+    return properties, list(row.iter_unpack(memoryview(data)[end:]))
 
 
 class Tensor:
@@ -184,6 +253,20 @@ def check_with_torch(torch, folder, tensors, values, count):
             print(f"ok: {name} is absent, as the loader accepts")
 
 
+def check_features_with_torch(torch, properties, rows, degree):
+    """What `load_ply` makes of colours."""
+    names = [name for _, name in properties]
+
+    def values(prefix):
+        found = sorted((name for name in names if name.startswith(prefix)), key=lambda name: int(name.split("_")[-1]))
+        return torch.tensor([[row[names.index(name)] for name in found] for row in rows])
+
+    rest = values("f_rest_").reshape((len(rows), 3, (degree + 1) ** 2 - 1)).transpose(1, 2)
+    features = torch.cat((values("f_dc_").reshape((len(rows), 1, 3)), rest), dim=1)
+    shape = (len(rows), (degree + 1) ** 2, 3)
+    hold(tuple(features.shape) == shape, f"colours of PyTorch are {list(shape)}")
+
+
 def parts(model, folder):
     """Bytes of what the renderer opens, by part."""
     return [path.stat().st_size for path in (folder / "point_cloud.ply", folder / "deformation.pth", model / "cfg_args")]
@@ -194,20 +277,10 @@ def main():
         print(__doc__)
         sys.exit(2)
     original, compressed = Path(sys.argv[1]), Path(sys.argv[2])
-    config = (original / "cfg_args").read_text()
-    hold((compressed / "cfg_args").read_text() == config, "cfg_args is unchanged")
-    degree = int(re.search(r"sh_degree=(\d+)", config).group(1)) if "sh_degree=" in config else 3
-
+    degree_before, degree = check_config(original / "cfg_args", compressed / "cfg_args")
     before, after = iteration_folder(original), iteration_folder(compressed)
     hold(before.name == after.name, f"{after.name} is the iteration the loader picks")
-    properties, count_before, _ = read_ply(before / "point_cloud.ply")
-    properties_after, count, finite = read_ply(after / "point_cloud.ply")
-    hold(properties_after == properties, f"{len(properties)} properties with the original's names, order and types")
-    rest = [name for _, name in properties if name.startswith("f_rest_")]
-    hold(len(rest) == 3 * (degree + 1) ** 2 - 3, f"{len(rest)} f_rest for SH degree {degree}")
-    hold(0 < count <= count_before, f"{count} of {count_before} Gaussians")
-    hold(finite, "every value is finite")
-
+    properties, rows = check_cloud(before / "point_cloud.ply", after / "point_cloud.ply", degree_before, degree)
     tensors, values = check_field(before / "deformation.pth", after / "deformation.pth")
     try:
         import torch
@@ -216,7 +289,8 @@ def main():
         tables = ["deformation_table.pth", "deformation_accum.pth"]
         hold(not any((after / name).exists() for name in tables), "no per-Gaussian tables to disagree with")
     else:
-        check_with_torch(torch, after, tensors, values, count)
+        check_with_torch(torch, after, tensors, values, len(rows))
+        check_features_with_torch(torch, properties, rows, degree)
     try:
         from plyfile import PlyData
     except ImportError:

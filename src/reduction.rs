@@ -1,6 +1,6 @@
 //! What is left of an input: which Gaussians stay, which of them stand for several, and what was changed of them.
 
-use crate::model::{Column, Columns, Gaussians};
+use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians};
 use crate::recipe::{Merge, Precision};
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
@@ -112,14 +112,24 @@ pub struct Reduction {
     pub change: Change,
     /// How the field that deforms them is written, where there is one.
     pub field: Precision,
+    /// Degree of the harmonics that stay of them; those above go, if there are any.
+    pub sh_degree: usize,
 }
 
 impl Reduction {
-    /// The Gaussians `kept` (increasing) as they are, with their field. Nothing is merged, so that nothing goes by
-    /// `rule`.
+    /// The Gaussians `kept` (increasing) as they are, with their field and all of their harmonics. Nothing is merged, so
+    /// that nothing goes by `rule`.
     pub fn pruned(kept: Vec<u32>, rule: &Merge) -> Self {
         let (clusters, proxies, change) = (Vec::new(), Proxies::default(), Change::default());
-        Reduction { kept, clusters, rule: rule.clone(), proxies, change, field: Precision::Exact }
+        Reduction {
+            kept,
+            clusters,
+            rule: rule.clone(),
+            proxies,
+            change,
+            field: Precision::Exact,
+            sh_degree: ALL_HARMONICS,
+        }
     }
 
     /// Number of Gaussians in the output.
@@ -139,7 +149,8 @@ impl Reduction {
     pub fn pick(&self, places: &[u32]) -> Reduction {
         assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
         let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
-        Reduction { change: self.change.pick(places), field: self.field, ..Reduction::pruned(kept, &self.rule) }
+        let (change, field, sh_degree) = (self.change.pick(places), self.field, self.sh_degree);
+        Reduction { change, field, sh_degree, ..Reduction::pruned(kept, &self.rule) }
     }
 
     /// For every Gaussian of an input of `count` its place in the output, if it has one.

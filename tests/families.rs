@@ -5,11 +5,11 @@ mod scene;
 
 use std::path::Path;
 
-use scene::{Workplace, state, tiny};
+use scene::{Workplace, state, tiny, without_sh_head};
 use splatsieve::emit::kind::OutputKind;
 use splatsieve::families::{self, Family, OpenOptions};
 use splatsieve::limits::Limits;
-use splatsieve::model::{Columns, Gaussians};
+use splatsieve::model::{ALL_HARMONICS, Columns, Gaussians};
 use splatsieve::recipe::{Precision, Recipe};
 use splatsieve::reduction::{Change, Cluster, Reduction, Reference};
 
@@ -70,8 +70,10 @@ fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_change
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 300 --frames 3 -o demo");
     workplace.done("unpack demo/scene.gseq -o frames");
+    without_sh_head(&tiny(), &workplace.path("free"));
     for (path, kinds) in [
         (tiny(), [OutputKind::Model, OutputKind::Gseq]),
+        (workplace.path("free"), [OutputKind::Model, OutputKind::Gseq]),
         (workplace.path("frames"), [OutputKind::PlySequence, OutputKind::Gseq]),
         (workplace.path("demo/scene.gseq"), [OutputKind::PlySequence, OutputKind::Gseq]),
     ] {
@@ -95,6 +97,16 @@ fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_change
                 let [reduced, written] = both(&workplace, &*input, &reduction, kind);
                 assert!(input.can_round_field().unwrap() && reduced != exact, "nothing was rounded");
                 assert!(reduced == written, "a field in half precision differs from what was promised");
+                reduction.field = Precision::Exact;
+            }
+            if input.needs_all_bands().is_none() {
+                for sh_degree in 0..input.source().info().sh_degree {
+                    reduction.sh_degree = sh_degree;
+                    let [reduced, written] = both(&workplace, &*input, &reduction, kind);
+                    assert!(reduced == written, "{}, {kind:?}: degree {sh_degree}", path.display());
+                    assert_eq!(written[0].sh_degree(), sh_degree);
+                }
+                reduction.sh_degree = ALL_HARMONICS;
             }
         }
     }

@@ -23,7 +23,7 @@ use crate::stream::{Batch, Progress, Subject, show, spread};
 /// What the stage is called.
 const NAME: &str = "field";
 /// Scoring pictures that are compared.
-const PICTURES: usize = 12;
+pub(super) const PICTURES: usize = 12;
 
 /// The precision of a result's field.
 #[derive(Debug, Clone)]
@@ -92,7 +92,7 @@ impl Field {
             false => Some(closeness(scene, [scene.source(), &*exact], &pictures)?),
         };
         drop((exact, half));
-        let least = result.map_or(CLOSE_ENOUGH, |result| CLOSE_ENOUGH.min(result + self.margin));
+        let least = result.map_or(CLOSE_ENOUGH, |result| least(result, self.margin));
         let found = FieldSummary { pictures: pictures.len(), rounding, result, least, half: rounding >= least };
         let fits = found.half;
         if !fits {
@@ -101,6 +101,12 @@ impl Field {
         journal.field = Some(found);
         Ok(if fits { halved } else { reduction })
     }
+}
+
+/// How close to pictures of a result those of a coarser one are to be, dB, so that next to nothing is lost: `margin` closer
+/// than the result's are to the original's (`result`).
+pub(super) fn least(result: f64, margin: f64) -> f64 {
+    CLOSE_ENOUGH.min(result + margin)
 }
 
 /// Mean PSNR between two sources over `pictures`, dB.

@@ -1,6 +1,7 @@
 //! What a run does: which stages, with which parameters, and what is left out and why. Made once, before any work.
 
 use super::archive::{Archive, LEFT_BY_SEARCH};
+use super::bands::Bands;
 use super::choose::Choose;
 use super::emit::Emit;
 use super::field::Field;
@@ -37,7 +38,9 @@ pub struct Job {
     pub refine: Option<Refine>,
     /// Rounds the field of what is left.
     pub field: Option<Field>,
-    /// Finds the size, instead of the five before it.
+    /// Drops bands of spherical harmonics that nobody sees.
+    pub bands: Option<Bands>,
+    /// Finds the size, instead of the six before it.
     pub search: Option<Search>,
     /// Says on which grids an archive's values lie.
     pub archive: Option<Archive>,
@@ -157,6 +160,7 @@ impl Job {
             || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
         let emit = Emit::new(request, outlook.own_output, merges);
         let field = Field::of(request, emit.kind);
+        let bands = Bands::of(request, emit.kind);
         Ok(Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             prune: Prune { prunes, merges, target },
@@ -165,12 +169,14 @@ impl Job {
             search: match &goal {
                 Some(Goal::Quality(quality)) => {
                     let (quality, rule) = (quality.clone(), recipe.merge.clone());
-                    Some(Search { quality, refine: refine.clone(), field: field.clone(), rule })
+                    let (refine, field, bands) = (refine.clone(), field.clone(), bands.clone());
+                    Some(Search { quality, refine, field, bands, rule })
                 }
                 _ => None,
             },
             refine: refine.filter(|_| !searches),
             field: field.filter(|_| !searches),
+            bands: bands.filter(|_| !searches),
             archive: is_archive.then_some(Archive { psnr: request.archive_psnr }),
             emit,
             measure,
@@ -237,6 +243,7 @@ impl Stages for Job {
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.bands.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.archive.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits));

@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use super::summary::{FieldSummary, LeftOut, Stage};
+use super::summary::{BandsSummary, FieldSummary, LeftOut, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::emit::atomic::Spill;
 use crate::error::Result;
@@ -22,6 +22,8 @@ pub struct Journal {
     pub notes: Vec<String>,
     /// What was found about the field's precision.
     pub field: Option<FieldSummary>,
+    /// What was found about the bands of spherical harmonics.
+    pub bands: Option<BandsSummary>,
 }
 
 impl Journal {

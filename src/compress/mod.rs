@@ -3,6 +3,7 @@
 
 pub mod archive;
 mod arrival;
+mod bands;
 mod choose;
 pub mod emit;
 mod field;
@@ -189,6 +190,7 @@ fn reduce(
         merge,
         goal,
         field: journal.field,
+        bands: journal.bands,
         archive,
         left_out: journal.left_out,
         notes: journal.notes,
@@ -240,6 +242,9 @@ fn of_size(
     }
     if let Some(field) = &job.field {
         outcome.reduction = field.run(scene, outcome.reduction, journal)?;
+    }
+    if let Some(bands) = &job.bands {
+        outcome.reduction = bands.run(scene, outcome.reduction, journal)?;
     }
     // An archive of any of them fits on some grids.
     if let Some(Goal::Bytes(most)) = request.goal.as_ref().filter(|_| job.archive.is_none()) {

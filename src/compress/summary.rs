@@ -174,7 +174,7 @@ pub struct TermSummary {
     pub active: bool,
 }
 
-/// Sizes with a number each.
+/// Sizes or degrees with a number each.
 fn sizes<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<Vec<(usize, f64)>, D::Error> {
     let found = Vec::<(usize, Option<f64>)>::deserialize(from)?;
     Ok(found.into_iter().map(|(size, of)| (size, of.unwrap_or(f64::NAN))).collect())
@@ -249,6 +249,38 @@ impl FieldSummary {
     }
 }
 
+/// What pictures of the result say of its bands of spherical harmonics.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BandsSummary {
+    /// SH degree of the output.
+    pub sh_degree: usize,
+    /// Pictures that were compared.
+    pub pictures: usize,
+    /// Every lower degree, and the mean PSNR of pictures with it against those with all bands, dB.
+    #[serde(deserialize_with = "sizes")]
+    pub tried: Vec<(usize, f64)>,
+    /// Mean PSNR of pictures with all bands against the original's, dB.
+    #[serde(deserialize_with = "number")]
+    pub result: f64,
+    /// What a degree was to have at least, dB.
+    #[serde(deserialize_with = "number")]
+    pub least: f64,
+}
+
+impl BandsSummary {
+    /// Why bands went, or stayed.
+    pub(super) fn why(&self) -> String {
+        let BandsSummary { pictures, tried, result, least, .. } = self;
+        let of = |(degree, apart): &(usize, f64)| format!("{apart:.1} dB at degree {degree}");
+        let tried: Vec<String> = tried.iter().map(of).collect();
+        format!(
+            "{pictures} pictures are {} from those with all bands, {result:.1} dB from the original's to these; at least \
+             {least:.1} dB were asked for",
+            tried.join(", ")
+        )
+    }
+}
+
 /// Version of the schema: grows when a field changes its meaning or goes.
 pub const SCHEMA: u32 = 3;
 
@@ -288,6 +320,9 @@ pub struct Summary {
     /// What half precision does to the field that is written; none where it was not asked for.
     #[serde(default)]
     pub field: Option<FieldSummary>,
+    /// What fewer bands of spherical harmonics do; none where they were not asked for or cannot be.
+    #[serde(default)]
+    pub bands: Option<BandsSummary>,
     /// What an archive is made of, if one was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub archive: Option<ArchiveSummary>,
@@ -349,6 +384,9 @@ impl Summary {
         }
         if let Some(field) = self.field.as_ref().filter(|field| field.half) {
             let _ = writeln!(out, "field: in half precision: {}", field.why());
+        }
+        if let Some(bands) = self.bands.as_ref().filter(|bands| bands.sh_degree < input.sh_degree) {
+            let _ = writeln!(out, "bands: SH degree {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why());
         }
         for left in &self.left_out {
             let _ = writeln!(out, "  left out: {} ({})", left.what, left.why);

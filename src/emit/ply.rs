@@ -9,7 +9,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use crate::error::{Error, Result};
-use crate::ingest::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, read_plane};
+use crate::ingest::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, name_without_bands, read_plane};
 use crate::model::{Columns, Gaussians, sh_coefficients};
 use crate::reduction::{Change, Reduction};
 
@@ -32,10 +32,11 @@ pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
 }
 
 /// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):
-/// only the count changes. A row without a proxy is the template's, byte for byte but for what
-/// `change`, by row, adds to it (zeros leave the bytes). A row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of its
-/// property (integers: nearest, saturated); normals and further properties stay the leader's. A
-/// template without `scale_2` has no place for a proxy's third scale: order axes largest first.
+/// only the count changes, and harmonics above `sh_degree` go, so that `f_rest_*` are numbered anew. What stays of a row
+/// without a proxy is the template's, byte for byte but for what `change`, by row, adds to it (zeros leave the bytes). A
+/// row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of
+/// its property (integers: nearest, saturated); normals and further properties stay the leader's. A template without
+/// `scale_2` has no place for a proxy's third scale: order axes largest first.
 ///
 /// Further elements and bytes after the last one are copied. A text template becomes little-endian
 /// binary; otherwise all rows in order without proxies give the template's own bytes.
@@ -43,11 +44,27 @@ pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
 /// # Errors
 /// A source or proxy that does not exist; proxies of another SH degree; changes of other rows; a template cut short since
 /// it was opened; a failed write.
-pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change, path: &Path) -> Result<()> {
+pub fn write_like(
+    template: &Ply,
+    rows: &[OutRow],
+    proxies: &Gaussians,
+    change: &Change,
+    sh_degree: usize,
+    path: &Path,
+) -> Result<()> {
     check_rows(template, rows, proxies, change)?;
     template.check_unshrunk()?;
+    let name = |name: &str| name_without_bands(name, template.sh_degree(), sh_degree);
+    let mut left: Vec<Range<usize>> = Vec::new();
+    for property in template.properties().iter().filter(|property| name(&property.name).is_some()) {
+        let end = property.offset + property.scalar.bytes();
+        match left.last_mut() {
+            Some(last) if last.end == property.offset => last.end = end,
+            _ => left.push(property.offset..end),
+        }
+    }
     create(path, |out| {
-        out.write_all(&template.header().text_for(rows.len()))?;
+        out.write_all(&template.header().text_for(rows.len(), name))?;
         out.write_all(template.lead())?;
         let mut changed = Vec::new();
         for (place, row) in rows.iter().enumerate() {
@@ -59,7 +76,7 @@ pub fn write_like(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: 
                 replace(&mut changed, template.layout(), big_endian, proxies, proxy as usize);
             }
             add(&mut changed, template, change, place);
-            out.write_all(&changed)?;
+            left.iter().try_for_each(|range| out.write_all(&changed[range.clone()]))?;
         }
         out.write_all(template.tail())
     })

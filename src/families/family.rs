@@ -133,6 +133,11 @@ pub trait Family: Send + Sync {
         Ok(false)
     }
 
+    /// Why harmonics of every degree have to stay, if they have to.
+    fn needs_all_bands(&self) -> Option<&'static str> {
+        None
+    }
+
     /// What an archive of what `reduction` leaves holds.
     ///
     /// # Errors

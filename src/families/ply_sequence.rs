@@ -100,7 +100,7 @@ impl Family for PlySequence {
     }
 
     fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
-        let (count, degree) = (content.cloud.len(), self.info().sh_degree);
+        let (count, degree) = (content.cloud.len(), content.cloud.sh_degree());
         let mut frames = HeldFrames::new(count, degree, Columns::empty(), content.cloud.clone());
         self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));
         Ok(Box::new(frames))
@@ -129,7 +129,7 @@ fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, 
             (OutputKind::PlySequence, Some(name)) => path.join(name),
             _ => path.to_owned(),
         };
-        write_like(&template, &rows, &proxies, &reduction.change, &target)?;
+        write_like(&template, &rows, &proxies, &reduction.change, reduction.sh_degree, &target)?;
         progress.advance(1);
         Ok(())
     };

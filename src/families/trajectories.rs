@@ -38,12 +38,12 @@ pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a Reduction) 
     MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
 }
 
-/// What is left of `source`, merged and changed.
+/// What is left of `source`, merged and changed, with what stays of its harmonics.
 pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a Reduction,
 ) -> Box<dyn FrameSource + 'a> {
-    Box::new(Changed::new(Box::new(merged(source, reduction)), &reduction.change))
+    Box::new(Changed::new(Box::new(merged(source, reduction)), &reduction.change, reduction.sh_degree))
 }
 
 /// Confirms that a sequence of so many frames can be written as `kind`.
@@ -80,8 +80,8 @@ pub(super) fn write_trajectories(
 fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, most: usize) -> Result<()> {
     let merged = merged(source, reduction);
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
-    let compression = Compression::Zstd(LEVEL);
-    let mut writer = ContainerWriter::create(path, *count, *sh_degree, FRAME_BLOCK, compression, BTreeMap::new())?;
+    let (compression, left) = (Compression::Zstd(LEVEL), reduction.sh_degree.min(*sh_degree));
+    let mut writer = ContainerWriter::create(path, *count, left, FRAME_BLOCK, compression, BTreeMap::new())?;
     let progress = Progress::new("emit", "Gaussian frames", (count * times.len()) as u64);
     let parts = parts(&merged, most);
     for start in (0..times.len()).step_by(FRAME_BLOCK) {
@@ -102,7 +102,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
             drop(frames);
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
             let change = reduction.change.pick(&places);
-            let held = Changed::new(Box::new(held), &change);
+            let held = Changed::new(Box::new(held), &change, reduction.sh_degree);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }

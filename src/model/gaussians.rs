@@ -49,6 +49,12 @@ impl Column {
         self.data.resize(self.width * len, 0.0);
     }
 
+    /// Leaves the first `width` components, of more.
+    fn narrow(&mut self, width: usize) {
+        self.width = width;
+        self.data.truncate(width * self.len);
+    }
+
     /// Component `c` of every Gaussian.
     pub fn plane(&self, c: usize) -> &[f32] {
         &self.data[c * self.len..(c + 1) * self.len]
@@ -131,6 +137,11 @@ impl Gaussians {
     /// Degree of the spherical harmonics.
     pub fn sh_degree(&self) -> usize {
         (self.sh.width() / 3).isqrt().saturating_sub(1)
+    }
+
+    /// Drops harmonics above degree `sh_degree`.
+    pub fn drop_bands(&mut self, sh_degree: usize) {
+        self.sh.narrow(3 * sh_coefficients(sh_degree.min(self.sh_degree())));
     }
 
     /// Makes room for `len` Gaussians; the values are unspecified until written.

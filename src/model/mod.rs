@@ -25,6 +25,9 @@ pub const fn sh_coefficients(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 
+/// A degree that no harmonics reach: all of them.
+pub const ALL_HARMONICS: usize = usize::MAX;
+
 /// What is known of a sequence before any frame is read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SequenceInfo {

@@ -48,6 +48,8 @@ pub struct Recipe {
     pub refine: Refine,
     /// What deforms it.
     pub field: Field,
+    /// How its colours change with direction.
+    pub bands: Bands,
 }
 
 /// Parameters of the pass over all frames.
@@ -201,6 +203,25 @@ pub struct Refine {
 pub struct Field {
     pub field: Precision,
     pub field_margin: f64,
+}
+
+/// Parameters of the bands of spherical harmonics that are written.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
+pub struct Bands {
+    pub bands: WhichBands,
+    pub bands_margin: f64,
+}
+
+/// Which bands of spherical harmonics are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WhichBands {
+    /// Those that there are.
+    All,
+    /// No more than pictures need.
+    Needed,
 }
 
 /// How a deformation field is written.
@@ -403,6 +424,7 @@ impl Recipe {
             ("merge.max_drift", max_drift, nonnegative(max_drift), "0 or more"),
             ("merge.max_dead_time", max_dead_time, nonnegative(max_dead_time), "0 or more"),
             ("field.field_margin", self.field.field_margin, finite(self.field.field_margin), "finite, 0 or more"),
+            ("bands.bands_margin", self.bands.bands_margin, finite(self.bands.bands_margin), "finite, 0 or more"),
             (
                 "merge.max_neighbors",
                 self.merge.max_neighbors as f64,

@@ -1,7 +1,7 @@
-//! A sequence with its Gaussians changed, frame by frame as it is read.
+//! A sequence with its Gaussians changed, or without the last of their harmonics, frame by frame as it is read.
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::model::{Column, Columns, Gaussians, SequenceInfo};
 use crate::reduction::Change;
 use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
 
@@ -9,35 +9,51 @@ use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
 pub struct Changed<'a> {
     source: Box<dyn FrameSource + 'a>,
     change: &'a Change,
+    info: SequenceInfo,
 }
 
 impl<'a> Changed<'a> {
-    /// `source` with `change` added to its Gaussians; an empty one: the source as it is.
-    pub fn new(source: Box<dyn FrameSource + 'a>, change: &'a Change) -> Self {
-        Changed { source, change }
+    /// `source` with `change` added to its Gaussians, and of their harmonics those up to `sh_degree`; nothing to add and
+    /// none above: the source as it is.
+    pub fn new(source: Box<dyn FrameSource + 'a>, change: &'a Change, sh_degree: usize) -> Self {
+        let mut info = source.info().clone();
+        info.sh_degree = info.sh_degree.min(sh_degree);
+        Changed { source, change, info }
+    }
+
+    fn is_plain(&self) -> bool {
+        self.change.is_empty() && self.drops().is_none()
+    }
+
+    /// Room for all harmonics, where some of them go.
+    fn drops(&self) -> Option<Column> {
+        let degree = self.source.info().sh_degree;
+        (degree > self.info.sh_degree).then(|| Gaussians::zeros(0, degree).sh)
     }
 }
 
 impl FrameSource for Changed<'_> {
     fn info(&self) -> &SequenceInfo {
-        self.source.info()
+        &self.info
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        if self.change.is_empty() {
+        if self.is_plain() {
             return self.source.open(ids);
         }
         let places: Vec<u32> = ids.iter().map(|id| id as u32).collect();
-        Ok(Box::new(ChangedReader { reader: self.source.open(ids)?, change: self.change.pick(&places) }))
+        let change = self.change.pick(&places);
+        Ok(Box::new(ChangedReader { reader: self.source.open(ids)?, change, all_sh: self.drops() }))
     }
 
     fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
         let opened = self.source.open_all(wanted)?;
-        if self.change.is_empty() {
+        if self.is_plain() {
             return Some(opened);
         }
-        let changed =
-            |reader| -> Box<dyn BlockReader + '_> { Box::new(ChangedReader { reader, change: self.change.clone() }) };
+        let changed = |reader| -> Box<dyn BlockReader + '_> {
+            Box::new(ChangedReader { reader, change: self.change.clone(), all_sh: self.drops() })
+        };
         Some(opened.map(changed))
     }
 
@@ -49,11 +65,24 @@ impl FrameSource for Changed<'_> {
 struct ChangedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     change: Change,
+    /// Where harmonics are read into, of which some go.
+    all_sh: Option<Column>,
 }
 
 impl BlockReader for ChangedReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        self.reader.read(frame, want, out)?;
+        match self.all_sh.as_mut().filter(|_| want.contains(Columns::SH)) {
+            None => self.reader.read(frame, want, out)?,
+            Some(all) => {
+                std::mem::swap(&mut out.sh, all);
+                let read = self.reader.read(frame, want, out);
+                std::mem::swap(&mut out.sh, all);
+                read?;
+                out.sh.resize(all.len());
+                let left = out.sh.planes().len();
+                out.sh.planes_mut().copy_from_slice(&all.planes()[..left]);
+            }
+        }
         self.change.add_to(out, want);
         Ok(())
     }
@@ -67,6 +96,7 @@ impl BlockReader for ChangedReader<'_> {
 mod tests {
     use super::*;
     use crate::demo::Scene;
+    use crate::model::ALL_HARMONICS;
 
     #[test]
     fn any_block_of_ids_gets_the_changes_of_its_own_gaussians_in_any_column() {
@@ -79,7 +109,7 @@ mod tests {
             by.sh.set_row(i, [0.125 * i as f32; 3]);
         }
         let change = Change(by);
-        let changed = Changed::new(Box::new(Scene::new(40, 3)), &change);
+        let changed = Changed::new(Box::new(Scene::new(40, 3)), &change, ALL_HARMONICS);
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
                 let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
@@ -95,9 +125,20 @@ mod tests {
             }
             assert!(got == expected, "{ids:?}");
         }
+        for ids in [Ids::List(&[39, 5, 0]), Ids::Range(0..40)] {
+            // Without the first band too, whose changes go with it.
+            let fewer = Changed::new(Box::new(Scene::new(40, 3)), &change, 0);
+            assert_eq!((fewer.info().sh_degree, plain.info().sh_degree), (0, 1));
+            let mut expected = Gaussians::zeros(ids.len(), 1);
+            changed.open(ids.clone()).unwrap().read(1, Columns::all(), &mut expected).unwrap();
+            expected.drop_bands(0);
+            let mut got = Gaussians::zeros(0, 0);
+            fewer.open(ids.clone()).unwrap().read(1, Columns::all(), &mut got).unwrap();
+            assert!(got == expected, "{ids:?}");
+        }
         let none = Change::default();
         let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
-        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none);
+        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, ALL_HARMONICS);
         unchanged.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut untouched).unwrap();
         let mut expected = untouched.clone();
         plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut expected).unwrap();

@@ -5,7 +5,7 @@ use super::baseline::Baseline;
 use crate::compress::Only;
 use crate::error::{Error, Result};
 use crate::model::Columns;
-use crate::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm};
+use crate::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm, WhichBands};
 
 /// A way to make a model smaller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,6 +82,7 @@ impl Method {
             let mut recipe = unrefined()?;
             // Pruning and nothing else.
             recipe.field.field = Precision::Exact;
+            recipe.bands.bands = WhichBands::All;
             recipe.scan.coverage = coverage;
             recipe.score.static_term = StaticTerm::Mean;
             // S = C without clipping, so that no two Gaussians tie that differ in C.

@@ -32,6 +32,23 @@ pub(crate) fn shared(name: &str) -> Option<PathBuf> {
     None
 }
 
+/// Copies the model at `from` to the new folder `to`, but that nothing deforms its colours.
+pub(crate) fn without_sh_head(from: &Path, to: &Path) {
+    for (name, bytes) in files(from) {
+        let path = to.join(&name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        match name.to_str().unwrap() {
+            "cfg_args" => {
+                let text = String::from_utf8(bytes).unwrap();
+                assert!(text.contains("no_dshs=False"));
+                fs::write(path, text.replace("no_dshs=False", "no_dshs=True")).unwrap();
+            }
+            _ if from.join(&name).is_dir() => fs::create_dir_all(path).unwrap(),
+            _ => fs::write(path, bytes).unwrap(),
+        }
+    }
+}
+
 /// The scene of a model folder that holds its cameras, all pictures.
 pub(crate) fn scene(model: &Path) -> Scene {
     let options = InputOptions { path: model.to_owned(), cameras: Some(model.to_owned()), ..InputOptions::default() };
@@ -205,12 +222,13 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
 /// A preset that scores by projected coverage and leaves nothing to renders: what the formulas decide alone.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
     use splatsieve::model::Columns;
-    use splatsieve::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm};
+    use splatsieve::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm, WhichBands};
     let mut recipe = Recipe::preset(preset).unwrap();
     recipe.scan.coverage = Coverage::Projected;
     recipe.score.static_term = StaticTerm::Mean;
     recipe.select.choose_by_views = false;
     recipe.refine.refine = Groups(Columns::empty());
     recipe.field.field = Precision::Exact;
+    recipe.bands.bands = WhichBands::All;
     recipe
 }

@@ -19,7 +19,7 @@ use super::score::{Scored, scored};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::model::Columns;
+use crate::model::{ALL_HARMONICS, Columns};
 use crate::recipe;
 use crate::reduction::{Change, Reduction};
 use crate::refine::{self, Schedule};
@@ -49,8 +49,6 @@ pub(super) const CUT: f64 = 0.8;
 const RANKED_ON: usize = 48;
 /// Pictures that tell how large steps after a cut should be.
 const LOOKED_AT: usize = 16;
-/// Degree that no harmonics reach.
-const ALL_HARMONICS: usize = usize::MAX;
 /// Rates of the last step, as a part of the first's: where a cut follows, and at the end.
 const LAST_RATE: [f32; 2] = [1.0, 0.05];
 

@@ -7,6 +7,7 @@
 
 mod gauge;
 
+use super::bands::Bands;
 use super::choose::CLUSTERED;
 use super::field::Field;
 use super::journal::Journal;
@@ -56,6 +57,8 @@ pub struct Search {
     pub refine: Option<Refine>,
     /// How its field is rounded.
     pub field: Option<Field>,
+    /// How bands of its harmonics are dropped.
+    pub bands: Option<Bands>,
     /// Merging does not take part.
     pub rule: recipe::Merge,
 }
@@ -144,7 +147,7 @@ impl Search {
             let (count, does) = (best.reduction.len(), self.spare(summary.searched) >= 0.0);
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
-            journal.field = best.journal.field;
+            (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             journal.notes.push(note(&summary, gauge.searched(), count, does));
             Ok(((best.reduction, summary), count))
         })
@@ -292,6 +295,9 @@ impl Way<'_> {
         };
         if let Some(field) = &self.search.field {
             reduction = field.round(self.scene, reduction, &mut journal)?;
+        }
+        if let Some(bands) = &self.search.bands {
+            reduction = bands.drop_some(self.scene, reduction, &mut journal)?;
         }
         let result = self.scene.input.reduced(&reduction)?;
         let value = self.search.value(self.gauge, &*result, self.scene, false)?;

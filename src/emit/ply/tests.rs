@@ -3,7 +3,7 @@ use std::path::PathBuf;
 
 use super::*;
 use crate::ingest::ply::tests::{file, names, shared_data};
-use crate::model::Column;
+use crate::model::{ALL_HARMONICS, Column};
 
 struct Scratch(tempfile::TempDir);
 
@@ -26,7 +26,7 @@ impl Scratch {
     }
 
     fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change) -> Vec<u8> {
-        write_like(template, rows, proxies, change, &self.path("out.ply")).unwrap();
+        write_like(template, rows, proxies, change, ALL_HARMONICS, &self.path("out.ply")).unwrap();
         fs::read(self.path("out.ply")).unwrap()
     }
 }
@@ -171,6 +171,39 @@ fn a_change_adds_to_any_column_of_rows_and_proxies_and_zeros_leave_the_bytes() {
 }
 
 #[test]
+fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_has_them() {
+    let scratch = Scratch::new();
+    let whole = proxies(4, 3);
+    write_inria(&whole, &["of degree 3".to_owned()], &scratch.path("whole.ply")).unwrap();
+    let ply = Ply::open(&scratch.path("whole.ply")).unwrap();
+    for degree in 0..=4 {
+        let mut fewer = whole.clone();
+        fewer.drop_bands(degree);
+        assert_eq!(fewer.sh_degree(), degree.min(3));
+        let [expected, found] = ["expected.ply", "found.ply"].map(|name| scratch.path(name));
+        write_inria(&fewer, ply.comments(), &expected).unwrap();
+        write_like(&ply, &kept(0..4), &Gaussians::default(), &Change::default(), degree, &found).unwrap();
+        assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
+    }
+    // Proxies and changes have all of them; what is no attribute stays where it was.
+    let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
+    let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], Change(proxies(2, 1)));
+    let mut expected = all(&scratch.open(&scratch.write_changed(&ply, &rows, &proxies(1, 1), &change)));
+    let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
+    write_like(&ply, &rows, &proxies(1, 1), &change, 0, &scratch.path("out.ply")).unwrap();
+    let found = Ply::open(&scratch.path("out.ply")).unwrap();
+    expected.drop_bands(0);
+    assert!(all(&found) == expected);
+    let left: Vec<String> = names().into_iter().filter(|name| !name.starts_with("f_rest_")).collect();
+    assert_eq!(found.properties().iter().map(|property| property.name.clone()).collect::<Vec<_>>(), left);
+    let confidence = |ply: &Ply, row: usize| {
+        let at = ply.properties().iter().find(|property| property.name == "confidence").unwrap().offset;
+        ply.row(row)[at..at + 8].to_vec()
+    };
+    assert_eq!([0, 1].map(|row| confidence(&found, row)), [2, 1].map(|row| confidence(&ply, row)));
+}
+
+#[test]
 fn a_surfel_has_no_place_for_a_third_scale() {
     let scratch = Scratch::new();
     let names: Vec<String> = names().into_iter().filter(|name| name != "scale_2").collect();
@@ -188,13 +221,16 @@ fn rows_and_proxies_that_do_not_exist_are_refused() {
     let scratch = Scratch::new();
     let ply = scratch.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &Change::default(), &scratch.path("none.ply")).unwrap_err().to_string()
+        write_like(&ply, rows, proxies, &Change::default(), ALL_HARMONICS, &scratch.path("none.ply"))
+            .unwrap_err()
+            .to_string()
     };
     assert!(refusal(&kept([2]), &Gaussians::default()).contains("Gaussian 2 "));
     assert!(refusal(&[OutRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
     assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
     let short = Change(Gaussians::zeros(1, 1));
-    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, &scratch.path("none.ply"));
+    let path = scratch.path("none.ply");
+    let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, ALL_HARMONICS, &path);
     assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));
     assert!(!scratch.path("none.ply").exists());
 }

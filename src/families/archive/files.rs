@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::archive::Content;
 use crate::emit::ply::{beside, write_rows};
 use crate::error::{Error, Result};
-use crate::ingest::ply::{Header, Ply};
+use crate::ingest::ply::{Header, Ply, name_without_bands};
 
 /// Names of what an archive holds of a PLY beside its rows.
 pub(crate) const HEADER: &str = "ply.header";
@@ -23,7 +23,8 @@ pub(crate) const ITERATION: &str = "iteration";
 pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
     content.beside = beside(template, rows);
-    let header = template.header().text_for(content.cloud.len());
+    let name = |name: &str| name_without_bands(name, template.sh_degree(), content.cloud.sh_degree());
+    let header = template.header().text_for(content.cloud.len(), name);
     for (name, bytes) in [(HEADER, &header[..]), (LEAD, template.lead()), (TAIL, template.tail())] {
         content.files.insert(name.to_owned(), bytes.to_vec());
     }

@@ -175,6 +175,10 @@ impl Family for Archive {
         self.inner.can_round_field()
     }
 
+    fn needs_all_bands(&self) -> Option<&'static str> {
+        self.inner.needs_all_bands()
+    }
+
     fn content(&self, reduction: &Reduction) -> Result<Content> {
         self.inner.content(reduction)
     }

@@ -11,6 +11,9 @@ use super::python_literal::{Literal, parse_call};
 
 /// Larger than any namespace an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
+/// What is called in it.
+const NAME: &str = "Namespace";
+const SH_DEGREE: &str = "sh_degree";
 
 /// The hyper-parameters of a model, with the defaults of the original where `cfg_args` lacks a key.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,15 +62,7 @@ pub struct ModelConfig {
 impl ModelConfig {
     /// Reads the `cfg_args` file at `path`.
     pub fn read(path: &Path) -> Result<Self> {
-        let bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
-        if bytes > MAX_BYTES {
-            return Err(Error::input(path, "", format!("at most {MAX_BYTES} bytes"), format!("{bytes} bytes")));
-        }
-        let bytes = fs::read(path).map_err(Error::io("read", path))?;
-        let text = std::str::from_utf8(&bytes).map_err(|error| {
-            Error::input(path, format!("byte {}", error.valid_up_to()), "UTF-8 text", "a byte that is not")
-        })?;
-        Self::parse(text, path)
+        Self::parse(&read(path)?, path)
     }
 
     /// Parses the text of `cfg_args`; `path` is for error messages.
@@ -75,17 +70,17 @@ impl ModelConfig {
     /// Keys this program does not need may hold anything, written in any syntax that keeps its
     /// brackets and quotes balanced.
     pub fn parse(text: &str, path: &Path) -> Result<Self> {
-        let keys = parse_call(text, "Namespace").map_err(|error| error.in_file(path, text))?;
+        let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
         let get = |name: &'static str| {
             // Python would refuse a repeated keyword; of a hand-edited file take the last one.
             keys.iter()
                 .rev()
-                .find(|(key, _)| key == name)
-                .map_or(Key { name, value: &Literal::None, path }, |found| Key { name, value: &found.1, path })
+                .find(|key| key.name == name)
+                .map_or(Key { name, value: &Literal::None, path }, |found| Key { name, value: &found.value, path })
         };
         let planes = get("kplanes_config");
         let config = ModelConfig {
-            sh_degree: get("sh_degree").int(3)?,
+            sh_degree: get(SH_DEGREE).int(3)?,
             source_path: get("source_path").string()?,
             white_background: get("white_background").bool(false)?,
             net_width: get("net_width").int(64)?,
@@ -126,6 +121,34 @@ impl ModelConfig {
             apply_rotation: self.apply_rotation,
         }
     }
+}
+
+/// The text of the `cfg_args` file at `path`.
+pub(super) fn read(path: &Path) -> Result<String> {
+    let bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
+    if bytes > MAX_BYTES {
+        return Err(Error::input(path, "", format!("at most {MAX_BYTES} bytes"), format!("{bytes} bytes")));
+    }
+    let bytes = fs::read(path).map_err(Error::io("read", path))?;
+    String::from_utf8(bytes).map_err(|error| {
+        let valid = error.utf8_error().valid_up_to();
+        Error::input(path, format!("byte {valid}"), "UTF-8 text", "a byte that is not")
+    })
+}
+
+/// `text`, that of `path`, with harmonics of `degree`, and all other bytes as they were. Where it does not say the degree,
+/// that comes first.
+pub(super) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
+    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
+        Some(key) => (key.place.clone(), degree.to_string()),
+        None => {
+            let start = text.find('(').map_or(text.len(), |bracket| bracket + 1);
+            let separator = if keys.is_empty() { "" } else { ", " };
+            (start..start, format!("{SH_DEGREE}={degree}{separator}"))
+        }
+    };
+    Ok([&text[..place.start], &value, &text[place.end..]].concat())
 }
 
 /// One key and its value; `None` stands for a missing key too, and takes the default.
@@ -273,6 +296,24 @@ mod tests {
         assert_eq!(path(r#""it's""#), "it's");
         assert_eq!(path(r"'\x41\u00e9\U0001F600\n'"), "Aé😀\n");
         assert_eq!(path("'данные, (1)'"), "данные, (1)");
+    }
+
+    #[test]
+    fn another_degree_changes_no_other_byte() {
+        for (text, expected) in [
+            ("Namespace(sh_degree=3)", "Namespace(sh_degree=1)"),
+            (
+                "Namespace(a='sh_degree=3, (', b={'sh_degree': 3}, sh_degree = 3 , my_sh_degree=3)\n",
+                "Namespace(a='sh_degree=3, (', b={'sh_degree': 3}, sh_degree = 1 , my_sh_degree=3)\n",
+            ),
+            (" Namespace (net_width=64)", " Namespace (sh_degree=1, net_width=64)"),
+            ("Namespace()", "Namespace(sh_degree=1)"),
+        ] {
+            let found = with_sh_degree(text, 1, Path::new("cfg_args")).unwrap();
+            assert_eq!(found, expected);
+            assert_eq!(parse(&found).unwrap(), ModelConfig { sh_degree: 1, ..parse(text).unwrap() });
+        }
+        assert!(with_sh_degree("Namespace(a=", 1, Path::new("cfg_args")).unwrap_err().to_string().contains("byte 12"));
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! 4DGaussians model folders as a family: a canonical cloud, and a field that deforms it.
 //!
 //! The result is a folder of the same layout with a smaller point cloud. The configuration stays byte for byte as it
-//! was; so does the field, or its tensors keep their names and shapes and take fewer bytes.
+//! was, but for the SH degree where that is lower; so does the field, or its tensors keep their names and shapes and take
+//! fewer bytes.
 
 mod cfg_args;
 mod model_folder;
@@ -30,6 +31,7 @@ use crate::model::{Columns, Gaussians, Jacobian};
 use crate::recipe::{Merge, Precision};
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
+use cfg_args::with_sh_degree;
 pub use model_folder::ModelFolder;
 use pth::{Stored, Values, is_floating, read_state_dict, write_state_dict};
 
@@ -151,9 +153,10 @@ impl Family for ModelFolder {
         };
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
-        let cfg_args = fs::read(&paths.cfg_args).map_err(Error::io("read", &paths.cfg_args))?;
+        let cloud = canonical_cloud(self, reduction);
+        let cfg_args = self.cfg_args(cloud.sh_degree())?;
         let mut content = Content {
-            cloud: canonical_cloud(self, reduction),
+            cloud,
             field: tensors.iter().map(role).collect(),
             tensors,
             times: [first as f32, last as f32],
@@ -183,6 +186,10 @@ impl Family for ModelFolder {
         is_floating(&self.paths().deformation)
     }
 
+    fn needs_all_bands(&self) -> Option<&'static str> {
+        self.field().active().contains(Columns::SH).then_some("the field's SH head adds to all of them")
+    }
+
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
         let mut notes = Vec::new();
         let paths = self.paths();
@@ -190,7 +197,8 @@ impl Family for ModelFolder {
             OutputKind::Model => {
                 let folder = iteration_folder(path, paths.iteration);
                 fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
-                copy(&paths.cfg_args, &path.join("cfg_args"))?;
+                let config = path.join("cfg_args");
+                fs::write(&config, self.cfg_args(reduction.sh_degree)?).map_err(Error::io("write", &config))?;
                 self.write_field(reduction.field, &folder.join("deformation.pth"))?;
                 self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
                 let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
@@ -213,6 +221,15 @@ impl Family for ModelFolder {
 }
 
 impl ModelFolder {
+    /// The bytes of `cfg_args`, with the degree of harmonics up to `sh_degree`.
+    fn cfg_args(&self, sh_degree: usize) -> Result<Vec<u8>> {
+        let path = &self.paths().cfg_args;
+        match sh_degree < self.info().sh_degree {
+            true => with_sh_degree(&cfg_args::read(path)?, sh_degree, path).map(String::into_bytes),
+            false => fs::read(path).map_err(Error::io("read", path)),
+        }
+    }
+
     /// Writes the field's state dict.
     fn write_field(&self, precision: Precision, path: &Path) -> Result<()> {
         let own = &self.paths().deformation;
@@ -229,7 +246,8 @@ impl ModelFolder {
     fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().unwrap_or(&none);
-        write_like(&Ply::open(&self.paths().point_cloud)?, &out_rows(reduction), proxies, &reduction.change, path)
+        let template = Ply::open(&self.paths().point_cloud)?;
+        write_like(&template, &out_rows(reduction), proxies, &reduction.change, reduction.sh_degree, path)
     }
 }
 
@@ -244,7 +262,8 @@ fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
     Ok(Size { cloud, field, rest, ..Size::default() })
 }
 
-/// The canonical cloud of what is left, changed: what the field adds to it stays as it is.
+/// The canonical cloud of what is left, changed, with what stays of its harmonics: what the field adds to it stays as it
+/// is.
 fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
     let mut cloud = ModelFolder::canonical(model).pick(&reduction.kept);
     if let Some(raw) = &reduction.proxies.raw {
@@ -256,6 +275,7 @@ fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
             }
         }
     }
+    cloud.drop_bands(reduction.sh_degree);
     reduction.change.add_to(&mut cloud, Columns::all());
     cloud
 }

@@ -1,6 +1,7 @@
 //! Python literals as text: numbers, strings, lists, tuples, dictionaries, True, False, None.
 
 use std::fmt;
+use std::ops::Range;
 use std::path::Path;
 
 use crate::error::Error;
@@ -39,6 +40,15 @@ impl fmt::Display for Literal {
     }
 }
 
+/// An argument of a call.
+#[derive(Debug)]
+pub(super) struct Argument {
+    pub(super) name: String,
+    pub(super) value: Literal,
+    /// Where its value stands in the text.
+    pub(super) place: Range<usize>,
+}
+
 /// Where parsing stopped.
 #[derive(Debug, PartialEq)]
 pub(super) struct ParseError {
@@ -63,8 +73,8 @@ impl ParseError {
 
 type Parsed<T> = std::result::Result<T, ParseError>;
 
-/// Parses `name(key=value, …)` into its keys in order.
-pub(super) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<(String, Literal)>> {
+/// Parses `name(key=value, …)` into its arguments in order.
+pub(super) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>> {
     let mut parser = Parser { text, at: 0 };
     parser.space();
     if !parser.take(name) {
@@ -78,7 +88,11 @@ pub(super) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<(String, 
             return Err(parser.error("a key or `)`"));
         }
         parser.expect("=", "`=`")?;
-        keys.push((key.to_owned(), parser.value(0)?));
+        parser.space();
+        let start = parser.at;
+        let value = parser.value(0)?;
+        let place = start..start + text[start..parser.at].trim_end().len();
+        keys.push(Argument { name: key.to_owned(), value, place });
         if !parser.take_token(",") && !parser.rest().trim_start().starts_with(')') {
             return Err(parser.error("`,` or `)`"));
         }

@@ -190,20 +190,28 @@ impl Header {
         Err(Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again"))
     }
 
-    /// The header text for `count` vertices: the same lines, but for the count and, where the body
-    /// was text, for the format, which becomes little-endian binary.
-    pub(crate) fn text_for(&self, count: usize) -> Vec<u8> {
+    /// The header text for `count` vertices, whose properties get other names or go: the same lines, but for these, the
+    /// count and, where the body was text, the format, which becomes little-endian binary.
+    pub(crate) fn text_for(&self, count: usize, name: impl Fn(&str) -> Option<String>) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.text.len() + 16);
+        let mut of_vertex = false;
         for line in self.text.split_inclusive(|&b| b == b'\n') {
-            let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+            let text = String::from_utf8_lossy(line);
+            let words: Vec<&str> = text.split_ascii_whitespace().collect();
             let line_end: &[u8] = if line.ends_with(b"\r\n") { b"\r\n" } else { b"\n" };
-            let changed = match (words.next(), words.next()) {
-                (Some(b"format"), _) if self.encoding == Encoding::Ascii => {
+            let changed = match words[..] {
+                ["format", ..] if self.encoding == Encoding::Ascii => {
                     Some("format binary_little_endian 1.0".to_owned())
                 }
-                (Some(b"element"), Some(b"vertex")) if self.vertex().is_some_and(|v| v.count != count as u64) => {
-                    Some(format!("element vertex {count}"))
+                ["element", element, ..] => {
+                    of_vertex = element == "vertex";
+                    let differs = self.vertex().is_some_and(|vertex| vertex.count != count as u64);
+                    (of_vertex && differs).then(|| format!("element vertex {count}"))
                 }
+                ["property", kind, old] if of_vertex => match name(old) {
+                    None => continue,
+                    Some(new) => (new != old).then(|| format!("property {kind} {new}")),
+                },
                 _ => None,
             };
             match changed {

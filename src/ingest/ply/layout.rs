@@ -71,6 +71,18 @@ impl Layout {
     }
 }
 
+/// The name of a property of rows with harmonics of degree `from` once those above `to` are gone; none where it goes with
+/// them.
+pub(crate) fn name_without_bands(name: &str, from: usize, to: usize) -> Option<String> {
+    let [had, left] = [from, to.min(from)].map(|degree| sh_coefficients(degree) - 1);
+    let Some(number) = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok()) else {
+        return Some(name.to_owned());
+    };
+    // Only a header with some of them has such a name.
+    let (channel, coefficient) = (number / had.max(1), number % had.max(1));
+    (coefficient < left).then(|| format!("f_rest_{}", channel * left + coefficient))
+}
+
 fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     let has = |name: &str| vertex.properties.iter().any(|property| property.name == name);
     let names: Vec<&str> = vertex.properties.iter().map(|property| property.name.as_str()).take(80).collect();

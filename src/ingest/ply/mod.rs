@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 pub(crate) use header::Header;
 pub use header::{Encoding, Property, Scalar};
 pub use layout::THIN_LOG_SCALE;
-pub(crate) use layout::{Layout, Plane};
+pub(crate) use layout::{Layout, Plane, name_without_bands};
 
 use super::map::FileMap;
 use crate::error::{Error, Result};

@@ -139,9 +139,10 @@ impl ModelFolder {
         Self::with_cloud(paths, canonical, ply.sh_degree())
     }
 
-    /// The same field and frames with other Gaussians, of the same SH degree.
+    /// The same field and frames with other Gaussians; of another SH degree only where no head deforms colour.
     pub fn with_canonical(&self, canonical: Gaussians) -> Self {
-        let info = SequenceInfo { count: canonical.len(), ..self.info.clone() };
+        let (count, sh_degree) = (canonical.len(), canonical.sh_degree());
+        let info = SequenceInfo { count, sh_degree, ..self.info.clone() };
         ModelFolder { canonical: Arc::new(canonical), info, ..self.clone() }
     }
 

@@ -1,0 +1,121 @@
+//! Stage `bands`: the lowest SH degree of what is left with which pictures change next to nothing.
+//!
+//! Memory: a state of the original and two of what is left, and three pictures.
+
+use super::field::{PICTURES, least};
+use super::journal::Journal;
+use super::request::Request;
+use super::score::scored;
+use super::summary::BandsSummary;
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::emit::kind::OutputKind;
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::metrics::psnr;
+use crate::model::{Columns, Gaussians, Picture};
+use crate::recipe::WhichBands;
+use crate::reduction::Reduction;
+use crate::render::{self, render};
+use crate::scene::Scene;
+use crate::source::FrameSource;
+use crate::stream::{Batch, Progress, Subject, show, spread};
+
+/// What the stage is called.
+const NAME: &str = "bands";
+
+/// The bands of spherical harmonics of a result.
+#[derive(Debug, Clone)]
+pub struct Bands {
+    /// How much closer pictures stay to those with all bands than to the original's, dB.
+    pub margin: f64,
+}
+
+impl Bands {
+    /// The stage, of a run whose output may have fewer. An archive has no bytes for bands that nobody sees.
+    pub fn of(request: &Request, kind: OutputKind) -> Option<Bands> {
+        let bands = &request.recipe.bands;
+        let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
+        drops.then_some(Bands { margin: bands.bands_margin })
+    }
+
+    /// Three states, and pictures of them.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let per_gaussian = vec![
+            ("kept", 24),
+            ("states", 3 * work.state(Columns::all())),
+            ("result", work.input.reduced),
+            ("readers", 2 * work.input.reader),
+            ("held", 2 * work.held(limits, Columns::all())),
+            ("pictures", PICTURE_ON_ALL_THREADS),
+        ];
+        let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
+        let renders = pictures as f64 * (2 + work.sh_degree) as f64;
+        Need {
+            stage: NAME,
+            seconds: work.reading(work.count(), 2.0 * pictures as f64) + work.picturing(renders, work.count(), RENDER),
+            reads: 2.0 * work.scattered_reads(pictures, limits),
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 36 * work.pixels)],
+        }
+    }
+
+    /// `reduction` with the lowest SH degree that shows in pictures no more than it may.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        let count = reduction.len();
+        journal.stage(NAME, count, scene.source(), |journal| Ok((self.drop_some(scene, reduction, journal)?, count)))
+    }
+
+    /// [`Bands::run`] as a part of another stage.
+    pub fn drop_some(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        let what = "fewer bands of spherical harmonics";
+        let all = scene.source().info().sh_degree;
+        let pictures = spread(&scene.schedule, PICTURES, 1);
+        let stay = match scene.input.needs_all_bands() {
+            _ if all == 0 => Some("colours are of degree 0"),
+            None if reduction.is_empty() || pictures.is_empty() => Some("there is nothing to be seen"),
+            why => why,
+        };
+        if let Some(why) = stay {
+            journal.leave_out(what, why);
+            return Ok(reduction);
+        }
+        let (result, tried) = without_bands(scene, &*scene.input.reduced(&reduction)?, all, &pictures)?;
+        let least = least(result, self.margin);
+        let sh_degree = tried.iter().position(|&apart| apart >= least).unwrap_or(all);
+        let tried = tried.into_iter().enumerate().rev().collect();
+        let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
+        if sh_degree == all {
+            journal.leave_out(what, found.why());
+        }
+        journal.bands = Some(found);
+        Ok(Reduction { sh_degree, ..reduction })
+    }
+}
+
+/// Mean PSNR over `pictures` of `result` against the original, and of `result` with harmonics up to each degree below
+/// `all` against itself with all, from degree 0 on, dB.
+fn without_bands(scene: &Scene, result: &dyn FrameSource, all: usize, pictures: &[Picture]) -> Result<(f64, Vec<f64>)> {
+    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let (mut from_original, mut apart) = (0.0, vec![0.0; all]);
+    let subjects = [Subject::all(scene.source()), Subject::all(result)];
+    show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
+        for view in views {
+            let picture = |state: &Gaussians| render(state, view.camera, scene.background);
+            let [original, whole] = view.states.map(picture);
+            from_original += psnr(&original, &whole);
+            drop(original);
+            let mut state = view.states[1].clone();
+            for (degree, sum) in apart.iter_mut().enumerate().rev() {
+                state.drop_bands(degree);
+                *sum += psnr(&picture(&state), &whole);
+            }
+        }
+        progress.advance(views.len() as u64);
+        Ok(())
+    })?;
+    let count = pictures.len() as f64;
+    Ok((from_original / count, apart.into_iter().map(|sum| sum / count).collect()))
+}
