@@ -91,7 +91,7 @@ pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
 #[inline(always)]
 pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
-    let times = |c: f32, v: [f32; 3]| v.map(|v| c * v);
+    let times = |c: f32, v: [f32; 3]| [c * v[0], c * v[1], c * v[2]];
     [
         [0.0; 3],
         [0.0, -C1, 0.0],

@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::backward::sums::Taken;
 use super::bin::{Bins, STRIP_PAIRS};
 use super::blend::{Blend, Colour, GROUPS, Lattice, Plane, Weight, Weights};
 use super::contribution::Contribution;
@@ -80,6 +81,7 @@ pub struct Renderer {
     pub(super) splats: Splats,
     pub(super) bins: Bins,
     weights: Vec<Weight>,
+    pub(super) taken: Taken,
     /// Pairs of splats and tiles that lie ready at a time.
     pub(super) strip_pairs: usize,
 }
@@ -108,6 +110,7 @@ impl Renderer {
             splats: Splats::default(),
             bins: Bins::default(),
             weights: Vec::new(),
+            taken: Taken::default(),
             strip_pairs: STRIP_PAIRS,
         }
     }

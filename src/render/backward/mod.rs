@@ -10,6 +10,7 @@
 //! cut at 0.99, a channel cut off at 0 and a scale beyond e^±80 pass nothing on.
 
 mod splat;
+pub(super) mod sums;
 mod tile;
 
 use rayon::prelude::*;
@@ -20,7 +21,8 @@ use super::convention::BLOCK;
 use super::project::View;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
 use crate::model::{Camera, Columns, Gaussians, GradientSpan, Gradients};
-use tile::{Pull, Pulled, Sums};
+use sums::{Sums, Taken};
+use tile::{Pull, Pulled};
 
 /// Gaussians whose gradients one task adds to: whole blocks.
 const SPAN: usize = 32 * BLOCK;
@@ -59,12 +61,12 @@ impl Renderer {
         let (value, pull) = loss(&picture);
         assert_eq!([pull.width, pull.height], view.size, "a derivative of another size");
 
-        let sums = if Columns::SH.contains(out.columns()) {
-            self.second_walk::<false>(&view, &picture, &pull)
+        if Columns::SH.contains(out.columns()) {
+            self.second_walk::<false>(&view, &picture, &pull);
         } else {
-            self.second_walk::<true>(&view, &picture, &pull)
-        };
-        let splats = &self.splats.splats;
+            self.second_walk::<true>(&view, &picture, &pull);
+        }
+        let (splats, sums) = (&self.splats.splats, &self.taken.totals);
         let add = |mut span: GradientSpan<'_>| {
             let [start, end] =
                 [span.ids().start, span.ids().end].map(|id| splats.partition_point(|splat| (splat.id as usize) < id));
@@ -79,9 +81,10 @@ impl Renderer {
     }
 
     /// What every splat takes: tiles at once, then splats at once, each adding up its tiles in their order.
-    fn second_walk<const SHAPE: bool>(&mut self, view: &View, picture: &Image, pull: &Image) -> Vec<Sums<f64>> {
-        let mut totals = vec![Sums::default(); self.splats.splats.len()];
-        let mut of_pairs: Vec<Sums<f32>> = Vec::new();
+    fn second_walk<const SHAPE: bool>(&mut self, view: &View, picture: &Image, pull: &Image) {
+        let Taken { totals, of_pairs } = &mut self.taken;
+        totals.clear();
+        totals.resize(self.splats.splats.len(), Sums::default());
         let part = match self.parallel {
             true => totals.len().div_ceil(rayon::current_num_threads()).max(1),
             false => totals.len().max(1),
@@ -89,13 +92,13 @@ impl Renderer {
         self.bins.rewind();
         while self.bins.next_strip(&self.splats, self.strip_pairs.min(SUMMED_PAIRS)).is_some() {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            fill_pairs(bins, self.parallel, &mut of_pairs, |tile, pairs, sums| {
+            fill_pairs(bins, self.parallel, of_pairs, |tile, pairs, sums| {
                 let lattice = Lattice::new(tile, view.size, 1);
                 let mut ink = Pulled::<SHAPE> { pull: Pull::new(picture, pull, tile), pairs: sums };
                 blend.tile(splats, pairs, &lattice, &mut ink);
             });
             let add = |(k, totals): (usize, &mut [Sums<f64>])| {
-                for (&splat, sums) in bins.pairs().iter().zip(&of_pairs) {
+                for (&splat, sums) in bins.pairs().iter().zip(&*of_pairs) {
                     // Of another part it wraps or lies beyond.
                     if let Some(total) = totals.get_mut((splat as usize).wrapping_sub(k * part)) {
                         total.add(sums);
@@ -108,6 +111,5 @@ impl Renderer {
                 totals.chunks_mut(part).enumerate().for_each(add);
             }
         }
-        totals
     }
 }

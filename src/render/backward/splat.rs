@@ -10,7 +10,7 @@ use std::ops::Range;
 use super::super::colour;
 use super::super::convention::BLOCK;
 use super::super::project::{LOGARITHM_LIMIT, Shape, Splat, View, cross, dot, opacity};
-use super::tile::Sums;
+use super::sums::Sums;
 use crate::model::{Columns, Gaussians, GradientSpan, sh_coefficients};
 
 /// Adds what the Gaussians behind `splats` take to `out`, whose splats these are; `sums` is what each splat takes.
@@ -49,15 +49,46 @@ fn add_blocks(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], view:
         block.fill(&splats[..of_block], &sums[..of_block], start);
         (splats, sums) = (&splats[of_block..], &sums[of_block..]);
         let columns = out.columns();
-        if columns.contains(Columns::SH) {
-            block.add_harmonics(gaussians, ids.clone(), view, out);
-        }
-        if columns.contains(Columns::POSITION) && colour::coefficients(gaussians) > 1 {
-            block.add_direction(gaussians, ids.clone(), view, out);
+        let turns = columns.contains(Columns::POSITION) && colour::coefficients(gaussians) > 1;
+        if turns || columns.contains(Columns::SH) {
+            let directions = Directions::new(gaussians, ids.clone(), view);
+            if columns.contains(Columns::SH) {
+                block.add_harmonics(gaussians, ids.clone(), &directions, out);
+            }
+            if turns {
+                block.add_direction(gaussians, ids.clone(), &directions, out);
+            }
         }
         if !Columns::SH.contains(columns) {
             block.add_shape(gaussians, ids, view, out);
         }
+    }
+}
+
+/// Of the Gaussians of a block: unit vectors toward them from the centre of view, and one over their distances.
+struct Directions {
+    unit: [[f32; BLOCK]; 3],
+    per_distance: [f32; BLOCK],
+}
+
+impl Directions {
+    #[inline(always)]
+    fn new(gaussians: &Gaussians, ids: Range<usize>, view: &View) -> Self {
+        let n = ids.len().min(BLOCK);
+        let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
+        let mut directions = Directions { unit: [[0.0; BLOCK]; 3], per_distance: [0.0; BLOCK] };
+        let Directions { unit: [x, y, z], per_distance } = &mut directions;
+        for i in 0..n {
+            let (unit, inverse) = colour::direction([position[0][i], position[1][i], position[2][i]], view.center);
+            (x[i], y[i], z[i]) = (unit[0], unit[1], unit[2]);
+            per_distance[i] = inverse as f32;
+        }
+        directions
+    }
+
+    #[inline(always)]
+    fn at(&self, i: usize) -> [f32; 3] {
+        [self.unit[0][i], self.unit[1][i], self.unit[2][i]]
     }
 }
 
@@ -91,13 +122,17 @@ impl Block {
 
     /// Harmonics: Y_k times what the colour takes.
     #[inline(always)]
-    fn add_harmonics(&self, gaussians: &Gaussians, ids: Range<usize>, view: &View, out: &mut GradientSpan<'_>) {
+    fn add_harmonics(
+        &self,
+        gaussians: &Gaussians,
+        ids: Range<usize>,
+        directions: &Directions,
+        out: &mut GradientSpan<'_>,
+    ) {
         let n = ids.len().min(BLOCK);
-        let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
         let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for i in 0..n {
-            let (direction, _) = colour::direction([position[0][i], position[1][i], position[2][i]], view.center);
-            for (values, value) in values.iter_mut().zip(colour::basis(direction)) {
+            for (values, value) in values.iter_mut().zip(colour::basis(directions.at(i))) {
                 values[i] = value;
             }
         }
@@ -111,9 +146,14 @@ impl Block {
 
     /// Position, through the colour's change with the direction of view.
     #[inline(always)]
-    fn add_direction(&self, gaussians: &Gaussians, ids: Range<usize>, view: &View, out: &mut GradientSpan<'_>) {
+    fn add_direction(
+        &self,
+        gaussians: &Gaussians,
+        ids: Range<usize>,
+        directions: &Directions,
+        out: &mut GradientSpan<'_>,
+    ) {
         let n = ids.len().min(BLOCK);
-        let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
         // By value of Y_k: what the colour takes times the coefficients.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(colour::coefficients(gaussians)).skip(1) {
@@ -125,7 +165,7 @@ impl Block {
         }
         let mut parts = [[0.0f32; BLOCK]; 3];
         for i in 0..n {
-            let (d, per_distance) = colour::direction([position[0][i], position[1][i], position[2][i]], view.center);
+            let d = directions.at(i);
             let mut sum = [0.0; 3];
             for (by_value, slope) in by_value.iter().zip(colour::basis_gradient(d)).skip(1) {
                 let of = by_value[i];
@@ -134,7 +174,7 @@ impl Block {
             // Along itself a direction does not change.
             let radial = sum[0] * d[0] + sum[1] * d[1] + sum[2] * d[2];
             for axis in 0..3 {
-                parts[axis][i] = per_distance as f32 * (sum[axis] - radial * d[axis]);
+                parts[axis][i] = directions.per_distance[i] * (sum[axis] - radial * d[axis]);
             }
         }
         for (axis, parts) in parts.iter().enumerate() {

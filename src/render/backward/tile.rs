@@ -9,35 +9,10 @@ use super::super::convention::{MAX_ALPHA, TILE};
 use super::super::lanes::{LANES, Lanes};
 use super::super::project::Splat;
 use super::super::renderer::Image;
+use super::sums::Sums;
 
 /// The largest alpha that was not cut.
 const UNCUT: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
-
-/// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
-///
-/// With p = alpha · ∂L/∂alpha and a pixel's offset (x, y), pixels: y along v from the splat's centre, x along u from the
-/// middle of the row.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Sums<T> {
-    /// Σ p.
-    pub(super) p: T,
-    /// Σ p·x and Σ p·y.
-    pub(super) first: [T; 2],
-    /// Σ p·x², Σ p·x·y and Σ p·y².
-    pub(super) second: [T; 3],
-    /// Σ weight · ∂L/∂ pixel, by channel.
-    pub(super) colour: [T; 3],
-}
-
-impl Sums<f64> {
-    #[inline(always)]
-    pub(super) fn add(&mut self, tile: &Sums<f32>) {
-        self.p += f64::from(tile.p);
-        (0..2).for_each(|k| self.first[k] += f64::from(tile.first[k]));
-        (0..3).for_each(|k| self.second[k] += f64::from(tile.second[k]));
-        (0..3).for_each(|k| self.colour[k] += f64::from(tile.colour[k]));
-    }
-}
 
 /// What the pixels of a tile take, before the walk.
 pub(super) struct Pull {
