@@ -85,7 +85,7 @@ fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
 }
 
 #[test]
-fn a_stream_is_packed_within_bounds_like_a_file() {
+fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
     let bounds = "--max-error position=2e-3,sh=1e-2";
@@ -97,6 +97,9 @@ fn a_stream_is_packed_within_bounds_like_a_file() {
         let at = TileId { column, gaussian_block: 0, frame_block: 0 };
         assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
     }
+    // Raw tiles and what says where they lie.
+    let larger = String::from_utf8(done(piped(&workplace, "pack - -o raw.gseq --raw", &stream))).unwrap();
+    assert!(larger.contains(&format!("bytes of {}: the input holds its values in fewer", stream.len())), "{larger}");
     let refused = piped(&workplace, "pack - -o x.gseq --max-error position=1%", &stream);
     let message = String::from_utf8_lossy(&refused.stderr);
     assert!(refused.status.code() == Some(2) && message.contains("expected scene units"), "{message}");

@@ -38,7 +38,7 @@ pub struct Packed {
     pub frames: usize,
     /// Size of the container.
     pub bytes: u64,
-    /// Why that is more than its input has, if it is; of a stream nobody knows.
+    /// Why that is more than its input has, if it is.
     pub larger: Option<String>,
     /// Things a person should know.
     pub notes: Vec<String>,
@@ -79,12 +79,13 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
         let staged = StagedFile::new(output, overwrite)?;
         let stream = open_stream(input)?;
         check_memory(input, stream.header())?;
-        pack_stream(stream, staged.path(), packing, |_| Ok(()))?;
+        let received = pack_stream(stream, staged.path(), packing, |_| Ok(()))?;
         let container = Container::open(staged.path())?;
         let (gaussians, frames) = (container.info().count, container.info().times.len());
         let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
         staged.commit()?;
-        return Ok(Packed { gaussians, frames, bytes, larger: None, notes: Vec::new() });
+        let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
+        return Ok(Packed { gaussians, frames, bytes, larger, notes: Vec::new() });
     }
     let opened = open_input(input)?;
     let source = opened.input.source();
