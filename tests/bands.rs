@@ -5,9 +5,8 @@ mod scene;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
-use scene::{PlyRows, Workplace, index_map, lasting_files, tiny, without_sh_head};
+use scene::{PlyRows, Workplace, check_model_folder, index_map, lasting_files, tiny, without_sh_head};
 use serde_json::Value;
 
 /// What a stage that runs writes down where nothing goes.
@@ -155,25 +154,13 @@ fn frames_and_single_files_lose_bands_too() {
     }
 }
 
-/// Runs `check_model_folder.py`, unless this machine has no Python; gives what it printed, and whether it accepts.
-fn checked(original: &Path, compressed: &Path) -> Option<(bool, String)> {
-    let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
-    if !Command::new(&python).arg("--version").stdout(Stdio::null()).status().is_ok_and(|status| status.success()) {
-        eprintln!("skipped: there is no {}", python.display());
-        return None;
-    }
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
-    let output = Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
-    Some((output.status.success(), String::from_utf8_lossy(&output.stdout).into_owned()))
-}
-
 #[test]
 fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_is_not_the_clouds() {
     let workplace = Workplace::new();
     let model = faint_above(&workplace, 1);
     let small = workplace.path("small");
     workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 -o small"));
-    let Some((accepted, text)) = checked(&model, &small) else { return };
+    let Some((accepted, text)) = check_model_folder(&model, &small) else { return };
     assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
 
     let own = fs::read_to_string(small.join("cfg_args")).unwrap();
@@ -184,7 +171,7 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
     ] {
         assert_ne!(other, own);
         fs::write(small.join("cfg_args"), other).unwrap();
-        let (accepted, text) = checked(&model, &small).unwrap();
+        let (accepted, text) = check_model_folder(&model, &small).unwrap();
         assert!(!accepted && text.lines().last().unwrap().contains(complaint), "{text}");
     }
     fs::write(small.join("cfg_args"), own).unwrap();
@@ -199,6 +186,6 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
         (0..4).for_each(|k| row.swap(one + k, other + k));
     }
     fs::write(&cloud, bytes).unwrap();
-    let (accepted, text) = checked(&model, &small).unwrap();
+    let (accepted, text) = check_model_folder(&model, &small).unwrap();
     assert!(!accepted && text.lines().last().unwrap().contains("the original's f_rest"), "{text}");
 }

@@ -5,9 +5,8 @@ mod scene;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
-use scene::{Workplace, lasting_files, shared, tiny};
+use scene::{Workplace, check_model_folder, lasting_files, shared, tiny};
 use serde_json::Value;
 
 fn field_of(model: &Path) -> PathBuf {
@@ -91,26 +90,12 @@ fn bytes_asked_for_count_the_field_as_it_is_written() {
     assert!(counts[0] >= counts[1] + saved / 248 - 8, "{counts:?} Gaussians, {saved} bytes saved");
 }
 
-/// Runs `check_model_folder.py`, unless this machine has no Python; gives what it printed.
-fn checked(original: &Path, compressed: &Path) -> Option<String> {
-    let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
-    if !Command::new(&python).arg("--version").stdout(Stdio::null()).status().is_ok_and(|status| status.success()) {
-        eprintln!("skipped: there is no {}", python.display());
-        return None;
-    }
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
-    let output = Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
-    Some(text)
-}
-
 #[test]
 fn the_original_loader_can_open_what_is_written() {
     let workplace = Workplace::new();
     workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 --field-margin 0 -o small"));
-    let Some(text) = checked(&tiny(), &workplace.path("small")) else { return };
-    assert!(text.contains("tensors in half precision") && text.contains("can open it"), "{text}");
+    let Some((accepted, text)) = check_model_folder(&tiny(), &workplace.path("small")) else { return };
+    assert!(accepted && text.contains("tensors in half precision") && text.contains("can open it"), "{text}");
 }
 
 /// The whole folder as a part of the original's, with a tenth of its Gaussians.

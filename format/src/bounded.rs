@@ -22,9 +22,9 @@ use crate::codec::{Stats, order_at, predict, shuffle_into, stats, zigzag};
 /// Least and greatest bound of a column, so that a step is a finite number above zero.
 pub(crate) const BOUNDS: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
 /// Bytes before the exceptions: step, number of exceptions, halvings of the step for tracks that stand still.
-pub(crate) const HEAD: usize = 16;
+const HEAD: usize = 16;
 /// There is at most one exception for so many values.
-pub(crate) const VALUES_PER_EXCEPTION: usize = 16;
+const VALUES_PER_EXCEPTION: usize = 16;
 /// Multiples stay below it, so that two differences of them fit 32 bits.
 const MOST: f64 = (1 << 28) as f64;
 /// zstd level that decides whether tracks that stand still shall have half the step: more of them do then, and each takes
@@ -75,7 +75,7 @@ pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -
 }
 
 /// The value of a multiple.
-pub(crate) fn value(multiple: u32, step: f64) -> u32 {
+fn value(multiple: u32, step: f64) -> u32 {
     ((f64::from(multiple as i32) * step) as f32).to_bits()
 }
 
@@ -279,11 +279,12 @@ impl Tracks {
         for (track, (out, &multiple)) in out.iter_mut().zip(multiples).enumerate() {
             *out = value(multiple, self.steps[usize::from(moves(bytes, track))]);
         }
-        let place = |(place, _): &(u32, u32)| *place as usize;
-        let first = self.exceptions.partition_point(|exception| place(exception) < frame * self.plane);
-        let of_frame =
-            self.exceptions[first..].iter().take_while(|exception| place(exception) < (frame + 1) * self.plane);
-        of_frame.for_each(|exception| out[place(exception) - frame * self.plane] = exception.1);
+        // Exceptions before a frame.
+        let before =
+            |frame: usize| self.exceptions.partition_point(|&(place, _)| (place as usize) < frame * self.plane);
+        for &(place, bits) in &self.exceptions[before(frame)..before(frame + 1)] {
+            out[place as usize - frame * self.plane] = bits;
+        }
     }
 
     /// Bytes it holds beside itself.

@@ -20,6 +20,20 @@ pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
+/// Runs `check_model_folder.py`, unless this machine has no Python; gives whether it accepts, and what it printed.
+pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> Option<(bool, String)> {
+    let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
+    let ran = std::process::Command::new(&python).arg("--version").output();
+    if !ran.is_ok_and(|output| output.status.success()) {
+        eprintln!("skipped: there is no {}", python.display());
+        return None;
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
+    let output = std::process::Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
+    let [complaints, text] = [&output.stderr, &output.stdout].map(|bytes| String::from_utf8_lossy(bytes));
+    Some((output.status.success(), format!("{complaints}{text}")))
+}
+
 /// A shared model, or none with a note where this machine has none.
 pub(crate) fn shared(name: &str) -> Option<PathBuf> {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
