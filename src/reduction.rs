@@ -132,6 +132,11 @@ impl Reduction {
         }
     }
 
+    /// The Gaussians `kept` (increasing) in the same manner.
+    pub fn with(&self, kept: Vec<u32>) -> Self {
+        Reduction { kept, ..self.clone() }
+    }
+
     /// Number of Gaussians in the output.
     pub fn len(&self) -> usize {
         self.kept.len()

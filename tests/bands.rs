@@ -189,3 +189,72 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
     let (accepted, text) = check_model_folder(&model, &small).unwrap();
     assert!(!accepted && text.lines().last().unwrap().contains("the original's f_rest"), "{text}");
 }
+
+#[test]
+fn a_degree_that_is_asked_for_is_refined_to_its_best() {
+    let workplace = Workplace::new();
+    let model = faint_above(&workplace, 3);
+    let how = "--target-ratio 0.3 --refine-steps 100 --refine-cut-steps 20 --field exact";
+    let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --bands 0 -o small"));
+    assert!(
+        summary["notes"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .any(|note| note == "harmonics above degree 0 of 3 go, as asked for")
+    );
+    assert!(summary["bands"].is_null() && why_left(&summary).is_none());
+    let configs = [&model, &workplace.path("small")].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
+    assert_eq!(configs[1], configs[0].replace("sh_degree=3", "sh_degree=0"));
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 17);
+
+    // As many whose bands went after they were refined are further away.
+    workplace.done(&format!("compress model --cameras {{tiny}} {how} --bands all -o whole"));
+    workplace.done(
+        "compress whole --cameras {tiny} --no-refine --prune-only --target-ratio 1 --field exact --bands 0 -o late",
+    );
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("late"))).names.len(), 17);
+    let psnr = |result: &str| {
+        let looks = workplace.done(&format!("evaluate model {result} --cameras {{tiny}} --json"));
+        serde_json::from_str::<Value>(&looks).unwrap()["psnr"].as_f64().unwrap()
+    };
+    let [small, late] = ["small", "late"].map(psnr);
+    assert!(small > late + 0.3, "{small:.2} dB refined at degree 0, {late:.2} dB cut down to it");
+}
+
+#[test]
+fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 3);
+    let cameras = "model --cameras {tiny} --no-refine --prune-only --bands 0";
+    for output in ["small.gsz", "small.gseq", "frames --as ply-sequence"] {
+        workplace.done(&format!("compress {cameras} --target-ratio 0.5 -o {output}"));
+        let path = output.split(' ').next().unwrap();
+        let shown: Value = serde_json::from_str(&workplace.done(&format!("info {path} --json"))).unwrap();
+        assert_eq!(shown["sh_degree"], 0, "{shown}");
+    }
+    let found = workplace.summary(&format!("{cameras} --min-psnr 20dB -o one.ply"));
+    assert!(found["goal"]["searched"].as_f64().unwrap() >= 20.0, "{}", found["goal"]);
+    assert_eq!(PlyRows::read(&workplace.path("one.ply")).names.len(), 17);
+
+    // What goes makes room.
+    let of_size = |bands: &str| {
+        let how = format!("--no-refine --target-size 80kB --field exact --bands {bands}");
+        let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} -o fits{bands}"));
+        summary["gaussians"].as_u64().unwrap()
+    };
+    let [all, none] = ["all", "0"].map(of_size);
+    assert!(none > 2 * all, "{none} at degree 0, {all} at degree 3");
+}
+
+#[test]
+fn a_degree_that_cannot_be_had_is_named() {
+    let workplace = Workplace::new();
+    let summary = workplace.summary("{tiny} --cameras {tiny} --no-refine --target-ratio 0.5 --bands 1 -o small");
+    assert!(why_left(&summary).unwrap().contains("SH head"));
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
+    for wrong in ["4", "-1", "some"] {
+        let arguments = format!("compress {{tiny}} --bands {wrong} -o none");
+        workplace.refused(2, &arguments, &["--bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
+    }
+}

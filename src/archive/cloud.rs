@@ -11,7 +11,7 @@ use super::entropy::{Decoder, Encoder, Model, SYMBOLS};
 use super::predict::{Fit, Parts, expected, factors};
 use super::residual::Residuals;
 use super::step::Grid;
-use crate::model::{Column, Columns, Gaussians, sh_coefficients};
+use crate::model::{Column, Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 
 /// Attributes with a step each, by place in [`CloudSteps`]: harmonics by degree.
 pub const ATTRIBUTES: [&str; 8] =
@@ -55,7 +55,7 @@ fn planes(sh_degree: usize) -> Vec<(Columns, usize, usize)> {
 impl Shape {
     /// Whether it goes together, whatever an archive says.
     pub(super) fn is_sound(&self) -> bool {
-        self.sh_degree <= 3
+        self.sh_degree <= HIGHEST_DEGREE
             && self.means.len() == planes(self.sh_degree).len()
             && self.parts.len() == self.means.len()
             && self.steps.iter().all(|step| super::STEPS.contains(step))

@@ -23,6 +23,25 @@ use crate::stream::{Batch, Progress, Subject, show, spread};
 /// What the stage is called.
 const NAME: &str = "bands";
 
+/// What is left out where bands have to stay.
+const WHAT: &str = "fewer bands of spherical harmonics";
+
+/// The highest SH degree of a result of `scene`, asked to have harmonics up to `degree`.
+pub(super) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
+    let all = scene.source().info().sh_degree;
+    match scene.input.needs_all_bands() {
+        _ if degree >= all => all,
+        Some(why) => {
+            journal.leave_out(WHAT, why);
+            all
+        }
+        None => {
+            journal.notes.push(format!("harmonics above degree {degree} of {all} go, as asked for"));
+            degree
+        }
+    }
+}
+
 /// The bands of spherical harmonics of a result.
 #[derive(Debug, Clone)]
 pub struct Bands {
@@ -70,7 +89,6 @@ impl Bands {
 
     /// [`Bands::run`] as a part of another stage.
     pub fn drop_some(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
-        let what = "fewer bands of spherical harmonics";
         let all = scene.source().info().sh_degree;
         let pictures = spread(&scene.schedule, PICTURES, 1);
         let stay = match scene.input.needs_all_bands() {
@@ -79,7 +97,7 @@ impl Bands {
             why => why,
         };
         if let Some(why) = stay {
-            journal.leave_out(what, why);
+            journal.leave_out(WHAT, why);
             return Ok(reduction);
         }
         let (result, tried) = without_bands(scene, &*scene.input.reduced(&reduction)?, all, &pictures)?;
@@ -88,7 +106,7 @@ impl Bands {
         let tried = tried.into_iter().enumerate().rev().collect();
         let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
         if sh_degree == all {
-            journal.leave_out(what, found.why());
+            journal.leave_out(WHAT, found.why());
         }
         journal.bands = Some(found);
         Ok(Reduction { sh_degree, ..reduction })

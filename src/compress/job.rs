@@ -168,9 +168,8 @@ impl Job {
             choose: (looks && prunes && !cuts && !searches && recipe.select.choose_by_views).then(choose),
             search: match &goal {
                 Some(Goal::Quality(quality)) => {
-                    let (quality, rule) = (quality.clone(), recipe.merge.clone());
                     let (refine, field, bands) = (refine.clone(), field.clone(), bands.clone());
-                    Some(Search { quality, refine, field, bands, rule })
+                    Some(Search { quality: quality.clone(), refine, field, bands })
                 }
                 _ => None,
             },

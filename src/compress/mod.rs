@@ -34,7 +34,8 @@ use crate::TOOL;
 use crate::budget::{Workload, seconds};
 use crate::error::Result;
 use crate::families::Size;
-use crate::recipe::{Precision, Recipe};
+use crate::model::ALL_HARMONICS;
+use crate::recipe::{Precision, Recipe, WhichBands};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 use crate::stream::begin_run;
@@ -111,15 +112,25 @@ fn reduce(
     }
     let recipe = Record::of(request, &job.measure.score.user, input.digest.clone()).text(request);
 
-    let mut job = job.clone();
-    if let Some(Goal::Bytes(most)) = request.goal {
-        let of = Space { emit: &job.emit, most, recipe: recipe.len() as u64 };
-        // A field that is to stay exact takes its room at the end.
-        let field = if job.field.is_some() { Precision::Half } else { Precision::Exact };
-        let like = Reduction { field, ..Reduction::pruned(Vec::new(), &request.recipe.merge) };
-        let count = of.count(scene, &like, &mut journal)?;
-        job = job.again(request, Outlook::of(scene), count)?;
-    }
+    let sh_degree = match request.recipe.bands.bands {
+        WhichBands::UpTo(degree) => bands::highest(scene, degree, &mut journal),
+        WhichBands::All | WhichBands::Needed => ALL_HARMONICS,
+    };
+    let like = Reduction { sh_degree, ..Reduction::pruned(Vec::new(), &request.recipe.merge) };
+    let emit = job.emit.clone();
+    let space = match request.goal {
+        Some(Goal::Bytes(most)) => Some(Space { emit: &emit, most, recipe: recipe.len() as u64 }),
+        _ => None,
+    };
+    let mut job = match &space {
+        Some(space) => {
+            // A field that is to stay exact takes its room at the end.
+            let field = if job.field.is_some() { Precision::Half } else { Precision::Exact };
+            let count = space.count(scene, &Reduction { field, ..like.clone() }, &mut journal)?;
+            job.again(request, Outlook::of(scene), count)?
+        }
+        None => job.clone(),
+    };
     if let Some(search) = &job.search {
         search.check(scene)?;
     }
@@ -137,12 +148,12 @@ fn reduce(
     }
     let (reduction, merge, mut goal) = match &job.search {
         Some(search) => {
-            let (reduction, goal) = search.run(scene, &scored, &ranked, &mut journal)?;
+            let (reduction, goal) = search.run(scene, &scored, &ranked, &like, &mut journal)?;
             (reduction, None, Some(goal))
         }
         None => {
             let Outcome { reduction, summary } =
-                of_size(scene, &job, request, &scored, &ranked, recipe.len() as u64, &mut journal)?;
+                of_size(scene, &job, space.as_ref(), (&scored, &ranked), &like, &mut journal)?;
             (reduction, summary, None)
         }
     };
@@ -213,29 +224,26 @@ fn follow(map: &mut [Option<u32>], order: &[u32]) {
     map.iter_mut().flatten().for_each(|place| *place = places[*place as usize]);
 }
 
-/// What is left where its size is known before, or is the recipe's own. `recipe`: bytes of its text.
+/// What is left, in the manner of `like`, where its size is known before, or is the recipe's own.
 fn of_size(
     scene: &Scene,
     job: &Job,
-    request: &Request,
-    scored: &Scored,
-    ranked: &Ranked,
-    recipe: u64,
+    space: Option<&Space<'_>>,
+    (scored, ranked): (&Scored, &Ranked),
+    like: &Reduction,
     journal: &mut Journal,
 ) -> Result<Outcome> {
     let wanted = job.prune.run(scene, scored, ranked, journal)?;
     let survivors = job.before_cuts(wanted, scored.count()).min(ranked.ranking.order().len());
     let mut outcome = match &job.merge {
         Some(merge) => merge.run(scene, scored, ranked, survivors, journal)?,
-        None => Outcome {
-            reduction: Reduction::pruned(ranked.ranking.take(survivors), &request.recipe.merge),
-            summary: None,
-        },
+        None => Outcome { reduction: like.with(ranked.ranking.take(survivors)), summary: None },
     };
     if let Some(choose) = &job.choose {
         outcome = choose.run(scene, scored, ranked, outcome, journal)?;
     }
     journal.notes.extend(outcome.reduction.proxies.notes.iter().cloned());
+    outcome.reduction.sh_degree = like.sh_degree;
     if let Some(refine) = &job.refine {
         let wanted = wanted.min(outcome.reduction.len());
         outcome.reduction = refine.run(scene, scored, outcome.reduction, wanted, journal)?;
@@ -247,9 +255,8 @@ fn of_size(
         outcome.reduction = bands.run(scene, outcome.reduction, journal)?;
     }
     // An archive of any of them fits on some grids.
-    if let Some(Goal::Bytes(most)) = request.goal.as_ref().filter(|_| job.archive.is_none()) {
-        let of = Space { emit: &job.emit, most: *most, recipe };
-        outcome.reduction = of.shrink(scene, scored, outcome.reduction, journal)?;
+    if let Some(space) = space.filter(|_| job.archive.is_none()) {
+        outcome.reduction = space.shrink(scene, scored, outcome.reduction, journal)?;
     }
     Ok(outcome)
 }

@@ -39,7 +39,7 @@ impl Space<'_> {
         journal.stage(NAME, all, scene.source(), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| (k * all / count) as u32).collect();
-                let some = Reduction { kept, ..like.clone() };
+                let some = like.with(kept);
                 match self.emit.kind {
                     // What lies beside it is neither stored nor sent.
                     OutputKind::Archive => archive::bytes(scene, &some),

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use crate::error::{Error, Result};
 use crate::ingest::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, name_without_bands, read_plane};
-use crate::model::{Columns, Gaussians, sh_coefficients};
+use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 use crate::reduction::{Change, Reduction};
 
 /// One row of a smaller PLY.
@@ -89,7 +89,7 @@ pub fn write_like(
 /// A failed write; an SH width that belongs to no degree from 0 to 3.
 pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
     let width = gaussians.sh.width();
-    if !(0..=3).any(|degree| 3 * sh_coefficients(degree) == width) {
+    if !(0..=HIGHEST_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
         return Err(Error::usage(format!("{width} SH planes belong to no degree from 0 to 3")));
     }
     let rest = width - 3;

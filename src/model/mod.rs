@@ -25,6 +25,9 @@ pub const fn sh_coefficients(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 
+/// Highest degree of harmonics that a renderer knows.
+pub const HIGHEST_DEGREE: usize = 3;
+
 /// A degree that no harmonics reach: all of them.
 pub const ALL_HARMONICS: usize = usize::MAX;
 

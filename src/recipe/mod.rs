@@ -10,7 +10,7 @@ use std::num::NonZeroU32;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
-use crate::model::Columns;
+use crate::model::{Columns, HIGHEST_DEGREE};
 
 pub use parameters::{Parameter, parameters};
 
@@ -216,12 +216,39 @@ pub struct Bands {
 
 /// Which bands of spherical harmonics are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(try_from = "String", into = "String")]
 pub enum WhichBands {
     /// Those that there are.
     All,
     /// No more than pictures need.
     Needed,
+    /// Up to this degree, which refining makes the best of.
+    UpTo(usize),
+}
+
+impl TryFrom<String> for WhichBands {
+    type Error = String;
+
+    fn try_from(text: String) -> std::result::Result<WhichBands, String> {
+        match text.as_str() {
+            "all" => Ok(WhichBands::All),
+            "needed" => Ok(WhichBands::Needed),
+            degree => match degree.parse() {
+                Ok(degree) if degree <= HIGHEST_DEGREE => Ok(WhichBands::UpTo(degree)),
+                _ => Err(format!("{text:?}: expected all, needed, or a degree from 0 to {HIGHEST_DEGREE}")),
+            },
+        }
+    }
+}
+
+impl From<WhichBands> for String {
+    fn from(bands: WhichBands) -> String {
+        match bands {
+            WhichBands::All => "all".to_owned(),
+            WhichBands::Needed => "needed".to_owned(),
+            WhichBands::UpTo(degree) => degree.to_string(),
+        }
+    }
 }
 
 /// How a deformation field is written.

@@ -20,7 +20,6 @@ use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, RENDER, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Columns, Picture};
-use crate::recipe;
 use crate::reduction::Reduction;
 use crate::render;
 use crate::scene::Scene;
@@ -59,8 +58,6 @@ pub struct Search {
     pub field: Option<Field>,
     /// How bands of its harmonics are dropped.
     pub bands: Option<Bands>,
-    /// Merging does not take part.
-    pub rule: recipe::Merge,
 }
 
 /// A size that was tried.
@@ -108,7 +105,7 @@ impl Search {
         need
     }
 
-    /// The smallest reduction found that is as good as asked for.
+    /// The smallest reduction in the manner of `like` found that is as good as asked for.
     ///
     /// # Errors
     /// Frames or photographs that cannot be read; too few pictures.
@@ -117,6 +114,7 @@ impl Search {
         scene: &Scene,
         scored: &Scored,
         ranked: &Ranked,
+        like: &Reduction,
         journal: &mut Journal,
     ) -> Result<(Reduction, GoalSummary)> {
         let all = ranked.ranking.order().len();
@@ -139,7 +137,7 @@ impl Search {
                 }
             };
             let walk = self.refine.as_ref().map(|refine| Walk::new(NAME, refine, scene, scored, &targets, parts));
-            let mut way = Way { search: self, scene, scored, ranked, gauge: &gauge, walk, cuts: Vec::new() };
+            let mut way = Way { search: self, scene, scored, ranked, like, gauge: &gauge, walk, cuts: Vec::new() };
             let (best, tried) = self.bracket(&mut way, scored.protected.len().max(1), all)?;
             let result = scene.input.reduced(&best.reduction)?;
             let summary = self.summary(&best, self.value(&gauge, &*result, scene, true)?, gauge.held(), tried);
@@ -265,6 +263,7 @@ struct Way<'a> {
     scene: &'a Scene,
     scored: &'a Scored,
     ranked: &'a Ranked,
+    like: &'a Reduction,
     gauge: &'a Gauge<'a>,
     walk: Option<Walk<'a>>,
     /// What cuts left, larger ones first.
@@ -276,7 +275,7 @@ impl Way<'_> {
     fn at(&mut self, size: usize) -> Result<Tried> {
         let mut journal = Journal::default();
         let all = self.ranked.ranking.order().len();
-        let prefix = |size: usize| Reduction::pruned(self.ranked.ranking.take(size), &self.search.rule);
+        let prefix = |size: usize| self.like.with(self.ranked.ranking.take(size));
         let mut reduction = match (&self.search.refine, &mut self.walk) {
             (Some(refine), Some(walk)) if size < all => {
                 let first = refine.first(size, self.scored.count()).min(all);

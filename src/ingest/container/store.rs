@@ -8,7 +8,7 @@ use gseq::{Reader, TileBuffer, TileFrames, TileId, Touched};
 
 use super::held::HeldTiles;
 use crate::error::{Error, Result};
-use crate::model::{Columns, SequenceInfo, sh_coefficients};
+use crate::model::{Columns, HIGHEST_DEGREE, SequenceInfo, sh_coefficients};
 use crate::source::Count;
 
 /// An open container with all columns of a Gaussian model.
@@ -57,7 +57,7 @@ impl Container {
             let legal = match column {
                 Columns::ROTATION => width == 4,
                 Columns::OPACITY => width == 1,
-                Columns::SH => (0..=3).any(|degree| width == 3 * sh_coefficients(degree)),
+                Columns::SH => (0..=HIGHEST_DEGREE).any(|degree| width == 3 * sh_coefficients(degree)),
                 _ => width == 3,
             };
             if !legal {
@@ -70,7 +70,7 @@ impl Container {
                 ));
             }
             if column == Columns::SH {
-                sh_degree = (0..=3).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
+                sh_degree = (0..=HIGHEST_DEGREE).find(|&degree| width == 3 * sh_coefficients(degree)).unwrap_or(0);
             }
             places.push((column, place));
         }
