@@ -4,13 +4,15 @@
     cargo build --release
     python3 scripts/refine_table.py target/release/splatsieve DATA [RATIO ...]
     python3 scripts/refine_table.py target/release/splatsieve DATA --steps [STEPS ...]
+    python3 scripts/refine_table.py target/release/splatsieve DATA --degrees [RATIO ...]
 
 DATA/<name>/ is a 4DGaussians model folder with its cameras inside and, if there are any, held-out photographs in test/;
 DATA/static/<name>.ply is a model without cameras, for which an orbit of 12 to score by and 4 to compare by is made.
 Prints a Markdown table: pruned alone (--no-refine --prune-only) → `default`, by mean PSNR of 15 frames of every held-out
 view against the unpruned model's own pictures, SSIM, and PSNR against the photographs; wall seconds of the whole run and
 those before refinement; the largest peak of both. With --steps error against run time instead: a tenth of every model
-by as many steps (cuts take 8% of them each), against pruning alone. Standard library only.
+by as many steps (cuts take 8% of them each), against pruning alone. With --degrees as many Gaussians of every SH degree as
+take the bytes of that part of the cloud, refined (models without an SH head). Standard library only.
 """
 
 import json
@@ -84,6 +86,26 @@ def work_precision(binary, models, steps):
                 )
 
 
+def degrees(binary, models, ratios):
+    """Every SH degree, at equal bytes of cloud."""
+    print("| model | bytes of the cloud | Gaussians kept: PSNR dB to the original, of degree 3 | 2 | 1 | 0 |")
+    print("|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for model in models:
+            cameras = model if model.is_dir() else orbit(model, Path(folder) / f"{model.stem}.json")
+            for ratio in ratios:
+                row = []
+                for degree in (3, 2, 1, 0):
+                    kept = float(ratio) * 62 / (14 + 3 * (degree + 1) ** 2)
+                    if kept >= 1:
+                        row.append("–")
+                        continue
+                    output = Path(folder) / f"{model.stem}{ratio}{degree}{'' if model.is_dir() else '.ply'}"
+                    found = point(binary, model, cameras, f"{kept:.4f}", output, "--bands", degree)
+                    row.append(f"{100 * kept:.1f}%: {found['psnr']:.1f}")
+                print(f"| {model.stem} | {100 * float(ratio):.0f}% | {' | '.join(row)} |", flush=True)
+
+
 def main():
     if len(sys.argv) < 3:
         print(__doc__)
@@ -92,6 +114,9 @@ def main():
     models = [path.parent for path in sorted(data.glob("*/cfg_args"))] + sorted(data.glob("static/*.ply"))
     if sys.argv[3:4] == ["--steps"]:
         work_precision(binary, models, sys.argv[4:] or ["100", "250", "500", "1000", "1500", "3000"])
+        return
+    if sys.argv[3:4] == ["--degrees"]:
+        degrees(binary, models, sys.argv[4:] or ["0.2", "0.1", "0.05"])
         return
     ratios = sys.argv[3:] or ["0.4", "0.2", "0.1", "0.05"]
     print("| model | kept | PSNR dB to the original | SSIM | PSNR dB to photographs (unpruned) | s (before refining) | MiB |")

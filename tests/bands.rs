@@ -258,3 +258,21 @@ fn a_degree_that_cannot_be_had_is_named() {
         workplace.refused(2, &arguments, &["--bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
     }
 }
+
+#[test]
+fn so_many_bytes_go_to_the_degree_at_which_they_show_most() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 0);
+    let how = "model --cameras {tiny} --target-size 85kB --field exact --refine-steps 100 --refine-cut-steps 20";
+    let chosen = workplace.summary(&format!("{how} -o chosen"));
+    let all = workplace.summary(&format!("{how} --bands all -o all"));
+    let names = |result: &str| PlyRows::read(&cloud_of(&workplace.path(result))).names.len();
+    assert_eq!([names("chosen"), names("all")], [17, 62]);
+    let stage = |summary: &Value| summary["stages"].as_array().unwrap().iter().any(|stage| stage["name"] == "degree");
+    assert_eq!([stage(&chosen), stage(&all)], [true, false]);
+    let said = |note: &&Value| note.as_str().unwrap().contains("those of SH degree 0 show most");
+    assert_eq!(chosen["notes"].as_array().unwrap().iter().filter(said).count(), 1, "{}", chosen["notes"]);
+    assert!(chosen["bands"].is_null() && chosen["output_bytes"].as_u64().unwrap() <= 85_000);
+    let of = |summary: &Value| summary["gaussians"].as_u64().unwrap();
+    assert!(of(&chosen) > 2 * of(&all), "{} at degree 0, {} at degree 3", of(&chosen), of(&all));
+}

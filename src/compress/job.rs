@@ -3,6 +3,7 @@
 use super::archive::{Archive, LEFT_BY_SEARCH};
 use super::bands::Bands;
 use super::choose::Choose;
+use super::degree::Degree;
 use super::emit::Emit;
 use super::field::Field;
 use super::ids::parse_ids;
@@ -28,6 +29,8 @@ pub struct Job {
     pub measure: Measure,
     /// Ranks anew as the model shrinks.
     pub rounds: Option<Rounds>,
+    /// Chooses an SH degree for so many bytes.
+    pub degree: Option<Degree>,
     /// Says how many survive.
     pub prune: Prune,
     /// Merges survivors.
@@ -40,7 +43,7 @@ pub struct Job {
     pub field: Option<Field>,
     /// Drops bands of spherical harmonics that nobody sees.
     pub bands: Option<Bands>,
-    /// Finds the size, instead of the six before it.
+    /// Finds the size, instead of all from `prune` on.
     pub search: Option<Search>,
     /// Says on which grids an archive's values lie.
     pub archive: Option<Archive>,
@@ -163,6 +166,7 @@ impl Job {
         let bands = Bands::of(request, emit.kind);
         Ok(Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
+            degree: Degree::of(request, refine.as_ref()),
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
             choose: (looks && prunes && !cuts && !searches && recipe.select.choose_by_views).then(choose),
@@ -238,6 +242,7 @@ impl Stages for Job {
     fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need> {
         let mut needs = self.measure.needs(work, limits);
         needs.extend(self.rounds.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.degree.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));

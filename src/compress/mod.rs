@@ -5,6 +5,7 @@ pub mod archive;
 mod arrival;
 mod bands;
 mod choose;
+mod degree;
 pub mod emit;
 mod field;
 mod ids;
@@ -116,35 +117,41 @@ fn reduce(
         WhichBands::UpTo(degree) => bands::highest(scene, degree, &mut journal),
         WhichBands::All | WhichBands::Needed => ALL_HARMONICS,
     };
-    let like = Reduction { sh_degree, ..Reduction::pruned(Vec::new(), &request.recipe.merge) };
+    let mut like = Reduction { sh_degree, ..Reduction::pruned(Vec::new(), &request.recipe.merge) };
     let emit = job.emit.clone();
     let space = match request.goal {
         Some(Goal::Bytes(most)) => Some(Space { emit: &emit, most, recipe: recipe.len() as u64 }),
         _ => None,
     };
-    let mut job = match &space {
+    let outlook = Outlook::of(scene);
+    let (mut job, fits) = match &space {
         Some(space) => {
             // A field that is to stay exact takes its room at the end.
             let field = if job.field.is_some() { Precision::Half } else { Precision::Exact };
-            let count = space.count(scene, &Reduction { field, ..like.clone() }, &mut journal)?;
-            job.again(request, Outlook::of(scene), count)?
+            let fits = space.fits(scene, &Reduction { field, ..like.clone() }, job.degree.is_some(), &mut journal)?;
+            (job.again(request, outlook, fits[0].gaussians)?, fits)
         }
-        None => job.clone(),
+        None => (job.clone(), Vec::new()),
     };
     if let Some(search) = &job.search {
         search.check(scene)?;
     }
     let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
-    if request.goal.is_some() {
-        // More may fit than may stay.
-        job.prune.target = job.prune.target.map(|target| target.min(ranked.ranking.order().len()));
-    }
     if let Some(rounds) = &job.rounds {
         let fewest = job.prune.target.unwrap_or(scored.selection.counts.kept);
         let fewest =
             job.search.as_ref().map_or(job.before_cuts(fewest, scored.count()), |search| search.fewest(scored.count()));
         ranked = rounds.run(scene, &scored, ranked, fewest, &mut journal)?;
+    }
+    if let Some(degree) = job.degree.as_ref().filter(|_| fits.len() > 1) {
+        let fit = degree.run(scene, &scored, &ranked, &like, &fits, &mut journal)?;
+        like.sh_degree = fit.sh_degree;
+        job = job.again(request, outlook, fit.gaussians)?;
+    }
+    if request.goal.is_some() {
+        // More may fit than may stay.
+        job.prune.target = job.prune.target.map(|target| target.min(ranked.ranking.order().len()));
     }
     let (reduction, merge, mut goal) = match &job.search {
         Some(search) => {
@@ -251,7 +258,8 @@ fn of_size(
     if let Some(field) = &job.field {
         outcome.reduction = field.run(scene, outcome.reduction, journal)?;
     }
-    if let Some(bands) = &job.bands {
+    // A degree that was chosen is one that pictures need.
+    if let Some(bands) = job.bands.as_ref().filter(|_| like.sh_degree >= scene.source().info().sh_degree) {
         outcome.reduction = bands.run(scene, outcome.reduction, journal)?;
     }
     // An archive of any of them fits on some grids.

@@ -29,12 +29,40 @@ pub(super) struct Space<'a> {
     pub(super) recipe: u64,
 }
 
+/// What fits into so many bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Fit {
+    /// Highest SH degree.
+    pub(super) sh_degree: usize,
+    /// How many Gaussians of that degree.
+    pub(super) gaussians: usize,
+}
+
 impl Space<'_> {
+    /// [`Space::count`] for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
+    ///
+    /// # Errors
+    /// Those of [`Space::count`].
+    pub(super) fn fits(&self, scene: &Scene, like: &Reduction, drops: bool, journal: &mut Journal) -> Result<Vec<Fit>> {
+        let info = scene.source().info();
+        let highest = like.sh_degree.min(info.sh_degree);
+        let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
+        let mut fits: Vec<Fit> = Vec::new();
+        for sh_degree in (lowest..=highest).rev() {
+            if fits.last().is_some_and(|fit| fit.gaussians == info.count) {
+                break;
+            }
+            let like = Reduction { sh_degree, ..like.clone() };
+            fits.push(Fit { sh_degree, gaussians: self.count(scene, &like, journal)? });
+        }
+        Ok(fits)
+    }
+
     /// As many of all Gaussians as fit, of any of them, with the rule and the field of `like`.
     ///
     /// # Errors
     /// Not even one fits; frames that cannot be read, a failed write.
-    pub(super) fn count(&self, scene: &Scene, like: &Reduction, journal: &mut Journal) -> Result<usize> {
+    fn count(&self, scene: &Scene, like: &Reduction, journal: &mut Journal) -> Result<usize> {
         let (all, most) = (scene.source().info().count, self.most);
         journal.stage(NAME, all, scene.source(), |_| {
             let bytes = |count: usize| {

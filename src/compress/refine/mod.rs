@@ -95,6 +95,12 @@ impl Refine {
         Refine { sh_degree: 0, ..self }
     }
 
+    /// The same in a `part` of the steps.
+    pub fn in_part(&self, part: f64) -> Refine {
+        let of = |steps: usize| (part * steps as f64).ceil() as usize;
+        Refine { steps: of(self.steps), cut_steps: of(self.cut_steps), ..self.clone() }
+    }
+
     fn manner(&self) -> Manner {
         Manner { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
@@ -200,18 +206,26 @@ impl Refine {
         journal.stage(NAME, count, scene.source(), |journal| {
             let targets = Targets::new(scene)?;
             let mut walk = Walk::new(NAME, self, scene, scored, &targets, targets.parted(false));
-            let result = scene.input.reduced(&reduction)?;
-            let mut moving = walk.begin(&reduction, &*result)?;
-            let sizes = sizes(count, wanted);
-            let of_cuts: usize = sizes.windows(2).map(|pair| self.steps_before(pair[0], wanted)).sum();
-            walk.expect(of_cuts + steps);
-            let mut left = reduction.clone();
-            for pair in sizes.windows(2) {
-                left = left.pick(&walk.cut(&mut moving, self.steps_before(pair[0], wanted), pair[1])?);
-            }
-            left.change = left.change.and(walk.finish(&mut moving, steps, journal)?);
-            Ok((left, wanted))
+            Ok((walk.all(&reduction, wanted, steps, journal)?.0, wanted))
         })
+    }
+
+    /// How close to the original's, dB, pictures kept apart come that way, as a part of `stage`.
+    ///
+    /// # Errors
+    /// Those of [`Refine::run`].
+    pub(super) fn closeness(
+        &self,
+        stage: &'static str,
+        scene: &Scene,
+        scored: &Scored,
+        targets: &Targets,
+        reduction: &Reduction,
+        wanted: usize,
+    ) -> Result<f64> {
+        let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
+        let mut walk = Walk::new(stage, self, scene, scored, targets, targets.parted(false));
+        Ok(walk.all(reduction, wanted, steps, &mut Journal::default())?.1)
     }
 }
 
@@ -290,6 +304,29 @@ impl<'a> Walk<'a> {
         Moving::new(self.scene, result, self.targets, self.refine.manner(), fixed)
     }
 
+    /// Goes all the way: cuts `reduction` down to `wanted`, and `steps` steps at the end. Also gives how close to the
+    /// original's, dB, pictures kept apart are then.
+    fn all(
+        &mut self,
+        reduction: &Reduction,
+        wanted: usize,
+        steps: usize,
+        journal: &mut Journal,
+    ) -> Result<(Reduction, f64)> {
+        let result = self.scene.input.reduced(reduction)?;
+        let mut moving = self.begin(reduction, &*result)?;
+        let sizes = sizes(reduction.len(), wanted);
+        let of_cuts: usize = sizes.windows(2).map(|pair| self.refine.steps_before(pair[0], wanted)).sum();
+        self.expect(of_cuts + steps);
+        let mut left = reduction.clone();
+        for pair in sizes.windows(2) {
+            left = left.pick(&self.cut(&mut moving, self.refine.steps_before(pair[0], wanted), pair[1])?);
+        }
+        let (change, psnr) = self.finish(&mut moving, steps, journal)?;
+        left.change = left.change.and(change);
+        Ok((left, psnr))
+    }
+
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
     pub(super) fn cut_down(&mut self, reduction: &Reduction, size: usize, wanted: usize) -> Result<Reduction> {
         let result = self.scene.input.reduced(reduction)?;
@@ -308,7 +345,7 @@ impl<'a> Walk<'a> {
         let change = {
             let result = self.scene.input.reduced(&reduction)?;
             let mut moving = self.begin(&reduction, &*result)?;
-            self.finish(&mut moving, steps, journal)?
+            self.finish(&mut moving, steps, journal)?.0
         };
         reduction.change = reduction.change.and(change);
         Ok(reduction)
@@ -337,14 +374,14 @@ impl<'a> Walk<'a> {
     }
 
     /// Takes `steps` steps; gives what is to be added to what is stored for the state that the pictures kept apart like
-    /// best.
-    fn finish(&mut self, moving: &mut Moving<'_>, steps: usize, journal: &mut Journal) -> Result<Change> {
+    /// best, and how close they are then, dB.
+    fn finish(&mut self, moving: &mut Moving<'_>, steps: usize, journal: &mut Journal) -> Result<(Change, f64)> {
         moving.find()?;
         let before = moving.closeness(&self.apart)?;
         let count = self.apart.len();
         if before.psnr >= CLOSE_ENOUGH {
             journal.leave_out("refinement", format!("{count} pictures kept apart keep {:.2} dB without", before.psnr));
-            return Ok(moving.change());
+            return Ok((moving.change(), before.psnr));
         }
         let mut schedule = Schedule::new(steps, LAST_RATE[1], before.error);
         let (mut best, mut kept, mut part) = (before, moving.change(), 1.0);
@@ -369,7 +406,7 @@ impl<'a> Walk<'a> {
         } else {
             journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
         }
-        Ok(kept)
+        Ok((kept, end))
     }
 }
 
