@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Makes a large model of a small one: every Gaussian of a 4DGaussians model folder split in nine, seen at 1352x1014.
+"""Makes a large model of a small one: every Gaussian of a 4DGaussians model folder split in nine or more, seen at 1352x1014.
 
-    python3 scripts/split_model.py MODEL FOLDER
+    python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
     python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
 
-The nine stand in a grid along a Gaussian's two longest axes, a standard deviation apart, √⅓ as wide along these: mass
-and variance stay. FOLDER gets 18 views at 30 frames: the model's own, of which those of transforms_test.json are held out
-again, and some halfway between neighbours. `--compare` refines and prunes FOLDER down to a fifth in a gibibyte, and says
+They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along
+these): mass and variance stay. FOLDER gets its views at every frame: the model's own, of which those of
+transforms_test.json are held out again, and some on the way between neighbours. `--compare` refines and prunes FOLDER down to a fifth in a gibibyte, and says
 how close the held-out pictures of both stay. Needs nothing but Python.
 """
 
@@ -20,9 +20,8 @@ from pathlib import Path
 
 from models_table import evaluated, peak, run
 
-SIZE, VIEWS, FRAMES = (1352, 1014), 18, 30
-# Nine children between which a parent's centre adds up 1 + 4·e^-1.5 + 4·e^-3 times one of them.
-OVERLAP = 1 + 4 * math.exp(-1.5) + 4 * math.exp(-3)
+# Distance of children and their width.
+APART = math.sqrt(3)
 
 
 def axes(w, x, y, z):
@@ -36,8 +35,13 @@ def axes(w, x, y, z):
     ]
 
 
-def split_cloud(source, target):
-    """Writes the PLY `target`: nine rows for every one of `source`."""
+def split_cloud(source, target, side):
+    """Writes the PLY `target`: side x side rows for every one of `source`."""
+    grid = [k - (side - 1) / 2 for k in range(side)]
+    # Of a row of children: a variance of 1 is that of their places and their own.
+    width = 1 / math.sqrt(1 + APART**2 * (side**2 - 1) / 12)
+    # What all of them add up to in the middle, of what one has at its centre.
+    overlap = sum(math.exp(-(APART**2) * (i * i + j * j) / 2) for i in grid for j in grid)
     header, body = source.read_bytes().split(b"end_header\n", 1)
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property")]
     place = {name: k for k, name in enumerate(names)}
@@ -48,15 +52,16 @@ def split_cloud(source, target):
         turned = axes(*(values[place[f"rot_{k}"]] for k in range(4)))
         first, second = sorted(range(3), key=lambda k: -scales[k])[:2]
         alpha = 1 / (1 + math.exp(-values[place["opacity"]]))
-        child_alpha = min(max(1 - (1 - alpha) ** (1 / OVERLAP), 1e-6), 1 - 1e-6)
-        for i in (-1, 0, 1):
-            for j in (-1, 0, 1):
+        child_alpha = min(max(1 - (1 - alpha) ** (1 / overlap), 1e-6), 1 - 1e-6)
+        for i in grid:
+            for j in grid:
                 child = list(values)
                 for axis, name in enumerate("xyz"):
                     along = i * math.exp(scales[first]) * turned[first][axis]
-                    child[place[name]] += along + j * math.exp(scales[second]) * turned[second][axis]
+                    along += j * math.exp(scales[second]) * turned[second][axis]
+                    child[place[name]] += APART * width * along
                 for k in (first, second):
-                    child[place[f"scale_{k}"]] -= 0.5 * math.log(3)
+                    child[place[f"scale_{k}"]] += math.log(width)
                 child[place["opacity"]] = math.log(child_alpha / (1 - child_alpha))
                 out += row.pack(*child)
                 count += 1
@@ -65,42 +70,43 @@ def split_cloud(source, target):
     return count
 
 
-def cameras(model, folder):
-    """Writes transforms of FRAMES frames of VIEWS views, large."""
+def cameras(model, folder, frames, count, size):
+    """Writes transforms of `frames` frames of `count` views of `size` pixels."""
     views = {}
     for split in ("train", "test"):
         for frame in json.loads((model / f"transforms_{split}.json").read_text())["frames"]:
             views.setdefault(frame["file_path"].rsplit("_v", 1)[1], (split, frame))
     train = [frame for split, frame in views.values() if split == "train"]
     poses = [(split, frame["transform_matrix"]) for split, frame in views.values()]
-    for before, after in zip(train, train[1:]):
-        if len(poses) < VIEWS:
-            between = [list(line) for line in before["transform_matrix"]]
-            for line, other in zip(between[:3], after["transform_matrix"]):
-                line[3] = (line[3] + other[3]) / 2
-            poses.append(("train", between))
-    focal = train[0]["fl_x"] * SIZE[0] / train[0]["w"]
+    pairs = list(zip(train, train[1:]))
+    for k in range(count - len(poses)):
+        (before, after), part = pairs[k % len(pairs)], 1 / (2 + k // len(pairs))
+        between = [list(line) for line in before["transform_matrix"]]
+        for line, other in zip(between[:3], after["transform_matrix"]):
+            line[3] += part * (other[3] - line[3])
+        poses.append(("train", between))
+    focal = train[0]["fl_x"] * size[0] / train[0]["w"]
     for split in ("train", "test"):
         shots = []
-        for t in range(FRAMES):
+        for t in range(frames):
             for number, (_, pose) in enumerate(pose for pose in enumerate(poses) if pose[1][0] == split):
-                view = number if split == "train" else VIEWS - 1 - number
+                view = number if split == "train" else len(poses) - 1 - number
                 shots.append(
-                    {"file_path": f"./{split}/t{t:03}_v{view:02}", "time": t / (FRAMES - 1), "fl_x": focal, "fl_y": focal}
-                    | {"cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1], "transform_matrix": pose[1]}
+                    {"file_path": f"./{split}/t{t:03}_v{view:02}", "time": t / max(frames - 1, 1), "fl_x": focal, "fl_y": focal}
+                    | {"cx": size[0] / 2, "cy": size[1] / 2, "w": size[0], "h": size[1], "transform_matrix": pose[1]}
                 )
         (folder / f"transforms_{split}.json").write_text(json.dumps({"frames": shots}))
 
 
-def make(model, folder):
+def make(model, folder, side, frames, views, size):
     cloud = next((model / "point_cloud").glob("iteration_*"))
     target = folder / "point_cloud" / cloud.name
     target.mkdir(parents=True)
-    count = split_cloud(cloud / "point_cloud.ply", target / "point_cloud.ply")
+    count = split_cloud(cloud / "point_cloud.ply", target / "point_cloud.ply", side)
     shutil.copy(cloud / "deformation.pth", target)
     shutil.copy(model / "cfg_args", folder)
-    cameras(model, folder)
-    print(f"{folder}: {count} Gaussians, {FRAMES} frames of {VIEWS} views of {SIZE[0]}x{SIZE[1]}")
+    cameras(model, folder, frames, views, size)
+    print(f"{folder}: {count} Gaussians, {frames} frames of {views} views of {size[0]}x{size[1]}")
 
 
 def compare(binary, folder):
@@ -121,10 +127,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", type=Path)
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--side", type=int, default=3)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--views", type=int, default=18)
+    parser.add_argument("--size", type=lambda text: tuple(map(int, text.split("x"))), default=(1352, 1014))
     parser.add_argument("--compare", metavar="SPLATSIEVE")
     args = parser.parse_args()
     if not args.folder.exists():
-        make(args.model, args.folder)
+        make(args.model, args.folder, args.side, args.frames, args.views, args.size)
     if args.compare:
         compare(args.compare, args.folder)
 

@@ -8,11 +8,10 @@
 //! measured instead: the result is the same either way.
 
 use std::cell::OnceCell;
-use std::time::Instant;
 
 use glam::DVec3;
 
-use super::journal::Journal;
+use super::journal::{Clock, Journal};
 use super::measure::{Measure, Measured, Outlook, Stages};
 use crate::budget::{Budget, Plan, Tell, Workload};
 use crate::error::Result;
@@ -36,7 +35,7 @@ pub fn open_to_measure<S: Stages>(
     plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
-    let start = Instant::now();
+    let start = Clock::start();
     if options.is_stream() {
         let found = receive_measured(options, plan)?;
         journal.opened("receive", start, found.0.source().info().count, Reads::default());
@@ -64,6 +63,7 @@ fn receive_measured<S: Stages>(
     let work = Workload::of_stream(stream.header(), block, &of_rig);
     let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = stages.measure();
+    let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
     let held = (block + AHEAD) as u64;
     let fit = |tell: Tell, measuring: Option<bool>| {
         Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
@@ -86,8 +86,7 @@ fn receive_measured<S: Stages>(
             none if measures => {
                 let rig: &Rig = rig.get_or_init(|| rig_around(held));
                 let plan = plan_of_scan.get_or_init(|| ScanPlan::arriving(&scan.recipe, &rig.cameras));
-                let seen =
-                    visible.as_ref().map(|_| RunningContribution::new(count, scan.recipe.pixel_stride, memory.limits));
+                let seen = visible.map(|_| RunningContribution::new(count, scan.recipe.pixel_stride, memory.limits));
                 none.insert(Measuring::new(count, rig, options.split, plan, &scan.recipe, seen))
             }
             _ => return Ok(()),

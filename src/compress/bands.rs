@@ -68,7 +68,7 @@ impl Bands {
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
-        let renders = pictures as f64 * (2 + work.sh_degree) as f64;
+        let renders = 3.0 * pictures as f64;
         Need {
             stage: NAME,
             seconds: work.reading(work.count(), 2.0 * pictures as f64) + work.picturing(renders, work.count(), RENDER),
@@ -100,10 +100,17 @@ impl Bands {
             journal.leave_out(WHAT, why);
             return Ok(reduction);
         }
-        let (result, tried) = without_bands(scene, &*scene.input.reduced(&reduction)?, all, &pictures)?;
-        let least = least(result, self.margin);
-        let sh_degree = tried.iter().position(|&apart| apart >= least).unwrap_or(all);
-        let tried = tried.into_iter().enumerate().rev().collect();
+        let source = scene.input.reduced(&reduction)?;
+        let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
+        // What a degree lacks every lower one lacks too.
+        while sh_degree > 0 && tried.len() == all - sh_degree {
+            let [result, apart] = without_bands(scene, &*source, sh_degree - 1, &pictures)?;
+            found = [result, least(result, self.margin)];
+            tried.push((sh_degree - 1, apart));
+            sh_degree -= usize::from(apart >= found[1]);
+        }
+        drop(source);
+        let [result, least] = found;
         let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
         if sh_degree == all {
             journal.leave_out(WHAT, found.why());
@@ -113,27 +120,23 @@ impl Bands {
     }
 }
 
-/// Mean PSNR over `pictures` of `result` against the original, and of `result` with harmonics up to each degree below
-/// `all` against itself with all, from degree 0 on, dB.
-fn without_bands(scene: &Scene, result: &dyn FrameSource, all: usize, pictures: &[Picture]) -> Result<(f64, Vec<f64>)> {
+/// Mean PSNR over `pictures` of `result` against the original, and of `result` with harmonics up to `degree` against itself
+/// with all, dB.
+fn without_bands(scene: &Scene, result: &dyn FrameSource, degree: usize, pictures: &[Picture]) -> Result<[f64; 2]> {
     let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
-    let (mut from_original, mut apart) = (0.0, vec![0.0; all]);
+    let mut sums = [0.0; 2];
     let subjects = [Subject::all(scene.source()), Subject::all(result)];
     show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
         for view in views {
             let picture = |state: &Gaussians| render(state, view.camera, scene.background);
             let [original, whole] = view.states.map(picture);
-            from_original += psnr(&original, &whole);
-            drop(original);
             let mut state = view.states[1].clone();
-            for (degree, sum) in apart.iter_mut().enumerate().rev() {
-                state.drop_bands(degree);
-                *sum += psnr(&picture(&state), &whole);
-            }
+            state.drop_bands(degree);
+            sums[0] += psnr(&original, &whole);
+            sums[1] += psnr(&picture(&state), &whole);
         }
         progress.advance(views.len() as u64);
         Ok(())
     })?;
-    let count = pictures.len() as f64;
-    Ok((from_original / count, apart.into_iter().map(|sum| sum / count).collect()))
+    Ok(sums.map(|sum| sum / pictures.len() as f64))
 }

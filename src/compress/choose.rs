@@ -1,22 +1,20 @@
-//! Stage `choose`: letting pictures choose among alternatives at one count, rendered beside the original.
+//! Stage `choose`: letting pictures choose whether to merge or to prune to one count, rendered beside the original.
 //!
-//! No rule wins everywhere, and merging pays on some scenes only (method.md, section 6.1).
-//! Memory: statistics and scores while the alternatives are made, then two states of one frame, the original's and an
-//! alternative's, and [`AT_ONCE`] pictures.
+//! Merging pays on some scenes only (method.md, section 6.1).
+//! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
 
 use super::journal::Journal;
 use super::merge::Outcome;
-use super::score::{Order, Ranked, Scored, scored};
+use super::score::{Ranked, Scored, scored};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::metrics::psnr;
-use crate::model::{Camera, Columns, Gaussians, Picture};
-use crate::recipe::{self, StaticTerm};
+use crate::model::{Columns, Gaussians, Picture};
 use crate::reduction::Reduction;
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
-use crate::stream::{Batch, Progress, Subject, View, show, spread};
+use crate::stream::{Batch, Progress, Subject, VIEWS_AT_ONCE, View, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -28,35 +26,21 @@ const PICTURES: usize = 24;
 /// Pictures of a frame that are compared at a time.
 const AT_ONCE: usize = 4;
 
-/// Most alternatives: the run's own order, those by C and by the mean, and what merging leaves.
-const ALTERNATIVES: f64 = 4.0;
-
 /// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
 pub(super) const CLUSTERED: u64 = 125;
 
 /// The choice of a run.
 #[derive(Debug, Clone)]
 pub struct Choose {
-    /// The scores that alternatives differ in.
-    pub score: recipe::Score,
-    /// The selection by them.
-    pub select: recipe::Select,
     /// Whether the size of the output is asked for.
     pub has_target: bool,
 }
 
-/// One way to keep the same number of Gaussians.
-struct Alternative {
-    /// What its Gaussians were ranked by.
-    by: Order,
-    reduction: Reduction,
-}
-
 impl Choose {
-    /// Alternatives, two states of a frame, and pictures.
+    /// Both alternatives, two states of a frame, and pictures.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let per_gaussian = vec![
-            ("alternatives", 24),
+            ("alternatives", 8),
             ("clusters", CLUSTERED),
             ("states", 2 * work.state(Columns::all())),
             ("result", work.input.reduced),
@@ -66,9 +50,9 @@ impl Choose {
         ];
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + AT_ONCE as u64);
         let frames = (PICTURES as u64).min(work.pictures);
-        // The original, and as many alternatives of about half as many Gaussians as there are orders and merging.
-        let made = work.picturing(frames as f64, (1.0 + 0.5 * ALTERNATIVES) * work.count(), (RENDER.0, 0.0))
-            + work.picturing((1.0 + ALTERNATIVES) * frames as f64, 0.0, RENDER);
+        // The original, and two of about half as many Gaussians.
+        let made = work.picturing(frames as f64, 2.0 * work.count(), (RENDER.0, 0.0))
+            + work.picturing(3.0 * frames as f64, 0.0, RENDER);
         Need {
             stage: NAME,
             seconds: work.reading(work.count(), frames as f64) + made,
@@ -78,10 +62,9 @@ impl Choose {
         }
     }
 
-    /// Compares `merged` with the first Gaussians of the run's ranking and of those by C and √(C·W), as many as it
-    /// has, by mean PSNR against the original on scoring pictures; keeps the best, of equals the one without merging
-    /// and with the run's own ranking. Where merging loses and no target asks for that count, the run's own number of
-    /// survivors stays.
+    /// Compares `merged` with the first Gaussians of the ranking, as many as it has, by mean PSNR against the original on
+    /// scoring pictures; keeps the better, of equals the one without merging. Where merging loses and no target asks for
+    /// that count, the run's own number of survivors stays.
     ///
     /// # Errors
     /// Frames that cannot be read.
@@ -95,125 +78,47 @@ impl Choose {
     ) -> Result<Outcome> {
         let reduction = &merged.reduction;
         let count = reduction.len();
-        let has_clusters = !reduction.clusters.is_empty();
-        let own = Alternative { by: ranked.by, reduction: reduction.clone() };
-        let mut alternatives =
-            if count > 0 { self.alternatives(scored, ranked, count, reduction)? } else { Vec::new() };
-        if !has_clusters {
-            // It is the prefix of its ranking already.
-            alternatives.retain(|other| other.reduction.kept != reduction.kept);
-            if !alternatives.is_empty() {
-                alternatives.insert(0, own);
-            }
-        } else if !alternatives.is_empty() {
-            alternatives.push(own);
-        }
-        if alternatives.is_empty() {
+        if reduction.clusters.is_empty() {
             return Ok(merged);
         }
-        let pictures = spread(&scene.schedule, PICTURES, 1);
-        let found =
-            journal.stage(NAME, count, scene.source(), |_| Ok((mean_psnr(scene, &alternatives, &pictures)?, count)))?;
-        // Strictly greater: of equals the first.
-        let best = (0..found.len()).fold(0, |best, i| if found[i] > found[best] { i } else { best });
-        let Alternative { by, reduction: mut chosen } = alternatives.swap_remove(best);
-        if by != ranked.by {
-            let (better, worse) = (found[best], found[0]);
-            journal.notes.push(format!(
-                "ranked by {} for {}: at {count} Gaussians scoring pictures keep {better:.2} dB, not {worse:.2}",
-                by.name(),
-                ranked.by.name()
-            ));
+        let pruned = ranked.ranking.take(count);
+        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
+        let found = journal
+            .stage(NAME, count, scene.source(), |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
+        let [without, with] = found;
+        if with > without {
+            return Ok(merged);
         }
-        if !has_clusters || best + 1 == found.len() {
-            return Ok(Outcome { reduction: chosen, summary: merged.summary.filter(|_| has_clusters) });
-        }
-        let (with, without) = (found[found.len() - 1], found[best]);
         journal.leave_out(
             "merging",
             format!(
                 "at the same {count} Gaussians scoring pictures keep {without:.2} dB without it, {with:.2} with it"
             ),
         );
-        if !self.has_target {
-            let survivors = scored.selection.counts.kept;
-            let ranking = self.rankings(scored, ranked)?.into_iter().find(|other| other.by == by);
-            let kept = ranking.as_ref().unwrap_or(ranked).ranking.take(survivors);
-            chosen = Reduction::pruned(kept, &reduction.rule);
-        }
-        Ok(Outcome { reduction: chosen, summary: None })
-    }
-
-    /// The rankings to compare, the run's own first.
-    fn rankings(&self, scored: &Scored, ranked: &Ranked) -> Result<Vec<Ranked>> {
-        let mut found = vec![ranked.clone()];
-        for term in [StaticTerm::Mean, StaticTerm::Geometric] {
-            found.push(Ranked { ranking: scored.ranking_by(term, &self.score, &self.select)?, by: Order::Term(term) });
-        }
-        Ok(found)
-    }
-
-    /// The first `count` of every ranking, none twice.
-    fn alternatives(
-        &self,
-        scored: &Scored,
-        ranked: &Ranked,
-        count: usize,
-        like: &Reduction,
-    ) -> Result<Vec<Alternative>> {
-        let mut found: Vec<Alternative> = Vec::new();
-        for Ranked { ranking, by } in self.rankings(scored, ranked)? {
-            let kept = ranking.take(count);
-            if found.iter().all(|other| other.reduction.kept != kept) {
-                found.push(Alternative { by, reduction: Reduction::pruned(kept, &like.rule) });
-            }
-        }
-        Ok(found)
+        let kept = if self.has_target { pruned } else { ranked.ranking.take(scored.selection.counts.kept) };
+        Ok(Outcome { reduction: Reduction::pruned(kept, &reduction.rule), summary: None })
     }
 }
 
-/// Mean PSNR of every alternative against the original over `pictures`, dB. At most one has clusters.
-fn mean_psnr(scene: &Scene, alternatives: &[Alternative], pictures: &[Picture]) -> Result<Vec<f64>> {
-    let merged = alternatives.iter().position(|other| !other.reduction.clusters.is_empty());
-    let result = merged.map(|at| scene.input.reduced(&alternatives[at].reduction)).transpose()?;
+/// Mean PSNR of the Gaussians `pruned` and of `merged` against the original over `pictures`, dB.
+fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Picture]) -> Result<[f64; 2]> {
+    let result = scene.input.reduced(merged)?;
     let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
-    let mut sums = vec![0.0; alternatives.len()];
-    let mut add = |original: &Gaussians, merged: Option<&Gaussians>, cameras: &[&Camera]| {
-        let picture = |state: &Gaussians, camera: &Camera| render(state, camera, scene.background);
-        let expected: Vec<Image> = cameras.iter().map(|camera| picture(original, camera)).collect();
-        for (other, sum) in alternatives.iter().zip(&mut sums) {
-            let pruned;
-            let state = match merged.filter(|_| !other.reduction.clusters.is_empty()) {
-                Some(merged) => merged,
-                None => {
-                    pruned = original.pick(&other.reduction.kept);
-                    &pruned
-                }
-            };
-            let quality = |(camera, expected): (&&Camera, &Image)| psnr(&picture(state, camera), expected);
-            *sum += cameras.iter().zip(&expected).map(quality).sum::<f64>();
-        }
-        progress.advance(cameras.len() as u64);
-    };
+    let mut sums = [0.0; 2];
     let batch = Batch { pictures: AT_ONCE, ..Batch::of_frame(&scene.limits) };
-    let (original, cameras) = (Subject::all(scene.source()), &scene.schedule.cameras);
-    match &result {
-        None => show([original], cameras, pictures, batch, |views| {
-            add(views[0].states[0], None, &cameras_of(views));
-            Ok(())
-        }),
-        Some(result) => show([original, Subject::all(&**result)], cameras, pictures, batch, |views| {
-            let [original, merged] = views[0].states;
-            add(original, Some(merged), &cameras_of(views));
-            Ok(())
-        }),
-    }?;
-    Ok(sums.into_iter().map(|sum| sum / pictures.len().max(1) as f64).collect())
-}
-
-/// The cameras of views of one frame.
-fn cameras_of<'a, const S: usize>(views: &[View<'a, S>]) -> Vec<&'a Camera> {
-    views.iter().map(|view| view.camera).collect()
+    let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
+    show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
+        let picture = |state: &Gaussians, view: &View<'_, 2>| render(state, view.camera, scene.background);
+        let [original, merged] = views[0].states;
+        let expected: Vec<Image> = views.iter().map(|view| picture(original, view)).collect();
+        for (state, sum) in [&original.pick(pruned), merged].into_iter().zip(&mut sums) {
+            let quality = |(view, expected): (&View<'_, 2>, &Image)| psnr(&picture(state, view), expected);
+            *sum += views.iter().zip(&expected).map(quality).sum::<f64>();
+        }
+        progress.advance(views.len() as u64);
+        Ok(())
+    })?;
+    Ok(sums.map(|sum| sum / pictures.len().max(1) as f64))
 }
 
 #[cfg(test)]
@@ -226,8 +131,7 @@ mod tests {
 
     /// Mean PSNR over the pictures that decide.
     fn quality(scene: &Scene, reduction: &Reduction) -> f64 {
-        let alone = [Alternative { by: Order::Rounds, reduction: reduction.clone() }];
-        mean_psnr(scene, &alone, &spread(&scene.schedule, PICTURES, 1)).unwrap()[0]
+        mean_psnr(scene, &[], reduction, &spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE)).unwrap()[1]
     }
 
     /// What merging leaves of a scene, and what is chosen then.
@@ -237,8 +141,7 @@ mod tests {
         let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.ranking.order().len());
         let merged = merge.run(scene, scored, &ranked, survivors, &mut journal).unwrap();
         let before = merged.reduction.clone();
-        let (score, select, has_target) = (recipe.score.clone(), recipe.select.clone(), target.is_some());
-        let chosen = Choose { score, select, has_target }.run(scene, scored, &ranked, merged, &mut journal).unwrap();
+        let chosen = Choose { has_target: target.is_some() }.run(scene, scored, &ranked, merged, &mut journal).unwrap();
         (before, chosen, journal)
     }
 
@@ -252,10 +155,8 @@ mod tests {
             let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
             assert_eq!(chosen.reduction.len(), target);
             let got = quality(&scene, &chosen.reduction);
-            let by_c = scored.ranking_by(StaticTerm::Mean, &recipe.score, &recipe.select).unwrap().take(target);
-            let by_c = Reduction::pruned(by_c, &recipe.merge);
             let own = Reduction::pruned(scored.ranked().ranking.take(target), &recipe.merge);
-            for other in [&merged, &by_c, &own] {
+            for other in [&merged, &own] {
                 let expected = quality(&scene, other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
             }

@@ -157,10 +157,7 @@ impl Job {
         // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
-        let cuts = refine.as_ref().is_some_and(Refine::will_cut);
         let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
-        let choose =
-            || Choose { score: recipe.score.clone(), select: recipe.select.clone(), has_target: target.is_some() };
         let emit = Emit::new(request, outlook.own_output, merges);
         let field = Field::of(request, emit.kind);
         let bands = Bands::of(request, emit.kind);
@@ -169,7 +166,8 @@ impl Job {
             degree: Degree::of(request, refine.as_ref()),
             prune: Prune { prunes, merges, target },
             merge: merges.then(merge),
-            choose: (looks && prunes && !cuts && !searches && recipe.select.choose_by_views).then(choose),
+            choose: (looks && prunes && merges && recipe.select.choose_by_views)
+                .then_some(Choose { has_target: target.is_some() }),
             search: match &goal {
                 Some(Goal::Quality(quality)) => {
                     let (refine, field, bands) = (refine.clone(), field.clone(), bands.clone());

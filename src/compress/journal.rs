@@ -3,11 +3,33 @@
 
 use std::time::Instant;
 
+use cpu_time::ProcessTime;
+
 use super::summary::{BandsSummary, FieldSummary, LeftOut, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::emit::atomic::Spill;
 use crate::error::Result;
 use crate::source::{FrameSource, Reads};
+
+/// When something began.
+#[derive(Debug, Clone, Copy)]
+pub struct Clock {
+    wall: Instant,
+    /// Seconds of all processors.
+    processors: Option<f64>,
+}
+
+impl Clock {
+    /// Now.
+    pub fn start() -> Clock {
+        Clock { wall: Instant::now(), processors: processor_seconds() }
+    }
+}
+
+/// Seconds that this process took of all processors together; none where the system does not say.
+fn processor_seconds() -> Option<f64> {
+    ProcessTime::try_now().ok().map(|time| time.as_duration().as_secs_f64())
+}
 
 /// The record of a run so far.
 #[derive(Debug, Default)]
@@ -38,7 +60,7 @@ impl Journal {
         source: &dyn FrameSource,
         work: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
-        let (start, before, scratch) = (Instant::now(), source.reads(), Spill::read_back());
+        let (start, before, scratch) = (Clock::start(), source.reads(), Spill::read_back());
         let (value, gaussians_out) = work(self)?;
         let (reads, scratch) = (source.reads() - before, Spill::read_back() - scratch);
         self.add(name, [gaussians_in, gaussians_out], start, reads, scratch);
@@ -46,7 +68,7 @@ impl Journal {
     }
 
     /// Writes down that opening the input, begun at `start`, gave `gaussians` Gaussians and read so much.
-    pub fn opened(&mut self, name: &'static str, start: Instant, gaussians: usize, reads: Reads) {
+    pub fn opened(&mut self, name: &'static str, start: Clock, gaussians: usize, reads: Reads) {
         self.add(name, [0, gaussians], start, reads, 0);
     }
 
@@ -59,7 +81,7 @@ impl Journal {
         &mut self,
         name: &str,
         [gaussians_in, gaussians_out]: [usize; 2],
-        start: Instant,
+        start: Clock,
         reads: Reads,
         scratch_bytes: u64,
     ) {
@@ -72,7 +94,8 @@ impl Journal {
             reads,
             full_reads: read as f64 / whole.max(1) as f64,
             scratch_bytes,
-            seconds: start.elapsed().as_secs_f64(),
+            seconds: start.wall.elapsed().as_secs_f64(),
+            processor_seconds: processor_seconds().zip(start.processors).map(|(now, before)| now - before),
             peak_memory_bytes: peak_memory_bytes(),
         });
     }

@@ -58,7 +58,7 @@ pub struct Measure {
 pub struct Measured {
     /// Statistics of every Gaussian.
     pub scanned: Scanned,
-    /// What the pictures show of each, where that is asked for.
+    /// What the pictures show of each, where they were looked at.
     pub seen: Option<Seen>,
 }
 
@@ -85,10 +85,11 @@ impl Measure {
     pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         let Measured { scanned, seen } = match arrived {
             Some(measured) => measured,
-            None => Measured {
-                scanned: self.scan.run(scene, journal)?,
-                seen: self.visible.as_ref().map(|visible| visible.run(scene, journal)).transpose()?,
-            },
+            None => Measured { scanned: self.scan.run(scene, journal)?, seen: None },
+        };
+        let seen = match (&self.visible, seen) {
+            (Some(visible), None) => Some(visible.run(scene, &scanned.rows.life, journal)?),
+            (_, seen) => seen,
         };
         self.score.run(scene, scanned, seen, journal)
     }

@@ -15,7 +15,7 @@ use crate::scene::Scene;
 use crate::score::{Graded, Scores, Term, score};
 use crate::select::{self, Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, fill_anisotropy, snap, ulp};
-use crate::stream::{Progress, Scanned, Seen, gather};
+use crate::stream::{Progress, Scanned, Seen, frames_to_see, gather};
 
 /// What the stage is called.
 const NAME: &str = "score";
@@ -50,6 +50,8 @@ pub struct Scored {
     statistics: Statistics,
     /// T.
     frames: usize,
+    /// See [`frames_to_see`].
+    pub frames_to_see: usize,
     /// How the terms of the scores were normalised.
     pub terms: Vec<Term>,
     /// Counts of odd Gaussians.
@@ -176,6 +178,7 @@ impl Score {
             let scored = Scored {
                 by: Order::Term(self.score.static_term),
                 frames: info.times.len(),
+                frames_to_see: frames_to_see(&rows.life, info.times.len()),
                 terms: scores.terms,
                 flags: flags(&rows),
                 statistics: match scene.limits.rows_aside {

@@ -39,6 +39,9 @@ pub struct Stage {
     pub scratch_bytes: u64,
     /// Wall-clock time.
     pub seconds: f64,
+    /// Time of all processors together, where the system tells.
+    #[serde(default)]
+    pub processor_seconds: Option<f64>,
     /// Largest resident memory of the process up to the end of this stage, where the system tells.
     pub peak_memory_bytes: Option<u64>,
 }
@@ -372,10 +375,11 @@ impl Summary {
                 0 => String::new(),
                 bytes => format!(", {:.1} MiB of scratch", bytes as f64 / f64::from(1 << 20)),
             };
+            let processors = stage.processor_seconds.map_or(String::new(), |s| format!(" ({s:.1} of processors)"));
             let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
             let _ = writeln!(
                 out,
-                "  {:<7} {:>9} -> {:>9}  {:8.2} s, {:.2} reads{scratch}{memory}",
+                "  {:<7} {:>9} -> {:>9}  {:8.2} s{processors}, {:.2} reads{scratch}{memory}",
                 stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds, stage.full_reads
             );
         }

@@ -7,7 +7,7 @@ use crate::limits::Limits;
 use crate::model::{Columns, Rows, Statistic};
 use crate::recipe::{self, Coverage};
 use crate::scene::Scene;
-use crate::stream::{Seen, strided, visible_contribution};
+use crate::stream::{Seen, frames_to_see, looked_at, visible_contribution};
 
 /// What the stage is called.
 const NAME: &str = "visible";
@@ -33,23 +33,34 @@ impl Visible {
     /// The rows scanned so far, C and W, and pictures in the making.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let (mut per_gaussian, fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
+        let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
+        let strided = work.pictures as f64 / every;
+        let most = match self.recipe.look_pictures {
+            0 => f64::INFINITY,
+            most => most as f64,
+        };
         let frames = work.frames.div_ceil(self.recipe.frame_stride.get().into());
+        let frames = if strided > most { frames.min(most as u64) } else { frames };
         let rows = Rows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
         per_gaussian.insert(0, ("rows", rows as u64));
-        let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
-        let seconds = work.reading(work.count(), frames as f64)
-            + work.picturing(work.pictures as f64 / every, work.count(), LOOK);
+        let seconds = work.reading(work.count(), frames as f64) + work.picturing(strided.min(most), work.count(), LOOK);
         Need { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
-    /// C and W of every Gaussian of `scene`.
+    /// Whether a frame's pictures are known as it arrives: of how many they are the ones to look at is only known at the end.
+    pub fn can_look_on_arrival(&self) -> bool {
+        self.recipe.look_pictures == 0
+    }
+
+    /// C and W of every Gaussian of `scene`, of which each lives in `life` frames.
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Seen> {
+    pub fn run(&self, scene: &Scene, life: &[u32], journal: &mut Journal) -> Result<Seen> {
         let source = scene.source();
         let count = source.info().count;
-        let pictures = strided(&scene.schedule, &self.recipe);
+        let frames = frames_to_see(life, source.info().times.len());
+        let pictures = looked_at(&scene.schedule, &self.recipe, frames);
         journal.stage(NAME, count, source, |_| {
             Ok((
                 visible_contribution(

@@ -64,6 +64,7 @@ pub struct Scan {
     pub pixel_stride: NonZeroU32,
     pub view_stride: NonZeroU32,
     pub frame_stride: NonZeroU32,
+    pub look_pictures: usize,
     pub non_finite: NonFinite,
 }
 

@@ -51,10 +51,14 @@ pub(super) fn stages(stages: &[Stage]) -> String {
             of.gaussians_in.to_string(),
             of.gaussians_out.to_string(),
             of.seconds.to_string(),
+            known(of.processor_seconds),
             known(of.peak_memory_bytes),
         ]
     };
-    table(&["stage", "gaussians_in", "gaussians_out", "seconds", "peak_memory_bytes"], stages.iter().map(row))
+    table(
+        &["stage", "gaussians_in", "gaussians_out", "seconds", "processor_seconds", "peak_memory_bytes"],
+        stages.iter().map(row),
+    )
 }
 
 #[cfg(test)]
@@ -111,13 +115,20 @@ mod tests {
             full_reads: 0.0,
             scratch_bytes: 0,
             seconds: 0.125,
+            processor_seconds: Some(0.25),
             peak_memory_bytes: Some(4096),
         };
-        let merge = Stage { name: "\"merge\"".to_owned(), seconds: 3.0, peak_memory_bytes: None, ..stage.clone() };
+        let merge = Stage {
+            name: "\"merge\"".to_owned(),
+            seconds: 3.0,
+            processor_seconds: None,
+            peak_memory_bytes: None,
+            ..stage.clone()
+        };
         assert_eq!(
             stages(&[stage, merge]),
-            "stage,gaussians_in,gaussians_out,seconds,peak_memory_bytes\nscan,10,7,0.125,4096\n\
-             \"\"\"merge\"\"\",10,7,3,\n"
+            "stage,gaussians_in,gaussians_out,seconds,processor_seconds,peak_memory_bytes\nscan,10,7,0.125,0.25,4096\n\
+             \"\"\"merge\"\"\",10,7,3,,\n"
         );
     }
 }

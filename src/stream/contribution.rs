@@ -101,12 +101,18 @@ mod tests {
     use crate::recipe::{self, Recipe};
     use crate::select::{Overrides, select};
     use crate::source::BlockReader;
-    use crate::stream::strided;
+    use crate::stream::looked_at;
     use crate::{render, score};
 
     fn strides(pixel: u32, view: u32, frame: u32) -> recipe::Scan {
         let [pixel_stride, view_stride, frame_stride] = [pixel, view, frame].map(|n| NonZeroU32::new(n).unwrap());
-        recipe::Scan { pixel_stride, view_stride, frame_stride, ..Recipe::preset("default").unwrap().scan }
+        recipe::Scan {
+            pixel_stride,
+            view_stride,
+            frame_stride,
+            look_pictures: 0,
+            ..Recipe::preset("default").unwrap().scan
+        }
     }
 
     fn on_threads<R: Send>(threads: usize, work: impl FnOnce() -> R + Send) -> R {
@@ -130,7 +136,7 @@ mod tests {
                     pictures += 1;
                 }
             }
-            let sample = strided(&schedule, &scan);
+            let sample = looked_at(&schedule, &scan, 1);
             let frames = sample.chunk_by(|a, b| a.frame == b.frame).count();
             assert_eq!((sample.len(), frames), (pictures, 7usize.div_ceil(frame as usize)));
             let one = Limits { frames_held: 1, frames_together: 1, pictures_together: 1, ..Limits::NONE };
@@ -153,7 +159,7 @@ mod tests {
         let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
         let total = |pixel| {
             let scan = strides(pixel, 1, 1);
-            let sample = (&schedule.cameras[..], &strided(&schedule, &scan)[..]);
+            let sample = (&schedule.cameras[..], &looked_at(&schedule, &scan, 1)[..]);
             let seen = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
             seen.coverage.iter().sum::<f64>()
         };
@@ -169,7 +175,7 @@ mod tests {
         let frames = vec![vec![], views(0, 3), views(0, 3), vec![], views(0, 3), views(0, 3)];
         let schedule = Schedule { cameras: (0..3).map(|_| camera.clone()).collect(), frames };
         let taken = |view, frame| -> Vec<(usize, u32)> {
-            let sample = strided(&schedule, &strides(1, view, frame));
+            let sample = looked_at(&schedule, &strides(1, view, frame), 1);
             sample.iter().map(|picture| (picture.frame, picture.camera)).collect()
         };
         assert_eq!(taken(3, 1), [(1, 0), (2, 1), (4, 2), (5, 0)]);
@@ -226,7 +232,7 @@ mod tests {
         };
         let schedule = rig.schedule(&info.times, None).unwrap();
         let recipe = Recipe::preset("default").unwrap();
-        let sample = strided(&schedule, &recipe.scan);
+        let sample = looked_at(&schedule, &recipe.scan, 1);
         let seen = visible_contribution(
             &Still(state, info),
             (&schedule.cameras, &sample),
@@ -260,7 +266,7 @@ mod tests {
         let scene = Scene::new(300, 2);
         let schedule = Schedule { cameras: Vec::new(), frames: vec![Vec::new(); 2] };
         let look = |source: &dyn FrameSource, schedule: &Schedule| {
-            let sample = strided(schedule, &strides(1, 1, 1));
+            let sample = looked_at(schedule, &strides(1, 1, 1), 1);
             visible_contribution(source, (&schedule.cameras, &sample), NonZeroU32::MIN, Limits::NONE).unwrap()
         };
         let seen = look(&scene, &schedule);

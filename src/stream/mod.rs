@@ -28,7 +28,7 @@ pub use parts::Parts;
 pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, View, show};
 pub use progress::{Mode, Progress, begin_run, duration};
 pub use removal::removal_error;
-pub use sample::{Sampler, VIEWS_AT_ONCE, spread, strided};
+pub use sample::{Sampler, VIEWS_AT_ONCE, frames_to_see, looked_at, spread, spread_over};
 pub use scan::{RunningScan, Scanned, scan};
 pub use states::States;
 

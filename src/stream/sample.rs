@@ -42,9 +42,34 @@ impl Sampler {
     }
 }
 
-/// The pictures that the strides of `scan` leave of `schedule`, see [`Sampler`].
-pub fn strided(schedule: &Schedule, scan: &recipe::Scan) -> Vec<Picture> {
-    Sampler::new(scan).all(schedule)
+/// The pictures of `schedule` that `scan` looks at: those that its strides leave (see [`Sampler`]), or as many of these as it
+/// looks at most, spread over `frames` frames or more, see [`spread_over`].
+pub fn looked_at(schedule: &Schedule, scan: &recipe::Scan, frames: usize) -> Vec<Picture> {
+    let strided = Sampler::new(scan).all(schedule);
+    if scan.look_pictures == 0 || strided.len() <= scan.look_pictures {
+        return strided;
+    }
+    let mut left = vec![Vec::new(); schedule.frames.len()];
+    strided.iter().for_each(|picture| left[picture.frame].push((picture.view, picture.camera)));
+    spread_over(&Schedule { cameras: Vec::new(), frames: left }, scan.look_pictures, frames)
+}
+
+/// How many frames, evenly spaced, it takes for all but a hundredth of those that ever live to live in one of them, if they
+/// live without a gap. `life`: in how many of the `frames` frames each lives.
+pub fn frames_to_see(life: &[u32], frames: usize) -> usize {
+    let mut lives: Vec<u32> = life.iter().copied().filter(|&life| life > 0).collect();
+    if lives.is_empty() {
+        return 0;
+    }
+    let hundredth = lives.len() / 100;
+    let (_, &mut shortest, _) = lives.select_nth_unstable(hundredth);
+    frames.div_ceil(shortest as usize)
+}
+
+/// [`spread`] of at most `pictures` pictures over `frames` frames or more, if there are as many pictures, and else over as few
+/// frames as [`VIEWS_AT_ONCE`] allows.
+pub fn spread_over(schedule: &Schedule, pictures: usize, frames: usize) -> Vec<Picture> {
+    spread(schedule, pictures, (pictures / frames.max(1)).clamp(1, VIEWS_AT_ONCE))
 }
 
 /// At most `pictures` pictures, spread evenly over all frames and views, of no more frames than it takes to have
@@ -105,6 +130,33 @@ mod tests {
             seen.dedup();
             assert_eq!(seen.len(), found.len().min(views as usize), "{of} frames: views that are seen of {views}");
         }
+    }
+
+    #[test]
+    fn short_lives_spread_pictures_over_more_frames() {
+        // Of 300 Gaussians three live in 5 frames or less, the others in 12 or more; one never does.
+        let life: Vec<u32> = [0, 1, 5, 5].into_iter().chain((0..297).map(|k| 12 + k)).collect();
+        assert_eq!((frames_to_see(&life, 300), frames_to_see(&[0, 0], 300), frames_to_see(&[300], 300)), (25, 0, 1));
+        let of = |frames_at_least: usize| frames(&spread_over(&schedule(300, 18), 48, frames_at_least));
+        assert_eq!([0, 1, 16, 17, 24, 25, 48, 300].map(of), [16, 16, 16, 24, 24, 48, 48, 48]);
+        // Whoever lives as long as all but a hundredth lives in one of them.
+        let seen: Vec<usize> = spread_over(&schedule(300, 18), 48, 25).iter().map(|picture| picture.frame).collect();
+        assert!((0..=288).all(|birth| seen.iter().any(|frame| (birth..birth + 12).contains(frame))));
+    }
+
+    #[test]
+    fn a_look_takes_what_strides_leave_up_to_so_many() {
+        let taken = |look_pictures: usize, view_stride: u32| {
+            let view_stride = std::num::NonZeroU32::new(view_stride).unwrap();
+            let scan = recipe::Scan { look_pictures, view_stride, ..recipe::Recipe::preset("paper").unwrap().scan };
+            looked_at(&schedule(60, 12), &scan, 1)
+        };
+        assert_eq!(
+            [(0, 1), (0, 4), (180, 4), (100, 1), (100, 4)].map(|(most, stride)| taken(most, stride).len()),
+            [720, 180, 180, 100, 100]
+        );
+        let strided = taken(0, 4);
+        assert!(taken(100, 4).iter().all(|picture| strided.contains(picture)));
     }
 
     #[test]
