@@ -123,6 +123,28 @@ fn a_column_that_never_changes_is_stored_once() {
 }
 
 #[test]
+fn motion_that_returns_to_where_it_began_is_kept() {
+    // Frame 8 is frame 0 again, in one block with all between.
+    let frames = 9;
+    let folder = scene::folder();
+    let path = folder.path().join("a");
+    let turning = || {
+        let mut scene = Scene::new(layout(50, 50, 9, &[2, 1]), frames, 5);
+        let place = |i: usize| (i % 100) as f32 + ((i / 100 % 8) as f32 * 0.7).sin();
+        scene.bits[0] = (0..frames * 100).map(|i| place(i).to_bits()).collect();
+        scene
+    };
+    for compression in [Compression::Raw, Compression::Zstd(1)] {
+        turning().write(&path, compression, |_| ());
+        turning().compare(&Reader::open(&path).unwrap(), frames).unwrap();
+    }
+    let (exact, back) = turning().bounded(1e-3, &path);
+    let off = |(&a, &b): (&u32, &u32)| (f32::from_bits(a) - f32::from_bits(b)).abs();
+    let furthest = exact.bits[0].iter().zip(&back.bits[0]).map(off).fold(0.0, f32::max);
+    assert!(furthest <= 1e-3, "a track is {furthest} off");
+}
+
+#[test]
 fn a_repeated_tile_is_the_tile_written_again() {
     let folder = scene::folder();
     let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
