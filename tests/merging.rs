@@ -108,8 +108,7 @@ fn move_alike(whole: &Whole, i: usize, j: usize, recipe: &Recipe, pass: &MergePa
         .collect();
     let similarity = match merge.trajectory {
         Trajectory::Cosine => {
-            let cosines = steps.iter().filter(|(a, b)| a.length() * b.length() > 0.0);
-            let sum: f64 = cosines.map(|(a, b)| a.dot(*b) / (a.length() * b.length())).sum();
+            let sum: f64 = steps.iter().map(|(a, b)| a.dot(*b) / (a.length() * b.length() + 1e-8)).sum();
             let terms = if recipe.scan.motion == Motion::Literal { common.len() } else { steps.len() };
             if terms == 0 { 0.0 } else { sum / terms as f64 }
         }

@@ -7,8 +7,8 @@ use glam::{DMat3, DQuat, DVec3};
 use crate::model::{Gaussians, SH_C0};
 use crate::recipe;
 
-/// ε in the denominator of the cosine of base colours, as in the paper (section 3.5.1).
-const COSINE_EPSILON: f64 = 1e-8;
+/// ε in the denominator of the cosines of base colours and of steps, as in the paper (section 3.5.1).
+pub(super) const COSINE_EPSILON: f64 = 1e-8;
 /// Share of the trace added to the diagonal of the averaged covariance, so that coplanar pancakes
 /// have a finite distance.
 const REGULARIZATION: f64 = 1e-6;

@@ -8,6 +8,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::gates::COSINE_EPSILON;
 use crate::recipe::{self, Motion, Trajectory};
 
 /// Memory of one pair while frames stream by.
@@ -19,7 +20,7 @@ pub const NODE_BYTES: usize = size_of::<Track>();
 /// frames, whatever their distance in time: the noise floor they are held against is one of steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
-    /// Mean cosine of velocities; a step with a velocity of zero counts as 0. The mean is over all
+    /// Mean cosine of velocities, a·b/(‖a‖‖b‖ + 1e-8); a step with a velocity of zero counts as 0. The mean is over all
     /// frames of the common life (`Motion::Literal`) or over the steps inside it (`Motion::Runs`).
     pub cosine: f64,
     /// Σ a·b over the steps, squared scene units.
@@ -202,8 +203,7 @@ impl Track {
 impl Pair {
     fn step(&mut self, a: DVec3, b: DVec3) {
         let dot = a.dot(b);
-        let speeds = a.length() * b.length();
-        self.cosines += if speeds > 0.0 { dot / speeds } else { 0.0 };
+        self.cosines += dot / (a.length() * b.length() + COSINE_EPSILON);
         self.dot += dot;
         self.squares += a.length_squared() + b.length_squared();
         self.steps += 1;
@@ -284,6 +284,16 @@ mod tests {
     }
 
     #[test]
+    fn steps_that_are_next_to_nothing_hardly_count_in_the_cosine_of_the_paper() {
+        let slow = path(|t| 1e-5 * t as f32);
+        assert!(merges_in_paper(&path(|t| 1e-3 * t as f32), &path(|t| 1e-3 * t as f32)));
+        let cosine = measure(&slow, &slow, Motion::Runs).cosine;
+        // 1e-10 / (1e-10 + 1e-8), of coordinates in f32.
+        assert!((cosine - 1.0 / 101.0).abs() < 1e-6, "{cosine}");
+        assert!(!merges_in_paper(&slow, &slow));
+    }
+
+    #[test]
     fn a_teleport_while_alive_never_merges_and_one_while_dead_does() {
         let still = path(|_| 0.0);
         let jump = path(|t| if t < 10 { 0.0 } else { 50.0 });
@@ -345,7 +355,8 @@ mod tests {
                 let ends: Vec<usize> =
                     common.iter().copied().filter(|&t| t > 0 && (motion == Motion::Literal || both(t - 1))).collect();
                 let v = |p: &Path, t: usize| f64::from(p[t].0) - f64::from(p[t - 1].0);
-                let signs: f64 = ends.iter().map(|&t| if v(&a, t) * v(&b, t) == 0.0 { 0.0 } else { (v(&a, t) * v(&b, t)).signum() }).sum();
+                let products = ends.iter().map(|&t| v(&a, t) * v(&b, t));
+                let signs: f64 = products.map(|product| product / (product.abs() + 1e-8)).sum();
                 let terms = if motion == Motion::Literal { common.len() } else { ends.len() };
                 let cosine = if terms == 0 { 0.0 } else { signs / terms as f64 };
                 let dot: f64 = ends.iter().map(|&t| v(&a, t) * v(&b, t)).sum();
