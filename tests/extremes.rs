@@ -254,6 +254,16 @@ fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
 }
 
 #[test]
+fn duplicates_merge_to_one_whatever_their_number() {
+    for count in [34, 100, 5000] {
+        let workplace = Workplace::new();
+        workplace.ply("same.ply", &balls(1).pick(&vec![0; count]));
+        let summary = workplace.summary("same.ply -o out.ply --merge-only --no-refine");
+        assert_eq!(summary["gaussians"], 1, "{count} copies");
+    }
+}
+
+#[test]
 fn frames_that_disagree_are_named() {
     let workplace = Workplace::new();
     workplace.ply("frames/frame_1.ply", &balls(5));

@@ -39,7 +39,7 @@ use proxy::Importance;
 use tree::Point;
 
 /// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
-/// rank 4, and the larger of the neighbour index, 46, and the clustering, 24.
+/// rank 4, and the largest of the neighbour index, 46, who coincides with whom, 24, and the clustering, 24.
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Memory per candidate pair of those handed on together, beside what measuring takes: the pair, the same pair as one
@@ -113,13 +113,13 @@ pub struct PassCounts {
     pub sequential: bool,
 }
 
-/// All passes of `recipe` over `survivors`.
+/// All passes of `recipe` over `survivors`, in each of which nodes that coincide merge first.
 ///
 /// `measure` answers test 3: for every pair, in order, how alike it moves; a pair passes where that exceeds the pass's
-/// τ_m. It is asked once per pass, unless no pair is left, and more often if there are more than `most_pairs`: then for
-/// so many at a time, in the voxel order of those that lead. The answer depends on the pair alone, so the caller may
-/// remember it. In later passes nodes are groups: state = proxy over all original members, size = ΣC, trajectory,
-/// life and hash = the leader's.
+/// τ_m. It is asked once per pass, and once before if nodes coincide, unless no pair is left; more often if there are
+/// more than `most_pairs`: then for so many at a time, in the voxel order of those that lead. The answer depends on the
+/// pair alone, so the caller may remember it. In later passes nodes are groups: state = proxy over all original members,
+/// size = ΣC, trajectory, life and hash = the leader's.
 ///
 /// With `limit`, merging stops after exactly that many joins over all passes, or fewer if there are
 /// not so many; the joins kept are the first ones in sequential order. Fails only if `measure` does.
@@ -139,31 +139,41 @@ pub fn run<E>(
         if left == Some(0) {
             break;
         }
-        let rank = ranks(&groups, importance);
-        let nodes = Nodes::new(survivors, &groups, &proxies);
-        let (mut pairs, mut candidates) = (Vec::new(), 0);
-        let truncated = each_candidate(&nodes, &rank, recipe, (pass, unit), most_pairs, |some, is_part| {
-            let asked = Asked { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
-            let likeness = measure(asked)?;
-            debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
-            let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
-            pairs.extend(alike.map(|(&pair, _)| pair));
-            candidates += some.len();
-            Ok(())
-        })?;
-        let passing = pairs.len();
-        let clustering = greedy::cluster(&rank, pairs, left);
-        left = left.map(|left| left - clustering.joins);
-        passes.push(PassCounts {
-            truncated,
-            candidates,
-            passing,
-            joins: clustering.joins,
-            rounds: clustering.rounds,
-            sequential: clustering.sequential,
-        });
-        groups = groups.joined(&clustering.leader_of);
-        proxies = proxy::merge_groups(&groups, importance, survivors.states, recipe);
+        let mut counts = PassCounts::default();
+        for coincident in [true, false] {
+            let rank = ranks(&groups, importance);
+            let nodes = Nodes::new(survivors, &groups, &proxies);
+            let mut pairs = Vec::new();
+            let take = |some: &[(u32, u32)], is_part| {
+                let asked = Asked { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
+                let likeness = measure(asked)?;
+                debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
+                let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
+                pairs.extend(alike.map(|(&pair, _)| pair));
+                counts.candidates += some.len();
+                Ok::<_, E>(())
+            };
+            if coincident {
+                each_coincident(&nodes, &rank, &Gates::new(recipe, pass), most_pairs, take)?;
+                if pairs.is_empty() {
+                    continue;
+                }
+            } else {
+                counts.truncated = each_candidate(&nodes, &rank, recipe, (pass, unit), most_pairs, take)?;
+            }
+            counts.passing += pairs.len();
+            let clustering = greedy::cluster(&rank, pairs, left);
+            left = left.map(|left| left - clustering.joins);
+            counts.joins += clustering.joins;
+            counts.rounds += clustering.rounds;
+            counts.sequential |= clustering.sequential;
+            groups = groups.joined(&clustering.leader_of);
+            proxies = proxy::merge_groups(&groups, importance, survivors.states, recipe);
+            if left == Some(0) {
+                break;
+            }
+        }
+        passes.push(counts);
     }
     Ok(Merged { groups, proxies, passes })
 }
@@ -219,6 +229,45 @@ impl<'a> Nodes<'a> {
         let (states, row) = self.state(node);
         Appearance::new(states, row)
     }
+
+    /// The bits of all that an [`Appearance`] is made of, −0 as 0.
+    fn look_bits(&self, node: usize) -> [u32; 13] {
+        let (states, row) = self.state(node);
+        let [x, y, z] = states.position.row(row);
+        let [qw, qx, qy, qz] = states.rotation.row(row);
+        let [a, b, c] = states.log_scale.row(row);
+        let [red, green, blue] = states.sh.row(row);
+        [x, y, z, qw, qx, qy, qz, a, b, c, red, green, blue].map(|value: f32| (value + 0.0).to_bits())
+    }
+}
+
+/// Hands on the pairs (leader, member) of nodes that coincide, alike in all that `gates` look at, and pass them: of each
+/// such crowd the first in rank with all others, whatever their number. By leader, `most` (at least 1) at a time.
+///
+/// The nearest neighbours of a crowd are some of itself, the same ones for all: without this it would stay many, and
+/// hide who is near.
+fn each_coincident<E>(
+    nodes: &Nodes<'_>,
+    rank: &[u32],
+    gates: &Gates,
+    most: usize,
+    mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
+) -> Result<(), E> {
+    let key = |node: usize| nodes.look_bits(node).iter().fold(0, |key, &bits| hash_id(key ^ u64::from(bits)));
+    let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
+    let mut order: Vec<(u64, u32, u32)> = usable.map(|node| (key(node), rank[node], node as u32)).collect();
+    order.par_sort_unstable();
+    let mut pairs = Vec::new();
+    for crowd in order.chunk_by(|a, b| a.0 == b.0).filter(|crowd| crowd.len() > 1) {
+        let leader = crowd[0].2;
+        let (bits, look) = (nodes.look_bits(leader as usize), nodes.look(leader as usize));
+        let alike = |node: u32| nodes.look_bits(node as usize) == bits && gates.pass(&look, &nodes.look(node as usize));
+        pairs.extend(crowd[1..].iter().filter(|member| alike(member.2)).map(|member| (leader, member.2)));
+    }
+    drop(order);
+    pairs.par_sort_unstable();
+    let is_part = pairs.len() > most;
+    pairs.chunks(most).try_for_each(|some| take(some, is_part))
 }
 
 /// Hands on the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`, `unit` being the length of one unit

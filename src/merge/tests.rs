@@ -206,6 +206,32 @@ fn exact_duplicates_merge_to_one() {
 }
 
 #[test]
+fn a_crowd_of_any_number_at_one_place_is_one_before_it_meets_its_neighbours() {
+    for count in [34, 100, 5000] {
+        // Two crowds of different colours at one place, of which the others are near; one other alone.
+        let mut scene = Scene::strewn(2 * count + 1);
+        let places: Vec<u32> = (0..=2 * count as u32).map(|i| if i == 0 { 0 } else { 1 + i % 2 }).collect();
+        scene.states = scene.states.pick(&places);
+        for (i, &place) in places.iter().enumerate() {
+            scene.states.position.set_row(i, [if i == 0 { 0.501 } else { 0.5 }, 0.5, 0.5]);
+            scene.states.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+            scene.states.log_scale.set_row(i, [-3.0; 3]);
+            scene.states.sh.set_row::<12>(i, [if place == 1 { 0.2 } else { -0.9 }; 12]);
+        }
+        let mut recipe = scene.recipe();
+        recipe.passes[0].epsilon = 0.01;
+        let merged = scene.merge(&recipe, None);
+        let members = |row| merged.groups.members(group_of(&merged.groups, row)).len();
+        assert_eq!((merged.groups.len(), members(1), members(2)), (2, count + 1, count), "{:?}", merged.passes);
+        let limited = scene.merge(&recipe, Some(count));
+        assert_eq!(limited.groups.len(), count + 1);
+        let (rows, frame) = ((0..=2 * count as u32).collect::<Vec<u32>>(), [scene.states.position.clone()]);
+        let (parts, _) = scene.merge_in_parts(&rows, &recipe, None, &frame, 7);
+        assert!(parts.groups == merged.groups && parts.proxies == merged.proxies);
+    }
+}
+
+#[test]
 fn one_giant_background_gaussian_swallows_nothing_and_stays_alone() {
     let mut scene = Scene::strewn(500);
     scene.states.position.set_row(7, [0.5; 3]);
