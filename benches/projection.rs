@@ -41,6 +41,7 @@ fn cameras(views: usize) -> Vec<Camera> {
             cy: 128.0,
             rotation: DMat3::from_rotation_y(v as f64 * 0.4),
             translation: DVec3::new(0.0, 0.0, 4.0),
+            near: Camera::NEAR,
         })
         .collect()
 }

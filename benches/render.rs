@@ -135,6 +135,7 @@ fn sizes(criterion: &mut Criterion) {
         cy: 256.0,
         rotation: DMat3::IDENTITY,
         translation: DVec3::ZERO,
+        near: Camera::NEAR,
     };
     for count in [10_000, 100_000, 1_000_000] {
         measure(criterion, "size", &count.to_string(), &cloud(count), &camera);

@@ -230,6 +230,29 @@ fn without_cameras_a_virtual_rig_is_used_and_said() {
 }
 
 #[test]
+fn without_cameras_what_stays_does_not_depend_on_the_unit_of_length() {
+    let kept = |power: i32| {
+        let (workplace, unit) = (Workplace::new(), 2f32.powi(power));
+        let mut cloud = balls(2000);
+        for i in 0..2000 {
+            let value = |k: f32| (i as f32 * k).fract();
+            let place = cloud.position.row::<3>(i);
+            cloud.position.set_row(i, [place[0], place[1], value(0.754_877)].map(|x| x * unit));
+            cloud.log_scale.set_row(i, [0.1, 0.2, 0.3].map(|k| unit.ln() - 3.5 - value(k)));
+            cloud.opacity_logit.set_row(i, [6.0 * value(0.569_84) - 3.0]);
+        }
+        workplace.ply("cloud.ply", &cloud);
+        workplace.done("compress cloud.ply -o out.ply --prune-only --no-refine --target-count 1000");
+        index_map(&workplace.path("out.ply.index_map.npy"))
+    };
+    let expected = kept(1);
+    // Cameras stand two extents away.
+    for power in [-4, 20] {
+        assert!(kept(power) == expected, "2^{power}: other Gaussians stay");
+    }
+}
+
+#[test]
 fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
     let workplace = Workplace::new();
     let cloud = balls(10).pick(&(0..30).map(|i| i / 3).collect::<Vec<_>>());

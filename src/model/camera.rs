@@ -26,9 +26,14 @@ pub struct Camera {
     pub rotation: DMat3,
     /// World to camera: `x_camera = rotation · x_world + translation`.
     pub translation: DVec3,
+    /// View depth up to which nothing is seen, scene units.
+    pub near: f64,
 }
 
 impl Camera {
+    /// [`Camera::near`] of the original rasteriser, for which models are trained.
+    pub const NEAR: f64 = 0.2;
+
     /// A camera at `eye` with `target` in the middle of its picture, z up in it, pixels square.
     ///
     /// `angle` is the horizontal field of view in radians, `size` (width, height) in pixels. The two
@@ -48,6 +53,7 @@ impl Camera {
             cy: 0.5 * f64::from(height),
             rotation,
             translation: -(rotation * eye),
+            near: Self::NEAR,
         }
     }
 

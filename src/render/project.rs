@@ -13,8 +13,6 @@ use super::colour::{self, Colours};
 use super::convention::{BLOCK, MIN_ALPHA, TILE};
 use crate::model::{Camera, Gaussians};
 
-/// View depths up to this are not drawn, scene units; an f32 in the reference kernel.
-const NEAR: f64 = 0.2f32 as f64;
 /// Variance added to the diagonal of every 2-D covariance, pixels².
 const DILATION: f64 = 0.3;
 /// The Jacobian is taken at directions no further out than this many half fields of view.
@@ -37,6 +35,8 @@ pub(super) struct View {
     pub(super) size: [u32; 2],
     /// Tiles across and down.
     pub(super) tiles: [u32; 2],
+    /// View depths up to this are not drawn; an f32 in the reference kernel.
+    near: f64,
 }
 
 impl View {
@@ -54,6 +54,7 @@ impl View {
             center: camera.center().to_array(),
             size: [camera.width, camera.height],
             tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
+            near: f64::from(camera.near as f32),
         }
     }
 }
@@ -232,7 +233,7 @@ impl Footprints {
     fn splat(&self, i: usize, id: u32, view: &View) -> Option<(Splat, TileRect)> {
         let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
         let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.narrow[i].is_finite();
-        if !(depth > NEAR && finite && opacity >= f64::from(MIN_ALPHA)) {
+        if !(depth > view.near && finite && opacity >= f64::from(MIN_ALPHA)) {
             return None;
         }
         let reach = log2_bound(opacity / f64::from(MIN_ALPHA)) + REACH_SLACK;

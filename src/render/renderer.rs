@@ -312,6 +312,7 @@ mod tests {
             cy: 35.0,
             rotation: DMat3::IDENTITY,
             translation: DVec3::ZERO,
+            near: Camera::NEAR,
         };
         (scene, camera)
     }

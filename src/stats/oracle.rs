@@ -58,7 +58,7 @@ pub(super) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
     let world = frame.position.row::<3>(i).map(f64::from);
     let p: [f64; 3] = std::array::from_fn(|r| (0..3).map(|k| w[r][k] * world[k]).sum::<f64>() + camera.translation[r]);
-    if p[2] <= 0.2 {
+    if p[2] <= camera.near {
         return 0.0;
     }
     let q = frame.rotation.row::<4>(i).map(f64::from);

@@ -1,7 +1,7 @@
 //! Projected coverage: how many pixels a Gaussian covers in a picture, times its opacity.
 //!
 //! Elliptical weighted averaging with the conventions of the original rasteriser: culled at depth
-//! z ≤ 0.2, Jacobian at x/z and y/z clamped to ±1.3·tan(fov/2), 0.3 px² added to the diagonal of the
+//! z ≤ 0.2 (the camera's near plane), Jacobian at x/z and y/z clamped to ±1.3·tan(fov/2), 0.3 px² added to the diagonal of the
 //! 2-D covariance Σ = MMᵀ + 0.3·I, where M = J·W·R·S is 2×3 (EWA splatting, Zwicker et al. 2001).
 //!
 //! A = 9π·√det Σ × (share of the box u ± 3√Σ_xx, v ± 3√Σ_yy that lies inside the picture), the area
@@ -17,8 +17,6 @@ use std::f64::consts::FRAC_PI_4;
 
 use crate::model::Camera;
 
-/// Depth up to which a Gaussian is culled, scene units.
-const NEAR: f64 = 0.2;
 /// Share of the half field of view to which the Jacobian's argument is clamped.
 const JACOBIAN_CLAMP: f64 = 1.3;
 /// Added to the diagonal of the 2-D covariance, px².
@@ -93,6 +91,7 @@ struct View {
     principal: [f64; 2],
     size: [f64; 2],
     slope_limit: [f64; 2],
+    near: f64,
 }
 
 impl View {
@@ -106,6 +105,7 @@ impl View {
             principal: [camera.cx, camera.cy],
             size,
             slope_limit: std::array::from_fn(|k| JACOBIAN_CLAMP * size[k] / (2.0 * focal[k])),
+            near: camera.near,
         }
     }
 }
@@ -161,11 +161,11 @@ impl<const N: usize> Stage<N> {
     /// Where the centers lie in the camera.
     #[inline(always)]
     fn place(&mut self, view: &View, [px, py, pz]: [&[f32; N]; 3]) {
-        let View { rotation: [w0, w1, w2], translation: t, .. } = view;
+        let View { rotation: [w0, w1, w2], translation: t, near, .. } = view;
         for i in 0..N {
             let world = [f64::from(px[i]), f64::from(py[i]), f64::from(pz[i])];
             let z = dot(w2, world) + t[2];
-            let inverse_depth = 1.0 / if z > NEAR { z } else { 1.0 };
+            let inverse_depth = 1.0 / if z > *near { z } else { 1.0 };
             self.depth[i] = z;
             self.inverse_depth[i] = inverse_depth;
             self.slope[0][i] = (dot(w0, world) + t[0]) * inverse_depth;
@@ -207,13 +207,13 @@ impl<const N: usize> Stage<N> {
         coverage: &mut [u64; N],
         touched: &mut [u32; N],
     ) {
-        let View { focal, principal, size, .. } = view;
+        let View { focal, principal, size, near, .. } = view;
         let unit = 2f64.powi(scale.exponent);
         for i in 0..N {
             let sigma = [self.sigma[0][i], self.sigma[1][i]];
             let inside = |k: usize| overlap(focal[k] * self.slope[k][i] + principal[k], REACH * sigma[k], size[k]);
             let (inside_x, inside_y) = (inside(0), inside(1));
-            let touches = (self.depth[i] > NEAR) & (inside_x > 0.0) & (inside_y > 0.0);
+            let touches = (self.depth[i] > *near) & (inside_x > 0.0) & (inside_y > 0.0);
             // 9π√det × inside_x·inside_y / (6σ_x · 6σ_y)
             let area = FRAC_PI_4 * (self.root_det[i] / (sigma[0] * sigma[1])) * (inside_x * inside_y);
             let contribution = if touches { area * opacity[i] } else { 0.0 };
@@ -279,6 +279,7 @@ mod tests {
             cy: 128.0,
             rotation: DMat3::from_rotation_y(0.3),
             translation: DVec3::new(0.1, -0.2, 3.0),
+            near: Camera::NEAR,
         };
         let position: [Vec<f32>; 3] =
             std::array::from_fn(|axis| (0..LEN).map(|i| (10.0 * random(3 * i + axis) - 5.0) as f32).collect());

@@ -32,6 +32,7 @@ fn camera(seed: u64) -> Camera {
         cy: 125.5,
         rotation,
         translation: -(rotation * eye),
+        near: Camera::NEAR,
     }
 }
 

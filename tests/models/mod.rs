@@ -57,6 +57,7 @@ impl Model {
             cy: number("cy"),
             rotation: DMat3::from_cols_array_2d(&std::array::from_fn(|c| std::array::from_fn(|r| m(r, c)))),
             translation: DVec3::new(m(0, 3), m(1, 3), m(2, 3)),
+            near: Camera::NEAR,
         }
     }
 

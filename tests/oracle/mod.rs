@@ -73,7 +73,7 @@ fn order([x, y, z]: [f32; 3], camera: &Camera) -> f32 {
 fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footprint> {
     let world = DVec3::from_array(gaussians.position.row::<3>(id).map(f64::from));
     let p = camera.rotation * world + camera.translation;
-    if p.z <= f64::from(0.2f32) {
+    if p.z <= f64::from(camera.near as f32) {
         return None;
     }
     let [w, x, y, z] = gaussians.rotation.row::<4>(id).map(f64::from);

@@ -14,6 +14,7 @@ pub(crate) fn camera(width: u32, height: u32) -> Camera {
         cy: 0.5 * f64::from(height) - 0.7,
         rotation: DMat3::from_quat(DQuat::from_xyzw(0.05, -0.03, 0.02, 1.0).normalize()),
         translation: DVec3::new(0.1, -0.2, 0.3),
+        near: Camera::NEAR,
     }
 }
 
@@ -28,6 +29,7 @@ pub(crate) fn plain_camera(size: u32) -> Camera {
         cy: 0.5 * f64::from(size),
         rotation: DMat3::IDENTITY,
         translation: DVec3::ZERO,
+        near: Camera::NEAR,
     }
 }
 

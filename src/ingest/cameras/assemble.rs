@@ -96,7 +96,7 @@ fn one_sided(timed: bool) -> &'static str {
 
 /// What is wrong with a camera, as (expected, found).
 pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)> {
-    let Camera { width, height, fx, fy, cx, cy, rotation, translation } = camera;
+    let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
     let side = 1..=MAX_SIDE_PX;
     if !side.contains(width) || !side.contains(height) {
         return Err((format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
@@ -129,7 +129,7 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
 
 /// Every value of a camera as bits, −0 as 0.
 fn key(camera: &Camera) -> [u64; 18] {
-    let Camera { width, height, fx, fy, cx, cy, rotation, translation } = camera;
+    let Camera { width, height, fx, fy, cx, cy, rotation, translation, near: _ } = camera;
     let mut key = [0; 18];
     let values = [*fx, *fy, *cx, *cy].into_iter().chain(rotation.to_cols_array()).chain(translation.to_array());
     for (to, value) in key.iter_mut().zip(values) {
@@ -148,7 +148,7 @@ pub(super) fn from_camera_to_world(
     center: DVec3,
 ) -> Camera {
     let rotation = rotation.transpose();
-    Camera { width, height, fx, fy, cx, cy, rotation, translation: -(rotation * center) }
+    Camera { width, height, fx, fy, cx, cy, rotation, translation: -(rotation * center), near: Camera::NEAR }
 }
 
 /// The view number in a picture's name of the form `…tNNN_vNN…`.

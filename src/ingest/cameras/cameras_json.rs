@@ -58,6 +58,7 @@ fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
         cy: own.number("cy")?,
         rotation,
         translation,
+        near: Camera::NEAR,
     };
     Ok(Picture {
         camera,

@@ -143,6 +143,7 @@ fn opengl_pose_becomes_an_opencv_camera() {
         // Right is +x, down is −z, forward is +y.
         rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Z, DVec3::Y).transpose(),
         translation: DVec3::new(0.0, 1.0, 4.0),
+        near: Camera::NEAR,
     };
     assert_eq!(rig.cameras[0], expected);
     assert_eq!(rig.cameras[1].center(), DVec3::new(1.0, -4.0, 1.0));

@@ -10,6 +10,8 @@ const CAMERAS: u32 = 12;
 /// equal sides is seen whole from every corner.
 const DISTANCE: f64 = 2.0;
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
+/// Near plane in extents: what is seen does not depend on the unit of length.
+const NEAR: f64 = 0.1;
 const SIDE_PX: u32 = 512;
 
 /// Cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, looking at it, every one at
@@ -26,7 +28,8 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
         let z = 1.0 - f64::from(2 * k + 1) / f64::from(CAMERAS);
         let (sin, cos) = (golden_angle * f64::from(k)).sin_cos();
         let outward = DVec3::new(cos, sin, 0.0) * (1.0 - z * z).sqrt() + DVec3::Z * z;
-        Camera::look_at(center + radius * outward, center, FIELD_OF_VIEW_DEGREES.to_radians(), (SIDE_PX, SIDE_PX))
+        let (eye, angle) = (center + radius * outward, FIELD_OF_VIEW_DEGREES.to_radians());
+        Camera { near: NEAR * extent, ..Camera::look_at(eye, center, angle, (SIDE_PX, SIDE_PX)) }
     });
     let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
     Rig {
