@@ -14,6 +14,9 @@ use crate::model::{Camera, Rig, Shot, Split};
 /// moves by 0.05 px at a focal length of 1000 px, and a scaled or sheared matrix is far beyond.
 const ROTATION_TOLERANCE: f64 = 1e-4;
 
+/// Longest focal length in pixels: beyond it, the squares of what a picture shows of the largest Gaussians overflow.
+const MAX_FOCAL_PX: f64 = 1e9;
+
 /// A picture as a file lists it.
 #[derive(Debug, Clone)]
 pub(super) struct Picture {
@@ -101,9 +104,12 @@ pub(super) fn check(camera: &Camera) -> std::result::Result<(), (String, String)
     if !side.contains(width) || !side.contains(height) {
         return Err((format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
     }
-    let usable = |focal: &f64| focal.is_finite() && *focal > 0.0;
+    let usable = |focal: &f64| *focal > 0.0 && *focal <= MAX_FOCAL_PX;
     if !usable(fx) || !usable(fy) {
-        return Err(("focal lengths above 0".into(), format!("{fx} and {fy}")));
+        return Err((
+            format!("focal lengths above 0 and at most {MAX_FOCAL_PX:e} pixels"),
+            format!("{fx:e} and {fy:e}"),
+        ));
     }
     if !cx.is_finite() || !cy.is_finite() {
         return Err(("a finite principal point".into(), format!("{cx} and {cy}")));

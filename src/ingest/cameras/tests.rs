@@ -310,6 +310,7 @@ fn what_is_wrong_with_a_picture_is_said_with_its_number() {
         ("time", json!(0.0), vec![]),
         ("fl_x", json!(0.0), vec!["frame 1", "focal", "0"]),
         ("fl_x", json!(-3), vec!["frame 1", "focal", "-3"]),
+        ("fl_x", json!(1e80), vec!["frame 1", "focal", "at most 1e9 pixels", "1e80"]),
         ("w", json!(80.5), vec!["frame 1", "\"w\"", "80.5"]),
         ("w", json!(1e9), vec!["frame 1", "\"w\"", "32768"]),
         ("transform_matrix", json!([[1, 0], [0, 1]]), vec!["frame 1", "transform_matrix"]),
