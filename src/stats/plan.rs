@@ -8,6 +8,10 @@ use crate::recipe::{Motion, Scan};
 /// even. Stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5; real gaps are far larger.
 const EVEN_TOLERANCE: f64 = 1e-2;
 
+/// Shortest time step, as a fraction of the mean step: κ divides differences of positions by two steps, and squares
+/// what it finds.
+const LEAST_STEP: f64 = 1e-50;
+
 /// Largest contribution of one (frame, view) pair in fixed point: [`super::projection`] rounds by
 /// adding 2⁵², so a contribution must stay below it; one bit is kept in reserve.
 const CONTRIBUTION_BITS: i32 = 51;
@@ -37,8 +41,8 @@ impl ScanPlan {
     /// no time stamps.
     ///
     /// # Errors
-    /// [`Error::Usage`] for time stamps that do not increase, a schedule of another number of
-    /// frames, or more than 2³² (frame, view) pairs.
+    /// [`Error::Usage`] for time stamps that do not increase, or of which two are nothing apart beside the others; for a
+    /// schedule of another number of frames, or more than 2³² (frame, view) pairs.
     pub fn new(scan: &Scan, times: &[f64], schedule: &Schedule) -> Result<Self> {
         if let Some(t) =
             (1..times.len()).find(|&t| times[t - 1].partial_cmp(&times[t]) != Some(std::cmp::Ordering::Less))
@@ -59,12 +63,18 @@ impl ScanPlan {
         }
         let pairs = u32::try_from(schedule.pairs())
             .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pairs())))?;
-        Ok(ScanPlan {
-            steps: if scan.motion == Motion::Runs { uneven_steps(times) } else { Vec::new() },
-            frames: times.len(),
-            pairs,
-            ..ScanPlan::arriving(scan, &schedule.cameras)
-        })
+        let steps = if scan.motion == Motion::Runs { uneven_steps(times) } else { Vec::new() };
+        if let Some(t) = steps.iter().position(|step| step.is_nan() || *step < LEAST_STEP) {
+            return Err(Error::usage(format!(
+                "time stamps must not be nothing apart beside the others: frame {} has {:e}, frame {t} has {:e}, and all \
+                 span {:e}",
+                t - 1,
+                times[t - 1],
+                times[t],
+                times[times.len() - 1] - times[0]
+            )));
+        }
+        Ok(ScanPlan { steps, frames: times.len(), pairs, ..ScanPlan::arriving(scan, &schedule.cameras) })
     }
 
     /// The scan of frames that are still to come, as it is if they prove to be even: then the plan that knows
@@ -138,6 +148,15 @@ mod tests {
         let times: Vec<f64> = (0..100_000).map(|i| f64::from(i as f32 / 1e5)).collect();
         assert!(plan(&times).unwrap().steps.is_empty());
         assert_eq!(plan(&[0.0, 1.0, 3.0]).unwrap().steps, [1.0, 2.0 / 3.0, 4.0 / 3.0]);
+    }
+
+    #[test]
+    fn stamps_that_are_nothing_apart_beside_the_others_are_named() {
+        for bad in [[0.0, 1.0, 1e300], [-1e300, 1.0, 2.0], [-1.7e308, 1.7e308, 1.75e308]] {
+            let message = plan(&bad).unwrap_err().to_string();
+            assert!(message.contains("nothing apart beside the others: frame"), "{message}");
+        }
+        assert!(plan(&[0.0, 1.0, 1e40]).is_ok());
     }
 
     #[test]
