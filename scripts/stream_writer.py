@@ -26,7 +26,7 @@ class StreamWriter:
         out.writelines(self.planes(constant[name]) for name in COLUMNS if name in constant)
 
     def planes(self, column):
-        return np.ascontiguousarray(np.reshape(column, (len(column), -1)).T, "<f4").tobytes()
+        return np.ascontiguousarray(np.moveaxis(np.asarray(column), 0, -1), "<f4").tobytes()
 
     def frame(self, time, columns):
         payload = b"".join(self.planes(columns[name]) for name in self.varying)

@@ -114,6 +114,23 @@ fn an_exporter_that_fails_writes_no_end_mark() {
 }
 
 #[test]
+fn a_stream_of_no_gaussians_is_written_and_read() {
+    let Some(python) = python("numpy") else { return };
+    let workplace = Workplace::new();
+    let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
+        import numpy as np\n\
+        from stream_writer import StreamWriter\n\
+        none = dict(rotation=np.zeros((0, 4)), log_scale=np.zeros((0, 3)), opacity_logit=[], sh=np.zeros((0, 4, 3)))\n\
+        with StreamWriter(sys.stdout.buffer, 0, 1, none) as s:\n    \
+            s.frame(0.0, dict(position=np.zeros((0, 3))))\n    \
+            s.frame(1.0, dict(position=np.zeros((0, 3))))";
+    let mut exporter = Command::new(python);
+    exporter.args(["-c", code]).arg(script(""));
+    let found = packed(&workplace, &mut exporter, "none.gseq");
+    assert_eq!((found.info().count, &found.info().times[..]), (0, &[0.0, 1.0][..]));
+}
+
+#[test]
 fn the_container_reader_gives_every_bit_of_every_column() {
     let Some(python) = python("numpy, zstandard") else { return };
     let workplace = Workplace::new();
