@@ -327,14 +327,20 @@ fn wrong_inputs_exit_with_1_and_leave_nothing() {
     refused(folder.path(), "evaluate scene.gseq none.gseq --cameras cameras.json", 1, &["none.gseq"]);
 }
 
+/// What each model's four pictures were measured to reproduce at, in dB, less 4: the last bits of `exp` and of the
+/// deformation field are the machine's.
+const LEAST_DB: [[f64; 4]; 3] =
+    [[110.5, 102.9, 102.6, 98.9], [119.8, 125.5, 121.5, 119.6], [113.3, 95.9, 110.1, 119.6]];
+
 #[test]
-fn models_render_their_reference_pictures_at_80_db_from_their_folders() {
+fn models_render_their_reference_pictures_to_rounding_from_their_folders() {
     let Some(data) = models::folder() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let mut compared = 0;
-    for name in models::NAMES {
+    for (name, least) in models::NAMES.into_iter().zip(LEAST_DB) {
         let model = models::Model::open(&data, name);
-        for (frame, view) in model.renders() {
+        let renders = model.renders();
+        assert_eq!(renders.len(), least.len());
+        for ((frame, view), least) in renders.into_iter().zip(least) {
             let path = data.join(name);
             // The folder's own transforms: the background comes from cfg_args.
             let line = format!("render . --cameras transforms_test.json --frame {frame} --view {view} -o");
@@ -343,11 +349,9 @@ fn models_render_their_reference_pictures_at_80_db_from_their_folders() {
             let squares = array(&output).into_iter().zip(model.reference(frame, view)).map(|(a, b)| f64::from(a - b));
             let psnr = -10.0 * mean_square(squares).log10();
             eprintln!("{name} frame {frame} view {view}: {psnr:.1} dB");
-            assert!(psnr >= 80.0, "{name} frame {frame} view {view}: {psnr} dB, expected at least 80");
-            compared += 1;
+            assert!(psnr >= least, "{name} frame {frame} view {view}: {psnr} dB, expected at least {least}");
         }
     }
-    assert_eq!(compared, 12);
 }
 
 #[test]

@@ -4,11 +4,15 @@ mod models;
 
 use splatsieve::render;
 
+/// What each model's picture was measured to reproduce at, in dB, less 3: the last bits of `exp` are the machine's.
+/// Depths summed in another order than the original's, which f32 alone shows, take the first to 81.
+const LEAST_DB: [f64; 3] = [113.6, 120.1, 114.8];
+
 #[test]
-fn reference_renders_reproduce_at_80_db() {
+fn reference_renders_reproduce_to_rounding() {
     let Some(folder) = models::folder() else { return };
     let mut compared = 0;
-    for name in models::NAMES {
+    for (name, least) in models::NAMES.into_iter().zip(LEAST_DB) {
         let model = models::Model::open(&folder, name);
         let recorded = model.frames();
         for (frame, view) in model.renders().into_iter().filter(|(frame, _)| recorded.contains(frame)) {
@@ -18,7 +22,7 @@ fn reference_renders_reproduce_at_80_db() {
             let squares = got.data.iter().zip(&expected).map(|(a, b)| f64::from(a - b).powi(2));
             let psnr = -10.0 * (squares.sum::<f64>() / expected.len() as f64).log10();
             eprintln!("{name} frame {frame} view {view}: {psnr:.1} dB");
-            assert!(psnr >= 80.0, "{name} frame {frame} view {view}: {psnr} dB, expected at least 80");
+            assert!(psnr >= least, "{name} frame {frame} view {view}: {psnr} dB, expected at least {least}");
             compared += 1;
         }
     }
