@@ -159,6 +159,26 @@ fn invisible_gaussians_are_all_prunable_without_nan() {
 }
 
 #[test]
+fn what_looks_like_its_background_counts_by_the_contrast_floor() {
+    let workplace = Workplace::new();
+    // The first is as black as what it hides; the second is fainter and hardly lighter.
+    let mut two = balls(2);
+    for (i, sh, logit) in [(0, -1.78, 2.0), (1, -1.70, 0.0)] {
+        two.position.set_row(i, [0.2 + 0.6 * i as f32, 0.5, 0.0]);
+        two.log_scale.set_row(i, [-2.0; 3]);
+        two.sh.set_row(i, [sh; 3]);
+        two.opacity_logit.set_row(i, [logit]);
+    }
+    workplace.ply("two.ply", &two);
+    fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
+    let request = "two.ply --cameras cameras.json --overwrite -o out.ply --prune-only --no-refine";
+    for (floor, expected) in [("", [0, -1]), ("--contrast-floor 0", [-1, 0])] {
+        workplace.done(&format!("compress {request} --choose-by-views=false --target-count 1 {floor}"));
+        assert_eq!(index_map(&workplace.path("out.ply.index_map.npy")), expected, "{floor:?}");
+    }
+}
+
+#[test]
 fn solid_gaussians_have_no_variance_and_finite_logits() {
     let workplace = Workplace::new();
     let mut cloud = balls(30).pick(&(0..60).map(|i| i / 2).collect::<Vec<_>>());

@@ -162,24 +162,19 @@ mod tests {
     #[test]
     fn the_floor_adds_the_sum_of_squared_weights() {
         let scene = cloud(40);
-        let mut white = scene.clone();
-        // All white before white: nothing differs from what it hides.
-        (0..40).for_each(|i| white.sh.set_row(i, [(0.5 / crate::model::SH_C0) as f32; 3]));
-        let weights = |floor| {
-            let mut found = RemovalError::new(40, floor);
-            Renderer::new().removal_error(&white, &camera(), [1.0; 3], &mut found);
-            found.sum.iter().map(|&units| units as f64 * RemovalError::UNIT).collect::<Vec<f64>>()
-        };
-        let (none, squares) = (weights(0.0), weights(1.0));
         let (plain, raised) = (errors(&scene, 0.0), errors(&scene, 0.5));
+        let white = (0.5 / crate::model::SH_C0) as f32;
+        let mut lit = scene.clone();
+        (0..40).for_each(|i| lit.sh.set_row(i, [-white; 3]));
         for i in 0..40 {
-            assert!(none[i] < 1e-6, "{i}: white before white changes by {}", none[i]);
-            let expected = plain[i] + 0.25 * squares[i];
-            assert!(
-                (raised[i] - expected).abs() <= 1e-4 * expected + 1e-6,
-                "{i}: got {}, expected {expected}",
-                raised[i]
-            );
+            // One that is white among black ones shows its weight in every pixel.
+            lit.sh.set_row(i, [white; 3]);
+            let weights = render(&lit, &camera(), [0.0; 3]).data;
+            lit.sh.set_row(i, [-white; 3]);
+            let squares: f64 = weights.iter().map(|&w| f64::from(w).powi(2)).sum::<f64>() / 3.0;
+            let expected = plain[i] + 0.25 * squares;
+            let got = raised[i];
+            assert!((got - expected).abs() <= 1e-4 * expected + 1e-6, "{i}: got {got}, expected {expected}");
         }
     }
 
