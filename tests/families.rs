@@ -111,3 +111,12 @@ fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_change
         }
     }
 }
+
+#[test]
+fn frames_of_a_model_are_asked_for_at_even_times_that_leave_out_the_end() {
+    let workplace = Workplace::new();
+    for (frames, expected) in [(1, &[0.0][..]), (4, &[0.0, 0.25, 0.5, 0.75])] {
+        workplace.done(&format!("pack {{tiny}} --frames {frames} -o {frames}.gseq"));
+        assert_eq!(open(&workplace.path(&format!("{frames}.gseq"))).source().info().times, expected);
+    }
+}

@@ -3,17 +3,17 @@
 
 mod scene;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DQuat, DVec3};
-use scene::{PlyRows, by_formula, lasting_files, state, tiny};
+use scene::{PlyRows, Workplace, by_formula, lasting_files, state, tiny};
 use splatsieve::compress::score::{Scored, UserOverrides};
 use splatsieve::compress::{Only, Request, Target, compress_scene, score_scene};
 use splatsieve::limits::Limits;
 use splatsieve::merge::proxy::merge_state;
 use splatsieve::model::{Columns, Gaussians, SH_C0};
 use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
-use splatsieve::scene::{InputOptions, Scene};
+use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 /// Tightens a gate.
 type Edit = fn(&mut Merge);
@@ -332,6 +332,117 @@ fn every_gate_binds_as_the_sequential_rule() {
         let joined = merges_as_method_says(&recipe, Only::Merge);
         assert!(joined < all, "{gate} binds nothing: {joined} joined, {all} without");
     }
+}
+
+/// A folder of eight frames of twelve pairs, each a tenth from the next; `offset`, from there, by frame and whether it
+/// is the second of a pair.
+fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> PathBuf {
+    for frame in 0..8 {
+        let mut cloud = Gaussians::zeros(24, 0);
+        for i in 0..24 {
+            let [x, y, z] = offset(frame, i % 2 == 1);
+            cloud.position.set_row(i, [x + 0.1 * (i / 2) as f32, y + 0.1 * (i / 2 % 5) as f32, z]);
+            cloud.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+            cloud.log_scale.set_row(i, [-3.0; 3]);
+            cloud.opacity_logit.set_row(i, [0.3 * (i % 5) as f32]);
+        }
+        workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
+    }
+    workplace.path("frames")
+}
+
+/// Merges explicit trajectories, without pruning; gives who joined whom and the number of proxies.
+fn merged(workplace: &Workplace, scene: &Scene, recipe: &Recipe) -> (Vec<Option<u32>>, usize) {
+    let (input, output) =
+        (InputOptions { path: workplace.path("frames"), ..InputOptions::default() }, workplace.path("out"));
+    let request = Request { only: Only::Merge, ..Request::new(input, output, recipe.clone()) };
+    let (summary, map) = compress_scene(scene, &request).unwrap();
+    (map, summary.merge.unwrap().proxies)
+}
+
+fn open(path: PathBuf) -> Scene {
+    open_scene(&InputOptions { path, ..InputOptions::default() }).unwrap()
+}
+
+#[test]
+fn a_proxy_of_trajectories_goes_the_way_of_the_weighted_mean_of_its_members() {
+    let workplace = Workplace::new();
+    // The second of a pair circles the first, which flies.
+    let flying = |frame: usize, second: bool| {
+        let (radius, (sin, cos)) = (if second { 0.003 } else { 0.0 }, (0.5 * frame as f32).sin_cos());
+        [0.025 * frame as f32 + radius * cos, 0.0, radius * sin]
+    };
+    let scene = open(pairs(&workplace, flying));
+    let mut recipe = by_formula("default");
+    recipe.merge.max_drift = 0.05;
+    let (map, proxies) = merged(&workplace, &scene, &recipe);
+    assert_eq!(proxies, 12);
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
+    let whole = Whole::read(&scene);
+    for frame in 0..8 {
+        let rows = PlyRows::read(&workplace.path(&format!("out/frame_{frame}.ply")));
+        for pair in 0..12 {
+            let members = weighted(&scored, &[2 * pair, 2 * pair + 1]);
+            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * whole.at(frame, id as usize)).sum();
+            let place = map[2 * pair].unwrap() as usize;
+            let found = DVec3::from(["x", "y", "z"].map(|axis| f64::from(rows.value(place, axis))));
+            // Coordinates up to 1.3, rounded to f32.
+            assert!((found - mean).length() < 2e-7, "pair {pair}, frame {frame}: {found}, expected {mean}");
+        }
+    }
+}
+
+#[test]
+fn jitter_below_the_noise_floor_is_no_motion() {
+    let mut recipe = by_formula("default");
+    // (where, by how much the second of a pair jitters, the floor in extents, proxies): a third of the floor; the same
+    // without one; and what is rounding at this distance, for which there always is a floor.
+    for (at, jitter, floor, expected) in [(0.0, 3e-5, 1e-4, 12), (0.0, 3e-5, 0.0, 0), (1024.0, 1.0 / 8192.0, 0.0, 12)] {
+        let workplace = Workplace::new();
+        let jittering = |frame: usize, second: bool| {
+            let moved = second && frame / 2 % 2 == 1;
+            [at + if moved { jitter } else { 0.0 }, if second { 0.003 } else { 0.0 }, 0.0]
+        };
+        let scene = open(pairs(&workplace, jittering));
+        recipe.merge.motion_noise = floor;
+        assert_eq!(merged(&workplace, &scene, &recipe).1, expected, "at {at}, floor {floor}");
+    }
+}
+
+#[test]
+fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
+    let mut recipe = by_formula("default");
+    recipe.merge.placement = Placement::Mean;
+    recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
+    recipe.merge.max_drift = 0.004;
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("out");
+    let scene = scene::scene(&tiny());
+    let (_, map) = compress_scene(&scene, &options(&output, &recipe, Only::Merge)).unwrap();
+    let (scored, whole) = (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), Whole::read(&scene));
+    let cloud = "point_cloud/iteration_7/point_cloud.ply";
+    let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
+    let result = splatsieve::families::ModelFolder::open(&output, None).unwrap();
+    let result = result.with_times(scene.source().info().times.clone()).unwrap();
+    let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
+    let limit = recipe.merge.max_drift * whole.extent;
+    let (mut at_leaders, mut at_means) = (0, 0);
+    for place in 0..after.rows.len() {
+        let group: Vec<usize> = (0..map.len()).filter(|&id| map[id] == Some(place as u32)).collect();
+        let members = if group.len() > 1 { weighted(&scored, &group) } else { continue };
+        let raw = |rows: &PlyRows, i: usize| ["x", "y", "z"].map(|axis| rows.value(i, axis));
+        if group.iter().any(|&id| raw(&before, id) == raw(&after, place)) {
+            at_leaders += 1;
+            continue;
+        }
+        at_means += 1;
+        for (t, frame) in frames.iter().enumerate() {
+            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * whole.at(t, id as usize)).sum();
+            let off = (DVec3::from(frame.position.row::<3>(place).map(f64::from)) - mean).length();
+            assert!(off <= limit * 1.001, "proxy {place} is {off} off at frame {t}, at most {limit} expected");
+        }
+    }
+    assert!(at_leaders > 0 && at_means > 0, "{at_leaders} at their leaders, {at_means} at their means");
 }
 
 #[test]

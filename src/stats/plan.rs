@@ -144,6 +144,14 @@ mod tests {
     }
 
     #[test]
+    fn steps_that_differ_by_more_than_a_hundredth_count_as_they_are() {
+        assert!(plan(&[0.0, 1.0, 2.01]).unwrap().steps.is_empty());
+        for second in [1.03, 1.2] {
+            assert_eq!(plan(&[0.0, 1.0, 1.0 + second]).unwrap().steps.len(), 3, "a second step of {second}");
+        }
+    }
+
+    #[test]
     fn stamps_rounded_to_f32_count_as_even() {
         let times: Vec<f64> = (0..100_000).map(|i| f64::from(i as f32 / 1e5)).collect();
         assert!(plan(&times).unwrap().steps.is_empty());
