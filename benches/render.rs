@@ -19,8 +19,6 @@
 
 #[path = "../tests/models/mod.rs"]
 mod models;
-#[path = "../tests/oracle/mod.rs"]
-mod oracle;
 
 use std::hint::black_box;
 use std::num::NonZeroU32;
@@ -31,6 +29,7 @@ use glam::{DMat3, DVec3};
 use splatsieve::demo::Scene;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
+use splatsieve::selfcheck::oracle::picture as oracle;
 use splatsieve::source::{FrameSource, Ids};
 
 /// Pictures, without and with their derivative, whose median times give the rates and the ratio.

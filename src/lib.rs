@@ -8,7 +8,7 @@
 //! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`], [`archive`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`families`], [`demo`] | files, threads, terminals |
-//! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`] | memory, the order of the passes, what verbs do |
+//! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`], [`selfcheck`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
 //!
 //! [`method`] derives what is computed.
@@ -42,6 +42,7 @@ pub mod report;
 pub mod scene;
 pub mod score;
 pub mod select;
+pub mod selfcheck;
 pub mod source;
 pub mod stats;
 pub mod stream;

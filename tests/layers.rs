@@ -12,7 +12,7 @@ const LAYERS: [&[&str]; 5] = [
     &["error", "machine", "model", "limits", "recipe", "reduction", "source"],
     &["deform", "stats", "score", "select", "merge", "render", "refine", "metrics", "archive"],
     &["ingest", "stream", "emit", "families", "demo"],
-    &["budget", "scene", "compress", "verbs", "report"],
+    &["budget", "scene", "compress", "verbs", "report", "selfcheck"],
     &["cli"],
 ];
 

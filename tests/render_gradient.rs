@@ -1,14 +1,13 @@
 //! The rasteriser's derivative against differences of the f64 oracle, closed forms, and laws.
 
-mod oracle;
-
 use std::path::Path;
 
 use glam::DVec3;
-use oracle::scenes::{Random, camera, plain_camera, scene, single};
 use splatsieve::families::ModelFolder;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
 use splatsieve::render::{Image, Renderer, render};
+use splatsieve::selfcheck::made::clouds::{Random, camera, plain_camera, scene, single};
+use splatsieve::selfcheck::oracle::picture as oracle;
 use splatsieve::source::FrameSource;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
@@ -43,7 +42,7 @@ fn derivatives_are_those_of_the_oracle_by_central_differences() {
             .map(|&doubtful| if doubtful { 0.0 } else { 1.0 })
             .collect();
         let mut random = Random(seed + 100);
-        let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next()).collect();
+        let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.draw()).collect();
         let found = gradients(&gaussians, &camera, |picture| Image {
             data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
             ..*picture
@@ -154,7 +153,7 @@ fn threads_kept_buffers_and_frozen_columns_do_not_change_a_bit() {
     let camera = camera(131, 77);
     let noise = |picture: &Image| {
         let mut random = Random(7);
-        Image { data: picture.data.iter().map(|x| x - random.next()).collect(), ..*picture }
+        Image { data: picture.data.iter().map(|x| x - random.draw()).collect(), ..*picture }
     };
     let mut kept = Renderer::new();
     for (seed, count) in [(31, 20_000), (32, 300), (33, 9000)] {
@@ -305,7 +304,7 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
         .map(|&doubtful| if doubtful { 0.0 } else { 1.0 })
         .collect();
     let mut random = Random(7);
-    let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.next()).collect();
+    let target: Vec<f32> = (0..3 * sure.len()).map(|_| random.draw()).collect();
     let mut found = gradients(&state, &camera, |picture| Image {
         data: (0..target.len()).map(|at| sure[at / 3] as f32 * (picture.data[at] - target[at])).collect(),
         ..*picture

@@ -1,13 +1,12 @@
 //! The rasteriser against arithmetic done another way: closed forms, a slow f64 oracle, and laws.
 
-mod oracle;
-
 use std::num::NonZeroU32;
 
 use glam::DVec3;
-use oracle::scenes::{camera, plain_camera, scene, single};
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Contribution, Image, Renderer, contribution, render};
+use splatsieve::selfcheck::made::clouds::{camera, plain_camera, scene, single};
+use splatsieve::selfcheck::oracle::picture as oracle;
 
 fn stride(s: u32) -> NonZeroU32 {
     NonZeroU32::new(s).unwrap()

@@ -4,8 +4,6 @@ mod deltas;
 mod field;
 mod jacobian;
 mod linear;
-#[cfg(test)]
-mod oracle;
 mod planes;
 mod slopes;
 mod tensors;

@@ -1,83 +1,9 @@
 use std::path::Path;
 
-use super::oracle::{Oracle, Parameters};
 use super::*;
 use crate::model::{Column, Columns, Gaussians, Gradients};
-
-/// Values in [−1, 1), the same on every run.
-struct Noise(u64);
-
-impl Noise {
-    fn next(&mut self) -> f32 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 40) as f32 / (1 << 23) as f32 - 1.0
-    }
-}
-
-/// No multiple of the outputs that are summed together.
-const WIDTH: usize = 22;
-const CHANNELS: usize = 5;
-
-fn plain() -> FieldConfig {
-    FieldConfig {
-        active: Columns::all(),
-        static_mlp: false,
-        empty_voxel: false,
-        grid_pe: 0,
-        no_grid: false,
-        apply_rotation: false,
-    }
-}
-
-/// A random state dict for `config` with `depth` trunk layers. Resolutions differ along every axis, so
-/// that swapped axes cannot pass.
-fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
-    let mut noise = Noise(7);
-    let mut tensors = Tensors::new();
-    let mut add = |name: &str, shape: &[usize], scale: f32| {
-        let data = (0..shape.iter().product()).map(|_| scale * noise.next()).collect();
-        tensors.insert(format!("deformation_net.{name}"), Tensor { shape: shape.to_vec(), data });
-    };
-    for level in 0..2 {
-        let size = [6 << level, 4 << level, 5 << level, 7];
-        for (plane, (a, b)) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].into_iter().enumerate() {
-            add(&format!("grid.grids.{level}.{plane}"), &[1, CHANNELS, size[b], size[a]], 1.5);
-        }
-    }
-    let features = match (config.no_grid, config.grid_pe > 1) {
-        (true, _) => 4,
-        (_, true) => 6 * CHANNELS,
-        _ => 2 * CHANNELS,
-    };
-    for layer in 0..depth {
-        let inputs = if layer == 0 { features } else { WIDTH };
-        add(&format!("feature_out.{}.weight", 2 * layer), &[WIDTH, inputs], 0.5);
-        add(&format!("feature_out.{}.bias", 2 * layer), &[WIDTH], 0.5);
-    }
-    let heads = [
-        ("pos_deform", 3),
-        ("scales_deform", 3),
-        ("rotations_deform", 4),
-        ("opacity_deform", 1),
-        ("shs_deform", 48),
-        ("static_mlp", 1),
-    ];
-    for (head, outputs) in heads {
-        add(&format!("{head}.1.weight"), &[WIDTH, WIDTH], 0.4);
-        add(&format!("{head}.1.bias"), &[WIDTH], 0.4);
-        add(&format!("{head}.3.weight"), &[outputs, WIDTH], 0.4);
-        add(&format!("{head}.3.bias"), &[outputs], 0.4);
-    }
-    add("empty_voxel.grid", &[1, 1, 3, 4, 5], 1.0);
-    for (name, shape, data) in [
-        ("grid.aabb", vec![2, 3], vec![1.5, 1.25, 1.0, -1.0, -1.25, -0.5]),
-        ("empty_voxel.xyz_min", vec![3], vec![-0.75, -1.0, -0.5]),
-        ("empty_voxel.xyz_max", vec![3], vec![1.0, 0.75, 1.0]),
-    ] {
-        tensors.insert(format!("deformation_net.{name}"), Tensor { shape, data });
-    }
-    tensors
-}
+use crate::selfcheck::made::field::{Noise, plain, tensors};
+use crate::selfcheck::oracle::field::{Oracle, Parameters};
 
 /// Random raw Gaussians; some lie outside the field's box.
 fn cloud(len: usize) -> Gaussians {
@@ -113,7 +39,7 @@ fn agrees_with_oracle(what: &str, config: FieldConfig, depth: usize) {
     for time in [0.0, 0.37, 1.0] {
         let (state, _) = states(&field, &raw, time, Columns::all());
         for i in 0..raw.len() {
-            let expected = oracle.state(&parameters(&raw, i), time);
+            let expected = oracle.state(&Parameters::of(&raw, i), time);
             for (column, expected) in [
                 (&state.position, &expected.position),
                 (&state.rotation, &expected.rotation),
@@ -326,16 +252,6 @@ fn a_time_that_is_not_finite_is_refused() {
     assert_says(&error.to_string(), &["NaN"]);
 }
 
-fn parameters(raw: &Gaussians, i: usize) -> Parameters {
-    Parameters {
-        position: values(&raw.position, i),
-        rotation: values(&raw.rotation, i),
-        log_scale: values(&raw.log_scale, i),
-        opacity_logit: values(&raw.opacity_logit, i),
-        sh: values(&raw.sh, i),
-    }
-}
-
 fn column_of(parameters: &mut Parameters, column: Columns) -> &mut Vec<f64> {
     match column {
         Columns::POSITION => &mut parameters.position,
@@ -376,7 +292,7 @@ fn derivatives_agree(what: &str, config: FieldConfig, depth: usize, columns: Col
             let weights = values(by_state.column(column), i);
             for c in 0..raw.column(column).width() {
                 let value = |step: f64| -> f64 {
-                    let mut nudged = parameters(&raw, i);
+                    let mut nudged = Parameters::of(&raw, i);
                     column_of(&mut nudged, column)[c] += step;
                     let mut state = oracle.state(&nudged, time);
                     column_of(&mut state, column).iter().zip(&weights).map(|(x, w)| x * w).sum()

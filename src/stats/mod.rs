@@ -13,8 +13,6 @@ mod bounds;
 mod life;
 mod motion;
 mod noise;
-#[cfg(test)]
-mod oracle;
 mod plan;
 pub mod projection;
 mod scan;

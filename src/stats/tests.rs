@@ -1,12 +1,13 @@
-//! Claims about the scan: against the slow answer of [`super::oracle`], against analysis, and as laws.
+//! Claims about the scan: against the slow answer of [`crate::selfcheck::oracle`], against analysis, and as laws.
 
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 
-use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, oracle, snap, ulp};
+use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap, ulp};
 use crate::model::{Camera, Columns, Flags, Gaussians, Schedule};
 use crate::recipe::{Motion, Recipe, Scan};
 use crate::select::hash_id;
+use crate::selfcheck::oracle::statistics as oracle;
 
 fn recipe(motion: Motion) -> Scan {
     Scan { motion, ..Recipe::preset("default").unwrap().scan }

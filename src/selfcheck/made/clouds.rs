@@ -1,10 +1,10 @@
 //! Clouds and cameras that are hard on a rasteriser.
 
+use crate::model::{Camera, Gaussians};
 use glam::{DMat3, DQuat, DVec3};
-use splatsieve::model::{Camera, Gaussians};
 
 /// A camera at the origin that looks along +z, turned a little so that no axis is special.
-pub(crate) fn camera(width: u32, height: u32) -> Camera {
+pub fn camera(width: u32, height: u32) -> Camera {
     Camera {
         width,
         height,
@@ -19,7 +19,7 @@ pub(crate) fn camera(width: u32, height: u32) -> Camera {
 }
 
 /// A camera at the origin whose axes are the world's.
-pub(crate) fn plain_camera(size: u32) -> Camera {
+pub fn plain_camera(size: u32) -> Camera {
     Camera {
         width: size,
         height: size,
@@ -34,10 +34,11 @@ pub(crate) fn plain_camera(size: u32) -> Camera {
 }
 
 /// Pseudo-random numbers in [0, 1) (splitmix64).
-pub(crate) struct Random(pub(crate) u64);
+pub struct Random(pub u64);
 
 impl Random {
-    pub(crate) fn next(&mut self) -> f32 {
+    /// The next one.
+    pub fn draw(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -45,13 +46,14 @@ impl Random {
         ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    pub(crate) fn within(&mut self, low: f32, high: f32) -> f32 {
-        low + (high - low) * self.next()
+    /// The next one in [`low`, `high`).
+    pub fn within(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * self.draw()
     }
 }
 
 /// A cloud with needles, pancakes, giants, specks, quaternions of any length and Gaussians off-screen.
-pub(crate) fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
+pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
     let mut random = Random(seed);
     let mut scene = Gaussians::zeros(count, degree);
     for i in 0..count {
@@ -69,7 +71,7 @@ pub(crate) fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
 }
 
 /// One Gaussian on the axis of [`plain_camera`], `depth` away, of the colour 1, ½, 0.
-pub(crate) fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
+pub fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
     let mut one = Gaussians::zeros(1, 0);
     one.position.set_row(0, [0.0, 0.0, depth]);
     one.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);

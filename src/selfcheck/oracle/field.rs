@@ -1,21 +1,40 @@
 //! A slow, independent evaluation of the field in f64, one Gaussian at a time, straight from the definition.
 
-use super::{FieldConfig, Tensors};
-use crate::model::Columns;
+use crate::deform::{FieldConfig, Tensors};
+use crate::model::{Column, Columns, Gaussians};
 
 /// Raw or deformed parameters of one Gaussian.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Parameters {
-    pub(super) position: Vec<f64>,
-    pub(super) rotation: Vec<f64>,
-    pub(super) log_scale: Vec<f64>,
-    pub(super) opacity_logit: Vec<f64>,
-    pub(super) sh: Vec<f64>,
+pub(crate) struct Parameters {
+    pub(crate) position: Vec<f64>,
+    pub(crate) rotation: Vec<f64>,
+    pub(crate) log_scale: Vec<f64>,
+    pub(crate) opacity_logit: Vec<f64>,
+    pub(crate) sh: Vec<f64>,
 }
 
-pub(super) struct Oracle<'a> {
-    pub(super) tensors: &'a Tensors,
-    pub(super) config: &'a FieldConfig,
+impl Parameters {
+    /// Those of Gaussian `i`.
+    pub(crate) fn of(raw: &Gaussians, i: usize) -> Parameters {
+        let values = |column: &Column| (0..column.width()).map(|c| f64::from(column.plane(c)[i])).collect();
+        Parameters {
+            position: values(&raw.position),
+            rotation: values(&raw.rotation),
+            log_scale: values(&raw.log_scale),
+            opacity_logit: values(&raw.opacity_logit),
+            sh: values(&raw.sh),
+        }
+    }
+
+    /// All of them.
+    pub(crate) fn values(&self) -> Vec<f64> {
+        [&self.position[..], &self.rotation, &self.log_scale, &self.opacity_logit, &self.sh].concat()
+    }
+}
+
+pub(crate) struct Oracle<'a> {
+    pub(crate) tensors: &'a Tensors,
+    pub(crate) config: &'a FieldConfig,
 }
 
 impl Oracle<'_> {
@@ -87,7 +106,7 @@ impl Oracle<'_> {
         sum
     }
 
-    pub(super) fn state(&self, raw: &Parameters, time: f64) -> Parameters {
+    pub(crate) fn state(&self, raw: &Parameters, time: f64) -> Parameters {
         let config = self.config;
         let mut features = if config.no_grid {
             vec![raw.position[0], raw.position[1], raw.position[2], time]

@@ -5,17 +5,17 @@ use crate::model::{Camera, Gaussians, Schedule};
 use crate::recipe::{Motion, Scan};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Row {
-    pub(super) d: f64,
-    pub(super) kappa: f64,
-    pub(super) v: f64,
-    pub(super) life: u32,
-    pub(super) c: f64,
-    pub(super) vis: f64,
+pub(crate) struct Row {
+    pub(crate) d: f64,
+    pub(crate) kappa: f64,
+    pub(crate) v: f64,
+    pub(crate) life: u32,
+    pub(crate) c: f64,
+    pub(crate) vis: f64,
 }
 
 /// The row of Gaussian `i`; frames are evenly spaced.
-pub(super) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Scan) -> Row {
+pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Scan) -> Row {
     let last = frames.len() - 1;
     let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
     let alpha: Vec<f64> =
@@ -54,7 +54,7 @@ pub(super) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Sc
 }
 
 /// Area, px², by way of the 3-D covariance and its projection.
-pub(super) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
+pub(crate) fn area(frame: &Gaussians, i: usize, camera: &Camera) -> f64 {
     let w: [[f64; 3]; 3] = std::array::from_fn(|r| camera.rotation.row(r).to_array());
     let world = frame.position.row::<3>(i).map(f64::from);
     let p: [f64; 3] = std::array::from_fn(|r| (0..3).map(|k| w[r][k] * world[k]).sum::<f64>() + camera.translation[r]);

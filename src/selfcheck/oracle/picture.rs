@@ -1,24 +1,21 @@
 //! The rasteriser's conventions a second time, slowly: f64 throughout, pixel by pixel, full matrices, no
 //! bound on the reach of an alpha but the tiles of the original kernel.
 
-#![allow(dead_code, reason = "each test and bench uses its part")]
-
-pub(crate) mod scenes;
-
+use crate::model::{Camera, Gaussians};
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
-use splatsieve::model::{Camera, Gaussians};
 
 /// What the oracle sees in one picture.
-pub(crate) struct Picture {
+pub struct Picture {
     /// `[height · width]`.
-    pub(crate) rgb: Vec<[f64; 3]>,
+    pub rgb: Vec<[f64; 3]>,
     /// Whether some decision of the pixel fell within 1e-4 (relative) of its threshold: f32 may differ.
-    pub(crate) doubtful: Vec<bool>,
+    pub doubtful: Vec<bool>,
     /// Per Gaussian Σ and max over sampled pixels of alpha · transmittance.
-    pub(crate) sum: Vec<f64>,
-    pub(crate) max: Vec<f64>,
+    pub sum: Vec<f64>,
+    /// See [`Picture::sum`].
+    pub max: Vec<f64>,
     /// Number of (Gaussian, pixel) pairs blended.
-    pub(crate) events: u64,
+    pub events: u64,
 }
 
 struct Footprint {
@@ -117,24 +114,19 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
 }
 
 /// Renders, and weighs the pixels of every `stride`-th column and row.
-pub(crate) fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> Picture {
+pub fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> Picture {
     picture_of(gaussians, camera, background, stride, |_, _| ())
 }
 
 /// What each pixel blends, by id, nearest first: every decision that a small change of a Gaussian may turn over.
-pub(crate) fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
+pub fn blended(gaussians: &Gaussians, camera: &Camera) -> Vec<Vec<usize>> {
     let mut ids = vec![Vec::new(); camera.width as usize * camera.height as usize];
     picture_of(gaussians, camera, [0.0; 3], 1, |pixel, id| ids[pixel].push(id));
     ids
 }
 
 /// The pixels with `blended` decided: a function without steps of everything that is stored.
-pub(crate) fn decided(
-    gaussians: &Gaussians,
-    camera: &Camera,
-    background: [f32; 3],
-    blended: &[Vec<usize>],
-) -> Vec<[f64; 3]> {
+pub fn decided(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], blended: &[Vec<usize>]) -> Vec<[f64; 3]> {
     let footprints: Vec<Option<Footprint>> = (0..gaussians.len()).map(|id| footprint(gaussians, id, camera)).collect();
     let pixel = |(at, ids): (usize, &Vec<usize>)| {
         let place = DVec2::new((at % camera.width as usize) as f64, (at / camera.width as usize) as f64);

@@ -1,0 +1,79 @@
+//! The deformation field of a 4DGaussians model.
+
+use std::path::Path;
+
+use super::made::field::{Noise, plain, tensors};
+use super::oracle::field::{Oracle, Parameters};
+use super::{Case, Worst};
+use crate::deform::{Deltas, Field, FieldConfig, Scratch};
+use crate::model::{Columns, Gaussians};
+
+/// Against the definition, in parts of 1 and the value; some 60 roundings of f32.
+pub(super) fn states() -> Case {
+    Case::new("deformation field", "states: planes, layers in f64", 5e-6, || {
+        let mut worst = Worst::default();
+        let raw = cloud(40);
+        for (config, depth) in [
+            (plain(), 1),
+            (FieldConfig { empty_voxel: true, ..plain() }, 2),
+            (FieldConfig { no_grid: true, ..plain() }, 1),
+            (FieldConfig { apply_rotation: true, static_mlp: true, grid_pe: 2, ..plain() }, 3),
+        ] {
+            let tensors = tensors(&config, depth);
+            let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
+            let prepared = field.prepare(&raw.position);
+            for time in [0.0, 0.37, 1.0] {
+                let mut deltas = Deltas::new(3);
+                field.deltas(&prepared, time, Columns::all(), &mut Scratch::default(), &mut deltas)?;
+                let mut state = Gaussians::zeros(0, 3);
+                deltas.apply(&raw, Columns::all(), &mut state);
+                for i in 0..raw.len() {
+                    let got = Parameters::of(&state, i).values();
+                    let oracle = Oracle { tensors: &tensors, config: &config };
+                    let expected = oracle.state(&Parameters::of(&raw, i), time).values();
+                    got.iter().zip(&expected).for_each(|(&got, &x)| worst.near(got, x, 1.0 + x.abs()));
+                }
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// Against differences of the definition over 2e-6, in parts of 1 and the value; f32 slopes of products of six samples.
+pub(super) fn derivative() -> Case {
+    Case::new("field's derivative", "of positions: differences in f64", 1e-5, || {
+        let (config, time, step) = (plain(), 0.37, 1e-6);
+        let tensors = tensors(&config, 2);
+        let field = Field::new(&tensors, config.clone(), 3, Path::new("made up"))?;
+        let oracle = Oracle { tensors: &tensors, config: &config };
+        let raw = cloud(40);
+        let found = field.jacobian(&raw, time, Columns::POSITION)?;
+        let mut worst = Worst::default();
+        worst.same(&found.column(Columns::POSITION).width(), &9);
+        for i in 0..raw.len() {
+            for by in 0..3 {
+                let [low, high] = [-step, step].map(|step| {
+                    let mut moved = Parameters::of(&raw, i);
+                    moved.position[by] += step;
+                    oracle.state(&moved, time).position
+                });
+                for of in 0..3 {
+                    let expected = (high[of] - low[of]) / (2.0 * step);
+                    let got = f64::from(found.column(Columns::POSITION).plane(3 * of + by)[i]);
+                    worst.near(got, expected, 1.0 + expected.abs());
+                }
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// Random Gaussians of degree 3, some outside the field's box.
+fn cloud(count: usize) -> Gaussians {
+    let mut noise = Noise(99);
+    let mut cloud = Gaussians::zeros(count, 3);
+    for column in cloud.columns_mut(Columns::all()) {
+        column.planes_mut().iter_mut().for_each(|x| *x = 2.0 * noise.next());
+    }
+    cloud
+}

@@ -1,0 +1,4 @@
+//! Inputs made from nothing, the same on every run.
+
+pub mod clouds;
+pub(crate) mod field;

@@ -1,0 +1,210 @@
+//! The numbers of this very program on this very machine, against closed forms and slow oracles.
+//!
+//! In: nothing; what cases look at is made up, the same on every run. Out: a [`Report`], one line a case. Memory: some
+//! 50 MiB, and as much on disk, in a folder for temporary files that is gone afterwards.
+//!
+//! A case runs the code that `compress` runs. What it expects shares none of it: a formula, integers, or the definition
+//! in f64 over whole arrays ([`oracle`]). Errors are as large as the worst of all values looked at.
+
+mod field;
+pub mod made;
+mod merging;
+pub mod oracle;
+mod pictures;
+mod score;
+mod statistics;
+mod storage;
+mod threads;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Instant;
+
+use serde::Serialize;
+
+use crate::TOOL;
+use crate::error::{Error, Result};
+
+/// Every case, in the order of the pipeline.
+const CASES: [fn() -> Case; 27] = [
+    statistics::motion,
+    statistics::motion_far_away,
+    statistics::motion_of_any_size,
+    statistics::short_lives,
+    statistics::steady_opacity,
+    statistics::projected_area,
+    statistics::needle_on_screen,
+    score::percentiles,
+    score::robust_box,
+    merging::mixture,
+    merging::needle,
+    merging::proxy,
+    merging::duplicates,
+    field::states,
+    field::derivative,
+    pictures::one_gaussian,
+    pictures::many_gaussians,
+    pictures::weights,
+    pictures::removal,
+    pictures::harmonics,
+    pictures::gradients,
+    pictures::comparison,
+    storage::container,
+    storage::bounded_container,
+    storage::archive_grid,
+    storage::archive_codes,
+    threads::same_bytes,
+];
+
+/// What was checked, how far off it may be, and how far off it is.
+#[derive(Debug, Serialize)]
+pub struct Case {
+    /// A few words that name it.
+    pub name: &'static str,
+    /// What is compared with what.
+    pub what: &'static str,
+    /// Largest error of a sound build. Errors are relative or in the unit that `what` names.
+    pub bound: f64,
+    /// The largest error; infinite, as JSON null, where it is none or nothing could be measured.
+    pub error: f64,
+    /// Whether the error is within the bound.
+    pub pass: bool,
+    /// Why nothing could be measured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failure: Option<String>,
+}
+
+impl Case {
+    fn new(name: &'static str, what: &'static str, bound: f64, measure: impl FnOnce() -> Result<Worst>) -> Case {
+        // A build so broken that it panics has other cases to show.
+        let (error, failure) = match catch_unwind(AssertUnwindSafe(measure)) {
+            Ok(Ok(Worst(error))) => (error, None),
+            Ok(Err(error)) => (f64::INFINITY, Some(error.to_string())),
+            Err(_) => (f64::INFINITY, Some("a panic".to_owned())),
+        };
+        Case { name, what, bound, error, pass: error <= bound, failure }
+    }
+}
+
+/// The largest error so far.
+#[derive(Debug, Default)]
+struct Worst(f64);
+
+impl Worst {
+    /// An error, which is infinite where it is no number.
+    fn add(&mut self, error: f64) {
+        self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };
+    }
+
+    /// |got − expected| in parts of `unit`, which is positive.
+    fn near(&mut self, got: f64, expected: f64, unit: f64) {
+        self.add((got - expected).abs() / unit);
+    }
+
+    /// |got − expected| in parts of what is expected, or 0 where both are the same.
+    fn relative(&mut self, got: f64, expected: f64) {
+        self.add(if got == expected { 0.0 } else { (got - expected).abs() / expected.abs() });
+    }
+
+    /// 1 where things differ that must be the same.
+    fn same<T: PartialEq + ?Sized>(&mut self, got: &T, expected: &T) {
+        self.add(if got == expected { 0.0 } else { 1.0 });
+    }
+}
+
+/// What all cases found.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    /// Program and version.
+    pub tool: &'static str,
+    /// Whether every case passes.
+    pub pass: bool,
+    /// How long it took.
+    pub seconds: f64,
+    /// The cases, in the order of the pipeline.
+    pub cases: Vec<Case>,
+}
+
+/// Runs every case.
+pub fn run() -> Report {
+    let start = Instant::now();
+    let cases: Vec<Case> = CASES.iter().map(|case| case()).collect();
+    Report::of(cases, start.elapsed().as_secs_f64())
+}
+
+impl Report {
+    fn of(cases: Vec<Case>, seconds: f64) -> Report {
+        Report { tool: TOOL, pass: cases.iter().all(|case| case.pass), seconds, cases }
+    }
+
+    /// A table for a person.
+    pub fn text(&self) -> String {
+        let mut out = format!("{:<20} {:>7} {:>7} {:<4} {}\n", "case", "bound", "error", "", "what is compared");
+        for case in &self.cases {
+            let pass = if case.pass { "pass" } else { "FAIL" };
+            let (name, what) = (case.name, case.what);
+            out += &format!("{name:<20} {:>7} {:>7} {pass:<4} {what}\n", short(case.bound), short(case.error));
+            if let Some(failure) = &case.failure {
+                out += &format!("    {failure}\n");
+            }
+        }
+        let passed = self.cases.iter().filter(|case| case.pass).count();
+        out + &format!("{passed} of {} pass in {:.1} s: {}\n", self.cases.len(), self.seconds, self.tool)
+    }
+
+    /// # Errors
+    /// A case that fails; the error names all that do.
+    pub fn verdict(&self) -> Result<()> {
+        let failed: Vec<&str> = self.cases.iter().filter(|case| !case.pass).map(|case| case.name).collect();
+        if failed.is_empty() {
+            return Ok(());
+        }
+        Err(Error::Unsound(failed.join(", ")))
+    }
+}
+
+/// A number in seven characters.
+fn short(value: f64) -> String {
+    match value {
+        0.0 => "0".to_owned(),
+        _ => format!("{value:.1e}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_case_passes_and_the_table_fits_a_terminal() {
+        let report = run();
+        assert!(report.pass, "{}", report.text());
+        report.verdict().unwrap();
+        for line in report.text().lines() {
+            assert!(line.chars().count() <= 80, "{line}");
+        }
+        let mut names: Vec<&str> = report.cases.iter().map(|case| case.name).collect();
+        names.sort_unstable();
+        names.dedup();
+        assert_eq!(names.len(), CASES.len(), "two cases of one name");
+    }
+
+    #[test]
+    fn a_case_fails_beyond_its_bound_without_a_number_and_with_an_error() {
+        let case = |error| Case::new("made up", "nothing", 1e-9, || Ok(error));
+        let nan = || {
+            let mut worst = Worst::default();
+            worst.near(f64::NAN, 0.0, 1.0);
+            worst.near(0.0, 0.0, 1.0);
+            worst
+        };
+        let refused = Case::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
+        let panics = Case::new("panics", "nothing", 1e-9, || panic!("as it should"));
+        let report = Report::of(vec![case(Worst(1e-9)), case(Worst(1.1e-9)), case(nan()), refused, panics], 0.5);
+        let passes: Vec<bool> = report.cases.iter().map(|case| case.pass).collect();
+        assert_eq!((passes, report.pass), (vec![true, false, false, false, false], false));
+        let text = report.text();
+        assert!(text.contains("FAIL") && text.contains("no disk") && text.contains("1 of 5 pass"), "{text}");
+        let error = report.verdict().unwrap_err().to_string();
+        assert!(error.contains("made up, made up, refused, panics"), "{error}");
+    }
+}

@@ -1,0 +1,242 @@
+//! What cameras see, how it changes with what is stored, and how pictures are compared.
+
+use std::f64::consts::TAU;
+use std::num::NonZeroU32;
+
+use glam::DVec3;
+
+use super::made::clouds::{Random, camera, plain_camera, scene, single};
+use super::oracle::picture::{blended, decided, picture};
+use super::{Case, Worst};
+use crate::metrics::{psnr, ssim};
+use crate::model::{Camera, Columns, Gaussians, Gradients};
+use crate::render::{Contribution, Image, RemovalError, Renderer, render};
+
+const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
+
+/// Against α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)); values of 1 in f32 are off by 6e-8, an exponential
+/// by some more.
+pub(super) fn one_gaussian() -> Case {
+    Case::new("one Gaussian", "its picture: closed form (of white)", 3e-7, || {
+        let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);
+        let image = render(&single(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
+        let variance = (50.0 * scale / depth).powi(2) + 0.3;
+        let middle = f64::from(size) / 2.0 - 0.5;
+        let mut worst = Worst::default();
+        for (at, pixel) in image.data.chunks_exact(3).enumerate() {
+            let [x, y] = [at % size as usize, at / size as usize].map(|k| k as f64 - middle);
+            let alpha = opacity * (-0.5 * (x * x + y * y) / variance).exp();
+            let alpha = if alpha < 1.0 / 255.0 { 0.0 } else { alpha };
+            for (&got, colour) in pixel.iter().zip([1.0, 0.5, 0.0]) {
+                worst.near(got.into(), alpha * colour + (1.0 - alpha) * 0.25, 1.0);
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// Against sums in f64, pixel by pixel; a pixel adds up some dozen f32. Where a threshold is as near as 1e-4, f32 may
+/// decide the other way: those pixels, of which there are few, are passed over.
+pub(super) fn many_gaussians() -> Case {
+    Case::new("many Gaussians", "their picture: f64 (of white)", 2e-6, || {
+        let (scene, camera) = (scene(1, 300, 3), camera(67, 45));
+        let expected = picture(&scene, &camera, BACKGROUND, 1);
+        let got = render(&scene, &camera, BACKGROUND);
+        let sure = expected.doubtful.iter().filter(|&&doubtful| !doubtful).count();
+        let mut worst = Worst::default();
+        worst.same(&(20 * sure > 19 * expected.doubtful.len()), &true);
+        for (at, rgb) in expected.rgb.iter().enumerate().filter(|&(at, _)| !expected.doubtful[at]) {
+            (0..3).for_each(|c| worst.near(got.data[3 * at + c].into(), rgb[c], 1.0));
+        }
+        Ok(worst)
+    })
+}
+
+/// Σ and largest α·T in parts of 1 and the value; sums in f32 over a tile of 256 pixels.
+pub(super) fn weights() -> Case {
+    Case::new("contributions", "C, W as seen: sums in f64 (px)", 2e-6, || {
+        let (scene, camera) = sure_scene();
+        let expected = picture(&scene, &camera, BACKGROUND, 1);
+        let mut seen = Contribution::new(scene.len());
+        Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
+        let mut worst = Worst::default();
+        for i in 0..scene.len() {
+            worst.near(seen.pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
+            worst.near(seen.max[i].into(), expected.max[i], 1.0);
+        }
+        Ok(worst)
+    })
+}
+
+/// Σ‖picture − picture without it‖², both in f64; a colour behind is what is left of a difference of f32.
+pub(super) fn removal() -> Case {
+    Case::new("removal errors", "pictures without one: f64 (px)", 5e-6, || {
+        let (scene, camera) = sure_scene();
+        let mut found = RemovalError::new(scene.len(), 0.0);
+        Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
+        let all = blended(&scene, &camera);
+        let whole = decided(&scene, &camera, BACKGROUND, &all);
+        let mut worst = Worst::default();
+        for i in 0..scene.len() {
+            let others: Vec<Vec<usize>> =
+                all.iter().map(|ids| ids.iter().copied().filter(|&id| id != i).collect()).collect();
+            let without = decided(&scene, &camera, BACKGROUND, &others);
+            let values = whole.as_flattened().iter().zip(without.as_flattened());
+            let expected: f64 = values.map(|(a, b)| (a - b).powi(2)).sum();
+            worst.near(found.sum[i] as f64 * RemovalError::UNIT, expected, 1.0 + expected);
+        }
+        Ok(worst)
+    })
+}
+
+/// Against K·P(cos θ)·cos mφ by recurrence; a colour of 1 is off by some 1e-7 in f32.
+pub(super) fn harmonics() -> Case {
+    Case::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
+        let mut worst = Worst::default();
+        for toward in [DVec3::new(0.3, -0.5, 0.8), DVec3::new(-0.7, 0.2, -0.4), DVec3::new(0.1, 0.9, 0.05)] {
+            let toward = toward.normalize();
+            let camera = Camera::look_at(DVec3::ZERO, toward, 1.0, (8, 8));
+            let mut wall = Gaussians::zeros(1, 3);
+            wall.position.set_row(0, toward.to_array().map(|x| 4.0 * x as f32));
+            wall.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
+            wall.log_scale.set_row(0, [9.0; 3]);
+            // Opaque but for a hundredth, where alpha is cut.
+            wall.opacity_logit.set_row(0, [9.0]);
+            for (k, expected) in basis(toward).into_iter().enumerate() {
+                wall.sh.planes_mut().fill(0.0);
+                (0..3).for_each(|c| wall.sh.plane_mut(3 * k + c)[0] = 0.3 * (c as f32 - 1.0));
+                let image = render(&wall, &camera, [0.0; 3]);
+                for c in 0..3 {
+                    let colour = 0.5 + f64::from(0.3 * (c as f32 - 1.0)) * expected;
+                    worst.near(image.data[3 * (8 * 4 + 4) + c].into(), 0.99 * colour, 1.0);
+                }
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// The largest of every column against differences of f64 pictures over 6e-5, in parts of each; sums of f32 with both
+/// signs.
+pub(super) fn gradients() -> Case {
+    Case::new("backward pass", "derivatives: differences in f64", 5e-5, || {
+        let (scene, camera) = (scene(3, 40, 2), camera(33, 100));
+        let doubtful = picture(&scene, &camera, BACKGROUND, 1).doubtful;
+        let mut random = Random(103);
+        let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.draw().into()).collect();
+        let off = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
+        let mut found = Gradients::new(scene.len(), Columns::all(), 2);
+        let slope = |image: &Image| {
+            let data = image.data.iter().enumerate().map(|(at, &x)| off(at, x.into()) as f32).collect();
+            (0.0, Image { data, ..*image })
+        };
+        Renderer::new().gradient(&scene, &camera, BACKGROUND, slope, &mut found);
+
+        // What is blended is decided beforehand, so that the loss has no steps.
+        let blended = blended(&scene, &camera);
+        let loss = |changed: &Gaussians| -> f64 {
+            let pixels = decided(changed, &camera, BACKGROUND, &blended);
+            let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| off(at, x).powi(2));
+            0.5 * squares.sum::<f64>()
+        };
+        let mut worst = Worst::default();
+        for column in Columns::all().iter() {
+            let got = found.column(column).planes();
+            let mut largest: Vec<usize> = (0..got.len()).collect();
+            largest.sort_by(|&a, &b| got[b].abs().total_cmp(&got[a].abs()));
+            for &at in largest.iter().take(20) {
+                let mut changed = scene.clone();
+                let middle = scene.column(column).planes()[at];
+                let both = [middle - 3e-5, middle + 3e-5];
+                let [low, high] = both.map(|x| {
+                    changed.column_mut(column).planes_mut()[at] = x;
+                    loss(&changed)
+                });
+                worst.relative(got[at].into(), (high - low) / (f64::from(both[1]) - f64::from(both[0])));
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// PSNR from whole numbers, in dB, and SSIM from its definition; sums in f64 of 786,432 squares lose 1e-12 at most.
+pub(super) fn comparison() -> Case {
+    Case::new("PSNR and SSIM", "whole numbers; windows in f64", 1e-12, || {
+        let mut random = Random(8);
+        let mut image = |size: u32| -> (Image, Vec<i64>) {
+            let levels: Vec<i64> = (0..3 * size * size).map(|_| (256.0 * random.draw()) as i64).collect();
+            let data = levels.iter().map(|&level| level as f32 / 256.0).collect();
+            (Image { width: size, height: size, data }, levels)
+        };
+        let ((a, levels), (b, others)) = (image(512), image(512));
+        let squares: i64 = levels.iter().zip(&others).map(|(a, b)| (a - b).pow(2)).sum();
+        let mut worst = Worst::default();
+        worst.near(psnr(&a, &b), -10.0 * (squares as f64 / 65536.0 / levels.len() as f64).log10(), 1.0);
+        let ((a, _), (b, _)) = (image(16), image(16));
+        worst.near(ssim(&a, &b), plain_ssim(&a, &b), 1.0);
+        Ok(worst)
+    })
+}
+
+/// Its picture holds no doubtful pixel.
+const SURE_SEED: u64 = 1;
+
+/// A scene and a camera that see no decision so near that f32 takes it otherwise, and no alpha that is cut.
+fn sure_scene() -> (Gaussians, Camera) {
+    let mut scene = scene(SURE_SEED, 60, 1);
+    scene.opacity_logit.planes_mut().iter_mut().for_each(|logit| *logit = logit.min(2.0));
+    (scene, camera(40, 33))
+}
+
+/// Real spherical harmonics of degree up to 3 by angles: √2·K·P(cos θ)·cos mφ, with sin |m|φ for negative m.
+fn basis(toward: DVec3) -> [f64; 16] {
+    let (height, angle) = (toward.z, toward.y.atan2(toward.x));
+    std::array::from_fn(|k| {
+        let degree = k.isqrt();
+        let order = k as i32 - (degree * degree + degree) as i32;
+        let m = order.unsigned_abs() as usize;
+        let factorial = |n: usize| (1..=n).map(|k| k as f64).product::<f64>();
+        let scale = ((2 * degree + 1) as f64 / (2.0 * TAU) * factorial(degree - m) / factorial(degree + m)).sqrt();
+        let wave = match order {
+            0 => 1.0,
+            1.. => 2f64.sqrt() * (m as f64 * angle).cos(),
+            _ => 2f64.sqrt() * (m as f64 * angle).sin(),
+        };
+        scale * legendre(degree, m, height) * wave
+    })
+}
+
+/// Associated Legendre function, with the sign (−1)^m, by the recurrence in its degree.
+fn legendre(degree: usize, m: usize, x: f64) -> f64 {
+    let sine = (1.0 - x * x).sqrt();
+    let (mut before, mut last) = (0.0, (0..m).map(|k| -((2 * k + 1) as f64) * sine).product::<f64>());
+    for l in m + 1..=degree {
+        let next = (((2 * l - 1) as f64) * x * last - ((l + m - 1) as f64) * before) / (l - m) as f64;
+        (before, last) = (last, next);
+    }
+    last
+}
+
+/// SSIM window by window: 11×11 values, σ = 1.5, zeros beyond the border.
+fn plain_ssim(a: &Image, b: &Image) -> f64 {
+    let size = a.width as i64;
+    let bell = |d: i64| (-(d * d) as f64 / 4.5).exp();
+    let total: f64 = (-5..=5).map(bell).sum();
+    let value = |image: &Image, x: i64, y: i64, c: i64| match (0..size).contains(&x) && (0..size).contains(&y) {
+        true => f64::from(image.data[(3 * (y * size + x) + c) as usize]),
+        false => 0.0,
+    };
+    let mut sum = 0.0;
+    for (y, x, c) in (0..size).flat_map(|y| (0..size).flat_map(move |x| (0..3).map(move |c| (y, x, c)))) {
+        let [mut a1, mut b1, mut aa, mut bb, mut ab] = [0.0; 5];
+        for (v, u) in (-5..=5).flat_map(|v| (-5..=5).map(move |u| (v, u))) {
+            let weight = bell(u) * bell(v) / (total * total);
+            let (a, b) = (value(a, x + u, y + v, c), value(b, x + u, y + v, c));
+            (a1, b1) = (a1 + weight * a, b1 + weight * b);
+            (aa, bb, ab) = (aa + weight * a * a, bb + weight * b * b, ab + weight * a * b);
+        }
+        let means = (2.0 * a1 * b1 + 1e-4) / (a1 * a1 + b1 * b1 + 1e-4);
+        sum += means * (2.0 * (ab - a1 * b1) + 9e-4) / (aa - a1 * a1 + bb - b1 * b1 + 9e-4);
+    }
+    sum / (3 * size * size) as f64
+}
