@@ -25,7 +25,8 @@ Examples:
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
   splatsieve unpack a.gseq --stream | splatsieve compress - -o b.gseq
-  splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq";
+  splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq
+  splatsieve selfcheck                                   are the numbers right on this machine?";
 
 /// Shrinks trained dynamic Gaussian-splatting models, without retraining.
 #[derive(Debug, Parser)]
@@ -69,6 +70,8 @@ pub(super) enum Verb {
     Recover(Recover),
     /// Generate a small dynamic scene, compress it, say what happened
     Demo(Demo),
+    /// Check the numbers of this program on this machine against closed forms and slow, plain sums; takes no files
+    Selfcheck(Selfcheck),
     /// Print a recipe file with every parameter documented
     Recipe(RecipeVerb),
     /// Print a completion script for a shell
@@ -87,7 +90,12 @@ impl Verb {
             | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
             Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(Report { models, .. }) => models.memory.explain,
             Verb::Demo(Demo { memory, .. }) => memory.explain,
-            Verb::Sweep(_) | Verb::Verify(_) | Verb::Recover(_) | Verb::Recipe(_) | Verb::Completions(_) => false,
+            Verb::Sweep(_)
+            | Verb::Verify(_)
+            | Verb::Recover(_)
+            | Verb::Selfcheck(_)
+            | Verb::Recipe(_)
+            | Verb::Completions(_) => false,
         }
     }
 }
@@ -531,6 +539,14 @@ pub(super) struct Demo {
     pub(super) earlier: Earlier,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
+}
+
+/// `selfcheck`
+#[derive(Debug, Args)]
+pub(super) struct Selfcheck {
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
 }
 
 /// `recipe`

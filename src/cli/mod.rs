@@ -23,6 +23,7 @@ use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions, trade_off};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, scratch_beside};
+use crate::selfcheck;
 use crate::stream::{Mode, Progress};
 use crate::verbs::container::Storing;
 use crate::verbs::evaluate::EvaluateOptions;
@@ -59,9 +60,13 @@ pub fn main() -> ExitCode {
         Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(error) => {
             tell(&format!("splatsieve: {error}"));
-            ExitCode::from(if matches!(error, Error::Usage(_)) { 2 } else { 1 })
+            ExitCode::from(code_of(&error))
         }
     }
+}
+
+fn code_of(error: &Error) -> u8 {
+    if matches!(error, Error::Usage(_)) { 2 } else { 1 }
 }
 
 fn run(cli: Cli) -> Result<()> {
@@ -198,6 +203,13 @@ fn run(cli: Cli) -> Result<()> {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
             }
             Ok(())
+        }
+        Verb::Selfcheck(args) => {
+            // What it makes up is nobody's progress.
+            Progress::set_mode(Mode::Quiet);
+            let found = selfcheck::run();
+            print(&if args.json { json(&found) } else { found.text() })?;
+            found.verdict()
         }
         Verb::Recipe(args) => print(preset_text(&args.preset)?),
         Verb::Completions(args) => {
@@ -382,4 +394,15 @@ fn print(text: &str) -> Result<()> {
 fn write_stdout(bytes: &[u8]) -> Result<()> {
     let mut out = io::stdout().lock();
     out.write_all(bytes).and_then(|()| out.flush()).map_err(Error::io("write", "standard output".as_ref()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_asked_wrongly_is_2_and_whatever_else_fails_is_1() {
+        assert_eq!(code_of(&Error::usage("no such frame")), 2);
+        assert_eq!(code_of(&Error::Unsound("motion far away".to_owned())), 1);
+    }
 }
