@@ -18,9 +18,9 @@ pub(super) fn mixture() -> Case {
         let mut worst = Worst::default();
         for count in [1, 2, 3, 12] {
             let mut within = |low, high| f64::from(random.within(low, high));
-            let parts: Vec<Part> = (0..count)
-                .map(|_| Part {
-                    weight: 1.0 / f64::from(count),
+            let parts: Vec<Part> = (1..=count)
+                .map(|k| Part {
+                    weight: 2.0 * f64::from(k) / f64::from(count * (count + 1)),
                     position: DVec3::new(within(-1.0, 1.0), within(-1.0, 1.0), within(-1.0, 1.0)),
                     rotation: DQuat::from_xyzw(within(-1.0, 1.0), within(-1.0, 1.0), within(-1.0, 1.0), 0.3)
                         .normalize(),

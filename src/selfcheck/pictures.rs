@@ -120,12 +120,12 @@ pub(super) fn harmonics() -> Case {
 /// signs.
 pub(super) fn gradients() -> Case {
     Case::new("backward pass", "derivatives: differences in f64", 5e-5, || {
-        let (scene, camera) = (scene(3, 40, 2), camera(33, 100));
+        let (scene, camera) = (scene(3, 40, 3), camera(33, 100));
         let doubtful = picture(&scene, &camera, BACKGROUND, 1).doubtful;
         let mut random = Random(103);
         let target: Vec<f64> = (0..3 * doubtful.len()).map(|_| random.draw().into()).collect();
         let off = |at: usize, value: f64| if doubtful[at / 3] { 0.0 } else { value - target[at] };
-        let mut found = Gradients::new(scene.len(), Columns::all(), 2);
+        let mut found = Gradients::new(scene.len(), Columns::all(), 3);
         let slope = |image: &Image| {
             let data = image.data.iter().enumerate().map(|(at, &x)| off(at, x.into()) as f32).collect();
             (0.0, Image { data, ..*image })

@@ -47,6 +47,29 @@ pub(super) fn motion_of_any_size() -> Case {
     })
 }
 
+/// x = t² at whole t of mean step m has velocities m·(t + t') and turns of 2m²; sums of 40 terms in f64.
+pub(super) fn uneven_frames() -> Case {
+    Case::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
+        let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
+        let frames: Vec<Gaussians> = times
+            .iter()
+            .map(|&time| {
+                let mut frame = resting(1);
+                frame.position.set_row(0, [0.0, (time * time) as f32, 0.0]);
+                frame
+            })
+            .collect();
+        let got = scan_at(&times, &frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let steps = times.len() - 1;
+        let mean_step = times[steps] / steps as f64;
+        let squares: f64 = times.windows(2).map(|pair| (mean_step * (pair[0] + pair[1])).powi(2)).sum();
+        let mut worst = Worst::default();
+        worst.relative(got.d[0], (squares / steps as f64).sqrt());
+        worst.relative(got.kappa[0], 2.0 * mean_step * mean_step);
+        Ok(worst)
+    })
+}
+
 /// Nothing, one and two life frames have exact answers.
 pub(super) fn short_lives() -> Case {
     Case::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
@@ -241,11 +264,18 @@ fn unseen(frames: usize) -> Schedule {
 /// The rows of evenly spaced frames.
 fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
-    let plan = ScanPlan::new(recipe, &times, schedule)?;
+    scan_at(&times, frames, schedule, recipe)
+}
+
+/// The rows of frames at `times`, told where opacities stay, as sources do.
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
+    let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, (frame, views)) in frames.iter().zip(&schedule.frames).enumerate() {
         let cameras: Vec<&Camera> = views.iter().map(|&(_, camera)| &schedule.cameras[camera as usize]).collect();
-        block.frame(t, frame, &cameras, Columns::all());
+        let stays = t > 0 && frame.opacity_logit == frames[t - 1].opacity_logit;
+        let changed = if stays { Columns::all().difference(Columns::OPACITY) } else { Columns::all() };
+        block.frame(t, frame, &cameras, changed);
     }
     Ok(block.finish().rows)
 }

@@ -1,6 +1,7 @@
 //! What comes back of what was written.
 
 use std::collections::BTreeMap;
+use std::iter::repeat;
 use std::path::Path;
 
 use gseq::Compression;
@@ -133,12 +134,11 @@ fn through_container(
     let mut state = Gaussians::zeros(0, made.info.sh_degree);
     for (frame, expected) in made.frames.iter().enumerate() {
         reader.read(frame, Columns::all(), &mut state)?;
-        if state.len() != expected.len() {
-            return Err(Error::Unsound(format!("{} Gaussians came back of {}", state.len(), expected.len())));
-        }
         for column in Columns::all().iter() {
-            let values = state.column(column).planes().iter().zip(expected.column(column).planes());
-            values.for_each(|(&got, &expected)| compare(got, expected, column));
+            // What is missing is no number.
+            let got = state.column(column).planes().iter().copied().chain(repeat(f32::NAN));
+            let values = got.zip(expected.column(column).planes());
+            values.for_each(|(got, &expected)| compare(got, expected, column));
         }
     }
     Ok(())
