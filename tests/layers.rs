@@ -113,7 +113,11 @@ fn import_of(statement: &str) -> Option<(bool, &str)> {
 fn without_tests_and_comments(text: &str) -> String {
     let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or("");
     let text = text.split("#[cfg(test)]\npub(crate) mod ").next().unwrap_or("");
-    text.lines().map(|line| line.split("//").next().unwrap_or("")).collect::<Vec<_>>().join("\n")
+    let text = text.lines().map(|line| line.split("//").next().unwrap_or("")).collect::<Vec<_>>().join("\n");
+    // Who may see something is not whom it uses.
+    let mut parts = text.split("pub(in ");
+    let first = parts.next().unwrap_or("").to_owned();
+    parts.fold(first, |code, part| code + "pub(crate)" + part.split_once(')').map_or("", |(_, after)| after))
 }
 
 /// Every path of a tree such as `crate::{a, b::{c, d}}`.
