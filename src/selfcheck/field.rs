@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use super::case::{Case, Worst};
 use super::made::field::{Noise, plain, tensors};
 use super::oracle::field::{Oracle, Parameters};
-use super::{Case, Worst};
 use crate::deform::{Deltas, Field, FieldConfig, Scratch};
 use crate::model::{Columns, Gaussians};
 

@@ -2,8 +2,8 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
+use super::case::{Case, Worst};
 use super::made::clouds::{Random, scene};
-use super::{Case, Worst};
 use crate::error::{Error, Result};
 use crate::merge::moments::{Ellipsoid, Part, align_axes, moments};
 use crate::merge::proxy::{Importance, merge_state, weights};

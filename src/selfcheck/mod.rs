@@ -6,6 +6,7 @@
 //! A case runs the code that `compress` runs. What it expects shares none of it: a formula, integers, or the definition
 //! in f64 over whole arrays ([`oracle`]). Errors are as large as the worst of all values looked at.
 
+mod case;
 mod field;
 pub mod made;
 mod merging;
@@ -16,13 +17,14 @@ mod statistics;
 mod storage;
 mod threads;
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
 
 use serde::Serialize;
 
 use crate::TOOL;
 use crate::error::{Error, Result};
+
+pub use case::Case;
 
 /// Every case, in the order of the pipeline.
 const CASES: [fn() -> Case; 28] = [
@@ -55,62 +57,6 @@ const CASES: [fn() -> Case; 28] = [
     storage::archive_codes,
     threads::same_bytes,
 ];
-
-/// What was checked, how far off it may be, and how far off it is.
-#[derive(Debug, Serialize)]
-pub struct Case {
-    /// A few words that name it.
-    pub name: &'static str,
-    /// What is compared with what.
-    pub what: &'static str,
-    /// Largest error of a sound build. Errors are relative or in the unit that `what` names.
-    pub bound: f64,
-    /// The largest error; infinite, as JSON null, where it is none or nothing could be measured.
-    pub error: f64,
-    /// Whether the error is within the bound.
-    pub pass: bool,
-    /// Why nothing could be measured.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub failure: Option<String>,
-}
-
-impl Case {
-    fn new(name: &'static str, what: &'static str, bound: f64, measure: impl FnOnce() -> Result<Worst>) -> Case {
-        // A build so broken that it panics has other cases to show.
-        let (error, failure) = match catch_unwind(AssertUnwindSafe(measure)) {
-            Ok(Ok(Worst(error))) => (error, None),
-            Ok(Err(error)) => (f64::INFINITY, Some(error.to_string())),
-            Err(_) => (f64::INFINITY, Some("a panic".to_owned())),
-        };
-        Case { name, what, bound, error, pass: error <= bound, failure }
-    }
-}
-
-/// The largest error so far.
-#[derive(Debug, Default)]
-struct Worst(f64);
-
-impl Worst {
-    /// An error, which is infinite where it is no number.
-    fn add(&mut self, error: f64) {
-        self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };
-    }
-
-    /// |got − expected| in parts of `unit`, which is positive.
-    fn near(&mut self, got: f64, expected: f64, unit: f64) {
-        self.add((got - expected).abs() / unit);
-    }
-
-    /// |got − expected| in parts of what is expected, or 0 where both are the same.
-    fn relative(&mut self, got: f64, expected: f64) {
-        self.add(if got == expected { 0.0 } else { (got - expected).abs() / expected.abs() });
-    }
-
-    /// 1 where things differ that must be the same.
-    fn same<T: PartialEq + ?Sized>(&mut self, got: &T, expected: &T) {
-        self.add(if got == expected { 0.0 } else { 1.0 });
-    }
-}
 
 /// What all cases found.
 #[derive(Debug, Serialize)]
@@ -173,6 +119,7 @@ fn short(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::case::Worst;
     use super::*;
 
     #[test]

@@ -5,9 +5,9 @@ use std::num::NonZeroU32;
 
 use glam::DVec3;
 
+use super::case::{Case, Worst};
 use super::made::clouds::{Random, camera, plain_camera, scene, single};
 use super::oracle::picture::{blended, decided, picture};
-use super::{Case, Worst};
 use crate::metrics::{psnr, ssim};
 use crate::model::{Camera, Columns, Gaussians, Gradients};
 use crate::render::{Contribution, Image, RemovalError, Renderer, render};

@@ -1,7 +1,7 @@
 //! Percentiles, by which values are normalised and scenes measured.
 
+use super::case::{Case, Worst};
 use super::made::clouds::Random;
-use super::{Case, Worst};
 use crate::model::Column;
 use crate::score::FloatSketch;
 use crate::stats::RobustBox;

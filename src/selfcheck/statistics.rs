@@ -4,9 +4,9 @@ use std::f64::consts::PI;
 
 use glam::{DMat3, DVec3};
 
+use super::case::{Case, Worst};
 use super::made::clouds::{Random, camera};
 use super::oracle::statistics::{Row, row};
-use super::{Case, Worst};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
 use crate::recipe::{Motion, Recipe, Scan};

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use gseq::Compression;
 
+use super::case::{Case, Worst};
 use super::made::clouds::{Random, scene};
-use super::{Case, Worst};
 use crate::archive::{
     ATTRIBUTES, Content, Encoded, FieldSteps, Role, Steps, TensorSteps, attribute, decode, encode, round_cloud, step,
 };

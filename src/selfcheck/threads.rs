@@ -2,8 +2,8 @@
 
 use std::fs;
 
+use super::case::{Case, Worst};
 use super::made::clouds::{camera, scene};
-use super::{Case, Worst};
 use crate::budget::Budget;
 use crate::emit::atomic::{Replace, ScratchFolder};
 use crate::error::{Error, Result};
