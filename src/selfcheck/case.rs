@@ -15,7 +15,7 @@ pub struct Case {
     pub what: &'static str,
     /// Largest error of a sound build. Errors are relative or in the unit that `what` names.
     pub bound: f64,
-    /// The largest error; infinite, as JSON null, where it is none or nothing could be measured.
+    /// The largest error; infinite or NaN, as JSON null, where one is no number or nothing could be measured.
     pub error: f64,
     /// Whether the error is within the bound.
     pub pass: bool,
@@ -41,9 +41,15 @@ impl Case {
     }
 }
 
-/// The largest error so far.
-#[derive(Debug, Default)]
+/// The largest error so far; NaN, which is within no bound, of nothing looked at.
+#[derive(Debug)]
 pub(super) struct Worst(pub(super) f64);
+
+impl Default for Worst {
+    fn default() -> Worst {
+        Worst(f64::NAN)
+    }
+}
 
 impl Worst {
     /// An error, which is infinite where it is no number.

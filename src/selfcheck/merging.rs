@@ -33,7 +33,8 @@ pub(super) fn mixture() -> Case {
     })
 }
 
-/// Twice the same is the same: scales of 1 : 1e12 come back to 1e-12 of each, of which a covariance in f64 keeps nothing.
+/// Twice the same is the same: scales of 1 : 1e12 come back to 1e-12 of each; a covariance in f64 would keep nothing of
+/// the smallest.
 pub(super) fn needle() -> Case {
     Case::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
         let mut worst = Worst::default();

@@ -146,13 +146,14 @@ mod tests {
             worst
         };
         let refused = Case::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
+        let idle = Case::new("idle", "nothing", 1e-9, || Ok(Worst::default()));
         let panics = Case::new("panics", "nothing", 1e-9, || panic!("as it should"));
-        let report = Report::of(vec![case(Worst(1e-9)), case(Worst(1.1e-9)), case(nan()), refused, panics], 0.5);
+        let report = Report::of(vec![case(Worst(1e-9)), case(Worst(1.1e-9)), case(nan()), refused, panics, idle], 0.5);
         let passes: Vec<bool> = report.cases.iter().map(|case| case.pass).collect();
-        assert_eq!((passes, report.pass), (vec![true, false, false, false, false], false));
+        assert_eq!((passes, report.pass), (vec![true, false, false, false, false, false], false));
         let text = report.text();
-        assert!(text.contains("FAIL") && text.contains("no disk") && text.contains("1 of 5 pass"), "{text}");
+        assert!(text.contains("FAIL") && text.contains("no disk") && text.contains("1 of 6 pass"), "{text}");
         let error = report.verdict().unwrap_err().to_string();
-        assert!(error.contains("made up, made up, refused, panics"), "{error}");
+        assert!(error.contains("made up, made up, refused, panics, idle"), "{error}");
     }
 }

@@ -14,8 +14,8 @@ use crate::render::{Contribution, Image, RemovalError, Renderer, render};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];
 
-/// Against α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)); values of 1 in f32 are off by 6e-8, an exponential
-/// by some more.
+/// Against α·c + (1 − α)·background, α = o·exp(−r²/2(f²s²/z² + 0.3)); values of 1 in f32 are off by 6e-8, an
+/// exponential by some more.
 pub(super) fn one_gaussian() -> Case {
     Case::new("one Gaussian", "its picture: closed form (of white)", 3e-7, || {
         let (size, depth, scale, opacity) = (48u32, 2.0f64, 0.08f64, 0.7f64);

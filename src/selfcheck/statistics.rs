@@ -104,7 +104,8 @@ pub(super) fn short_lives() -> Case {
     })
 }
 
-/// Opacities of 0.9 that differ by 1e-6 are off by 1e-16, so V by less than 1e-9 of itself; unshifted moments would lose 1e-4.
+/// Opacities of 0.9 that differ by 1e-6 are off by 1e-16, so V by less than 1e-9 of itself; of unshifted moments nothing
+/// would be left but 2 digits.
 pub(super) fn steady_opacity() -> Case {
     Case::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
         let mut random = Random(5);

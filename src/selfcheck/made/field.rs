@@ -29,8 +29,8 @@ pub(crate) fn plain() -> FieldConfig {
     }
 }
 
-/// A random state dict for `config` with `depth` trunk layers and harmonics of degree 3. Resolutions differ along every axis, so
-/// that swapped axes cannot pass.
+/// A random state dict for `config` with `depth` trunk layers and harmonics of degree 3. Resolutions differ along every
+/// axis, so that swapped axes cannot pass.
 pub(crate) fn tensors(config: &FieldConfig, depth: usize) -> Tensors {
     let mut noise = Noise(7);
     let mut tensors = Tensors::new();
