@@ -81,9 +81,10 @@ impl Merge {
             ("readers", work.input.reader),
             ("followed", motion::bytes_per_gaussian(limits.frames_held) as u64),
         ];
-        // States once; every pass follows its pairs along all frames, of every set of survivors that is tried.
+        // States once; every pass follows its pairs along all frames, of every set of survivors that is tried: first those
+        // that coincide, if any do.
         let trials = if self.target.is_some() && self.prunes { TRIALS } else { 1.0 };
-        let followed = trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
+        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
         Need {
             stage: NAME,
             reads: work.scattered_reads(1, limits) + followed,
