@@ -267,6 +267,11 @@ pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 /// A named part of a stage's memory.
 pub type Part = (&'static str, u64);
 
+/// `bytes` per Gaussian of what is left, of which there are a part `left` of all, per Gaussian of the input.
+pub fn of_left(left: f64, bytes: u64) -> u64 {
+    (left * bytes as f64).ceil() as u64
+}
+
 /// What a stage needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Need {

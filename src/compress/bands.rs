@@ -7,7 +7,7 @@ use super::journal::Journal;
 use super::request::Request;
 use super::score::scored;
 use super::summary::BandsSummary;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
 use crate::limits::Limits;
@@ -57,14 +57,15 @@ impl Bands {
         drops.then_some(Bands { margin: bands.bands_margin })
     }
 
-    /// Three states, and pictures of them.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    /// Three states, and pictures of them. A part `left` of the Gaussians stays.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let (whole, reader, held) = (work.state(Columns::all()), work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
-            ("kept", 24),
-            ("states", 3 * work.state(Columns::all())),
-            ("result", work.input.reduced),
-            ("readers", 2 * work.input.reader),
-            ("held", 2 * work.held(limits, Columns::all())),
+            ("kept", of_left(left, 24)),
+            ("states", whole + of_left(left, 2 * whole)),
+            ("result", of_left(left, work.input.reduced)),
+            ("readers", reader + of_left(left, reader)),
+            ("held", held + of_left(left, held)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };

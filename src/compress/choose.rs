@@ -6,7 +6,7 @@
 use super::journal::Journal;
 use super::merge::Outcome;
 use super::score::{Ranked, Scored, scored};
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::metrics::psnr;
@@ -37,18 +37,23 @@ pub struct Choose {
 }
 
 impl Choose {
-    /// Both alternatives, two states of a frame, and pictures.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    /// Both alternatives, two states of a frame, and pictures. A part `left` of the Gaussians stays.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let whole = work.state(Columns::all());
+        // Merged trajectories are read of all that merge.
+        let merging = if work.input.reduced > 0 { left } else { 1.0 };
+        let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
-            ("alternatives", 8),
+            ("alternatives", of_left(left, 8)),
             ("clusters", CLUSTERED),
-            ("states", 2 * work.state(Columns::all())),
-            ("result", work.input.reduced),
-            ("readers", 2 * work.input.reader),
-            ("held", 2 * work.held(limits, Columns::all())),
+            ("states", whole + of_left(left, whole)),
+            ("result", of_left(left, work.input.reduced)),
+            ("readers", reader + of_left(merging, reader)),
+            ("held", held + of_left(merging, held)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
-        let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + AT_ONCE as u64);
+        let together = AT_ONCE.min(limits.pictures_together) as u64;
+        let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
         let frames = (PICTURES as u64).min(work.pictures);
         // The original, and two of about half as many Gaussians.
         let made = work.picturing(frames as f64, 2.0 * work.count(), (RENDER.0, 0.0))
@@ -105,7 +110,8 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Pict
     let result = scene.input.reduced(merged)?;
     let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
-    let batch = Batch { pictures: AT_ONCE, ..Batch::of_frame(&scene.limits) };
+    let pictures_together = AT_ONCE.min(scene.limits.pictures_together);
+    let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
     let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
         let picture = |state: &Gaussians, view: &View<'_, 2>| render(state, view.camera, scene.background);

@@ -9,7 +9,7 @@ use super::request::Request;
 use super::score::scored;
 use super::summary::Summary;
 use crate::archive::Encoded;
-use crate::budget::{Need, Workload};
+use crate::budget::{Need, Workload, of_left};
 use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFile, StagedFolder, check_target, commit_files};
 use crate::emit::container::FRAME_BLOCK;
 use crate::emit::index_map::write_index_map;
@@ -81,11 +81,12 @@ impl Emit {
         Ok(())
     }
 
-    /// What is left, and buffers of what is written.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    /// What is left, a part `left` of the Gaussians, and buffers of what is written.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
         let whole = work.state(Columns::all());
         let is_solved = work.input.reduced > 0;
-        let mut per_gaussian = [scored(limits), vec![("kept", 40), ("result", work.input.reduced)]].concat();
+        let mut per_gaussian =
+            [scored(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
         let mut fixed = work.writing();
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
@@ -97,11 +98,14 @@ impl Emit {
                 fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
             }
             OutputKind::Gseq => (),
-            // A file's rows and the proxies among them for each thread, or one state and what it is made of.
+            // A file to be like, its rows and the proxies among them for each thread, or one state and what it is made of.
             _ => {
-                per_gaussian.push(("readers", work.input.reader));
-                per_gaussian.push(("held", work.held(limits, Columns::all())));
-                per_gaussian.push(("files", work.threads * (work.input.file + 2 * whole)));
+                // Merged trajectories are read of all that merge.
+                let merging = if is_solved { left } else { 1.0 };
+                per_gaussian.push(("readers", of_left(merging, work.input.reader)));
+                per_gaussian.push(("held", of_left(merging, work.held(limits, Columns::all()))));
+                let rows = of_left(left, work.threads * (work.input.file + 2 * whole));
+                per_gaussian.push(("files", work.input.file + rows));
                 per_gaussian.push(("members", CLUSTERED));
             }
         }

@@ -7,7 +7,7 @@ use super::refine::CLOSE_ENOUGH;
 use super::request::Request;
 use super::score::scored;
 use super::summary::FieldSummary;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
 use crate::limits::Limits;
@@ -39,13 +39,14 @@ impl Field {
         (kind == OutputKind::Model && field.field == Precision::Half).then_some(Field { margin: field.field_margin })
     }
 
-    /// Two states, pictures, and the field once more.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    /// Two states, pictures, and the field once more. A part `left` of the Gaussians stays.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let whole = work.state(Columns::all());
         let per_gaussian = vec![
-            ("kept", 24),
-            ("states", 2 * work.state(Columns::all())),
-            ("result", 2 * work.input.reduced),
-            ("readers", 2 * work.input.reader),
+            ("kept", of_left(left, 24)),
+            ("states", whole + of_left(left, whole)),
+            ("result", of_left(left, 2 * work.input.reduced)),
+            ("readers", work.input.reader + of_left(left, work.input.reader)),
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = (PICTURES as u64).min(work.pictures);

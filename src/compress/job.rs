@@ -49,6 +49,8 @@ pub struct Job {
     pub archive: Option<Archive>,
     /// Writes.
     pub emit: Emit,
+    /// Part of the Gaussians that stays at most.
+    left: f64,
     has_cameras: bool,
     spared: Spared,
 }
@@ -180,6 +182,7 @@ impl Job {
             bands: bands.filter(|_| !searches),
             archive: is_archive.then_some(Archive { psnr: request.archive_psnr }),
             emit,
+            left: part.unwrap_or(1.0).min(1.0),
             measure,
             has_cameras: outlook.has_cameras,
             spared,
@@ -242,13 +245,13 @@ impl Stages for Job {
         needs.extend(self.rounds.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.degree.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.merge.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits, self.left)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits)));
-        needs.extend(self.bands.as_ref().map(|stage| stage.need(work, limits)));
+        needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits, self.left)));
+        needs.extend(self.bands.as_ref().map(|stage| stage.need(work, limits, self.left)));
         needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.archive.as_ref().map(|stage| stage.need(work, limits)));
-        needs.push(self.emit.need(work, limits));
+        needs.push(self.emit.need(work, limits, self.left));
         needs
     }
 }
