@@ -6,8 +6,8 @@
 
 They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along
 these): mass and variance stay. FOLDER gets its views at every frame: the model's own, of which those of
-transforms_test.json are held out again, and some on the way between neighbours. `--compare` refines and prunes FOLDER down to a fifth in a gibibyte, and says
-how close the held-out pictures of both stay. Needs nothing but Python.
+transforms_test.json are held out again, and some on the way between neighbours. `--compare` refines and prunes FOLDER down
+to a fifth in a gibibyte, and says how close the held-out pictures of both stay. Needs nothing but Python.
 """
 
 import argparse

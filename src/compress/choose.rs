@@ -5,7 +5,7 @@
 
 use super::journal::Journal;
 use super::merge::Outcome;
-use super::score::{Ranked, Scored, scored};
+use super::score::{Scored, scored};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
@@ -14,6 +14,7 @@ use crate::model::{Columns, Gaussians, Picture};
 use crate::reduction::Reduction;
 use crate::render::{self, Image, render};
 use crate::scene::Scene;
+use crate::select::Ranking;
 use crate::stream::{Batch, Progress, Subject, VIEWS_AT_ONCE, View, show, spread};
 
 /// What the stage is called.
@@ -77,7 +78,7 @@ impl Choose {
         &self,
         scene: &Scene,
         scored: &Scored,
-        ranked: &Ranked,
+        ranked: &Ranking,
         merged: Outcome,
         journal: &mut Journal,
     ) -> Result<Outcome> {
@@ -86,7 +87,7 @@ impl Choose {
         if reduction.clusters.is_empty() {
             return Ok(merged);
         }
-        let pruned = ranked.ranking.take(count);
+        let pruned = ranked.take(count);
         let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
         let found = journal
             .stage(NAME, count, scene.source(), |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
@@ -100,7 +101,7 @@ impl Choose {
                 "at the same {count} Gaussians scoring pictures keep {without:.2} dB without it, {with:.2} with it"
             ),
         );
-        let kept = if self.has_target { pruned } else { ranked.ranking.take(scored.selection.counts.kept) };
+        let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
         Ok(Outcome { reduction: Reduction::pruned(kept, &reduction.rule), summary: None })
     }
 }
@@ -144,7 +145,7 @@ mod tests {
     fn chosen(scene: &Scene, scored: &Scored, recipe: &Recipe, target: Option<usize>) -> (Reduction, Outcome, Journal) {
         let merge = Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
         let (ranked, mut journal) = (scored.ranked(), Journal::default());
-        let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.ranking.order().len());
+        let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.order().len());
         let merged = merge.run(scene, scored, &ranked, survivors, &mut journal).unwrap();
         let before = merged.reduction.clone();
         let chosen = Choose { has_target: target.is_some() }.run(scene, scored, &ranked, merged, &mut journal).unwrap();
@@ -161,7 +162,7 @@ mod tests {
             let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
             assert_eq!(chosen.reduction.len(), target);
             let got = quality(&scene, &chosen.reduction);
-            let own = Reduction::pruned(scored.ranked().ranking.take(target), &recipe.merge);
+            let own = Reduction::pruned(scored.ranked().take(target), &recipe.merge);
             for other in [&merged, &own] {
                 let expected = quality(&scene, other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");

@@ -10,7 +10,7 @@ use super::journal::Journal;
 use super::refine::Refine;
 use super::refine::targets::Targets;
 use super::request::{Goal, Request};
-use super::score::{Ranked, Scored};
+use super::score::Scored;
 use super::size::Fit;
 use crate::budget::{Need, Workload};
 use crate::error::Result;
@@ -18,6 +18,7 @@ use crate::limits::Limits;
 use crate::recipe::WhichBands;
 use crate::reduction::Reduction;
 use crate::scene::Scene;
+use crate::select::Ranking;
 
 /// What the stage is called.
 const NAME: &str = "degree";
@@ -53,7 +54,7 @@ impl Degree {
         &self,
         scene: &Scene,
         scored: &Scored,
-        ranked: &Ranked,
+        ranked: &Ranking,
         like: &Reduction,
         fits: &[Fit],
         journal: &mut Journal,
@@ -63,8 +64,8 @@ impl Degree {
             let targets = Targets::new(scene)?;
             let mut tried: Vec<(Fit, f64)> = Vec::new();
             for &fit in fits {
-                let first = self.refine.first(fit.gaussians, all).min(ranked.ranking.order().len());
-                let start = Reduction { sh_degree: fit.sh_degree, ..like.with(ranked.ranking.take(first)) };
+                let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());
+                let start = Reduction { sh_degree: fit.sh_degree, ..like.with(ranked.take(first)) };
                 let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));

@@ -6,7 +6,7 @@
 use std::borrow::Cow;
 
 use super::journal::Journal;
-use super::score::{Ranked, Scored, scored};
+use super::score::{Scored, scored};
 use super::summary::MergeSummary;
 use crate::budget::{Need, Workload};
 use crate::error::{Error, Result};
@@ -20,6 +20,7 @@ use crate::model::{Columns, Gaussians};
 use crate::recipe;
 use crate::reduction::{Cluster, Reduction};
 use crate::scene::Scene;
+use crate::select::Ranking;
 use crate::source::FrameSource;
 use crate::stream::motion::{self, PairMeter};
 use crate::stream::{BLOCK, gather};
@@ -102,11 +103,10 @@ impl Merge {
         &self,
         scene: &Scene,
         scored: &Scored,
-        ranked: &Ranked,
+        ranking: &Ranking,
         survivors: usize,
         journal: &mut Journal,
     ) -> Result<Outcome> {
-        let ranking = &ranked.ranking;
         journal.stage(NAME, survivors, scene.source(), |_| {
             let mut trial = Trial::new(scene, scored, self, ranking.take(survivors))?;
             let mut merged = match self.target {

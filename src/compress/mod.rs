@@ -39,12 +39,13 @@ use crate::model::ALL_HARMONICS;
 use crate::recipe::{Precision, Recipe, WhichBands};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
+use crate::select::Ranking;
 use crate::stream::begin_run;
 use archive::{Asked, LEFT_BY_SEARCH};
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
-use score::{Ranked, Scored, UserOverrides};
+use score::{Scored, UserOverrides};
 use size::Space;
 use summary::{CameraSummary, InputSummary, Summary};
 
@@ -151,7 +152,7 @@ fn reduce(
     }
     if request.goal.is_some() {
         // More may fit than may stay.
-        job.prune.target = job.prune.target.map(|target| target.min(ranked.ranking.order().len()));
+        job.prune.target = job.prune.target.map(|target| target.min(ranked.order().len()));
     }
     let (reduction, merge, mut goal) = match &job.search {
         Some(search) => {
@@ -236,15 +237,15 @@ fn of_size(
     scene: &Scene,
     job: &Job,
     space: Option<&Space<'_>>,
-    (scored, ranked): (&Scored, &Ranked),
+    (scored, ranked): (&Scored, &Ranking),
     like: &Reduction,
     journal: &mut Journal,
 ) -> Result<Outcome> {
     let wanted = job.prune.run(scene, scored, ranked, journal)?;
-    let survivors = job.before_cuts(wanted, scored.count()).min(ranked.ranking.order().len());
+    let survivors = job.before_cuts(wanted, scored.count()).min(ranked.order().len());
     let mut outcome = match &job.merge {
         Some(merge) => merge.run(scene, scored, ranked, survivors, journal)?,
-        None => Outcome { reduction: like.with(ranked.ranking.take(survivors)), summary: None },
+        None => Outcome { reduction: like.with(ranked.take(survivors)), summary: None },
     };
     if let Some(choose) = &job.choose {
         outcome = choose.run(scene, scored, ranked, outcome, journal)?;

@@ -1,9 +1,10 @@
 //! Stage `prune`: how many of the ranking survive, as far as that is known before anything merges.
 
 use super::journal::Journal;
-use super::score::{Ranked, Scored};
+use super::score::Scored;
 use crate::error::{Error, Result};
 use crate::scene::Scene;
+use crate::select::Ranking;
 
 /// What the stage is called.
 const NAME: &str = "prune";
@@ -25,8 +26,8 @@ impl Prune {
     ///
     /// # Errors
     /// A target that protected or dropped Gaussians rule out.
-    pub fn run(&self, scene: &Scene, scored: &Scored, ranked: &Ranked, journal: &mut Journal) -> Result<usize> {
-        let all = ranked.ranking.order().len();
+    pub fn run(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, journal: &mut Journal) -> Result<usize> {
+        let all = ranked.order().len();
         if let Some(target) = self.target {
             check_reachable(target, scored, all)?;
         }

@@ -7,7 +7,7 @@
 //! Memory: see [`removal_error`].
 
 use super::journal::Journal;
-use super::score::{Order, Ranked, Scored, scored};
+use super::score::{Scored, scored};
 use crate::budget::{Need, REMOVE, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
@@ -76,17 +76,17 @@ impl Rounds {
         &self,
         scene: &Scene,
         scored: &Scored,
-        before: Ranked,
+        before: Ranking,
         fewest: usize,
         journal: &mut Journal,
-    ) -> Result<Ranked> {
+    ) -> Result<Ranking> {
         let pictures = spread_over(&scene.schedule, PICTURES, scored.frames_to_see);
         let pictures = (&scene.schedule.cameras[..], &pictures[..]);
         let floor = self.contrast_floor as f32;
         let source = scene.source();
         let protected = &scored.protected;
         let is_free = |id: &u32| !scored.is_protected(*id);
-        let mut free: Vec<u32> = before.ranking.order().iter().copied().filter(is_free).collect();
+        let mut free: Vec<u32> = before.order().iter().copied().filter(is_free).collect();
         // Worst last.
         let mut gone: Vec<u32> = Vec::new();
         let mut rounds = 0;
@@ -111,7 +111,7 @@ impl Rounds {
             return Ok(before);
         }
         let order = protected.iter().copied().chain(free).chain(gone).collect();
-        Ok(Ranked { ranking: Ranking::new(order), by: Order::Rounds })
+        Ok(Ranking::new(order))
     }
 }
 
@@ -127,7 +127,7 @@ mod tests {
     use crate::stream::{gather, spread};
 
     /// The order of scoring, and that of the rounds.
-    fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranked, Ranked) {
+    fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
         let rounds = Rounds::of(&recipe.select, None).unwrap();
@@ -140,9 +140,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let [(once, few), (_, many)] = [200, 800].map(|fewest| ranked(&scene, &UserOverrides::default(), fewest));
-        assert_eq!(few.ranking.take(800), many.ranking.take(800));
-        assert_ne!(few.ranking.take(800), once.ranking.take(800), "rounds changed nothing");
-        let mut every = few.ranking.order().to_vec();
+        assert_eq!(few.take(800), many.take(800));
+        assert_ne!(few.take(800), once.take(800), "rounds changed nothing");
+        let mut every = few.order().to_vec();
         every.sort_unstable();
         assert!(every.iter().copied().eq(0..1500), "a Gaussian is missing or stands twice");
     }
@@ -162,8 +162,8 @@ mod tests {
                 };
                 spread(&scene.schedule, 12, 1).iter().map(of_picture).sum::<f64>() / 12.0
             };
-            let got = quality(&rounds.ranking.take(target));
-            let at_once = quality(&once.ranking.take(target));
+            let got = quality(&rounds.take(target));
+            let at_once = quality(&once.take(target));
             assert!(got > at_once + 1.0, "{target}: got {got} dB in rounds, {at_once} at once");
         }
     }
@@ -172,14 +172,14 @@ mod tests {
     fn what_the_user_keeps_comes_first_and_what_he_drops_does_not_come() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        let worst = ranked(&scene, &UserOverrides::default(), 100).1.ranking.order()[1490..].to_vec();
+        let worst = ranked(&scene, &UserOverrides::default(), 100).1.order()[1490..].to_vec();
         let user = UserOverrides { keep: worst[..5].to_vec(), drop: worst[5..].to_vec(), keep_box: None };
         let (_, rounds) = ranked(&scene, &user, 100);
-        let (mut first, mut kept) = (rounds.ranking.order()[..5].to_vec(), worst[..5].to_vec());
+        let (mut first, mut kept) = (rounds.order()[..5].to_vec(), worst[..5].to_vec());
         first.sort_unstable();
         kept.sort_unstable();
         assert_eq!(first, kept);
-        assert!(worst[5..].iter().all(|id| !rounds.ranking.order().contains(id)));
+        assert!(worst[5..].iter().all(|id| !rounds.order().contains(id)));
     }
 
     #[test]
@@ -188,6 +188,5 @@ mod tests {
         let scene = scene(folder.path());
         let (once, rounds) = ranked(&scene, &UserOverrides::default(), 1500);
         assert_eq!(rounds, once);
-        assert_eq!(rounds.by.name(), "sqrt(C*W)");
     }
 }

@@ -9,10 +9,10 @@ use crate::budget::{Need, Part, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Columns, Flags, Gaussians, Rows};
-use crate::recipe::{self, NonFinite, StaticTerm};
+use crate::recipe::{self, NonFinite};
 use crate::reduction::Reference;
 use crate::scene::Scene;
-use crate::score::{Graded, Scores, Term, score};
+use crate::score::{Scores, Term, score};
 use crate::select::{self, Overrides, Ranking, Selection, select};
 use crate::stats::{RobustBox, fill_anisotropy, snap, ulp};
 use crate::stream::{Progress, Scanned, Seen, frames_to_see, gather};
@@ -58,25 +58,12 @@ pub struct Scored {
     pub flags: FlagSummary,
     /// Stages 1 and 2, with the user's overrides.
     pub selection: Selection,
-    /// What the selection's ranking goes by.
-    pub by: Order,
     /// Ids that are to be kept as they are, unmerged; increasing.
     pub protected: Vec<u32>,
-    /// Ids that are to be dropped; increasing.
-    pub dropped: Vec<u32>,
     /// Where Gaussians are compared with one another.
     pub reference: Reference,
     /// Distance between f32 values at the scene's largest coordinate: the noise floor of a position.
     pub position_ulp: f64,
-}
-
-/// The order in which Gaussians stay, and what it goes by.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Ranked {
-    /// Ids, the most important first; those that are to be dropped are not among them.
-    pub ranking: Ranking,
-    /// What it goes by.
-    pub by: Order,
 }
 
 /// What the user knows better, before ids are resolved.
@@ -88,25 +75,6 @@ pub struct UserOverrides {
     pub drop: Vec<u32>,
     /// Box (low corner, high corner) whose Gaussians at the reference frame are kept.
     pub keep_box: Option<[f64; 6]>,
-}
-
-/// What a ranking goes by.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Order {
-    /// The scores, by this static term.
-    Term(StaticTerm),
-    /// What pictures lose with each Gaussian, in rounds.
-    Rounds,
-}
-
-impl Order {
-    /// As people know it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Order::Term(term) => Graded::from(term).name(),
-            Order::Rounds => "removal in rounds",
-        }
-    }
 }
 
 impl Score {
@@ -171,12 +139,11 @@ impl Score {
                 ids.dedup();
             }
             let scores = score(&rows, info.times.len(), &self.score);
-            let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop.clone() };
+            let overrides = Overrides { keep_ids: protected.clone(), drop_ids: drop };
             let selection = select(&scores, &self.select, &overrides)?;
             let reference = Reference { frame: reference_frame, extent };
             let position_ulp = ulp(scanned.largest_coordinate);
             let scored = Scored {
-                by: Order::Term(self.score.static_term),
                 frames: info.times.len(),
                 frames_to_see: frames_to_see(&rows.life, info.times.len()),
                 terms: scores.terms,
@@ -187,7 +154,6 @@ impl Score {
                 },
                 selection,
                 protected,
-                dropped: drop,
                 reference,
                 position_ulp,
             };
@@ -276,8 +242,8 @@ impl Scored {
     }
 
     /// The selection's own order.
-    pub fn ranked(&self) -> Ranked {
-        Ranked { ranking: self.selection.ranking.clone(), by: self.by }
+    pub fn ranked(&self) -> Ranking {
+        self.selection.ranking.clone()
     }
 
     /// N.
@@ -292,16 +258,6 @@ impl Scored {
     pub fn scores(&self, recipe: &recipe::Score) -> Result<Scores> {
         let rows = self.rows()?;
         Ok(score(&rows, self.frames, recipe))
-    }
-
-    /// The ranking by another static term.
-    ///
-    /// # Errors
-    /// Those of [`Scored::rows`].
-    pub fn ranking_by(&self, term: StaticTerm, score: &recipe::Score, rule: &recipe::Select) -> Result<Ranking> {
-        let scores = self.scores(&recipe::Score { static_term: term, ..score.clone() })?;
-        let overrides = Overrides { keep_ids: self.protected.clone(), drop_ids: self.dropped.clone() };
-        Ok(select(&scores, rule, &overrides)?.ranking)
     }
 
     /// Percentiles of every term.

@@ -16,7 +16,7 @@ pub(super) mod targets;
 
 use super::journal::Journal;
 use super::score::{Scored, scored};
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{ALL_HARMONICS, Columns};
@@ -105,11 +105,6 @@ impl Refine {
         Manner { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
-    /// Whether what is wanted is so few that cuts lead there.
-    pub fn will_cut(&self) -> bool {
-        self.cuts && self.target.is_some_and(|target| target < CUTS_FROM)
-    }
-
     /// Steps at the end where a part `kept` of the Gaussians stays: the fewer go, the fewer.
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - CUTS_FROM)).clamp(0.0, 1.0);
@@ -142,8 +137,7 @@ impl Refine {
         ];
         // First the original is looked at, then only what is left, of which there are fewer.
         let part = self.target.map_or(1.0, |target| target.max(CUTS_FROM)).min(1.0);
-        let of_left = |(name, bytes): Part| (name, (bytes as f64 * part).ceil() as u64);
-        let left: Vec<Part> = read.into_iter().chain(left).map(of_left).collect();
+        let left: Vec<Part> = read.into_iter().chain(left).map(|(name, bytes)| (name, of_left(part, bytes))).collect();
         let bytes = |parts: &[Part]| parts.iter().map(|part| part.1).sum::<u64>();
         let per_gaussian = if bytes(&left) > bytes(&original) { left } else { original };
         let [own, between] = targets::numbers(work.pixels);
@@ -426,7 +420,7 @@ mod tests {
     fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Reduction, Journal) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
-        let reduction = Reduction::pruned(scored.ranked().ranking.take(count), &recipe.merge);
+        let reduction = Reduction::pruned(scored.ranked().take(count), &recipe.merge);
         let mut journal = Journal::default();
         let refine = Refine { steps, ..Refine::of(&recipe, None, false).unwrap() };
         (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
@@ -490,7 +484,7 @@ mod tests {
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-        let reduction = Reduction::pruned(scored.ranked().ranking.take(300), &recipe.merge);
+        let reduction = Reduction::pruned(scored.ranked().take(300), &recipe.merge);
         let (mut journal, count) = (Journal::default(), reduction.len());
         let refine = Refine { steps: 100, ..Refine::of(&recipe, None, false).unwrap() }.without_bands();
         let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();

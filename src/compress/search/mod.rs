@@ -14,7 +14,7 @@ use super::journal::Journal;
 use super::refine::targets::Targets;
 use super::refine::{CUT, Refine, Walk};
 use super::request::Quality;
-use super::score::{Ranked, Scored, scored};
+use super::score::{Scored, scored};
 use super::summary::GoalSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, RENDER, Workload};
 use crate::error::{Error, Result};
@@ -25,6 +25,7 @@ use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{PictureSet, pictures};
+use crate::select::Ranking;
 use crate::source::FrameSource;
 use gauge::{Gauge, With};
 
@@ -113,11 +114,11 @@ impl Search {
         &self,
         scene: &Scene,
         scored: &Scored,
-        ranked: &Ranked,
+        ranked: &Ranking,
         like: &Reduction,
         journal: &mut Journal,
     ) -> Result<(Reduction, GoalSummary)> {
-        let all = ranked.ranking.order().len();
+        let all = ranked.order().len();
         journal.stage(NAME, all, scene.source(), |journal| {
             let photographs = self.photographs(scene)?;
             let targets = Targets::new(scene)?;
@@ -262,7 +263,7 @@ struct Way<'a> {
     search: &'a Search,
     scene: &'a Scene,
     scored: &'a Scored,
-    ranked: &'a Ranked,
+    ranked: &'a Ranking,
     like: &'a Reduction,
     gauge: &'a Gauge<'a>,
     walk: Option<Walk<'a>>,
@@ -274,8 +275,8 @@ impl Way<'_> {
     /// The best of `size` Gaussians.
     fn at(&mut self, size: usize) -> Result<Tried> {
         let mut journal = Journal::default();
-        let all = self.ranked.ranking.order().len();
-        let prefix = |size: usize| self.like.with(self.ranked.ranking.take(size));
+        let all = self.ranked.order().len();
+        let prefix = |size: usize| self.like.with(self.ranked.take(size));
         let mut reduction = match (&self.search.refine, &mut self.walk) {
             (Some(refine), Some(walk)) if size < all => {
                 let first = refine.first(size, self.scored.count()).min(all);
