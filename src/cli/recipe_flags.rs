@@ -7,7 +7,7 @@ use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use crate::compress::Record;
 use crate::error::{Error, Result};
-use crate::recipe::{MergePass, PRESETS, Recipe, parameters};
+use crate::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
 const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a documented file)";
 
@@ -16,6 +16,7 @@ const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a doc
 pub(super) struct RecipeFlags {
     preset: Option<String>,
     file: Option<PathBuf>,
+    effort: Option<String>,
     /// (section, key, value as TOML)
     set: Vec<(String, String, String)>,
     passes: Vec<MergePass>,
@@ -40,6 +41,9 @@ impl RecipeFlags {
                     .map_err(|message| Error::usage(format!("{}: {message}", path.display())))?
             }
         };
+        if let Some(effort) = Effort::ALL.into_iter().find(|effort| self.effort.as_deref() == Some(effort.name())) {
+            recipe = recipe.at_effort(effort);
+        }
         for (section, key, value) in &self.set {
             recipe = recipe.with(section, key, value).map_err(|message| {
                 Error::usage(format!("--{}: {value:?} does not fit: {}", key.replace('_', "-"), message.trim_end()))
@@ -66,6 +70,11 @@ impl Args for RecipeFlags {
                     .value_parser(clap::value_parser!(PathBuf))
                     .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run, options and all"),
             );
+        command = command.arg(
+            Arg::new("effort").long("effort").value_parser(Effort::ALL.map(Effort::name)).help(
+                "How much time to take for how small an error: `fast`, a third of the time; `default`; `best`, three times as long",
+            ),
+        );
         for parameter in parameters() {
             let mut arg = Arg::new(parameter.key.clone())
                 .long(parameter.key.replace('_', "-"))
@@ -111,6 +120,7 @@ impl FromArgMatches for RecipeFlags {
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> std::result::Result<(), clap::Error> {
         self.preset = matches.get_one::<String>("preset").cloned();
         self.file = matches.get_one::<PathBuf>("recipe").cloned();
+        self.effort = matches.get_one::<String>("effort").cloned();
         self.set = parameters()
             .into_iter()
             .filter_map(|p| Some((p.section, p.key.clone(), matches.get_one::<String>(&p.key)?.clone())))
@@ -154,6 +164,16 @@ mod tests {
         expected.score.weigh_motion_by_life = true;
         expected.select.low_priority = crate::recipe::LowPriority::Rescue;
         assert_eq!(recipe, expected);
+    }
+
+    #[test]
+    fn effort_moves_the_preset_and_single_parameters_stand_over_it() {
+        let default = parse(&[]).unwrap();
+        assert_eq!(parse(&["--effort", "default"]).unwrap(), default);
+        let best = parse(&["--effort", "best", "--round-pictures", "7"]).unwrap();
+        assert_eq!(best.select.round_pictures, 7);
+        assert!(best.refine.refine_steps > default.refine.refine_steps);
+        assert!(parse(&["--effort", "luck"]).is_err());
     }
 
     #[test]

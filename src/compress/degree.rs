@@ -61,7 +61,7 @@ impl Degree {
     ) -> Result<Fit> {
         let all = scored.count();
         journal.stage(NAME, all, scene.source(), |journal| {
-            let targets = Targets::new(scene)?;
+            let targets = Targets::new(scene, self.refine.pictures)?;
             let mut tried: Vec<(Fit, f64)> = Vec::new();
             for &fit in fits {
                 let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());

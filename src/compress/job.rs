@@ -173,7 +173,13 @@ impl Job {
             search: match &goal {
                 Some(Goal::Quality(quality)) => {
                     let (refine, field, bands) = (refine.clone(), field.clone(), bands.clone());
-                    Some(Search { quality: quality.clone(), refine, field, bands })
+                    Some(Search {
+                        quality: quality.clone(),
+                        pictures: recipe.refine.refine_pictures,
+                        refine,
+                        field,
+                        bands,
+                    })
                 }
                 _ => None,
             },

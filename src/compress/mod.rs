@@ -17,7 +17,7 @@ mod prune;
 mod record;
 mod refine;
 mod request;
-mod rounds;
+pub mod rounds;
 mod scan;
 pub mod score;
 mod search;

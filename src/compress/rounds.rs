@@ -11,24 +11,24 @@ use super::score::{Scored, scored};
 use crate::budget::{Need, REMOVE, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::model::Columns;
+use crate::model::{Columns, Picture};
 use crate::recipe;
 use crate::scene::Scene;
 use crate::select::Ranking;
-use crate::stream::{removal_error, spread_over};
+use crate::stream::{Progress, removal_error, spread_over};
 
 /// What the stage is called.
 const NAME: &str = "rounds";
-
-/// Pictures per round, the same for a longer sequence: of scenes of 780, these rank as well as 80 (within 0.3 dB either way
-/// at 57 to 10% kept), 24 up to half a decibel worse.
-const PICTURES: usize = 48;
 
 /// The rounds of a run.
 #[derive(Debug, Clone)]
 pub struct Rounds {
     /// Part of the Gaussians that a round leaves.
     pub fraction: f64,
+    /// Pictures that a round looks at, the same for a longer sequence.
+    pub pictures: usize,
+    /// Turns that they take: a round looks at one part of so many, and goes by what the others showed in theirs.
+    pub turns: usize,
     /// Contrast that every Gaussian is taken to have at least with what it hides.
     pub contrast_floor: f64,
     /// Part of the Gaussians that the last round is taken to leave at least, to say how many rounds there are at most.
@@ -46,24 +46,51 @@ impl Rounds {
     /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
     /// contributions.
     pub fn of(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
-        let recipe::Select { round_fraction: fraction, contrast_floor, .. } = *recipe;
+        let recipe::Select {
+            round_fraction: fraction,
+            round_pictures: pictures,
+            round_turns: turns,
+            contrast_floor,
+            ..
+        } = *recipe;
         let (fewest, usual) = (target.unwrap_or(FEWEST), target.unwrap_or(USUAL));
-        (fraction < 1.0).then_some(Rounds { fraction, contrast_floor, fewest, usual })
+        (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
     }
 
     /// The ranking, and pictures of all that is left.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
-        let per_gaussian = [scored(limits), vec![("ranking", 32)], looking].concat();
-        let rounds = |fewest: f64| (fewest.ln() / self.fraction.ln()).ceil().max(0.0);
-        let pictures = (PICTURES as u64).min(work.pictures);
-        let frames = pictures.min(work.frames);
-        let seconds = (0..rounds(self.usual) as i32).map(|round| {
+        let per_gaussian = [scored(limits), vec![("ranking", 32), ("errors", 8 * self.turns as u64)], looking].concat();
+        let all = (self.pictures as u64).min(work.pictures);
+        let seconds = (0..self.rounds(self.usual) as i32).map(|round| {
             let left = work.count() * self.fraction.powi(round);
-            work.reading(left, frames as f64) + work.picturing(pictures as f64, left, REMOVE)
+            let pictures = self.pictures_of(1.0, all as usize) / if round == 0 { 1.0 } else { self.turns as f64 };
+            work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
         });
-        let reads = rounds(self.fewest) * work.scattered_reads(frames, limits);
+        // A frame is read in one of the turns.
+        let reads = self.pictures_of(self.rounds(self.fewest), 1) * work.scattered_reads(all.min(work.frames), limits);
         Need { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
+    }
+
+    /// Rounds until a part `fewest` is left at most.
+    fn rounds(&self, fewest: f64) -> f64 {
+        (fewest.ln() / self.fraction.ln()).ceil().max(0.0)
+    }
+
+    /// Pictures that so many rounds look at, of `all`.
+    fn pictures_of(&self, rounds: f64, all: usize) -> f64 {
+        all as f64 * (rounds.min(1.0) + (rounds - 1.0).max(0.0) / self.turns as f64)
+    }
+
+    /// The pictures in as many parts as there are turns, each of some frames.
+    fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
+        let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
+        let mut turns = vec![Vec::new(); self.turns];
+        for (k, of_frame) in pictures.chunk_by(|a, b| a.frame == b.frame).enumerate() {
+            turns[k % self.turns].extend_from_slice(of_frame);
+        }
+        turns.retain(|turn| !turn.is_empty());
+        turns
     }
 
     /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
@@ -80,36 +107,50 @@ impl Rounds {
         fewest: usize,
         journal: &mut Journal,
     ) -> Result<Ranking> {
-        let pictures = spread_over(&scene.schedule, PICTURES, scored.frames_to_see);
-        let pictures = (&scene.schedule.cameras[..], &pictures[..]);
-        let floor = self.contrast_floor as f32;
-        let source = scene.source();
         let protected = &scored.protected;
         let is_free = |id: &u32| !scored.is_protected(*id);
         let mut free: Vec<u32> = before.order().iter().copied().filter(is_free).collect();
+        let first = free.len() + protected.len();
+        let enough = |free: &[u32]| free.is_empty() || free.len() + protected.len() <= fewest;
+        if enough(&free) {
+            return Ok(before);
+        }
         // Worst last.
         let mut gone: Vec<u32> = Vec::new();
-        let mut rounds = 0;
-        while free.len() + protected.len() > fewest && !free.is_empty() {
-            let seen = free.len() + protected.len();
-            let left = ((seen as f64 * self.fraction) as usize).max(protected.len());
-            journal.stage(NAME, seen, source, |_| {
+        let turns = self.turns(scene, scored);
+        let mut errors = vec![vec![0u64; scored.count()]; turns.len()];
+        let pictures =
+            self.pictures_of(self.rounds(fewest.max(1) as f64 / first as f64), turns.iter().map(Vec::len).sum());
+        let progress = Progress::new(NAME, "pictures", pictures.ceil() as u64);
+        journal.stage(NAME, first, scene.source(), |_| {
+            for round in 0.. {
+                if enough(&free) {
+                    break;
+                }
+                let seen = free.len() + protected.len();
+                let left = ((seen as f64 * self.fraction) as usize).max(protected.len());
                 let mut ids: Vec<u32> = free.iter().chain(protected).copied().collect();
                 ids.sort_unstable();
-                let errors = removal_error(source, &ids, pictures, scene.background, floor, scene.limits)?.sum;
-                let error = |id: &u32| ids.binary_search(id).map_or(0, |row| errors[row]);
+                // First all look, then one after the other.
+                let turn = round % turns.len().max(1);
+                let looking = if round == 0 { 0..turns.len() } else { turn..(turn + 1).min(turns.len()) };
+                for turn in looking {
+                    let pictures = (&scene.schedule.cameras[..], &turns[turn][..]);
+                    let (background, floor) = (scene.background, self.contrast_floor as f32);
+                    let advance = || progress.advance(1);
+                    let found =
+                        removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?;
+                    ids.iter().zip(found.sum).for_each(|(&id, error)| errors[turn][id as usize] = error);
+                }
+                let error = |id: &u32| errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
                 // Stable: ties keep the order there was.
                 free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
                 let mut worst = free.split_off(left - protected.len());
                 worst.append(&mut gone);
                 gone = worst;
-                Ok(((), left))
-            })?;
-            rounds += 1;
-        }
-        if rounds == 0 {
-            return Ok(before);
-        }
+            }
+            Ok(((), free.len() + protected.len()))
+        })?;
         let order = protected.iter().copied().chain(free).chain(gone).collect();
         Ok(Ranking::new(order))
     }
@@ -121,7 +162,6 @@ mod tests {
     use crate::compress::score::UserOverrides;
     use crate::compress::tests::{scene, score_scene};
     use crate::metrics::psnr;
-    use crate::model::Picture;
     use crate::recipe::Recipe;
     use crate::render::render;
     use crate::stream::{gather, spread};

@@ -149,7 +149,7 @@ impl Space<'_> {
         let places: Vec<u32> = (0..reduction.len() as u32).collect();
         let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
-        let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits)?;
+        let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
         Ok(errors.most_missed(count, |place| scored.is_protected(reduction.kept[place])))
     }
 }

@@ -3,6 +3,7 @@
 //! What a parameter means is written beside its value in `paper.toml`; the types here only give
 //! each its range.
 
+mod effort;
 mod parameters;
 
 use std::num::NonZeroU32;
@@ -12,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::{Error, Result};
 use crate::model::{Columns, HIGHEST_DEGREE};
 
+pub use effort::Effort;
 pub use parameters::{Parameter, parameters};
 
 /// Text of preset `paper`, with a comment on every parameter.
@@ -153,6 +155,8 @@ pub struct Select {
     pub tau_dynamic: f64,
     pub low_priority: LowPriority,
     pub round_fraction: f64,
+    pub round_pictures: usize,
+    pub round_turns: usize,
     pub contrast_floor: f64,
     pub choose_by_views: bool,
 }
@@ -194,6 +198,7 @@ pub struct Refine {
     pub refine: Groups,
     pub refine_steps: u32,
     pub refine_cut_steps: u32,
+    pub refine_pictures: usize,
     pub refine_ssim: f64,
 }
 
@@ -413,6 +418,17 @@ impl Recipe {
         table.try_into().map_err(|e: toml::de::Error| e.to_string())
     }
 
+    /// The same with so many steps of refinement, and before each cut as many in proportion.
+    pub fn refining_by(&self, steps: u32) -> Recipe {
+        let mut recipe = self.clone();
+        let refine = &mut recipe.refine;
+        let before_cuts = u64::from(refine.refine_cut_steps) * u64::from(steps);
+        let before_cuts = before_cuts.div_ceil(u64::from(refine.refine_steps.max(1)));
+        refine.refine_cut_steps = before_cuts.try_into().unwrap_or(u32::MAX);
+        refine.refine_steps = steps;
+        recipe
+    }
+
     /// The parameters as TOML.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("a recipe is plain data")
@@ -443,6 +459,14 @@ impl Recipe {
                 self.select.round_fraction,
                 (0.1..=1.0).contains(&self.select.round_fraction),
                 "0.1 to 1",
+            ),
+            ("select.round_pictures", self.select.round_pictures as f64, self.select.round_pictures > 0, "1 or more"),
+            ("select.round_turns", self.select.round_turns as f64, self.select.round_turns > 0, "1 or more"),
+            (
+                "refine.refine_pictures",
+                self.refine.refine_pictures as f64,
+                (16..=1_000_000).contains(&self.refine.refine_pictures),
+                "16 to 1000000",
             ),
             ("refine.refine_ssim", self.refine.refine_ssim, in_unit(self.refine.refine_ssim), "0 to 1"),
             ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),

@@ -83,6 +83,17 @@ impl Drop for RunOfStages {
     }
 }
 
+/// Silence, and whether there was silence before.
+#[must_use = "it is quiet as long as this lives"]
+#[derive(Debug)]
+pub struct Hush(bool);
+
+impl Drop for Hush {
+    fn drop(&mut self) {
+        QUIET.store(self.0, Ordering::Relaxed);
+    }
+}
+
 /// Progress through `total` units of work, e.g. Gaussians × frames. Cheap to advance from any thread.
 #[derive(Debug)]
 pub struct Progress(Shown);
@@ -98,6 +109,11 @@ impl Progress {
     /// Decides for everything that begins from now on.
     pub fn set_mode(mode: Mode) {
         QUIET.store(mode == Mode::Quiet, Ordering::Relaxed);
+    }
+
+    /// Nothing is shown of what begins while what this gives lives.
+    pub fn hush() -> Hush {
+        Hush(QUIET.swap(true, Ordering::Relaxed))
     }
 
     /// A bar named after what it does; `unit` is plural ("Gaussian frames").

@@ -1,6 +1,5 @@
 //! What the scored pictures would lose with each Gaussian of a part of the input.
 
-use super::Progress;
 use super::pictures::{Subject, Workers};
 use crate::error::Result;
 use crate::limits::Limits;
@@ -21,8 +20,8 @@ pub fn removal_error(
     background: [f32; 3],
     contrast_floor: f32,
     limits: Limits,
+    advance: impl Fn() + Sync,
 ) -> Result<RemovalError> {
-    let progress = Progress::new("rounds", "pictures", pictures.len() as u64);
     let mut workers = Workers::new(limits);
     workers.show(
         Subject { source, ids: Some(Ids::List(ids)), columns: Columns::all() },
@@ -31,7 +30,7 @@ pub fn removal_error(
         || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
         |(renderer, errors), state, camera| {
             renderer.removal_error(state, camera, background, errors);
-            progress.advance(1);
+            advance();
         },
     )?;
     let mut sum = RemovalError::new(ids.len(), contrast_floor);
@@ -66,7 +65,7 @@ mod tests {
         for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let found = pool
-                .install(|| removal_error(&scene, &ids, (&schedule.cameras, &sample), background, 0.1, limits))
+                .install(|| removal_error(&scene, &ids, (&schedule.cameras, &sample), background, 0.1, limits, || ()))
                 .unwrap();
             assert!(found == plain, "{threads} threads");
         }

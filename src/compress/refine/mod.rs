@@ -65,6 +65,8 @@ pub struct Refine {
     pub steps: usize,
     /// And before each cut.
     pub cut_steps: usize,
+    /// Pictures that it goes through.
+    pub pictures: usize,
     /// Whether a strong reduction goes there in cuts.
     pub cuts: bool,
     /// Contrast that every Gaussian is taken to have at least with what it hides, for a cut.
@@ -76,13 +78,14 @@ pub struct Refine {
 impl Refine {
     /// The stage, unless `recipe` lets nothing move. Of a run that ranks by pictures (`cuts`), down to the part `target`.
     pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<Refine> {
-        let recipe::Refine { refine, refine_steps, refine_cut_steps, refine_ssim } = recipe.refine;
+        let recipe::Refine { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim } = recipe.refine;
         let refine = Refine {
             columns: refine.0,
             sh_degree: ALL_HARMONICS,
             loss: Loss { ssim: refine_ssim },
             steps: refine_steps as usize,
             cut_steps: refine_cut_steps as usize,
+            pictures: refine_pictures,
             cuts,
             contrast_floor: recipe.select.contrast_floor,
             target,
@@ -140,7 +143,7 @@ impl Refine {
         let left: Vec<Part> = read.into_iter().chain(left).map(|(name, bytes)| (name, of_left(part, bytes))).collect();
         let bytes = |parts: &[Part]| parts.iter().map(|part| part.1).sum::<u64>();
         let per_gaussian = if bytes(&left) > bytes(&original) { left } else { original };
-        let [own, between] = targets::numbers(work.pixels);
+        let [own, between] = targets::numbers(self.pictures, work.pixels);
         let (pictures, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let sizes = sizes(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
@@ -198,7 +201,7 @@ impl Refine {
             return Ok(reduction);
         }
         journal.stage(NAME, count, scene.source(), |journal| {
-            let targets = Targets::new(scene)?;
+            let targets = Targets::new(scene, self.pictures)?;
             let mut walk = Walk::new(NAME, self, scene, scored, &targets, targets.parted(false));
             Ok((walk.all(&reduction, wanted, steps, journal)?.0, wanted))
         })
@@ -510,7 +513,7 @@ mod tests {
         let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
         let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
         for scene in [explicit, open_scene(&options).unwrap()] {
-            let targets = Targets::new(&scene).unwrap();
+            let targets = Targets::new(&scene, 520).unwrap();
             let count = scene.source().info().count;
             let kept = (0..count as u32).step_by(2).collect();
             let reduction = Reduction::pruned(kept, &Recipe::preset("default").unwrap().merge);

@@ -10,8 +10,8 @@ use crate::scene::Scene;
 use crate::scene::between::{Dice, between};
 use crate::stream::{Batch, Subject, VIEWS_AT_ONCE, show, spread};
 
-/// Pictures of the scene's cameras, and of cameras in between: fewer of large ones.
-const PICTURES: [usize; 2] = [60, 460];
+/// Parts of the pictures that are of the scene's cameras, and of cameras in between, in 26ths.
+const PARTS: [usize; 2] = [3, 23];
 /// Bytes that they may take in a scratch file, as long as there are [`FEWEST`].
 const MOST_BYTES: u64 = 1 << 30;
 /// See [`MOST_BYTES`].
@@ -32,11 +32,11 @@ pub(in crate::compress) struct Parted {
     pub(in crate::compress) held: Vec<usize>,
 }
 
-/// How many pictures of the scene's cameras are looked at, and how many of cameras in between, if one has `pixels`.
-pub(super) fn numbers(pixels: u64) -> [usize; 2] {
-    let all = PICTURES.iter().sum::<usize>() as u64;
-    let count = (MOST_BYTES / (6 * pixels.max(1))).max(FEWEST).min(all);
-    PICTURES.map(|of| of * count as usize / all as usize)
+/// How many pictures of the scene's cameras are looked at, and how many of cameras in between, of `most` if one has
+/// `pixels`.
+pub(super) fn numbers(most: usize, pixels: u64) -> [usize; 2] {
+    let count = (MOST_BYTES / (6 * pixels.max(1))).max(FEWEST).min(most as u64) as usize;
+    PARTS.map(|part| part * count / 26)
 }
 
 /// The original's pictures, of the cameras that the scene is scored by and of cameras in between, in a scratch file.
@@ -50,12 +50,12 @@ pub(in crate::compress) struct Targets {
 }
 
 impl Targets {
-    /// Renders them.
+    /// Renders `most` pictures, or fewer large ones.
     ///
     /// # Errors
     /// Frames that cannot be read; a scratch file that cannot be written.
-    pub(in crate::compress) fn new(scene: &Scene) -> Result<Targets> {
-        let (cameras, pictures) = looked_at(scene);
+    pub(in crate::compress) fn new(scene: &Scene, most: usize) -> Result<Targets> {
+        let (cameras, pictures) = looked_at(scene, most);
         let (mut values, mut places, mut end) = (Spill::new(&scene.scratch)?, Vec::new(), 0);
         show([Subject::all(scene.source())], &cameras, &pictures, Batch::of_frame(&scene.limits), |views| {
             let made: Vec<Vec<u16>> =
@@ -97,8 +97,8 @@ impl Targets {
 }
 
 /// Cameras and pictures that are looked at, by frame: those that the scene is scored by, and those in between.
-fn looked_at(scene: &Scene) -> (Vec<Camera>, Vec<Picture>) {
-    let [own, more] = numbers(scene.workload().pixels);
+fn looked_at(scene: &Scene, most: usize) -> (Vec<Camera>, Vec<Picture>) {
+    let [own, more] = numbers(most, scene.workload().pixels);
     let mut pictures = spread(&scene.schedule, own, VIEWS_AT_ONCE);
     let mut used: Vec<u32> = scene.schedule.frames.iter().flatten().map(|&(_, camera)| camera).collect();
     used.sort_unstable();
@@ -149,9 +149,10 @@ mod tests {
 
     #[test]
     fn large_pictures_are_fewer_but_never_too_few() {
-        assert_eq!(numbers(320 * 256), PICTURES);
-        assert_eq!(numbers(0), PICTURES);
-        assert_eq!(numbers(1352 * 1014), [15, 115]);
-        assert_eq!(numbers(1 << 40), [11, 84]);
+        assert_eq!(numbers(520, 320 * 256), [60, 460]);
+        assert_eq!(numbers(520, 0), [60, 460]);
+        assert_eq!(numbers(520, 1352 * 1014), [15, 115]);
+        assert_eq!(numbers(520, 1 << 40), [11, 84]);
+        assert_eq!(numbers(40, 1 << 40), [4, 35]);
     }
 }

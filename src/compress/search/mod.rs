@@ -53,6 +53,8 @@ const HELD_EVERY: usize = 4;
 pub struct Search {
     /// What is asked for.
     pub quality: Quality,
+    /// Pictures of the original that sizes are compared and refined by.
+    pub pictures: usize,
     /// How a size is refined.
     pub refine: Option<Refine>,
     /// How its field is rounded.
@@ -88,7 +90,8 @@ impl Search {
         let looked = Need {
             stage: NAME,
             reads: work.scattered_reads(frames, limits),
-            seconds: work.reading(work.count(), frames as f64) + work.picturing(520.0, work.count(), RENDER),
+            seconds: work.reading(work.count(), frames as f64)
+                + work.picturing(self.pictures as f64, work.count(), RENDER),
             per_gaussian: [
                 scored(limits),
                 vec![("states", whole), ("readers", reader), ("held", held), ("pictures", PICTURE_ON_ALL_THREADS)],
@@ -121,7 +124,7 @@ impl Search {
         let all = ranked.order().len();
         journal.stage(NAME, all, scene.source(), |journal| {
             let photographs = self.photographs(scene)?;
-            let targets = Targets::new(scene)?;
+            let targets = Targets::new(scene, self.pictures)?;
             let parts = targets.parted(photographs.is_none());
             let gauge = match photographs {
                 Some((of, photographs)) => {
