@@ -8,6 +8,7 @@ use super::recipe_flags::RecipeFlags;
 use crate::emit::atomic::Replace;
 use crate::emit::bounds::MaxError;
 use crate::verbs::method::Method;
+use crate::verbs::precision::Turned;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -21,6 +22,7 @@ Examples:
   splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
   splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
   splatsieve sweep model --cameras data -o curves        every method at every size, curves as a page
+  splatsieve precision model --cameras data -o page      error against run time, knob by knob
   splatsieve report model small --cameras data -o page   what it cost, as a page to look at
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
@@ -56,6 +58,8 @@ pub(super) enum Verb {
     Evaluate(Evaluate),
     /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
     Sweep(Sweep),
+    /// Work-precision diagrams: what every knob of a run costs in time and memory, and what error it leaves
+    Precision(Precision),
     /// Write a page that shows what compression cost: pictures, curves, failure modes
     Report(Report),
     /// Pack any input into a .gseq container
@@ -91,6 +95,7 @@ impl Verb {
             Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(Report { models, .. }) => models.memory.explain,
             Verb::Demo(Demo { memory, .. }) => memory.explain,
             Verb::Sweep(_)
+            | Verb::Precision(_)
             | Verb::Verify(_)
             | Verb::Recover(_)
             | Verb::Selfcheck(_)
@@ -445,6 +450,40 @@ pub(super) struct Sweep {
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
+}
+
+/// `precision`
+#[derive(Debug, Args)]
+pub(super) struct Precision {
+    #[command(flatten)]
+    pub(super) input: Input,
+    #[command(flatten)]
+    pub(super) cameras: CameraFile,
+    /// What to turn: pictures and strides of the first `look`; pictures and cuts of `rounds`; bits of `percentiles`; f32
+    /// and f64 `sums`; radius and passes of `merging`; steps and pictures of `refining`; threads and memory of the
+    /// `machine` [default: all, of long inputs without the last three, whose settings are whole runs]
+    #[arg(long, value_name = "KNOBS", value_delimiter = ',',
+          value_parser = clap::builder::PossibleValuesParser::new(Turned::ALL.map(Turned::name)))]
+    pub(super) knobs: Vec<String>,
+    /// Fraction of the Gaussians that every setting keeps
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.3)]
+    pub(super) target_ratio: f64,
+    /// Look at pictures of at most this many frames, evenly from first to last
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) max_frames: u32,
+    /// Run every setting up to so often and give median and range; fewer times where that takes 10 s
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(super) repeat: u32,
+    /// Folder to write precision.html into, a page with the diagrams, and what it shows as JSON and CSV
+    #[arg(short, long, value_name = "FOLDER")]
+    pub(super) output: PathBuf,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
+    /// Print JSON
+    #[arg(long)]
+    pub(super) json: bool,
+    #[command(flatten)]
+    pub(super) recipe: RecipeFlags,
 }
 
 /// `pack`

@@ -13,7 +13,7 @@ use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
 use crate::budget::{self, Budget, Tell};
-use crate::compress::{Only, Request, Run, compress};
+use crate::compress::{Only, Request, Run, Target, compress};
 use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
@@ -28,9 +28,10 @@ use crate::stream::{Mode, Progress};
 use crate::verbs::container::Storing;
 use crate::verbs::evaluate::EvaluateOptions;
 use crate::verbs::method::Method;
+use crate::verbs::precision::{PrecisionOptions, Turned};
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::SweepOptions;
-use crate::verbs::{archive, container, demo, evaluate, render, score, sweep};
+use crate::verbs::{archive, container, demo, evaluate, precision, render, score, sweep};
 use args::{
     CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, OutputSize, Render, SideBySide, SplitArg, Sweep, Verb,
 };
@@ -110,6 +111,11 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Sweep(args) => {
             let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
             let found = sweep::sweep(&sweep_options(args))?;
+            print(&if as_json { found.json() } else { format!("{}{}\n", found.text(), page.display()) })
+        }
+        Verb::Precision(args) => {
+            let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
+            let found = precision::precision(&precision_options(args)?)?;
             print(&if as_json { found.json() } else { format!("{}{}\n", found.text(), page.display()) })
         }
         Verb::Report(args) => {
@@ -333,6 +339,23 @@ fn sweep_options(args: Sweep) -> SweepOptions {
         output: args.output,
         overwrite: args.earlier.replace(),
     }
+}
+
+fn precision_options(args: args::Precision) -> Result<PrecisionOptions> {
+    let mut input = input_options(args.input, None, Some(&args.output));
+    input.use_cameras(args.cameras);
+    let named = |name: &String| Turned::ALL.into_iter().find(|knob| knob.name() == name);
+    let knobs: Vec<Turned> = args.knobs.iter().filter_map(named).collect();
+    Ok(PrecisionOptions {
+        input,
+        recipe: args.recipe.recipe()?,
+        knobs: (!knobs.is_empty()).then_some(knobs),
+        target: Target::Ratio(args.target_ratio),
+        max_frames: args.max_frames as usize,
+        runs: args.repeat as usize,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+    })
 }
 
 fn part_of(split: SplitArg) -> PictureSet {

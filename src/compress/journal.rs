@@ -24,6 +24,16 @@ impl Clock {
     pub fn start() -> Clock {
         Clock { wall: Instant::now(), processors: processor_seconds() }
     }
+
+    /// Seconds since then.
+    pub fn seconds(&self) -> f64 {
+        self.wall.elapsed().as_secs_f64()
+    }
+
+    /// Seconds that this process took since then of all processors together; none where the system does not say.
+    pub fn processor_seconds(&self) -> Option<f64> {
+        processor_seconds().zip(self.processors).map(|(now, before)| now - before)
+    }
 }
 
 /// Seconds that this process took of all processors together; none where the system does not say.
@@ -94,8 +104,8 @@ impl Journal {
             reads,
             full_reads: read as f64 / whole.max(1) as f64,
             scratch_bytes,
-            seconds: start.wall.elapsed().as_secs_f64(),
-            processor_seconds: processor_seconds().zip(start.processors).map(|(now, before)| now - before),
+            seconds: start.seconds(),
+            processor_seconds: start.processor_seconds(),
             peak_memory_bytes: peak_memory_bytes(),
         });
     }

@@ -14,6 +14,7 @@ mod findings;
 pub mod histogram;
 mod html;
 mod page;
+pub mod precision;
 pub mod run;
 pub mod shown;
 mod tables;

@@ -7,7 +7,7 @@
 mod norm;
 pub mod sketch;
 
-pub use norm::Norm;
+pub use norm::{Looks, Norm};
 pub use sketch::FloatSketch;
 
 use crate::model::{Flags, Rows, Statistic};
@@ -95,13 +95,18 @@ impl Graded {
 /// Rows with [`Flags::NON_FINITE`] count in no percentile and score 0 throughout. `rows.e` is used
 /// only when λ > 0. No rows give empty scores.
 pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
+    score_by(Looks::Two, rows, frames, recipe)
+}
+
+/// [`score`] with percentiles found by `looks`.
+pub fn score_by(looks: Looks, rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
     use Graded::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
     let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
     let life = |i: usize| f64::from(rows.life[i]) / frames.max(1) as f64;
     let motion_weight = |i: usize| if recipe.weigh_motion_by_life { life(i) } else { 1.0 };
 
-    let mut sum = Summation { counts: &counts, recipe, terms: Vec::new() };
+    let mut sum = Summation { counts: &counts, recipe, looks, terms: Vec::new() };
     let mut static_score = vec![0.0; rows.len()];
     match recipe.static_term {
         StaticTerm::Peak if !rows.w.is_empty() => sum.add(&mut static_score, By(W), 1.0, |i| rows.w[i]),
@@ -131,6 +136,7 @@ pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
 struct Summation<'a> {
     counts: &'a [bool],
     recipe: &'a recipe::Score,
+    looks: Looks,
     terms: Vec<Term>,
 }
 
@@ -141,7 +147,7 @@ impl Summation<'_> {
             return;
         }
         let counted = || (0..total.len()).filter(|&i| self.counts[i]);
-        let norm = Norm::of(|| counted().map(&value), self.recipe);
+        let norm = Norm::of(|| counted().map(&value), self.recipe, self.looks);
         for (i, total) in total.iter_mut().enumerate() {
             if self.counts[i] {
                 *total += weight * norm.apply(value(i));

@@ -18,12 +18,30 @@ pub struct Norm {
     clip: bool,
 }
 
+/// How often the values are looked at for a percentile.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Looks {
+    /// Twice: exact.
+    Two,
+    /// Once, by so many mantissa bits: the middle of the bucket that holds it.
+    One(u32),
+}
+
 impl Norm {
     /// The normalisation of a set of values; NaN and infinities are passed over.
-    pub fn of<I: Iterator<Item = f64>>(values: impl Fn() -> I, recipe: &recipe::Score) -> Self {
-        let sketch = FloatSketch::of(values());
-        let percentile = |p| sketch.percentile(p, values()).unwrap_or(0.0);
-        Norm { p1: percentile(1.0), p99: percentile(99.0), epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
+    pub fn of<I: Iterator<Item = f64>>(values: impl Fn() -> I, recipe: &recipe::Score, looks: Looks) -> Self {
+        let [p1, p99] = match looks {
+            Looks::Two => {
+                let sketch = FloatSketch::of(values());
+                [1.0, 99.0].map(|p| sketch.percentile(p, values()))
+            }
+            Looks::One(bits) => {
+                let sketch = FloatSketch::keyed_by(bits, values());
+                [1.0, 99.0].map(|p| sketch.rough_percentile(p))
+            }
+        }
+        .map(|percentile| percentile.unwrap_or(0.0));
+        Norm { p1, p99, epsilon: recipe.norm_epsilon, clip: recipe.clip_norm }
     }
 
     /// Whether the percentiles differ, so that the term grades rather than splits.
@@ -47,7 +65,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     fn norm_of(preset: &str, values: &[f64]) -> Norm {
-        Norm::of(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score)
+        Norm::of(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score, Looks::Two)
     }
 
     #[test]

@@ -1,19 +1,23 @@
 //! Percentiles, exact: a histogram of order-preserving float bits finds the bucket that holds one, and a second look at
 //! the values that fall into it finds the value.
 //!
-//! A value is rounded to f32 and keyed by its sign, exponent and upper 7 mantissa bits, so that keys order as values do;
-//! those in one bucket are within 0.8% of each other. Counts are integers: any order, same answer. 256 KiB, and a copy of
-//! the values in one bucket.
+//! A value is rounded to f32 and keyed by its sign, exponent and upper mantissa bits, so that keys order as values do. With
+//! 7 of these, values in one bucket are within 0.8% of each other, and counts take 256 KiB; the second look takes a copy of
+//! the values in one bucket. Counts are integers: any order, same answer.
 //! Rank-error sketches (KLL, t-digest) are random or depend on order, and at P99 of a heavy tail were
 //! off by 3–47% in value.
 
-/// Number of keys: 16 bits.
-const BUCKETS: usize = 1 << 16;
-/// f32 mantissa bits below a key.
-const DROPPED_BITS: u32 = 16;
+/// Mantissa bits of a key, unless asked otherwise.
+pub const MANTISSA_BITS: u32 = 7;
+/// Most mantissa bits of a key: counts then take 64 MiB.
+pub const MOST_BITS: u32 = 15;
+/// Mantissa bits of an f32.
+const ALL_BITS: u32 = 23;
 
 /// Histogram of the finite ones of up to 2³² − 1 values.
 pub struct FloatSketch {
+    /// f32 mantissa bits below a key.
+    dropped: u32,
     counts: Vec<u32>,
     finite: u64,
 }
@@ -22,12 +26,25 @@ impl FloatSketch {
     /// The sketch of all of `values`; NaN and infinities are passed over. −0 counts as 0, and a finite value beyond f32
     /// as the largest f32.
     pub fn of(values: impl IntoIterator<Item = f64>) -> Self {
-        let mut sketch = FloatSketch { counts: vec![0; BUCKETS], finite: 0 };
+        Self::keyed_by(MANTISSA_BITS, values)
+    }
+
+    /// The same with keys of `bits` mantissa bits, at most [`MOST_BITS`]: 2⁹ times 2 to that of counts of 4 bytes.
+    pub fn keyed_by(bits: u32, values: impl IntoIterator<Item = f64>) -> Self {
+        let dropped = ALL_BITS - bits.min(MOST_BITS);
+        let mut sketch = FloatSketch { dropped, counts: vec![0; 1 << (32 - dropped)], finite: 0 };
         for value in values.into_iter().filter(|value| value.is_finite()) {
-            sketch.counts[usize::from(key(value))] += 1;
+            sketch.counts[key(value, dropped) as usize] += 1;
             sketch.finite += 1;
         }
         sketch
+    }
+
+    /// The middle of the bucket that holds the `p`-th percentile: what one look tells.
+    pub fn rough_percentile(&self, p: f64) -> Option<f64> {
+        let (bucket, _) = self.locate(p)?;
+        let [low, high] = [bucket << self.dropped, (bucket << self.dropped) | ((1 << self.dropped) - 1)].map(value_of);
+        Some(0.5 * (low + high))
     }
 
     /// The `p`-th percentile (0 to 100) by nearest rank, ⌈p·n/100⌉ but at least 1, over the n finite
@@ -35,18 +52,18 @@ impl FloatSketch {
     pub fn percentile(&self, p: f64, values: impl IntoIterator<Item = f64>) -> Option<f64> {
         let (bucket, rank) = self.locate(p)?;
         let mut inside: Vec<f64> =
-            values.into_iter().filter(|x| x.is_finite() && key(*x) == bucket).map(|x| x + 0.0).collect();
+            values.into_iter().filter(|x| x.is_finite() && key(*x, self.dropped) == bucket).map(|x| x + 0.0).collect();
         // A rank beyond the bucket means that other values were counted than are given now.
         (rank < inside.len()).then(|| *inside.select_nth_unstable_by(rank, f64::total_cmp).1)
     }
 
     /// The key of the `p`-th percentile, and the rank inside that bucket, from 0.
-    fn locate(&self, p: f64) -> Option<(u16, usize)> {
+    fn locate(&self, p: f64) -> Option<(u32, usize)> {
         // p·n before the division: exact for whole p, so that P1 of 100 values is the first.
         let mut rank = ((p * self.finite as f64 / 100.0).ceil() as u64).max(1) - 1;
         for (key, &count) in self.counts.iter().enumerate() {
             if rank < u64::from(count) {
-                return Some((key as u16, rank as usize));
+                return Some((key as u32, rank as usize));
             }
             rank -= u64::from(count);
         }
@@ -54,12 +71,18 @@ impl FloatSketch {
     }
 }
 
-/// Upper half of the f32 bits of `value`, mapped so that keys order as values do.
-fn key(value: f64) -> u16 {
+/// The f32 bits of `value` without the last `dropped`, mapped so that keys order as values do.
+fn key(value: f64, dropped: u32) -> u32 {
     let bits = (value.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32 + 0.0).to_bits();
     // Negative floats order backwards: flip all bits; positive ones go above them: flip the sign.
     let ordered = if bits >> 31 == 1 { !bits } else { bits | 1 << 31 };
-    (ordered >> DROPPED_BITS) as u16
+    ordered >> dropped
+}
+
+/// The value whose bits were mapped to `ordered`.
+fn value_of(ordered: u32) -> f64 {
+    let bits = if ordered >> 31 == 1 { ordered ^ (1 << 31) } else { !ordered };
+    f64::from(f32::from_bits(bits))
 }
 
 #[cfg(test)]
@@ -98,12 +121,26 @@ mod tests {
         #[test]
         fn keys_order_as_values_do(a in any_value(), b in any_value()) {
             prop_assume!(a.is_finite() && b.is_finite());
-            prop_assert!(key(a.min(b)) <= key(a.max(b)));
+            let [low, high] = [a.min(b), a.max(b)];
+            for dropped in [0, 16, 22] {
+                prop_assert!(key(low, dropped) <= key(high, dropped));
+            }
+        }
+
+        #[test]
+        fn one_look_is_off_by_half_a_bucket_at_most(
+            values in prop::collection::vec(-1e6..1e6f64, 1..300), p in 0u32..=100, bits in 1u32..16
+        ) {
+            let exact = sorted_percentile(&values, p).unwrap();
+            let rough = FloatSketch::keyed_by(bits, values.iter().copied()).rough_percentile(f64::from(p)).unwrap();
+            // Of a bucket [m, m + 1)·2^(e − bits) half is at most 2^−bits / 2 of its least value, but for subnormals.
+            prop_assert!((rough - exact).abs() <= 0.51 * exact.abs().max(1e-37) * 0.5f64.powi(bits as i32));
         }
     }
 
     #[test]
     fn subnormals_order_as_values_and_minus_zero_is_zero() {
+        let key = |value| key(value, ALL_BITS - MANTISSA_BITS);
         assert_eq!(key(-0.0), key(0.0));
         assert!(key(-1e-39) < key(0.0) && key(0.0) < key(1e-39) && key(1e-39) < key(1e-38));
         assert!(FloatSketch::of([-0.0; 5]).percentile(50.0, [-0.0; 5]).unwrap().is_sign_positive());

@@ -12,7 +12,7 @@ use crate::source::{FrameSource, Ids};
 use crate::stats::{BlockScan, NEEDED, ScanPlan};
 
 /// What a scan gives.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Scanned {
     /// One row per Gaussian; D and κ before noise is snapped, E not filled.
     pub rows: Rows,

@@ -124,13 +124,7 @@ pub(super) const STEPS: &str = "refine_steps";
 
 /// [`Method::Default`] with so many steps, and before each cut as many in proportion.
 pub(super) fn refining_by(steps: u32) -> Result<Means> {
-    let mut recipe = Recipe::preset("default")?;
-    let refine = &mut recipe.refine;
-    let before_cuts = u64::from(refine.refine_cut_steps) * u64::from(steps);
-    refine.refine_cut_steps =
-        before_cuts.div_ceil(u64::from(refine.refine_steps.max(1))).try_into().unwrap_or(u32::MAX);
-    refine.refine_steps = steps;
-    Ok(Means::Recipe(Box::new(recipe), Only::Both))
+    Ok(Means::Recipe(Box::new(Recipe::preset("default")?.refining_by(steps)), Only::Both))
 }
 
 #[cfg(test)]

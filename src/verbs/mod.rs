@@ -3,12 +3,15 @@
 pub mod archive;
 pub mod baseline;
 pub mod container;
+pub mod cost;
 pub(crate) mod csv;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluation;
 pub mod method;
+pub mod precision;
 pub mod render;
 pub mod score;
 pub mod sweep;
 pub mod trade_off;
+mod whole_run;

@@ -6,21 +6,17 @@
 //! `compress`, then that of `evaluate`.
 
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::path::PathBuf;
 
-use super::baseline::prune_by;
-use super::evaluate::{EvaluateOptions, evaluate};
+use super::cost::Repeats;
 use super::method::{Means, Method, STEPS, refining_by};
 use super::trade_off::{Knob, Point, Setting, TradeOff};
+use super::whole_run::{WholeRun, trained};
 use crate::TOOL;
-use crate::budget::{peak_memory_bytes, reset_peak_memory};
-use crate::compress::{Request, Target, compress};
+use crate::compress::Target;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
-use crate::model::Split;
 use crate::report::trade_off::{PAGE, page};
-use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, open_scene};
 use crate::stream::Progress;
 
@@ -75,7 +71,14 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     steps.dedup();
 
     let (mut found, name) = start(options)?;
-    let scratch = staged.path().join("point");
+    let run = WholeRun {
+        input: &options.input,
+        scratch: &staged.path().join("point"),
+        name,
+        repeats: Repeats::always(options.runs),
+        max_frames: options.max_frames,
+        background: options.background,
+    };
     let points: Vec<(Method, Option<f64>)> = options
         .methods
         .iter()
@@ -87,7 +90,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     let progress = Progress::new("sweep", "points", (points.len() + steps.len()) as u64);
     for (method, asked) in points {
         if !beyond_merging(method, asked, &found) {
-            let point = measure(options, method, asked, method.means()?, &scratch, name, &mut found)?;
+            let point = measure(&run, method, asked, &method.means()?, &mut found)?;
             found.points.push(point);
         }
         progress.advance(1);
@@ -95,7 +98,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     let mut settings = Vec::with_capacity(steps.len());
     for value in steps {
         let (method, asked) = (Method::Default, Some(options.steps_at));
-        let point = measure(options, method, asked, refining_by(value)?, &scratch, name, &mut found)?;
+        let point = measure(&run, method, asked, &refining_by(value)?, &mut found)?;
         settings.push(Setting { value, point });
         progress.advance(1);
     }
@@ -124,7 +127,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
 
 /// What all points share, and the name by which a result is of the input's kind.
 fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
-    let scene = open_scene(&train(&options.input))?;
+    let scene = open_scene(&trained(&options.input))?;
     let name = if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" };
     let found = TradeOff {
         tool: TOOL.to_owned(),
@@ -143,10 +146,6 @@ fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     Ok((found, name))
 }
 
-fn train(input: &InputOptions) -> InputOptions {
-    InputOptions { split: Some(Split::Train), ..input.clone() }
-}
-
 /// Gaussians that merging leaves where nothing is pruned, once that point is measured.
 fn merged_alone(found: &TradeOff) -> Option<usize> {
     let own = |point: &&Point| point.method == Method::PaperMerge.name() && point.asked.is_none();
@@ -159,80 +158,26 @@ fn beyond_merging(method: Method, asked: Option<f64>, found: &TradeOff) -> bool 
     wanted.zip(merged_alone(found)).is_some_and(|(wanted, least)| wanted.round() < least as f64)
 }
 
-/// One point: compresses to `name` in the new folder `scratch` as often as is asked for, measures, deletes both.
+/// One point of the sweep.
 fn measure(
-    options: &SweepOptions,
+    run: &WholeRun<'_>,
     method: Method,
     asked: Option<f64>,
-    means: Means,
-    scratch: &Path,
-    name: &str,
+    means: &Means,
     found: &mut TradeOff,
 ) -> Result<Point> {
-    let input = train(&options.input);
-    let output = scratch.join(name);
-    let target = asked.map(Target::Ratio);
-    let clear = || fs::remove_dir_all(scratch).map_err(Error::io("remove", scratch));
-    let (mut bytes, mut seconds, mut peak) = (None, Vec::with_capacity(found.runs), None);
-    for run in 0..found.runs {
-        if run > 0 {
-            clear()?;
-        }
-        fs::create_dir(scratch).map_err(Error::io("create", scratch))?;
-        let resets = reset_peak_memory();
-        let start = Instant::now();
-        bytes = match &means {
-            Means::Recipe(recipe, only) => {
-                let run = Request::new(input.clone(), output.clone(), (**recipe).clone());
-                compress(&Request { only: *only, target, ..run })?.output_bytes
-            }
-            Means::Baseline(baseline) => Some(prune_by(*baseline, &input, target, &output)?),
-        };
-        seconds.push(start.elapsed().as_secs_f64());
-        // None is less than any.
-        peak = peak.max(if resets { peak_memory_bytes() } else { None });
-    }
-    let evaluation = evaluate(&EvaluateOptions {
-        original: input,
-        compressed: output.clone(),
-        ground_truth: None,
-        part: PictureSet::HeldOut,
-        max_frames: options.max_frames,
-        background: options.background,
-        flip: false,
-        csv: None,
-        overwrite: Replace::Never,
-    })?;
-    clear()?;
+    let (evaluation, cost) = run.run(means, asked.map(Target::Ratio), |result| run.compared(result))?;
     found.pictures = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
     Ok(Point {
         method: method.name().to_owned(),
         asked,
         count: evaluation.count.compressed,
-        bytes: bytes.unwrap_or(evaluation.bytes.compressed),
+        bytes: evaluation.bytes.compressed,
         psnr: means.psnr,
         ssim: means.ssim,
         temporal: means.temporal,
-        seconds: median(seconds),
-        peak_memory_bytes: peak,
+        seconds: cost.seconds.median,
+        peak_memory_bytes: cost.peak_memory_bytes,
     })
-}
-
-/// Of at least one value the one in the middle, or the mean of the two there.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    0.5 * (values[(values.len() - 1) / 2] + values[values.len() / 2])
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_median_is_the_middle_of_any_number() {
-        for (values, expected) in [(vec![7.0], 7.0), (vec![9.0, 1.0], 5.0), (vec![9.0, 1.0, 2.0], 2.0)] {
-            assert_eq!(median(values), expected);
-        }
-    }
 }

@@ -1,0 +1,213 @@
+//! Work-precision diagrams as a page: error against time and memory, a curve for every way to turn a knob, a mark for every
+//! value.
+//!
+//! Data in: a [`Precision`]. Data out: charts as SVG, and a page with them.
+
+use super::chart::{Axis, Plot, Series};
+use super::document::{document, figure_of, links, list};
+use super::html::{count, escape, figure, file_name};
+use super::trade_off::Chart;
+use crate::verbs::precision::found::{ADDED, Curve, KEPT, Knob, Mark, PICTURES, Precision, STAYING, meaning};
+
+/// The page's name in the folder of its data.
+pub const PAGE: &str = "precision.html";
+
+/// A measure of work: what it is called, and where it is found.
+type Work = (&'static str, fn(&Mark) -> Option<f64>);
+
+/// What is drawn along the bottom.
+const WORK: [Work; 3] = [
+    ("time of all processors, s", |mark| mark.cost.processor_seconds.map(|seconds| seconds.median)),
+    ("time on the wall, s", |mark| Some(mark.cost.seconds.median)),
+    ("peak memory, MiB", |mark| mark.cost.peak_memory_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20))),
+];
+
+/// The page, to lie beside its data.
+pub fn page(found: &Precision) -> String {
+    let title = format!("{} – error against run time", file_name(&found.path));
+    let mut body = format!(
+        "<header>\n<h1>Error against run time: {}</h1>\n</header>\n<p class=\"note\">{} Gaussians × {} frames; {} pictures \
+         of {} frames looked at, judged by {} others: {}. Every setting keeps {} Gaussians. {} threads; medians of up to {} \
+         runs, fewer where they took {} s.</p>\n",
+        escape(file_name(&found.path)),
+        count(found.gaussians),
+        count(found.frames),
+        count(found.pictures),
+        count(found.frames_looked_at),
+        found.judged,
+        escape(&found.cameras),
+        count(found.kept),
+        found.threads,
+        found.runs,
+        found.enough,
+    );
+    body += &list(&found.notes);
+    for knob in &found.knobs {
+        body += &section(knob);
+    }
+    body += &format!(
+        "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
+        links(&["precision.json", "precision.csv"]),
+        escape(&found.tool)
+    );
+    document(&title, &body)
+}
+
+fn section(knob: &Knob) -> String {
+    let mut out = format!(
+        "<section>\n<h2>{} <small>({} error)</small></h2>\n<p>{}</p>\n<div class=\"charts\">\n",
+        escape(&knob.name),
+        knob.source.name(),
+        escape(&knob.about)
+    );
+    for (caption, svg) in charts(knob) {
+        out += &figure_of(&caption, &svg);
+    }
+    out += "</div>\n";
+    for curve in &knob.curves {
+        out += &table(curve);
+    }
+    out + "</section>\n"
+}
+
+/// Charts of a knob: its errors against the time of all processors, and the first one of them against the wall and memory
+/// too. What is 0 throughout has none.
+pub fn charts(knob: &Knob) -> Vec<Chart> {
+    let mut errors: Vec<&String> =
+        knob.curves.iter().flat_map(|curve| &curve.marks).flat_map(|m| m.errors.keys()).collect();
+    // What pictures say comes first.
+    errors
+        .sort_by_key(|error| ([ADDED, PICTURES, KEPT, STAYING].iter().position(|of| of == error).unwrap_or(4), *error));
+    errors.dedup();
+    let seen = |error: &&String| {
+        knob.curves.iter().flat_map(|curve| &curve.marks).any(|mark| mark.errors.get(*error).is_some_and(|&e| e > 0.0))
+    };
+    let errors: Vec<&String> = errors.into_iter().filter(seen).collect();
+    let mut charts: Vec<Chart> = errors.iter().map(|error| chart(knob, error, WORK[0])).collect();
+    charts.extend(errors.first().into_iter().flat_map(|error| WORK[1..].iter().map(|&work| chart(knob, error, work))));
+    charts
+}
+
+/// An error against work, both as ratios.
+fn chart(knob: &Knob, error: &str, (work, at): Work) -> Chart {
+    let series = knob.curves.iter().map(|curve| {
+        let marks: Vec<(&Mark, f64, f64)> =
+            curve.marks.iter().filter_map(|mark| Some((mark, at(mark)?, *mark.errors.get(error)?))).collect();
+        Series {
+            name: curve.name.clone(),
+            points: marks.iter().map(|&(_, work, error)| (work, error)).collect(),
+            joined: true,
+            paired: false,
+            labels: marks.iter().map(|(mark, ..)| label(curve, mark)).collect(),
+        }
+    });
+    let log = |label: String| Axis { label, log: true, from_zero: false };
+    let title = format!("{}: {}, by {}", knob.name, meaning(error), work.split(',').next().unwrap_or(work));
+    let plot = Plot { title: title.clone(), x: log(work.to_owned()), y: log(meaning(error)), series: series.collect() };
+    (title, plot.svg())
+}
+
+/// A mark's value; the recipe's own with a star.
+fn label(curve: &Curve, mark: &Mark) -> String {
+    let own = if curve.own == Some(mark.value) { "*" } else { "" };
+    format!("{}{own}", figure(mark.value))
+}
+
+/// Every mark with all its numbers.
+fn table(curve: &Curve) -> String {
+    let mut errors: Vec<&String> = curve.marks.iter().flat_map(|mark| mark.errors.keys()).collect();
+    errors.sort_unstable();
+    errors.dedup();
+    let names: String = errors.iter().map(|error| format!("<th>{}</th>", escape(error))).collect();
+    let mut out = format!(
+        "<details><summary>{}, against {}</summary>\n<table><tr><th>{}</th><th>s</th><th>from – to</th><th>processor s</th>\
+         <th>MiB</th><th>dB</th>{names}</tr>\n",
+        escape(&curve.name),
+        escape(&curve.against),
+        escape(&curve.name)
+    );
+    for mark in &curve.marks {
+        let cost = &mark.cost;
+        let known = |value: Option<f64>| value.map_or("–".to_owned(), figure);
+        let cells = [
+            label(curve, mark),
+            figure(cost.seconds.median),
+            format!("{} – {}", figure(cost.seconds.least), figure(cost.seconds.most)),
+            known(cost.processor_seconds.map(|seconds| seconds.median)),
+            known(cost.peak_memory_bytes.map(|bytes| (bytes >> 20) as f64)),
+            known(mark.psnr),
+        ];
+        let errors =
+            errors.iter().map(|error| mark.errors.get(*error).map_or("–".to_owned(), |&error| figure(error)));
+        let cells: String = cells.into_iter().chain(errors).map(|cell| format!("<td>{cell}</td>")).collect();
+        out += &format!("<tr>{cells}</tr>\n");
+    }
+    out += "</table>\n";
+    let mut said: Vec<String> = curve
+        .orders
+        .iter()
+        .map(|order| {
+            let expected = order.expected.map_or(String::new(), |expected| format!(" (theory: {expected})"));
+            format!("order of {}: {:.2}{expected}", order.of, order.observed)
+        })
+        .collect();
+    said.extend(curve.enough.map(|enough| {
+        format!("from {} on it adds less than a tenth of the model's own error to pictures", figure(enough))
+    }));
+    out += &list(&said);
+    out + "</details>\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::verbs::cost::{Cost, Spread};
+    use crate::verbs::precision::found::Source;
+
+    fn mark(value: f64, errors: &[(&str, f64)]) -> Mark {
+        let seconds = Spread::of(vec![value]);
+        let errors: BTreeMap<String, f64> = errors.iter().map(|&(of, error)| (of.to_owned(), error)).collect();
+        let cost = Cost { runs: 1, seconds, processor_seconds: Some(seconds), peak_memory_bytes: Some(1 << 22) };
+        Mark { value, step: 1.0 / value, cost, errors, psnr: None }
+    }
+
+    fn knob(marks: Vec<Mark>) -> Knob {
+        Knob {
+            name: "look".to_owned(),
+            about: "<b>".to_owned(),
+            source: Source::Discretisation,
+            curves: vec![Curve::new("look_pictures", "all", marks, Some(2.0), &[])],
+        }
+    }
+
+    #[test]
+    fn every_error_has_a_diagram_over_time_and_the_first_over_memory_too() {
+        let marks = [4.0, 2.0, 1.0].map(|value| mark(value, &[("C", 0.1 / value), (ADDED, 0.2 / value), ("W", 0.0)]));
+        let charts = charts(&knob(marks.to_vec()));
+        let titles: Vec<&str> = charts.iter().map(|chart| chart.0.as_str()).collect();
+        assert_eq!(
+            titles,
+            [
+                "look: error added to pictures, parts of the model's own, by time of all processors",
+                "look: relative L2 error of C, by time of all processors",
+                "look: error added to pictures, parts of the model's own, by time on the wall",
+                "look: error added to pictures, parts of the model's own, by peak memory",
+            ]
+        );
+        for (title, svg) in &charts {
+            // One of the marks is the legend's.
+            assert_eq!(svg.matches("class=\"mark ").count(), 4, "{title}");
+            assert!(svg.contains(">2*</text>") && svg.contains(">4</text>"), "{title}: {svg}");
+        }
+    }
+
+    #[test]
+    fn what_is_exact_has_a_table_and_no_diagram() {
+        let knob = knob(vec![mark(1.0, &[("bytes", 0.0)])]);
+        assert!(charts(&knob).is_empty());
+        let section = section(&knob);
+        assert!(section.contains("<td>0</td>") && !section.contains("<b>"), "{section}");
+    }
+}

@@ -1,0 +1,280 @@
+//! Work-precision diagrams: what every knob of a run costs in time and memory, and what error it leaves, on a given model.
+//!
+//! Errors of three sources are kept apart. *Discretisation*: pictures, pixels, frames, rounds and buckets are samples; the
+//! error of each is measured against the finest of its kind, at an equal number of kept Gaussians. *Rounding*: sums in f32
+//! and in f64 against longer ones; threads and memory, which must change nothing. *Model*: fewer Gaussians stand for more,
+//! merged or refined.
+//!
+//! Memory: that of `compress`, and 12 bytes for every pixel of the pictures that results are judged by.
+
+pub mod found;
+mod judge;
+mod ranking;
+mod runs;
+mod sums;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::cost::Repeats;
+use super::whole_run::trained;
+use crate::TOOL;
+use crate::compress::journal::Journal;
+use crate::compress::measure::{Measure, Outlook, Stages};
+use crate::compress::score::UserOverrides;
+use crate::compress::{Job, Request, Target};
+use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::error::{Error, Result};
+use crate::model::{Schedule, Split};
+use crate::recipe::Recipe;
+use crate::report::precision::{PAGE, page};
+use crate::scene::{InputOptions, Scene, open_scene};
+use crate::stream::{Progress, Scanned};
+use found::{Knob, Precision};
+use judge::Judge;
+
+/// Something to turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Turned {
+    /// The first look: pictures, and strides of pixels, views and frames.
+    Look,
+    /// Rounds: pictures of each, and the part that each leaves.
+    Rounds,
+    /// Percentiles: bits of one look.
+    Percentiles,
+    /// Running sums: f32, compensated, f64.
+    Sums,
+    /// Merging: radius and passes.
+    Merging,
+    /// Refining: steps and pictures.
+    Refining,
+    /// Threads and memory.
+    Machine,
+}
+
+impl Turned {
+    /// Every one, in the order of the pipeline.
+    pub const ALL: [Turned; 7] = [
+        Turned::Look,
+        Turned::Rounds,
+        Turned::Percentiles,
+        Turned::Sums,
+        Turned::Merging,
+        Turned::Refining,
+        Turned::Machine,
+    ];
+
+    /// As the command line and the results name it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Turned::Look => "look",
+            Turned::Rounds => "rounds",
+            Turned::Percentiles => "percentiles",
+            Turned::Sums => "sums",
+            Turned::Merging => "merging",
+            Turned::Refining => "refining",
+            Turned::Machine => "machine",
+        }
+    }
+
+    /// Whether every one of its settings is a run from beginning to end.
+    fn is_of_whole_runs(self) -> bool {
+        matches!(self, Turned::Merging | Turned::Refining | Turned::Machine)
+    }
+}
+
+/// What to turn, and on what.
+#[derive(Debug, Clone)]
+pub struct PrecisionOptions {
+    /// What to read, and the cameras; of its split nothing is used.
+    pub input: InputOptions,
+    /// What every knob starts from.
+    pub recipe: Recipe,
+    /// What to turn; none: everything, but whole runs only of models that are not too long.
+    pub knobs: Option<Vec<Turned>>,
+    /// How many Gaussians every setting keeps.
+    pub target: Target,
+    /// Look at pictures of at most this many frames, evenly from first to last.
+    pub max_frames: usize,
+    /// Times to run every setting at most, at least 1: the median time counts.
+    pub runs: usize,
+    /// Folder for `precision.json`, `precision.csv` and the page.
+    pub output: PathBuf,
+    /// Replace an earlier folder.
+    pub overwrite: Replace,
+}
+
+/// Seconds after which a setting is not run again.
+const ENOUGH: f64 = 10.0;
+
+/// Gaussians times frames up to which whole runs are part of everything.
+const SHORT: u64 = 10_000_000;
+
+/// What all knobs are turned on.
+struct Bench<'a> {
+    /// As the training cameras see it, at some of its frames.
+    scene: &'a Scene,
+    input: &'a InputOptions,
+    recipe: &'a Recipe,
+    scanned: Scanned,
+    judge: Judge,
+    /// Gaussians that every setting keeps.
+    kept: usize,
+    repeats: Repeats,
+    /// Folder for results of whole runs, and their name.
+    scratch: &'a Path,
+    name: &'a str,
+    progress: Progress,
+}
+
+impl Bench<'_> {
+    /// Another setting is done.
+    fn advance(&self) {
+        self.progress.advance(1);
+    }
+}
+
+/// Turns knobs of a run on a model and writes what it finds.
+///
+/// # Errors
+/// Whatever is wrong with input, cameras, recipe, options or output. Nothing is left behind then.
+pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
+    if options.input.is_stream() {
+        return Err(Error::usage("precision reads its input many times: pack the stream first, then give the .gseq"));
+    }
+    let mut inputs = vec![options.input.path.as_path()];
+    inputs.extend(options.input.cameras.as_deref());
+    check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;
+    let staged = StagedFolder::new(&options.output, options.overwrite)?;
+
+    let input = trained(&options.input);
+    let mut scene = open_scene(&input)?;
+    if !scene.has_cameras {
+        return Err(Error::usage(format!(
+            "{}: precision looks at pictures, and no cameras were found\n  give --cameras",
+            scene.path.display()
+        )));
+    }
+    let info = scene.source().info();
+    let (gaussians, frames) = (info.count, info.times.len());
+    let kept = options.target.count(gaussians)?;
+    let name = if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" };
+    let request = Request {
+        target: Some(options.target),
+        ..Request::new(input.clone(), options.output.join(name), options.recipe.clone())
+    };
+    let job = Job::within(&request, Outlook::of(&scene), &scene.workload())?;
+    scene.keep_to(input.memory, |work, limits| {
+        let mut needs = job.needs(work, limits);
+        needs.iter_mut().for_each(|need| need.fixed.push(("judged", Judge::bytes(work.pixels))));
+        needs
+    })?;
+    let mut notes = scene.notes.clone();
+    thin(&mut scene.schedule, options.max_frames);
+    let looked_at = scene.schedule.frames.iter().filter(|views| !views.is_empty()).count();
+    if scene.rig.shots.iter().all(|shot| shot.split != Split::Test) {
+        notes.push("no pictures are held out: those judged by are also looked at".to_owned());
+    }
+    let knobs = options.knobs.clone().unwrap_or_else(|| Turned::ALL.to_vec());
+    let is_long = gaussians as u64 * frames as u64 > SHORT;
+    let (left_out, turned): (Vec<Turned>, Vec<Turned>) =
+        knobs.into_iter().partition(|knob| options.knobs.is_none() && is_long && knob.is_of_whole_runs());
+    if !left_out.is_empty() {
+        let names: Vec<&str> = left_out.iter().map(|knob| knob.name()).collect();
+        let names = names.join(",");
+        notes.push(format!("{names}: left out for {gaussians} Gaussians x {frames} frames (--knobs {names})"));
+    }
+
+    let measure = Measure::new(&options.recipe, true, UserOverrides::default());
+    let bench = Bench {
+        scanned: measure.scan.run(&scene, &mut Journal::default())?,
+        judge: Judge::new(&scene)?,
+        scene: &scene,
+        input: &options.input,
+        recipe: &options.recipe,
+        kept,
+        repeats: Repeats { most: options.runs, enough: ENOUGH },
+        scratch: &staged.path().join("run"),
+        name,
+        progress: Progress::counting("precision", "settings"),
+    };
+    let mut found = Precision {
+        tool: TOOL.to_owned(),
+        path: scene.path.display().to_string(),
+        digest: scene.input.digest()?,
+        gaussians,
+        frames,
+        frames_looked_at: looked_at,
+        pictures: scene.schedule.pairs(),
+        judged: bench.judge.pictures(),
+        cameras: scene.rig.origin.clone(),
+        kept,
+        threads: rayon::current_num_threads(),
+        runs: options.runs.max(1),
+        enough: ENOUGH,
+        knobs: Vec::new(),
+        notes,
+    };
+    // Hundreds of stages would hide which setting it is at.
+    let _quiet = Progress::hush();
+    for knob in turned {
+        match bench.turn(knob)? {
+            Some(knob) => found.knobs.push(knob),
+            None => found.notes.push(format!("{}: nothing to turn, of {frames} frames", knob.name())),
+        }
+    }
+    let write = |name: &str, text: String| {
+        let path = staged.path().join(name);
+        fs::write(&path, text).map_err(Error::io("write", &path))
+    };
+    write("precision.csv", found.csv())?;
+    write("precision.json", found.json())?;
+    write(PAGE, page(&found))?;
+    // By this a later run knows the folder as one that it may replace.
+    write(MARKER, format!("{:#}\n", serde_json::json!({ "tool": found.tool })))?;
+    staged.commit()?;
+    Ok(found)
+}
+
+impl Bench<'_> {
+    /// All settings of a knob; none where the scene has nothing to turn it on.
+    fn turn(&self, knob: Turned) -> Result<Option<Knob>> {
+        match knob {
+            Turned::Look => self.look().map(Some),
+            Turned::Rounds => self.rounds().map(Some),
+            Turned::Percentiles => self.percentiles().map(Some),
+            Turned::Sums => self.sums(),
+            Turned::Merging => self.merging().map(Some),
+            Turned::Refining => self.refining().map(Some),
+            Turned::Machine => self.machine().map(Some),
+        }
+    }
+}
+
+/// Leaves the pictures of at most `most` (at least one) of the frames that have some, evenly from first to last.
+fn thin(schedule: &mut Schedule, most: usize) {
+    let seen: Vec<usize> = (0..schedule.frames.len()).filter(|&frame| !schedule.frames[frame].is_empty()).collect();
+    let most = most.clamp(1, seen.len().max(1));
+    let kept: Vec<usize> = (0..most.min(seen.len())).map(|k| seen[(2 * k + 1) * seen.len() / (2 * most)]).collect();
+    for frame in seen.into_iter().filter(|frame| kept.binary_search(frame).is_err()) {
+        schedule.frames[frame].clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thinned_schedules_keep_frames_evenly_and_all_of_their_pictures() {
+        let of = |frames: usize, most: usize| -> Vec<usize> {
+            let views = |frame: usize| if frame % 2 == 0 { vec![(0, 0), (1, 1)] } else { Vec::new() };
+            let mut schedule = Schedule { cameras: Vec::new(), frames: (0..frames).map(views).collect() };
+            thin(&mut schedule, most);
+            assert!(schedule.frames.iter().all(|views| views.is_empty() || views.len() == 2));
+            (0..frames).filter(|&frame| !schedule.frames[frame].is_empty()).collect()
+        };
+        assert_eq!(of(12, 3), [2, 6, 10]);
+        assert_eq!((of(5, 100), of(5, 0), of(0, 5)), (vec![0, 2, 4], vec![2], vec![]));
+    }
+}

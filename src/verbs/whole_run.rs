@@ -1,0 +1,87 @@
+//! A whole run as a user starts it, from opening the input to a result on the disk, and how close its result is.
+
+use std::fs;
+use std::path::Path;
+
+use super::baseline::prune_by;
+use super::cost::{Cost, Repeats};
+use super::evaluate::{EvaluateOptions, evaluate};
+use super::evaluation::Evaluation;
+use super::method::Means;
+use crate::compress::{Request, Target, compress};
+use crate::emit::atomic::Replace;
+use crate::error::{Error, Result};
+use crate::model::Split;
+use crate::scene::InputOptions;
+use crate::scene::pictures::PictureSet;
+
+/// What all runs that are compared with one another share.
+#[derive(Debug, Clone)]
+pub(super) struct WholeRun<'a> {
+    /// What to read, and the cameras; scored by the training pictures.
+    pub(super) input: &'a InputOptions,
+    /// Folder that does not exist, for results while they are measured.
+    pub(super) scratch: &'a Path,
+    /// The result's name, which says its kind.
+    pub(super) name: &'a str,
+    /// How often it is run.
+    pub(super) repeats: Repeats,
+    /// Compare on at most this many frames, evenly; none: all.
+    pub(super) max_frames: Option<usize>,
+    /// Red, green, blue in [0, 1]; none: as `evaluate`.
+    pub(super) background: Option<[f32; 3]>,
+}
+
+impl WholeRun<'_> {
+    /// Compresses by `means`, measures, and looks at the result by `look` while it is there. Gives what that saw and what
+    /// compressing took.
+    ///
+    /// # Errors
+    /// Those of `compress` and of `look`.
+    pub(super) fn run<T>(
+        &self,
+        means: &Means,
+        target: Option<Target>,
+        look: impl FnOnce(&Path) -> Result<T>,
+    ) -> Result<(T, Cost)> {
+        let input = trained(self.input);
+        let output = self.scratch.join(self.name);
+        let clear = || fs::remove_dir_all(self.scratch).map_err(Error::io("remove", self.scratch));
+        let create = || fs::create_dir(self.scratch).map_err(Error::io("create", self.scratch));
+        let once = || match means {
+            Means::Recipe(recipe, only) => {
+                let run = Request::new(input.clone(), output.clone(), (**recipe).clone());
+                compress(&Request { only: *only, target, ..run }).map(|_| ())
+            }
+            Means::Baseline(baseline) => prune_by(*baseline, &input, target, &output).map(|_| ()),
+        };
+        create()?;
+        let ((), cost) = self.repeats.measure(once, || clear().and_then(|()| create()))?;
+        let seen = look(&output)?;
+        clear()?;
+        Ok((seen, cost))
+    }
+
+    /// A result beside the original, on held-out pictures.
+    ///
+    /// # Errors
+    /// Those of `evaluate`.
+    pub(super) fn compared(&self, result: &Path) -> Result<Evaluation> {
+        evaluate(&EvaluateOptions {
+            original: trained(self.input),
+            compressed: result.to_owned(),
+            ground_truth: None,
+            part: PictureSet::HeldOut,
+            max_frames: self.max_frames,
+            background: self.background,
+            flip: false,
+            csv: None,
+            overwrite: Replace::Never,
+        })
+    }
+}
+
+/// The same input, scored by its training pictures.
+pub(super) fn trained(input: &InputOptions) -> InputOptions {
+    InputOptions { split: Some(Split::Train), ..input.clone() }
+}

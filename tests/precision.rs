@@ -1,0 +1,130 @@
+//! `precision` as a user runs it: what is exact has no error, what converges does so at the rate that theory predicts, and
+//! nothing but the diagrams stays.
+
+mod scene;
+
+use std::fs;
+
+use scene::Workplace;
+use serde_json::Value;
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
+}
+
+/// The curves of a knob.
+fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
+    let knobs = found["knobs"].as_array().unwrap();
+    knobs.iter().find(|of| of["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"].as_array().unwrap()
+}
+
+/// An error of every mark of a curve.
+fn errors(curve: &Value, of: &str) -> Vec<f64> {
+    curve["marks"].as_array().unwrap().iter().map(|mark| mark["errors"][of].as_f64().unwrap()).collect()
+}
+
+fn observed(curve: &Value, of: &str) -> f64 {
+    let orders = curve["orders"].as_array().unwrap();
+    orders.iter().find(|order| order["of"] == of).unwrap()["observed"].as_f64().unwrap()
+}
+
+#[test]
+fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
+    let place = Workplace::new();
+    let demo = "demo -o d --gaussians 1000 --frames 5";
+    place.done(demo);
+    let run = place.run(
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs look,rounds,percentiles,sums --repeat 1 --json",
+    );
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let found = json(&run.stdout);
+    assert_eq!(found, json(&fs::read_to_string(place.path("diagrams/precision.json")).unwrap()));
+    assert_eq!(found["kept"], 300);
+
+    for curve in curves(&found, "look") {
+        for of in ["C", "W", "kept", "staying", "added"] {
+            assert_eq!(errors(curve, of).last(), Some(&0.0), "{of} of {}", curve["name"]);
+        }
+        let of_c = errors(curve, "C");
+        assert!(of_c[0] > 0.0, "{}: nothing is sampled", curve["name"]);
+        let costs = curve["marks"].as_array().unwrap().iter().map(|mark| &mark["cost"]);
+        for cost in costs {
+            let seconds = ["least", "median", "most"].map(|of| cost["seconds"][of].as_f64().unwrap());
+            assert!(seconds.is_sorted() && seconds[0] > 0.0 && cost["runs"] == 1, "{cost}");
+        }
+    }
+    let rounds = curves(&found, "rounds");
+    assert!(errors(&rounds[0], "kept").first() > Some(&0.0), "rounds of fewer pictures rank alike");
+
+    let percentiles = &curves(&found, "percentiles")[0];
+    let of = errors(percentiles, "percentiles");
+    // Half a bucket of 2⁻ᵇⁱᵗˢ at most; the exact ones have no error.
+    for (mark, error) in percentiles["marks"].as_array().unwrap().iter().zip(&of) {
+        assert!(*error <= 0.51 * mark["step"].as_f64().unwrap(), "{mark}");
+    }
+    let order = observed(percentiles, "percentiles");
+    assert!((0.6..1.4).contains(&order), "percentiles converge at order {order}, not 1");
+
+    let [plain, compensated, scan] = &curves(&found, "sums")[..] else { panic!("three ways to sum") };
+    for of in ["D", "kappa"] {
+        let last = |curve| *errors(curve, of).last().unwrap();
+        assert!(last(plain) > 1e-6, "{of}: f32 loses nothing: {}", last(plain));
+        assert!(last(compensated) < 1e-7 && last(scan) < 1e-11, "{of}: {} {}", last(compensated), last(scan));
+        assert!(errors(plain, of).is_sorted(), "{of}: errors of f32 do not grow with frames");
+    }
+
+    let page = fs::read_to_string(place.path("diagrams/precision.html")).unwrap();
+    for words in ["look: error added to pictures", "order of percentiles", "relative L2 error of kappa", "peak memory"]
+    {
+        assert!(page.contains(words), "{words} is missing");
+    }
+    let csv = fs::read_to_string(place.path("diagrams/precision.csv")).unwrap();
+    let marks = found["knobs"].as_array().unwrap().iter().flat_map(|knob| knob["curves"].as_array().unwrap());
+    let lines: usize = marks
+        .flat_map(|curve| curve["marks"].as_array().unwrap())
+        .map(|mark| mark["errors"].as_object().unwrap().len())
+        .sum();
+    assert_eq!(csv.lines().count(), lines + 1);
+    let mut left: Vec<_> =
+        fs::read_dir(place.path("diagrams")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["precision.csv", "precision.html", "precision.json", "summary.json"]);
+}
+
+#[test]
+fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
+    let place = Workplace::new();
+    place.done("demo -o d --gaussians 1500 --frames 4");
+    let found = json(&place.done(
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --target-ratio 0.4 --repeat 1 --json",
+    ));
+    for curve in curves(&found, "machine") {
+        let of = errors(curve, "bytes");
+        assert!(!of.is_empty() && of.iter().all(|&error| error == 0.0), "{curve}");
+    }
+    // Radius 0: pruning alone.
+    let mark = &curves(&found, "merging")[0]["marks"][0];
+    place.done(
+        "compress d/scene.gseq --cameras d/cameras.json -o small.gseq --target-ratio 0.4 --no-refine --prune-only",
+    );
+    let evaluated =
+        json(&place.done("evaluate d/scene.gseq small.gseq --cameras d/cameras.json --max-frames 12 --json"));
+    let [got, expected] = [&mark["psnr"], &evaluated["psnr"]].map(|psnr| psnr.as_f64().unwrap());
+    assert!((got - expected).abs() < 1e-9, "{got} {expected}");
+}
+
+#[test]
+fn what_cannot_be_turned_is_refused_before_anything_is_written() {
+    let place = Workplace::new();
+    place.done("demo -o d --gaussians 300 --frames 3");
+    for (words, expected) in [
+        ("precision d/scene.gseq -o diagrams", "give --cameras"),
+        ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --target-ratio 0", "--target-ratio"),
+        ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs luck", "luck"),
+        ("precision - --cameras d/cameras.json -o diagrams", "pack the stream first"),
+    ] {
+        let run = place.run(words);
+        assert!(run.code == 2 && run.stderr.contains(expected), "{words}: {} {}", run.code, run.stderr);
+        assert!(!place.path("diagrams").exists(), "{words}");
+    }
+}
