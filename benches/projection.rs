@@ -52,7 +52,8 @@ fn projection(c: &mut Criterion) {
     let mut group = c.benchmark_group("scan");
     for (views, changed) in [(16, Columns::POSITION), (1, Columns::all())] {
         let cameras = cameras(views);
-        let schedule = Schedule { cameras: cameras.clone(), frames: vec![(0..views as u32).map(|v| (v, v)).collect()] };
+        let mut schedule = Schedule::new(cameras.clone());
+        schedule.push(1, &(0..views as u32).map(|v| (v, v)).collect::<Vec<_>>());
         let plan = ScanPlan::new(&scan, &[0.0], &schedule).unwrap();
         let seen: Vec<&Camera> = cameras.iter().collect();
         let mut running = BlockScan::new(GAUSSIANS, 0, &plan);

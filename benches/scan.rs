@@ -103,7 +103,8 @@ fn each_tile(reader: &Reader, varying: Columns, mut take: impl FnMut(&[f32])) {
 fn benches(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
-    let schedule = Schedule { cameras: vec![], frames: vec![vec![]; FRAMES] };
+    let mut schedule = Schedule::default();
+    schedule.push(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
@@ -277,7 +278,8 @@ fn drop_cached(path: &Path) {
 fn ways(criterion: &mut Criterion) {
     let recipe = Recipe::preset("default").unwrap().scan;
     let times: Vec<f64> = (0..FRAMES).map(|t| t as f64).collect();
-    let schedule = Schedule { cameras: vec![], frames: vec![vec![]; FRAMES] };
+    let mut schedule = Schedule::default();
+    schedule.push(FRAMES, &[]);
     let plan = ScanPlan::new(&recipe, &times, &schedule).unwrap();
     // Not where temporary files may lie in memory.
     let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();

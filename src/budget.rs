@@ -3,8 +3,8 @@
 //!
 //! A need is a number of bytes per Gaussian and a fixed one, both as sums of named parts; the largest stage counts.
 //! [`Plan::fit`] begins with limits that cost no time and halves the one that frees most, until all stages fit.
-//! A result never depends on the limits. Nothing grows with frames but time stamps, the cameras' pictures and a
-//! byte per tile of a container, which are parts like any other.
+//! A result never depends on the limits. Nothing grows with frames but time stamps, lists of pictures, how many Gaussians
+//! live in each, and a byte per tile of a container, which are parts like any other.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -54,8 +54,15 @@ const PER_THREAD: u64 = 2 << 20;
 const PER_TILE: u64 = 1;
 /// Resident per column and block of Gaussians while a container is opened or written: its last constant tile.
 const PER_SLOT: u64 = 80;
-/// Resident per frame of a container that is written: its time stamp, when it finishes once more as bytes.
+/// Resident per frame of a container that is written: its time stamp, in a list that grows by being copied to twice its length.
 const PER_WRITTEN_FRAME: u64 = 16;
+/// Resident per frame of an open input: its time stamp, as a container has it and as everybody does, and how many Gaussians
+/// live in it.
+const PER_FRAME: u64 = 8 + 8 + 8;
+/// Resident per picture that the cameras name: itself, its name, and three times its place in a schedule.
+const PER_SHOT: u64 = 160 + 3 * 40;
+/// Resident per picture in a list of those to be made.
+const PER_PICTURE: u64 = 24;
 
 /// What the need for memory depends on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -110,8 +117,7 @@ impl Workload {
 
     /// The same as the cameras of `schedule`, of `rig`, see it.
     pub fn seen(self, rig: &Rig, schedule: &Schedule) -> Workload {
-        let views = schedule.frames.iter().map(Vec::len).max().unwrap_or(0);
-        self.seen_by(rig, views as u64, schedule.pairs() as u64)
+        self.seen_by(rig, schedule.most_views() as u64, schedule.pairs() as u64)
     }
 
     fn seen_by(self, rig: &Rig, views: u64, pairs: u64) -> Workload {
@@ -130,15 +136,18 @@ impl Workload {
     }
 
     /// Of a stream of which only the header has arrived, as `rig` will see it once it is packed into tiles of
-    /// `frame_block` frames.
-    pub fn of_stream(header: &StreamHeader, frame_block: usize, rig: &Rig) -> Workload {
+    /// `frame_block` frames, if there prove to be `frames` of them; 0: nobody knows.
+    pub fn of_stream(header: &StreamHeader, frame_block: usize, rig: &Rig, frames: u64) -> Workload {
         let mut times: Vec<f64> = rig.shots.iter().filter_map(|shot| shot.time).collect();
         times.sort_by(f64::total_cmp);
         let together = times.chunk_by(|a, b| a == b).map(<[f64]>::len).max().unwrap_or(0);
-        let views = (together + rig.shots.len() - times.len()) as u64;
+        let timeless = rig.shots.len() - times.len();
+        let views = (together + timeless) as u64;
+        let pairs = if frames > 0 { timeless as u64 * frames + times.len() as u64 } else { 0 };
         let StreamHeader { count, sh_degree, varying } = *header;
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
-        Workload::new(&info, Residence::of_tiles(frame_block as u64)).seen_by(rig, views, 0)
+        let work = Workload { frames, ..Workload::new(&info, Residence::of_tiles(frame_block as u64)) };
+        work.seen_by(rig, views, pairs)
     }
 
     /// Bytes of one Gaussian's columns `of`.
@@ -183,6 +192,11 @@ impl Workload {
         ];
         let of_pictures = pictures * (render::STRIP_BYTES as u64 + 12 * self.pixels);
         (per_gaussian, vec![self.arriving(), ("pictures", of_pictures)])
+    }
+
+    /// A list of so many pictures.
+    pub fn listed(pictures: f64) -> Part {
+        ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }
 
     /// Buffers of a container, or of a frame's file, in the making.
@@ -241,8 +255,7 @@ impl Workload {
                 slots * (PER_SLOT + PER_TILE * self.frames.div_ceil(frames))
             }
         };
-        // Pictures are listed by frame, and while they are gone through once more.
-        index + self.input.fixed + 112 * self.frames + 24 * self.pictures + 160 * self.shots
+        index + self.input.fixed + PER_FRAME * self.frames + PER_SHOT * self.shots
     }
 
     /// What a container knows while it is written.
@@ -326,7 +339,7 @@ impl Plan {
         let plan = Self::closest(work, budget.limit(), needs);
         let fits = plan.excess() == 0;
         match budget.tell {
-            Tell::Plan => eprint!("{}{}", budget.text(), plan.text()),
+            Tell::Plan => eprint!("budget: {}\n{}", budget.named(), plan.text()),
             Tell::Time if fits => eprint!("{}", plan.time()),
             _ => (),
         }
@@ -421,10 +434,11 @@ impl Plan {
         let least = self.peak().div_ceil(1 << 20);
         let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
         Error::usage(format!(
-            "--memory {}{origin}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians\n  \
+            "--memory {}{origin}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians{}\n  \
              give it that, or fewer --threads; --explain shows what takes how much",
             size(self.budget),
-            self.work.gaussians
+            self.work.gaussians,
+            if self.work.frames > 0 { format!(" x {} frames", self.work.frames) } else { String::new() }
         ))
     }
 
@@ -498,7 +512,7 @@ impl Plan {
 
 impl Budget {
     /// Bytes that the run may take.
-    fn limit(self) -> u64 {
+    pub fn limit(self) -> u64 {
         self.bytes.unwrap_or_else(|| Budget::by_default().0)
     }
 
@@ -509,12 +523,12 @@ impl Budget {
     }
 
     /// The budget for a person.
-    fn text(self) -> String {
+    pub fn named(self) -> String {
         match self.bytes {
-            Some(bytes) => format!("budget: {}, as asked for\n", size(bytes)),
+            Some(bytes) => format!("{}, as asked for", size(bytes)),
             None => {
                 let (bytes, origin) = Budget::by_default();
-                format!("budget: {}, {origin}\n", size(bytes))
+                format!("{}, {origin}", size(bytes))
             }
         }
     }

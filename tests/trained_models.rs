@@ -8,7 +8,7 @@ use std::path::Path;
 use scene::{arrays, shared, state, tiny};
 use splatsieve::compress::score::UserOverrides;
 use splatsieve::compress::score_scene;
-use splatsieve::model::{Gaussians, Rows};
+use splatsieve::model::{Gaussians, Rows, Schedule};
 use splatsieve::recipe::{Motion, Recipe};
 
 fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
@@ -80,7 +80,10 @@ fn rows(model: &Path, motion: Motion) -> (Rows, f64) {
     recipe.scan.snap_noise = false;
     let mut scene = scene::scene(model);
     // Motion and opacity do not look at cameras; those of one frame tell that the scene is in view.
-    scene.schedule.frames[1..].iter_mut().for_each(Vec::clear);
+    let first = scene.schedule.views(0).to_vec();
+    scene.schedule = Schedule::new(scene.schedule.cameras.clone());
+    scene.schedule.push(1, &first);
+    scene.schedule.push(scene.source().info().times.len() - 1, &[]);
     let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
     (scored.rows().unwrap().into_owned(), scored.position_ulp)
 }

@@ -18,9 +18,9 @@ use crate::error::Result;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
 use crate::ingest::cameras;
-use crate::model::{Camera, Picture, Rig, Split};
+use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::recipe;
-use crate::scene::{InputOptions, Opened, Scene, load_cameras, open_scene, open_stream, receiving, scene_of};
+use crate::scene::{InputOptions, Opened, Room, Scene, load_cameras, open_scene, open_stream, receiving, scene_of};
 use crate::source::{FrameSource, Reads};
 use crate::stats::{RobustBox, ScanPlan};
 use crate::stream::{HeldFrames, RunningContribution, RunningScan, Sampler};
@@ -60,20 +60,34 @@ fn receive_measured<S: Stages>(
     let count = stream.header().count;
     let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
     let block = frame_block(stream.header());
-    let work = Workload::of_stream(stream.header(), block, &of_rig);
+    let header = *stream.header();
+    let counting = |frames| Workload::of_stream(&header, block, &of_rig, frames);
+    let work = counting(0);
     let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = stages.measure();
     let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
     let held = (block + AHEAD) as u64;
     let fit = |tell: Tell, measuring: Option<bool>| {
         Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
-            let mut all = vec![receiving(work, limits, held, measuring)];
+            let mut all = vec![receiving(work, limits, held, measuring, 0)];
             all.extend(stages.needs(work, limits));
             all
         })
     };
     let measures = fit(Tell::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
+    let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
+        let limits = memory.limits;
+        Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
+    };
+    let mut room = Room::new(options.memory, |budget, frames| {
+        let later = Plan::closest(counting(frames), budget, |work, limits| stages.needs(work, limits));
+        later.peak().max(receive(budget, None, frames))
+    });
+    let to_measure = Room::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
+    if options.memory.tell == Tell::Plan {
+        eprintln!("frames: there is memory for {}, for {to_measure} to be measured as they arrive", room.most);
+    }
     // Without cameras the rig stands around the first frame, and everything else around the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
     if let Some(loaded) = loaded {
@@ -81,6 +95,11 @@ fn receive_measured<S: Stages>(
     }
     let mut measuring: Option<Measuring<'_>> = None;
     let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| {
+        room.admit(held.len())?;
+        if room.arrived() > to_measure {
+            measuring = None;
+            return Ok(());
+        }
         let measuring = match &mut measuring {
             Some(measuring) => measuring,
             none if measures => {
@@ -96,10 +115,15 @@ fn receive_measured<S: Stages>(
     let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
     let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = scene_of(opened, options)?;
-    // Now that the frames are counted; what they add is small, and no reason to throw away what has arrived.
+    // Now that the frames are counted.
     let counted = Budget { tell: Tell::Nothing, ..options.memory };
-    let counted = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits));
-    scene.follow(counted.as_ref().unwrap_or(&memory));
+    scene.keep_to(counted, |work, limits| stages.needs(work, limits))?;
+    if measures && measuring.is_none() && room.arrived() > 0 {
+        let note = format!(
+            "statistics were taken from the packed frames, not as they arrived: there is memory for {to_measure} that way"
+        );
+        scene.notes.push(note);
+    }
     let mut arrived = None;
     if let Some(measuring) = measuring {
         let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
@@ -125,8 +149,8 @@ struct Measuring<'a> {
     plan: &'a ScanPlan,
     cameras: &'a [Camera],
     assumed: AssumedTimes<'a>,
-    /// For every frame its (view number, camera index) pairs, as assumed.
-    frames: Vec<Vec<(u32, u32)>>,
+    /// Which cameras see the frames so far, as assumed.
+    schedule: Schedule,
     scan: RunningScan<'a>,
     seen: Option<(Sampler, RunningContribution)>,
 }
@@ -144,16 +168,15 @@ impl<'a> Measuring<'a> {
             plan,
             cameras: &rig.cameras,
             assumed: AssumedTimes::new(rig, split),
-            frames: Vec::new(),
+            schedule: Schedule::new(rig.cameras.clone()),
             scan: RunningScan::new(count, plan),
             seen: seen.map(|seen| (Sampler::new(scan), seen)),
         }
     }
 
     fn add(&mut self, held: &HeldFrames) -> Result<()> {
-        let first = self.frames.len();
-        self.frames.extend(held.info().times.iter().map(|&time| self.assumed.at(time)));
-        let new = &self.frames[first..];
+        let new: Vec<Vec<(u32, u32)>> = held.info().times.iter().map(|&time| self.assumed.at(time)).collect();
+        new.iter().for_each(|views| self.schedule.push(1, views));
         let cameras: Vec<Vec<&Camera>> =
             new.iter().map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect()).collect();
         self.scan.add(held, &cameras)?;
@@ -170,7 +193,7 @@ impl<'a> Measuring<'a> {
         if !complete.finishes(self.plan) {
             return Some("the frames are not evenly spaced in time");
         }
-        (self.frames != scene.schedule.frames).then_some("the cameras' times are not exactly those of the frames")
+        (self.schedule != scene.schedule).then_some("the cameras' times are not exactly those of the frames")
     }
 
     fn finish(self, complete: &ScanPlan) -> Measured {

@@ -64,7 +64,7 @@ impl Rounds {
         let all = (self.pictures as u64).min(work.pictures);
         let seconds = (0..self.rounds(self.usual) as i32).map(|round| {
             let left = work.count() * self.fraction.powi(round);
-            let pictures = self.pictures_of(1.0, all as usize) / if round == 0 { 1.0 } else { self.turns as f64 };
+            let pictures = all as f64 / if round == 0 { 1.0 } else { self.turns as f64 };
             work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
         });
         // A frame is read in one of the turns.

@@ -31,13 +31,15 @@ impl Scan {
     pub fn need(&self, work: &Workload, _: &Limits) -> Need {
         // In stages a second reader decodes while the first is read.
         let block = stats::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::all());
+        // How many live in each, in the blocks of all threads; the steps between uneven ones.
+        let frames = work.frames * (4 * work.threads + 8);
         Need {
             stage: NAME,
             reads: 1.0,
             seconds: work.count() * work.frames as f64 * (ACCUMULATING + work.views as f64 * PROJECTING)
                 + work.reading(work.count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
-            fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving()],
+            fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving(), ("frames", frames)],
         }
     }
 

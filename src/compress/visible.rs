@@ -32,7 +32,7 @@ impl Visible {
 
     /// The rows scanned so far, C and W, and pictures in the making.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
-        let (mut per_gaussian, fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
+        let (mut per_gaussian, mut fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
         let strided = work.pictures as f64 / every;
         let most = match self.recipe.look_pictures {
@@ -43,6 +43,11 @@ impl Visible {
         let frames = if strided > most { frames.min(most as u64) } else { frames };
         let rows = Rows::BYTES_PER_GAUSSIAN + Statistic::C.bytes() + Statistic::W.bytes();
         per_gaussian.insert(0, ("rows", rows as u64));
+        fixed.push(Workload::listed(strided.min(most)));
+        if every > 1.0 {
+            // What strides leave of a schedule is another list for each frame.
+            fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
+        }
         let seconds = work.reading(work.count(), frames as f64) + work.picturing(strided.min(most), work.count(), LOOK);
         Need { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
     }

@@ -1,7 +1,7 @@
 //! A frame stream (format/STREAM.md) as a family: packed into a container as it arrives, then read from that.
 //!
 //! Memory, with b the bytes of one Gaussian's varying columns: frames held N·b·F, at most 64 MiB or one frame;
-//! two more on their way in; the constant columns. A thread reads ahead while the frames before are encoded.
+//! two more on their way in; the constant columns; 24 bytes per frame that has arrived. A thread reads ahead while the frames before are encoded.
 
 use std::collections::BTreeMap;
 use std::io::Read;

@@ -4,13 +4,17 @@ mod camera;
 mod gaussians;
 mod gradients;
 mod jacobian;
+mod rig;
 mod rows;
+mod schedule;
 
-pub use camera::{Camera, Picture, Rig, Schedule, Shot, Split};
+pub use camera::Camera;
 pub use gaussians::{Column, Columns, Gaussians};
 pub use gradients::{GradientSpan, Gradients};
 pub use jacobian::Jacobian;
+pub use rig::{Rig, Shot, Split};
 pub use rows::{Flags, Rows, Statistic, Values};
+pub use schedule::{Picture, Schedule};
 
 /// Zeroth spherical-harmonic basis constant: colour = 0.5 + SH_C0 · f_dc.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;

@@ -18,7 +18,7 @@ use crate::source::{FrameSource, Reads};
 
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
-pub use stream::{check_memory, open_stream, receiving};
+pub use stream::{Room, open_stream, receiving, room_to_pack};
 
 /// An input with the cameras that look at it.
 pub struct Scene {

@@ -26,7 +26,8 @@ pub enum PictureSet {
 /// only splits of one numbering can.
 pub fn pictures(rig: &Rig, frame_times: &[f64], part: PictureSet) -> Result<Vec<Picture>> {
     let mut found = Vec::new();
-    for (frame, mut views) in rig.schedule(frame_times, part.split(rig))?.frames.into_iter().enumerate() {
+    for (frame, views) in rig.schedule(frame_times, part.split(rig))?.iter().enumerate() {
+        let mut views = views.to_vec();
         views.sort_by_key(|&(view, _)| view);
         // Train and test files may both list a picture.
         views.dedup();
@@ -105,7 +106,11 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
             ("held", models * work.held(limits, Columns::all())),
             ("pictures", pictures * PICTURE_ON_ALL_THREADS),
         ],
-        fixed: vec![work.arriving(), ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels))],
+        fixed: vec![
+            work.arriving(),
+            ("pictures", pictures * (render::STRIP_BYTES as u64 + pixel * work.pixels)),
+            Workload::listed(work.pictures as f64),
+        ],
     }
 }
 

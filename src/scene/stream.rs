@@ -4,7 +4,7 @@ use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
 use super::input::{InputOptions, Opened, load_cameras};
-use crate::budget::{Need, Plan, Workload};
+use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
@@ -39,31 +39,87 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
     let rig = load_cameras(options, options.cameras.as_deref())?;
     let stream = open_stream(options)?;
-    check_memory(options, stream.header())?;
-    let streamed = Streamed::receive(stream, &options.scratch_folder(), |_| Ok(()))?;
+    let mut room = room_to_pack(options, stream.header())?;
+    let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| room.admit(held.len()))?;
     Ok(Opened { input: Box::new(streamed), rig, notes: Vec::new() })
 }
 
-/// Confirms that there is memory to pack a stream.
+/// The memory there is to pack a stream.
 ///
 /// # Errors
 /// A budget that does not hold the frames that are packed together.
-pub fn check_memory(options: &InputOptions, header: &StreamHeader) -> Result<()> {
+pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Room> {
     let block = frame_block(header);
     let held = (block + AHEAD) as u64;
     let nobody = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
-    let work = Workload::of_stream(header, block, &nobody);
-    Plan::fit(work, options.memory, |work, limits| vec![receiving(work, limits, held, None)])?;
-    Ok(())
+    let work = |frames| Workload::of_stream(header, block, &nobody, frames);
+    let receive = |frames| move |work: &Workload, limits: &Limits| vec![receiving(work, limits, held, None, frames)];
+    Plan::fit(work(0), options.memory, receive(0))?;
+    Ok(Room::new(options.memory, |budget, frames| {
+        let packed = Plan::closest(work(frames), budget, |_, _| Vec::new()).peak();
+        packed.max(Plan::closest(work(0), budget, receive(frames)).peak())
+    }))
 }
 
-/// What it takes to pack a stream of which `held` frames are in memory together, and to scan it on the way unless
-/// `measuring` is none; if it says so, to look at pictures too.
-pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<bool>) -> Need {
+/// The frames of a stream that there is memory for: how many will come nobody knows when it begins.
+#[derive(Debug)]
+pub struct Room {
+    /// Frames that have come.
+    arrived: u64,
+    /// Frames that there is memory for.
+    pub most: u64,
+    /// What to do about it if more come.
+    hint: String,
+    budget: Budget,
+}
+
+impl Room {
+    /// What `budget` has room for; `peak` says how much memory a run within a budget takes for so many frames.
+    pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> Room {
+        let bytes = budget.limit();
+        // A stream has fewer than 2^32 frames.
+        let most = (0..32).rev().fold(0, |most, bit| {
+            let more = most | 1 << bit;
+            if peak(bytes, more) <= bytes { more } else { most }
+        });
+        let enough = (2 * most).max(1000);
+        let least = peak(0, enough).div_ceil(1 << 20);
+        let hint = format!("give it --memory {least}MiB, which is enough for {enough}, or send fewer frames");
+        Room { arrived: 0, most, hint, budget }
+    }
+
+    /// Lets `frames` more frames in.
+    ///
+    /// # Errors
+    /// More than there is memory for.
+    pub fn admit(&mut self, frames: usize) -> Result<()> {
+        self.arrived += frames as u64;
+        if self.arrived <= self.most {
+            return Ok(());
+        }
+        let expected = format!("at most {} frames, for which there is memory ({})", self.most, self.budget.named());
+        let found = format!("{} frames, and the stream goes on", self.arrived);
+        Err(Error::input(Path::new(STANDARD_INPUT), format!("frame {}", self.most), expected, found).hint(&self.hint))
+    }
+
+    /// Frames that have come.
+    pub fn arrived(&self) -> u64 {
+        self.arrived
+    }
+}
+
+/// Resident per frame while a stream is packed: its time stamp and, if it is scanned, how many Gaussians live in it, in lists
+/// that grow by being copied to twice their length.
+const PER_FRAME: u64 = 2 * (8 + 4);
+
+/// What it takes to pack a stream of which `held` frames are in memory together and `frames` come in all, and to scan it on
+/// the way unless `measuring` is none; if it says so, to look at pictures too.
+pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<bool>, frames: u64) -> Need {
     let whole = work.state(Columns::all());
     let mut per_gaussian =
         vec![("frames", held * work.state(work.varying)), ("constant columns", whole - work.state(work.varying))];
     let mut fixed = work.writing();
+    fixed.push(("times", PER_FRAME * frames));
     if let Some(visible) = measuring {
         per_gaussian.push(("accumulators", stats::BYTES_PER_GAUSSIAN as u64));
         fixed.push(("blocks", work.threads * BLOCK as u64 * whole));

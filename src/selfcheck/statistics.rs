@@ -136,7 +136,8 @@ pub(super) fn projected_area() -> Case {
     Case::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
         let frames = wanderers(500, 3);
         let cameras = vec![camera(320, 256), camera(40, 300)];
-        let schedule = Schedule { cameras, frames: vec![vec![(0, 0), (1, 1)]; frames.len()] };
+        let mut schedule = Schedule::new(cameras);
+        schedule.push(frames.len(), &[(0, 0), (1, 1)]);
         let recipe = recipe(Motion::Runs)?;
         let got = scan(&frames, &schedule, &recipe)?;
         let mut worst = Worst::default();
@@ -166,7 +167,8 @@ pub(super) fn needle_on_screen() -> Case {
             rotation: DMat3::IDENTITY,
             translation: DVec3::ZERO,
         };
-        let schedule = Schedule { cameras: vec![camera], frames: vec![vec![(0, 0)]] };
+        let mut schedule = Schedule::new(vec![camera]);
+        schedule.push(1, &[(0, 0)]);
         let mut worst = Worst::default();
         for (turn, length) in [(0.1f32, 1e2f64), (0.4, 1e3), (0.9, 1e4), (1.3, 1e5)] {
             let mut frame = resting(1);
@@ -259,7 +261,9 @@ fn recipe(motion: Motion) -> Result<Scan> {
 }
 
 fn unseen(frames: usize) -> Schedule {
-    Schedule { cameras: Vec::new(), frames: vec![Vec::new(); frames] }
+    let mut schedule = Schedule::default();
+    schedule.push(frames, &[]);
+    schedule
 }
 
 /// The rows of evenly spaced frames.
@@ -272,7 +276,7 @@ fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows
 fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
-    for (t, (frame, views)) in frames.iter().zip(&schedule.frames).enumerate() {
+    for (t, (frame, views)) in frames.iter().zip(schedule.iter()).enumerate() {
         let cameras: Vec<&Camera> = views.iter().map(|&(_, camera)| &schedule.cameras[camera as usize]).collect();
         let stays = t > 0 && frame.opacity_logit == frames[t - 1].opacity_logit;
         let changed = if stays { Columns::all().difference(Columns::OPACITY) } else { Columns::all() };

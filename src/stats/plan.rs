@@ -54,10 +54,10 @@ impl ScanPlan {
                 times[t]
             )));
         }
-        if schedule.frames.len() != times.len() {
+        if schedule.frames() != times.len() {
             return Err(Error::usage(format!(
                 "the cameras are scheduled for {} frames, the sequence has {}",
-                schedule.frames.len(),
+                schedule.frames(),
                 times.len()
             )));
         }
@@ -123,8 +123,8 @@ impl ScanPlan {
 fn uneven_steps(times: &[f64]) -> Vec<f64> {
     let [first, .., last] = times else { return Vec::new() };
     let mean = (last - first) / (times.len() - 1) as f64;
-    let steps: Vec<f64> = std::iter::once(1.0).chain(times.windows(2).map(|pair| (pair[1] - pair[0]) / mean)).collect();
-    if steps.iter().all(|step| (step - 1.0).abs() <= EVEN_TOLERANCE) { Vec::new() } else { steps }
+    let steps = || std::iter::once(1.0).chain(times.windows(2).map(|pair| (pair[1] - pair[0]) / mean));
+    if steps().all(|step| (step - 1.0).abs() <= EVEN_TOLERANCE) { Vec::new() } else { steps().collect() }
 }
 
 /// Largest e for which one contribution of `image_px`, times 2ᵉ, fits. It must not depend on the number of
@@ -139,7 +139,8 @@ mod tests {
     use crate::recipe::Recipe;
 
     fn plan(times: &[f64]) -> Result<ScanPlan> {
-        let schedule = Schedule { cameras: vec![], frames: vec![vec![]; times.len()] };
+        let mut schedule = Schedule::default();
+        schedule.push(times.len(), &[]);
         ScanPlan::new(&Recipe::preset("default").unwrap().scan, times, &schedule)
     }
 

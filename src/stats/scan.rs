@@ -251,7 +251,8 @@ mod tests {
             let cases: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
             for opacities in cases {
                 let times: Vec<f64> = (0..opacities.len()).map(|t| t as f64 + f64::from(t > 4)).collect();
-                let schedule = Schedule { cameras: vec![], frames: vec![vec![]; times.len()] };
+                let mut schedule = Schedule::default();
+                schedule.push(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut all, mut named] = [BlockScan::new(77, 0, &plan), BlockScan::new(77, 0, &plan)];
                 for (t, &of) in opacities.iter().enumerate() {
@@ -275,7 +276,8 @@ mod tests {
         for motion in [Motion::Literal, Motion::Runs] {
             for times in [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 1.5, 4.0, 4.5]] {
                 let scan = Scan { motion, ..Recipe::preset("default").unwrap().scan };
-                let schedule = Schedule { cameras: vec![], frames: vec![vec![]; times.len()] };
+                let mut schedule = Schedule::default();
+                schedule.push(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();
                 let [mut wide, mut baseline] = [BlockScan::new(LEN, 0, &plan), BlockScan::new(LEN, 0, &plan)];
                 for t in 0..times.len() {

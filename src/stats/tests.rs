@@ -39,7 +39,9 @@ fn camera(seed: u64) -> Camera {
 
 fn schedule(frames: usize, views: u32) -> Schedule {
     let cameras: Vec<Camera> = (0..views.into()).map(camera).collect();
-    Schedule { cameras, frames: vec![(0..views).map(|v| (v, v)).collect(); frames] }
+    let mut schedule = Schedule::new(cameras);
+    schedule.push(frames, &(0..views).map(|v| (v, v)).collect::<Vec<_>>());
+    schedule
 }
 
 /// N wandering Gaussians; about a third of their frames are dead.
@@ -69,7 +71,7 @@ fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, scan: &Scan
     let plan = ScanPlan::new(scan, times, schedule).unwrap();
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
-        let cameras: Vec<&Camera> = schedule.frames[t].iter().map(|&(_, c)| &schedule.cameras[c as usize]).collect();
+        let cameras: Vec<&Camera> = schedule.views(t).iter().map(|&(_, c)| &schedule.cameras[c as usize]).collect();
         block.frame(t, frame, &cameras, Columns::all());
     }
     block.finish()
@@ -307,7 +309,8 @@ fn needle_keeps_the_digits_of_its_area() {
     let turn = DQuat::from_rotation_arc(DVec3::X, along);
     g.rotation.set_row(0, [turn.w, turn.x, turn.y, turn.z].map(|x| x as f32));
     g.log_scale.set_row(0, [f64::ln(length) as f32, -30.0, -30.0]);
-    let schedule = Schedule { cameras: vec![camera.clone()], frames: vec![vec![(0, 0)]] };
+    let mut schedule = Schedule::new(vec![camera.clone()]);
+    schedule.push(1, &[(0, 0)]);
     let area = 2.0 * scan(std::slice::from_ref(&g), &schedule, &recipe(Motion::Runs)).rows.c[0];
     // A diagonal line: det = 0.3·(Σ_xx + Σ_yy − 0.3), clipped to the picture's share of its box.
     let (sx, sy) = (250.0 * length / depth / 2f64.sqrt(), 260.0 * length / depth / 2f64.sqrt());
@@ -361,7 +364,8 @@ fn coverage_of_very_many_pictures_is_that_of_one() {
     // Far more contributions than a 64-bit sum in fixed point holds; the mean of equal ones is any of them.
     let (mut frames, one) = (wanderers(40, 1, 3), schedule(1, 1));
     frames[0].log_scale.planes_mut().fill(2.0);
-    let many = Schedule { frames: vec![vec![(0, 0); 300_000]], ..one.clone() };
+    let mut many = Schedule::new(one.cameras.clone());
+    many.push(1, &[(0, 0); 300_000]);
     let [one, many] = [one, many].map(|schedule| scan(&frames, &schedule, &recipe(Motion::Runs)).rows);
     assert!(one.c.iter().filter(|&&c| c * 300_000.0 > 2f64.powi(64 - 34)).count() > 10, "the case must overflow");
     for i in 0..40 {

@@ -5,14 +5,15 @@ use std::sync::{Mutex, PoisonError};
 
 use super::{BLOCK, Progress};
 use crate::error::Result;
-use crate::model::{Camera, Columns, Gaussians, Rows};
+use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::stats::{BlockScan, ScanPlan};
 
 /// What the scans of all blocks share.
 pub(super) struct BlockScans<'a> {
     pub(super) source: &'a dyn FrameSource,
-    pub(super) cameras: Vec<Vec<&'a Camera>>,
+    /// Cameras, frame by frame.
+    pub(super) schedule: &'a Schedule,
     pub(super) plan: &'a ScanPlan,
     pub(super) progress: Progress,
     /// Living Gaussians in each frame. Sums of integers: the order in which blocks finish does not show.
@@ -51,10 +52,14 @@ impl<'a> BlockScans<'a> {
         frames: Range<usize>,
         reader: &mut dyn BlockReader,
     ) -> Result<()> {
+        let mut cameras: Vec<&Camera> = Vec::new();
         for frame in frames {
             let changed = self.changed(frame);
             reader.read(frame, changed, state)?;
-            scan.frame(frame, state, &self.cameras[frame], changed);
+            cameras.clear();
+            cameras
+                .extend(self.schedule.views(frame).iter().map(|&(_, camera)| &self.schedule.cameras[camera as usize]));
+            scan.frame(frame, state, &cameras, changed);
             self.progress.advance(state.len() as u64);
         }
         Ok(())

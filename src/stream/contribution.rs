@@ -130,7 +130,7 @@ mod tests {
             for (turn, t) in (0..7).step_by(frame as usize).enumerate() {
                 let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
                 scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::all(), &mut state).unwrap();
-                for &(_, camera) in schedule.frames[t].iter().skip(turn % view as usize).step_by(view as usize) {
+                for &(_, camera) in schedule.views(t).iter().skip(turn % view as usize).step_by(view as usize) {
                     let camera = &schedule.cameras[camera as usize];
                     render::contribution(&state, camera, scan.pixel_stride, &mut plain);
                     pictures += 1;
@@ -172,8 +172,10 @@ mod tests {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let views = |from: u32, to: u32| (from..to).map(|view| (view, view)).collect::<Vec<_>>();
         // The first frame has no picture in this split.
-        let frames = vec![vec![], views(0, 3), views(0, 3), vec![], views(0, 3), views(0, 3)];
-        let schedule = Schedule { cameras: (0..3).map(|_| camera.clone()).collect(), frames };
+        let mut schedule = Schedule::new((0..3).map(|_| camera.clone()).collect());
+        for (count, seen) in [(1, views(0, 0)), (2, views(0, 3)), (1, views(0, 0)), (2, views(0, 3))] {
+            schedule.push(count, &seen);
+        }
         let taken = |view, frame| -> Vec<(usize, u32)> {
             let sample = looked_at(&schedule, &strides(1, view, frame), 1);
             sample.iter().map(|picture| (picture.frame, picture.camera)).collect()
@@ -264,7 +266,8 @@ mod tests {
     #[test]
     fn nothing_to_see_gives_zeros() {
         let scene = Scene::new(300, 2);
-        let schedule = Schedule { cameras: Vec::new(), frames: vec![Vec::new(); 2] };
+        let mut schedule = Schedule::default();
+        schedule.push(2, &[]);
         let look = |source: &dyn FrameSource, schedule: &Schedule| {
             let sample = looked_at(schedule, &strides(1, 1, 1), 1);
             visible_contribution(source, (&schedule.cameras, &sample), NonZeroU32::MIN, Limits::NONE).unwrap()

@@ -52,7 +52,7 @@ mod tests {
         let ids: Vec<u32> = (0..2500).filter(|id| id % 3 != 1).collect();
         let background = [0.1, 0.2, 0.3];
         let mut plain = RemovalError::new(ids.len(), 0.1);
-        for (t, views) in schedule.frames.iter().enumerate() {
+        for (t, views) in schedule.iter().enumerate() {
             let state = gather(&scene, &ids, t, Columns::all()).unwrap();
             for &(_, camera) in views {
                 Renderer::new().removal_error(&state, &schedule.cameras[camera as usize], background, &mut plain);

@@ -37,21 +37,29 @@ impl Sampler {
         taken.map(move |&(view, camera)| Picture { frame, view, camera })
     }
 
-    fn all(mut self, schedule: &Schedule) -> Vec<Picture> {
-        schedule.frames.iter().enumerate().flat_map(|(frame, views)| self.next(frame, views)).collect()
+    /// What is left of `schedule`.
+    fn thin(mut self, schedule: &Schedule) -> Schedule {
+        let mut left = Schedule::default();
+        for (frame, views) in schedule.iter().enumerate() {
+            let taken: Vec<(u32, u32)> =
+                self.next(frame, views).map(|picture| (picture.view, picture.camera)).collect();
+            left.push(1, &taken);
+        }
+        left
     }
 }
 
 /// The pictures of `schedule` that `scan` looks at: those that its strides leave (see [`Sampler`]), or as many of these as it
 /// looks at most, spread over `frames` frames or more, see [`spread_over`].
 pub fn looked_at(schedule: &Schedule, scan: &recipe::Scan, frames: usize) -> Vec<Picture> {
-    let strided = Sampler::new(scan).all(schedule);
-    if scan.look_pictures == 0 || strided.len() <= scan.look_pictures {
-        return strided;
+    let left = Sampler::new(scan).thin(schedule);
+    if scan.look_pictures == 0 || left.pairs() <= scan.look_pictures {
+        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<Picture> {
+            views.iter().map(|&(view, camera)| Picture { frame, view, camera }).collect()
+        };
+        return left.iter().enumerate().flat_map(of_frame).collect();
     }
-    let mut left = vec![Vec::new(); schedule.frames.len()];
-    strided.iter().for_each(|picture| left[picture.frame].push((picture.view, picture.camera)));
-    spread_over(&Schedule { cameras: Vec::new(), frames: left }, scan.look_pictures, frames)
+    spread_over(&left, scan.look_pictures, frames)
 }
 
 /// How many frames, evenly spaced, it takes for all but a hundredth of those that ever live to live in one of them, if they
@@ -75,14 +83,15 @@ pub fn spread_over(schedule: &Schedule, pictures: usize, frames: usize) -> Vec<P
 /// At most `pictures` pictures, spread evenly over all frames and views, of no more frames than it takes to have
 /// `views` of each (see [`VIEWS_AT_ONCE`]); all there are, if they are no more.
 pub fn spread(schedule: &Schedule, pictures: usize, views: usize) -> Vec<Picture> {
-    let seen: Vec<usize> = (0..schedule.frames.len()).filter(|&frame| !schedule.frames[frame].is_empty()).collect();
+    let seen = schedule.iter().filter(|views| !views.is_empty()).count();
     let pictures = pictures.min(schedule.pairs());
-    let of_frame = schedule.pairs().div_ceil(seen.len().max(1)).clamp(1, views.max(1));
-    let count = seen.len().min(pictures.div_ceil(of_frame));
+    let of_frame = schedule.pairs().div_ceil(seen.max(1)).clamp(1, views.max(1));
+    let count = seen.min(pictures.div_ceil(of_frame));
     let mut found = Vec::with_capacity(pictures);
+    let mut frames = schedule.iter().enumerate().filter(|(_, views)| !views.is_empty()).enumerate();
     for k in 0..count {
-        let frame = seen[(2 * k + 1) * seen.len() / (2 * count)];
-        let views = &schedule.frames[frame];
+        let wanted = (2 * k + 1) * seen / (2 * count);
+        let Some((_, (frame, views))) = frames.find(|&(place, _)| place == wanted) else { break };
         let wanted = (pictures * (k + 1) / count - pictures * k / count).min(views.len());
         // From the view after the last one of the frame before, so that all take their turns.
         let first = found.len();
@@ -102,7 +111,9 @@ mod tests {
     fn schedule(frames: usize, views: u32) -> Schedule {
         let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
         let of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, view)).collect();
-        Schedule { cameras: vec![camera; views as usize], frames: vec![of_frame; frames] }
+        let mut schedule = Schedule::new(vec![camera; views as usize]);
+        schedule.push(frames, &of_frame);
+        schedule
     }
 
     fn frames(pictures: &[Picture]) -> usize {

@@ -31,13 +31,8 @@ pub struct Scanned {
 pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
     let info = source.info();
     let frames = info.times.len();
-    let cameras: Vec<Vec<&Camera>> = schedule
-        .frames
-        .iter()
-        .map(|views| views.iter().map(|&(_, camera)| &schedule.cameras[camera as usize]).collect())
-        .collect();
     let progress = Progress::new("scan", "Gaussian frames", info.count as u64 * frames as u64);
-    let scan = BlockScans { source, cameras, plan, progress, alive: Mutex::new(vec![0; frames]) };
+    let scan = BlockScans { source, schedule, plan, progress, alive: Mutex::new(vec![0; frames]) };
     let blocks = match source.ahead() {
         Some(ahead) if frames > 0 => stages::scan_in_stages(&scan, ahead)?,
         _ => (0..scan.blocks()).into_par_iter().map(|block| scan.block(block)).collect::<Result<_>>()?,

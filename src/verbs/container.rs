@@ -25,7 +25,7 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::Limits;
 use crate::model::Columns;
-use crate::scene::{InputOptions, Opened, check_memory, first_box, open_input, open_stream};
+use crate::scene::{InputOptions, Opened, first_box, open_input, open_stream, room_to_pack};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
 
@@ -78,8 +78,8 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
         })?;
         let staged = StagedFile::new(output, overwrite)?;
         let stream = open_stream(input)?;
-        check_memory(input, stream.header())?;
-        let received = pack_stream(stream, staged.path(), packing, |_| Ok(()))?;
+        let mut room = room_to_pack(input, stream.header())?;
+        let received = pack_stream(stream, staged.path(), packing, |held| room.admit(held.len()))?;
         let container = Container::open(staged.path())?;
         let (gaussians, frames) = (container.info().count, container.info().times.len());
         let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();

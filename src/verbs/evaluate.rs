@@ -73,6 +73,7 @@ pub fn needs(work: &Workload, limits: &Limits) -> Vec<Need> {
     // Both models' and the photograph, and what they are compared with.
     let mut need = pictures::need(work, limits, "evaluate", 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
+    need.fixed.push(("scores", size_of::<PictureScores>() as u64 * work.pictures));
     need.fixed.push(("pictures before", 3 * 12 * work.viewpoints * work.pixels));
     vec![need]
 }

@@ -433,7 +433,7 @@ mod tests {
     fn held_out(scene: &Scene, rig: &Rig, reduction: &Reduction) -> f64 {
         let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
         let result = scene.input.reduced(reduction).unwrap();
-        let of_frame = |(frame, views): (usize, &Vec<(u32, u32)>)| -> f64 {
+        let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> f64 {
             let [original, now] =
                 [scene.source(), &*result].map(|source| gather_all(source, frame, Columns::all()).unwrap());
             let of_view = |&(_, camera): &(u32, u32)| {
@@ -442,7 +442,7 @@ mod tests {
             };
             views.iter().map(of_view).sum()
         };
-        schedule.frames.iter().enumerate().map(of_frame).sum::<f64>() / schedule.pairs() as f64
+        schedule.iter().enumerate().map(of_frame).sum::<f64>() / schedule.pairs() as f64
     }
 
     #[test]

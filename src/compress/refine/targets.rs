@@ -100,9 +100,7 @@ impl Targets {
 fn looked_at(scene: &Scene, most: usize) -> (Vec<Camera>, Vec<Picture>) {
     let [own, more] = numbers(most, scene.workload().pixels);
     let mut pictures = spread(&scene.schedule, own, VIEWS_AT_ONCE);
-    let mut used: Vec<u32> = scene.schedule.frames.iter().flatten().map(|&(_, camera)| camera).collect();
-    used.sort_unstable();
-    used.dedup();
+    let used = scene.schedule.used();
     let mut cameras: Vec<Camera> = used.iter().map(|&camera| scene.schedule.cameras[camera as usize].clone()).collect();
     for picture in &mut pictures {
         picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;

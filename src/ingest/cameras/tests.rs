@@ -96,7 +96,7 @@ fn transforms_and_cameras_json_of_the_trained_models_give_the_same_cameras() {
             let times = rig.times();
             assert_eq!(times.len(), 60);
             let schedule = rig.schedule(&times, None).unwrap();
-            assert!(schedule.frames.iter().all(|frame| frame.len() == 16));
+            assert!(schedule.iter().all(|views| views.len() == 16));
         }
         assert!(transforms.background.is_none() && cameras.background.is_some());
         for shot in &cameras.shots {
@@ -252,7 +252,8 @@ fn dynerf_poses_are_used_at_half_size_with_camera_0_held_out() {
     assert_eq!(camera.rotation * DVec3::Y, DVec3::Z, "+y is forward");
     assert_eq!(camera.rotation * DVec3::Z, DVec3::NEG_Y, "+z is up");
     assert_eq!(rig.times(), [0.0, 0.25, 0.5, 0.75]);
-    assert_eq!(rig.schedule(&rig.times(), Some(Split::Test)).unwrap().frames, vec![vec![(0, 0)]; 4]);
+    let held_out = rig.schedule(&rig.times(), Some(Split::Test)).unwrap();
+    assert_eq!(held_out.iter().collect::<Vec<_>>(), [[(0, 0)]; 4]);
     let default = load(folder.path(), &CameraOptions { size: Some((676, 507)), frames: None }).unwrap();
     assert_eq!((default.times().len(), default.cameras[0].fx), (300, 350.0));
     assert!(default.origin.contains("300 frames"));

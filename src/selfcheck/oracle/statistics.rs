@@ -42,7 +42,7 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Sc
     let deviations: Vec<f64> = lived.iter().map(|a| (a - mean(&lived)).powi(2)).collect();
 
     let (mut c, mut touched) = (0.0, 0);
-    for (t, views) in schedule.frames.iter().enumerate() {
+    for (t, views) in schedule.iter().enumerate() {
         for &(_, camera) in views {
             let area = area(&frames[t], i, &schedule.cameras[camera as usize]);
             c += area * alpha[t];

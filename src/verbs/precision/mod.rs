@@ -170,8 +170,8 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
         needs
     })?;
     let mut notes = scene.notes.clone();
-    thin(&mut scene.schedule, options.max_frames);
-    let looked_at = scene.schedule.frames.iter().filter(|views| !views.is_empty()).count();
+    scene.schedule = thin(&scene.schedule, options.max_frames);
+    let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
     if scene.rig.shots.iter().all(|shot| shot.split != Split::Test) {
         notes.push("no pictures are held out: those judged by are also looked at".to_owned());
     }
@@ -251,14 +251,17 @@ impl Bench<'_> {
     }
 }
 
-/// Leaves the pictures of at most `most` (at least one) of the frames that have some, evenly from first to last.
-fn thin(schedule: &mut Schedule, most: usize) {
-    let seen: Vec<usize> = (0..schedule.frames.len()).filter(|&frame| !schedule.frames[frame].is_empty()).collect();
+/// The same with the pictures of at most `most` (at least one) of the frames that have some, evenly from first to last.
+fn thin(schedule: &Schedule, most: usize) -> Schedule {
+    let seen: Vec<usize> =
+        schedule.iter().enumerate().filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect();
     let most = most.clamp(1, seen.len().max(1));
     let kept: Vec<usize> = (0..most.min(seen.len())).map(|k| seen[(2 * k + 1) * seen.len() / (2 * most)]).collect();
-    for frame in seen.into_iter().filter(|frame| kept.binary_search(frame).is_err()) {
-        schedule.frames[frame].clear();
+    let mut thinned = Schedule::new(schedule.cameras.clone());
+    for (frame, views) in schedule.iter().enumerate() {
+        thinned.push(1, if kept.binary_search(&frame).is_ok() { views } else { &[] });
     }
+    thinned
 }
 
 #[cfg(test)]
@@ -268,11 +271,14 @@ mod tests {
     #[test]
     fn thinned_schedules_keep_frames_evenly_and_all_of_their_pictures() {
         let of = |frames: usize, most: usize| -> Vec<usize> {
-            let views = |frame: usize| if frame % 2 == 0 { vec![(0, 0), (1, 1)] } else { Vec::new() };
-            let mut schedule = Schedule { cameras: Vec::new(), frames: (0..frames).map(views).collect() };
-            thin(&mut schedule, most);
-            assert!(schedule.frames.iter().all(|views| views.is_empty() || views.len() == 2));
-            (0..frames).filter(|&frame| !schedule.frames[frame].is_empty()).collect()
+            let mut schedule = Schedule::default();
+            for frame in 0..frames {
+                schedule.push(1, if frame % 2 == 0 { &[(0, 0), (1, 1)] } else { &[] });
+            }
+            let thinned = thin(&schedule, most);
+            assert_eq!(thinned.frames(), frames);
+            assert!(thinned.iter().all(|views| views.is_empty() || views.len() == 2));
+            thinned.iter().enumerate().filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect()
         };
         assert_eq!(of(12, 3), [2, 6, 10]);
         assert_eq!((of(5, 100), of(5, 0), of(0, 5)), (vec![0, 2, 4], vec![2], vec![]));

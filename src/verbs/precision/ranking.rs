@@ -73,8 +73,8 @@ impl Bench<'_> {
             &finest,
             Some(own).filter(|&own| own < all).unwrap_or(all) as f64,
         )?);
-        let seen = self.scene.schedule.frames.iter().filter(|views| !views.is_empty()).count();
-        let views = self.scene.schedule.frames.iter().map(Vec::len).max().unwrap_or(0);
+        let seen = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
+        let views = self.scene.schedule.most_views();
         type Set = fn(&mut Recipe, NonZeroU32);
         let strides: [(&str, usize, Set); 3] = [
             ("pixel_stride", usize::MAX, |recipe, stride| recipe.scan.pixel_stride = stride),

@@ -206,7 +206,8 @@ fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> Statistics 
 /// The same by the scan itself, of Gaussians that all count as living.
 fn scanned(states: &[Gaussians], played: usize, changed: Columns) -> Result<Statistics> {
     let times: Vec<f64> = (0..played).map(|k| k as f64).collect();
-    let schedule = Schedule { cameras: Vec::new(), frames: vec![Vec::new(); played] };
+    let mut schedule = Schedule::default();
+    schedule.push(played, &[]);
     let scan = recipe::Scan { alpha_min: 0.0, motion: Motion::Runs, ..Recipe::preset("default")?.scan };
     let plan = ScanPlan::new(&scan, &times, &schedule)?;
     let mut block = BlockScan::new(states.first().map_or(0, Gaussians::len), 0, &plan);
