@@ -154,7 +154,7 @@ fn extent(position: &Column) -> f64 {
 fn neighbours(criterion: &mut Criterion) {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let mut cases: Vec<(String, Column, f64)> = Vec::new();
-    if let Some(folder) = models::folder() {
+    if let Some(folder) = models::found() {
         for name in models::NAMES {
             let model = models::Model::open(&folder, name);
             let position = model.state(model.frames()[0]).position;

@@ -96,7 +96,7 @@ fn pictures(criterion: &mut Criterion) {
     let everything = Ids::Range(0..demo.info().count);
     demo.open(everything).unwrap().read(Scene::FRAMES / 2, Columns::all(), &mut state).unwrap();
     measure(criterion, "picture", "demo", &state, &demo.rig().cameras[0]);
-    let Some(folder) = models::folder() else { return };
+    let Some(folder) = models::found() else { return };
     for name in models::NAMES {
         let model = models::Model::open(&folder, name);
         let (frame, view) = model.renders()[0];

@@ -155,12 +155,13 @@ fn frames_and_single_files_lose_bands_too() {
 }
 
 #[test]
+#[ignore = "needs Python"]
 fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_is_not_the_clouds() {
     let workplace = Workplace::new();
     let model = faint_above(&workplace, 1);
     let small = workplace.path("small");
     workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 -o small"));
-    let Some((accepted, text)) = check_model_folder(&model, &small) else { return };
+    let (accepted, text) = check_model_folder(&model, &small);
     assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
 
     let own = fs::read_to_string(small.join("cfg_args")).unwrap();
@@ -171,7 +172,7 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
     ] {
         assert_ne!(other, own);
         fs::write(small.join("cfg_args"), other).unwrap();
-        let (accepted, text) = check_model_folder(&model, &small).unwrap();
+        let (accepted, text) = check_model_folder(&model, &small);
         assert!(!accepted && text.lines().last().unwrap().contains(complaint), "{text}");
     }
     fs::write(small.join("cfg_args"), own).unwrap();
@@ -186,7 +187,7 @@ fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_
         (0..4).for_each(|k| row.swap(one + k, other + k));
     }
     fs::write(&cloud, bytes).unwrap();
-    let (accepted, text) = check_model_folder(&model, &small).unwrap();
+    let (accepted, text) = check_model_folder(&model, &small);
     assert!(!accepted && text.lines().last().unwrap().contains("the original's f_rest"), "{text}");
 }
 

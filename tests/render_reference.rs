@@ -9,8 +9,9 @@ use splatsieve::render;
 const LEAST_DB: [f64; 3] = [113.6, 120.1, 114.8];
 
 #[test]
+#[ignore = "needs the trained models"]
 fn reference_renders_reproduce_to_rounding() {
-    let Some(folder) = models::folder() else { return };
+    let folder = models::folder();
     let mut compared = 0;
     for (name, least) in models::NAMES.into_iter().zip(LEAST_DB) {
         let model = models::Model::open(&folder, name);

@@ -17,8 +17,9 @@ const CUT: &str = "(() => {
 })()";
 
 #[test]
+#[ignore = "needs a browser"]
 fn the_page_asks_for_nothing_and_its_slider_and_choices_work() {
-    let Some(program) = browser::installed() else { return };
+    let program = browser::installed();
     let at = Workplace::new();
     at.done("demo -o d --gaussians 1500 --frames 5");
     // A name that would run if it were not escaped.
@@ -105,8 +106,9 @@ const UNREADABLE: &str = "[...document.querySelectorAll('svg')].flatMap(svg => {
 })";
 
 #[test]
+#[ignore = "needs a browser"]
 fn a_sweep_draws_every_chart_with_words_that_can_be_read_and_asks_for_nothing() {
-    let Some(program) = browser::installed() else { return };
+    let program = browser::installed();
     let at = Workplace::new();
     let steps = "--fractions 0.8,0.5,0.3 --steps 0,5,10,20 --steps-at 0.3";
     let methods = "--methods default,no-refine,visible,random";
@@ -123,8 +125,9 @@ fn a_sweep_draws_every_chart_with_words_that_can_be_read_and_asks_for_nothing() 
 }
 
 #[test]
+#[ignore = "needs a browser"]
 fn a_page_that_fails_or_asks_for_something_would_be_seen() {
-    let Some(program) = browser::installed() else { return };
+    let program = browser::installed();
     let at = Workplace::new();
     let bad = "<!doctype html><img src=\"http://127.0.0.1:9/x.png\"><script>console.log(1); nothing.there;</script>";
     fs::write(at.path("bad.html"), bad).unwrap();

@@ -11,15 +11,12 @@ use splatsieve::ingest::container::Container;
 use splatsieve::model::Columns;
 use splatsieve::source::FrameSource;
 
-/// A Python with `modules`, or none with a note where this machine has none. `PYTHON` names another than python3.
-fn python(modules: &str) -> Option<PathBuf> {
+/// A Python, which must have `modules`. `PYTHON` names another than python3.
+fn python(modules: &str) -> PathBuf {
     let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
     let found = Command::new(&python).args(["-c", &format!("import {modules}")]).stderr(Stdio::null()).status();
-    if found.is_ok_and(|status| status.success()) {
-        return Some(python);
-    }
-    eprintln!("skipped: {} cannot import {modules}", python.display());
-    None
+    assert!(found.is_ok_and(|status| status.success()), "{} cannot import {modules}", python.display());
+    python
 }
 
 fn script(name: &str) -> PathBuf {
@@ -60,8 +57,9 @@ fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
 }
 
 #[test]
+#[ignore = "needs numpy"]
 fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
-    let Some(python) = python("numpy") else { return };
+    let python = python("numpy");
     let workplace = Workplace::new();
     workplace.done("pack {tiny} -o scene.gseq");
     let scene = Container::open(&workplace.path("scene.gseq")).unwrap();
@@ -93,8 +91,9 @@ fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
 }
 
 #[test]
+#[ignore = "needs numpy"]
 fn an_exporter_that_fails_writes_no_end_mark() {
-    let Some(python) = python("numpy") else { return };
+    let python = python("numpy");
     let workplace = Workplace::new();
     let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
         from stream_writer import StreamWriter\n\
@@ -114,8 +113,9 @@ fn an_exporter_that_fails_writes_no_end_mark() {
 }
 
 #[test]
+#[ignore = "needs numpy"]
 fn a_stream_of_no_gaussians_is_written_and_read() {
-    let Some(python) = python("numpy") else { return };
+    let python = python("numpy");
     let workplace = Workplace::new();
     let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
         import numpy as np\n\
@@ -131,8 +131,9 @@ fn a_stream_of_no_gaussians_is_written_and_read() {
 }
 
 #[test]
+#[ignore = "needs numpy and zstandard"]
 fn the_container_reader_gives_every_bit_of_every_column() {
-    let Some(python) = python("numpy, zstandard") else { return };
+    let python = python("numpy, zstandard");
     let workplace = Workplace::new();
     workplace.done("pack {tiny} -o zstd.gseq");
     workplace.done("pack {tiny} -o raw.gseq --raw");
@@ -208,8 +209,9 @@ const REPOSITORY: [(&str, &str); 3] = [
 ];
 
 #[test]
+#[ignore = "needs numpy and PyTorch"]
 fn the_4dgaussians_exporter_streams_what_the_repository_evaluates_whatever_it_prints() {
-    let Some(python) = python("numpy, torch") else { return };
+    let python = python("numpy, torch");
     let workplace = Workplace::new();
     for (name, text) in REPOSITORY {
         fs::create_dir_all(workplace.path("scene")).unwrap();
@@ -237,8 +239,9 @@ fn the_4dgaussians_exporter_streams_what_the_repository_evaluates_whatever_it_pr
 }
 
 #[test]
+#[ignore = "needs numpy"]
 fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again() {
-    let Some(python) = python("numpy") else { return };
+    let python = python("numpy");
     let workplace = Workplace::new();
     let exporter = |arguments: &[&str]| {
         let mut command = Command::new(&python);
@@ -266,8 +269,9 @@ fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again(
 }
 
 #[test]
+#[ignore = "needs numpy"]
 fn the_scale_script_compresses_every_size_and_says_what_it_took() {
-    let Some(python) = python("numpy") else { return };
+    let python = python("numpy");
     let workplace = Workplace::new();
     let mut scale = Command::new(python);
     scale.arg(script("scale.py")).arg(assert_cmd::cargo::cargo_bin("splatsieve")).arg("here");

@@ -118,9 +118,7 @@ fn statistics_agree(model: &Path) {
 }
 
 fn on_shared(name: &str, test: fn(&Path)) {
-    if let Some(model) = shared(name) {
-        test(&model);
-    }
+    test(&shared(name));
 }
 
 #[test]
@@ -129,6 +127,7 @@ fn frames_of_the_tiny_model_are_those_of_pytorch() {
 }
 
 #[test]
+#[ignore = "needs the trained models"]
 fn frames_of_deform2_are_those_of_pytorch() {
     // The field is held against all three models beside its code; here it is cameras and point cloud as well.
     on_shared("deform2", frames_agree);
@@ -140,16 +139,19 @@ fn statistics_of_the_tiny_model_are_those_of_float64_states() {
 }
 
 #[test]
+#[ignore = "needs the trained models"]
 fn statistics_of_deform2_are_those_of_float64_states() {
     on_shared("deform2", statistics_agree);
 }
 
 #[test]
+#[ignore = "needs the trained models"]
 fn statistics_of_room2_dynerf_are_those_of_float64_states() {
     on_shared("room2_dynerf", statistics_agree);
 }
 
 #[test]
+#[ignore = "needs the trained models"]
 fn statistics_of_room2_big_are_those_of_float64_states() {
     on_shared("room2_big", statistics_agree);
 }

@@ -19,7 +19,7 @@ const TIMES: usize = 60;
 /// Every scene by name: made-up curves, and the trained models where they are.
 pub(crate) fn scenes() -> Vec<(&'static str, HeldFrames)> {
     let models =
-        models::folder().into_iter().flat_map(|folder| models::NAMES.map(|name| (name, trained(&folder, name))));
+        models::found().into_iter().flat_map(|folder| models::NAMES.map(|name| (name, trained(&folder, name))));
     std::iter::once(("curves", curves())).chain(models).collect()
 }
 

@@ -16,18 +16,15 @@ const NAMES: [&str; 5] =
 /// A browser that says nothing for so long is stuck.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// The browser to use: `SPLATSIEVE_BROWSER`, else one that is installed; else none, with a note.
-pub(crate) fn installed() -> Option<PathBuf> {
+/// The browser to use: `SPLATSIEVE_BROWSER`, else one that is installed, as one must be.
+pub(crate) fn installed() -> PathBuf {
     if let Some(given) = std::env::var_os("SPLATSIEVE_BROWSER") {
-        return Some(PathBuf::from(given));
+        return PathBuf::from(given);
     }
     let path = std::env::var_os("PATH").unwrap_or_default();
     let found = NAMES.iter().flat_map(|name| std::env::split_paths(&path).map(move |folder| folder.join(name)));
     let found = found.into_iter().find(|file| file.is_file());
-    if found.is_none() {
-        eprintln!("skipped: no Chromium is installed (apt-get install chromium-headless-shell)");
-    }
-    found
+    found.expect("an installed Chromium (apt-get install chromium-headless-shell)")
 }
 
 /// A browser with one page.

@@ -14,12 +14,17 @@ use splatsieve::model::{Camera, Gaussians};
 /// The models, by folder name.
 pub(crate) const NAMES: [&str; 3] = ["deform2", "room2_dynerf", "room2_big"];
 
-/// The folder of trained models: `SPLATSIEVE_DATA`, else `../shared/data`; none where neither exists.
-pub(crate) fn folder() -> Option<PathBuf> {
+/// The folder of trained models, which must be there: `SPLATSIEVE_DATA`, else `../shared/data`.
+pub(crate) fn folder() -> PathBuf {
+    found().expect("trained models (SPLATSIEVE_DATA)")
+}
+
+/// The same for what does without: none, with a note, where there are none.
+pub(crate) fn found() -> Option<PathBuf> {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
     if !folder.is_dir() {
-        eprintln!("skipped: no trained models at {}", folder.display());
+        eprintln!("no trained models at {}", folder.display());
         return None;
     }
     Some(folder)

@@ -20,30 +20,22 @@ pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
-/// Runs `check_model_folder.py`, unless this machine has no Python; gives whether it accepts, and what it printed.
-pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> Option<(bool, String)> {
+/// Runs `check_model_folder.py`; gives whether it accepts, and what it printed. `PYTHON` names another than python3.
+pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> (bool, String) {
     let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
-    let ran = std::process::Command::new(&python).arg("--version").output();
-    if !ran.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: there is no {}", python.display());
-        return None;
-    }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
     let output = std::process::Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
     let [complaints, text] = [&output.stderr, &output.stdout].map(|bytes| String::from_utf8_lossy(bytes));
-    Some((output.status.success(), format!("{complaints}{text}")))
+    (output.status.success(), format!("{complaints}{text}"))
 }
 
-/// A shared model, or none with a note where this machine has none.
-pub(crate) fn shared(name: &str) -> Option<PathBuf> {
+/// A trained model in `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
+pub(crate) fn shared(name: &str) -> PathBuf {
     let folder = std::env::var_os("SPLATSIEVE_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from)
         .join(name);
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("skipped: {} is not here", folder.display());
-    None
+    assert!(folder.is_dir(), "no trained model at {} (SPLATSIEVE_DATA)", folder.display());
+    folder
 }
 
 /// Copies the model at `from` to the new folder `to`, but that nothing deforms its colours.
