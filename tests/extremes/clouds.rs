@@ -1,41 +1,19 @@
-//! Stiff scenes through the binary: what EXTREME input comes out as, file to file.
-
-mod scene;
+//! Odd clouds, file to file.
 
 use std::fs;
 
-use scene::{PlyRows, Workplace, index_map};
+use super::scene::{self, PlyRows, Workplace, index_map};
+use super::{CAMERA, balls, says};
 use splatsieve::model::Gaussians;
-
-/// `n` grey balls of radius 0.05 strewn over a unit square by the golden ratio, opacity 0.73.
-fn balls(n: usize) -> Gaussians {
-    let mut balls = Gaussians::zeros(n, 0);
-    for i in 0..n {
-        let x = (i as f32 * 0.618_034).fract();
-        balls.position.set_row(i, [x, i as f32 / n as f32, 0.0]);
-        balls.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
-        balls.log_scale.set_row(i, [-3.0; 3]);
-        balls.opacity_logit.set_row(i, [1.0]);
-        balls.sh.set_row(i, [0.2; 3]);
-    }
-    balls
-}
 
 /// Makes something of a scene odd.
 type Edit = fn(&mut Gaussians);
-
-/// One camera as 3DGS writes them, which sees all of [`balls`] at every frame.
-const CAMERA: &str = r#"[{"id": 0, "img_name": "a", "width": 64, "height": 64, "fx": 60, "fy": 60,
-    "position": [0.5, 0.5, -3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]"#;
 
 fn numbers(summary: &serde_json::Value, key: &str) -> Vec<f64> {
     summary["terms"].as_array().unwrap().iter().map(|term| term[key].as_f64().unwrap()).collect()
 }
 
-fn says(summary: &serde_json::Value, list: &str, part: &str) -> bool {
-    summary[list].to_string().contains(part)
-}
-
+/// Row 1.
 #[test]
 fn no_gaussians_give_a_valid_empty_output() {
     let workplace = Workplace::new();
@@ -51,6 +29,7 @@ fn no_gaussians_give_a_valid_empty_output() {
     }
 }
 
+/// Row 2.
 #[test]
 fn one_gaussian_is_kept_byte_for_byte() {
     let workplace = Workplace::new();
@@ -61,6 +40,7 @@ fn one_gaussian_is_kept_byte_for_byte() {
     }
 }
 
+/// Row 3.
 #[test]
 fn one_frame_is_static_and_said_to_be() {
     let workplace = Workplace::new();
@@ -76,6 +56,7 @@ fn one_frame_is_static_and_said_to_be() {
     assert!(rows["life"].iter().all(|&frames| frames == 1.0));
 }
 
+/// Row 6.
 #[test]
 fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
     let workplace = Workplace::new();
@@ -96,6 +77,7 @@ fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
     }
 }
 
+/// Row 7.
 #[test]
 fn static_neighbours_merge_and_the_dynamic_arm_is_off() {
     let workplace = Workplace::new();
@@ -119,6 +101,7 @@ fn static_neighbours_merge_and_the_dynamic_arm_is_off() {
     assert!(frames.iter().all(|frame| frame.rows == frames[0].rows));
 }
 
+/// Row 8.
 #[test]
 fn movers_around_one_percent_are_kept_whatever_their_number() {
     for movers in [1, 2, 3] {
@@ -140,6 +123,7 @@ fn movers_around_one_percent_are_kept_whatever_their_number() {
     }
 }
 
+/// Row 9.
 #[test]
 fn invisible_gaussians_are_all_prunable_without_nan() {
     for logit in [-100.0, -30.0] {
@@ -178,6 +162,7 @@ fn what_looks_like_its_background_counts_by_the_contrast_floor() {
     }
 }
 
+/// Row 10.
 #[test]
 fn solid_gaussians_have_no_variance_and_finite_logits() {
     let workplace = Workplace::new();
@@ -197,6 +182,7 @@ fn solid_gaussians_have_no_variance_and_finite_logits() {
     }
 }
 
+/// Row 18.
 #[test]
 fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
     let edits: [(&str, Edit); 5] = [
@@ -238,6 +224,7 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
     }
 }
 
+/// Row 28.
 #[test]
 fn without_cameras_a_virtual_rig_is_used_and_said() {
     let workplace = Workplace::new();
@@ -249,6 +236,7 @@ fn without_cameras_a_virtual_rig_is_used_and_said() {
     assert_eq!(summary["flags"]["never_in_view"], 0);
 }
 
+/// Row 40.
 #[test]
 fn without_cameras_what_stays_does_not_depend_on_the_unit_of_length() {
     let kept = |power: i32| {
@@ -272,6 +260,7 @@ fn without_cameras_what_stays_does_not_depend_on_the_unit_of_length() {
     }
 }
 
+/// Row 31.
 #[test]
 fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
     let workplace = Workplace::new();
@@ -296,6 +285,7 @@ fn exact_duplicates_merge_to_one_and_the_summary_names_the_opacity_rule() {
     }
 }
 
+/// Row 31.
 #[test]
 fn duplicates_merge_to_one_whatever_their_number() {
     for count in [34, 100, 5000] {
@@ -306,6 +296,7 @@ fn duplicates_merge_to_one_whatever_their_number() {
     }
 }
 
+/// Row 43.
 #[test]
 fn frames_that_disagree_are_named() {
     let workplace = Workplace::new();

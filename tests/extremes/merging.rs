@@ -1,0 +1,338 @@
+//! What merges, what must not, and what comes of it, file to file.
+
+use std::fs;
+
+use glam::{DMat3, DQuat, DVec3};
+use splatsieve::model::Gaussians;
+
+use super::scene::{PlyRows, Workplace, arrays, index_map};
+use super::{CAMERA, balls, close};
+
+/// Merges nothing but what formulas let merge.
+const MERGE: &str = "--merge-only --no-refine --choose-by-views=false --coverage projected --overwrite";
+
+/// Two equal balls at one place, and one far off so that the scene has an extent.
+fn twins() -> Gaussians {
+    let mut cloud = balls(1).pick(&[0, 0, 0]);
+    cloud.position.set_row(2, [3.0, 2.0, 1.0]);
+    cloud
+}
+
+/// How many of the first two of [`twins`] are left, if `edit` changes the state of both at frame t.
+fn left(frames: usize, edit: impl Fn(usize, &mut Gaussians)) -> usize {
+    let workplace = Workplace::new();
+    for t in 0..frames {
+        let mut cloud = twins();
+        edit(t, &mut cloud);
+        workplace.ply(&format!("frames/frame_{t:03}.ply"), &cloud);
+    }
+    workplace.done(&format!("compress frames -o out {MERGE}"));
+    let map = index_map(&workplace.path("out/index_map.npy"));
+    assert_ne!(map[0], map[2], "what is far off merged");
+    if map[0] == map[1] { 1 } else { 2 }
+}
+
+fn moved(cloud: &mut Gaussians, i: usize, by: f64) {
+    cloud.position.plane_mut(0)[i] += by as f32;
+}
+
+/// Rows 13, 17 and 38, each beside the same without what is odd, which merges.
+#[test]
+fn what_moves_or_lives_otherwise_never_merges() {
+    const T: usize = 12;
+    for speed in [1e-3, 0.02, 1.0] {
+        let both = |other: f64| {
+            left(T, |t, cloud| {
+                moved(cloud, 0, speed * (t as f64 - 6.0));
+                moved(cloud, 1, other * speed * (t as f64 - 6.0));
+            })
+        };
+        assert_eq!([both(1.0), both(-1.0), both(10.0), both(0.1)], [1, 2, 2, 2], "speed {speed}");
+    }
+    for (distance, expected) in [(0.0, 1), (0.5, 2), (100.0, 2)] {
+        let teleport = |t: usize, cloud: &mut Gaussians| moved(cloud, 1, if t >= 5 { distance } else { 0.0 });
+        assert_eq!(left(T, teleport), expected, "a teleport by {distance}");
+    }
+    for (birth, death, expected) in [(0, T, 1), (6, T, 2), (1, 6, 2), (11, T, 2)] {
+        let lives = |t: usize, cloud: &mut Gaussians| {
+            let of = |alive: bool| if alive { 2.0 } else { -9.0 };
+            // The first lives where the second does not, or both all the time.
+            let second = (birth..death).contains(&t);
+            cloud.opacity_logit.plane_mut(0)[0] = of(expected == 1 || !second);
+            cloud.opacity_logit.plane_mut(0)[1] = of(second);
+        };
+        assert_eq!(left(T, lives), expected, "a second life from {birth} to {death}");
+    }
+}
+
+/// Row 35: coefficients of one direction, of which one is black.
+#[test]
+fn what_looks_otherwise_never_merges() {
+    let coloured = |dc: [[f32; 3]; 2]| left(1, |_, cloud| (0..2).for_each(|i| cloud.sh.set_row(i, dc[i])));
+    assert_eq!(coloured([[-1.772; 3]; 2]), 1);
+    for grey in [-1.2, -0.9, -0.5, -0.1] {
+        assert_eq!(coloured([[-1.772; 3], [grey; 3]]), 2, "black beside a grey of {grey}");
+    }
+    // Black however much less than nothing.
+    assert_eq!(coloured([[-1.78; 3], [-2.5; 3]]), 1);
+}
+
+/// The one Gaussian that two make, with `edit` made to both: scales, the axes as columns, and its row.
+fn merged(edit: impl Fn(&mut Gaussians), flags: &str) -> ([f64; 3], DMat3, PlyRows) {
+    let workplace = Workplace::new();
+    let mut cloud = balls(1).pick(&[0, 0]);
+    edit(&mut cloud);
+    workplace.ply("two.ply", &cloud);
+    workplace.done(&format!("compress two.ply -o out.ply {MERGE} {flags}"));
+    let rows = PlyRows::read(&workplace.path("out.ply"));
+    assert_eq!(rows.rows.len(), 1, "the case must merge");
+    let value = |name: &str| f64::from(rows.value(0, name));
+    let [w, x, y, z] = [0, 1, 2, 3].map(|k| value(&format!("rot_{k}")));
+    let scales = [0, 1, 2].map(|k| value(&format!("scale_{k}")).exp());
+    (scales, DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()), rows)
+}
+
+/// Lengths are scene units and pairs a whole unit apart may merge, however unlike in place.
+const WIDE: &str = "--length-unit scene --merge-pass 1,1e9,-1,-1";
+
+/// Row 21, for needles along every axis and any way round.
+#[test]
+fn a_needle_keeps_its_smallest_scale_through_a_ply() {
+    for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
+        for long in 0..3 {
+            let mut log_scale = [(1e-6f32).ln(); 3];
+            log_scale[long] = (1e6f32).ln();
+            let needle = |cloud: &mut Gaussians| {
+                for i in 0..2 {
+                    cloud.log_scale.set_row(i, log_scale);
+                    cloud.rotation.set_row(i, turn);
+                }
+            };
+            let (scales, _, _) = merged(needle, "");
+            for k in 0..3 {
+                let expected = f64::from(log_scale[k]).exp();
+                close(format!("scale {k} of {turn:?}"), scales[k], expected, 1e-6 * expected);
+            }
+        }
+    }
+}
+
+/// Row 22: beside each other in their plane, however it lies and however flat they are, f32 rotations allowing: their error of
+/// 1e-7 lifts what lies 0.02 away by 2e-9.
+#[test]
+fn coplanar_pancakes_stay_flat() {
+    for turn in [[1.0, 0.0, 0.0, 0.0], [0.5, -0.5, 0.1, 0.7], [0.2, 0.9, -0.3, 0.1]] {
+        for thickness in [1e-3, 1e-5, 1e-7] {
+            let [w, x, y, z] = turn.map(f64::from);
+            let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+            let pancakes = |cloud: &mut Gaussians| {
+                for i in 0..2 {
+                    let at = axes * DVec3::new(0.02 * i as f64, 0.005 * i as f64, 0.0);
+                    cloud.position.set_row(i, at.to_array().map(|x| x as f32));
+                    cloud.rotation.set_row(i, turn);
+                    cloud.log_scale.set_row(i, [0.05f64, 0.04, thickness].map(|s| s.ln() as f32));
+                }
+            };
+            let (mut scales, found, _) = merged(pancakes, WIDE);
+            let flat = (0..3).min_by(|&a, &b| scales[a].total_cmp(&scales[b])).unwrap();
+            close("the angle between normals", found.col(flat).dot(axes.z_axis).abs(), 1.0, 1e-9);
+            scales.sort_by(f64::total_cmp);
+            close(format!("thickness of {turn:?}"), scales[0], thickness, 1e-6 * thickness + 4e-9);
+            assert!(scales[1] > 0.039, "{scales:?}");
+        }
+    }
+}
+
+/// Row 23: two balls along a diagonal have a covariance with equal diagonal, and the diagonal is its axis.
+#[test]
+fn a_covariance_with_equal_diagonal_has_its_axes() {
+    for direction in [[1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, -1.0]] {
+        let half = 0.02;
+        let apart = |cloud: &mut Gaussians| {
+            cloud.position.set_row(0, direction.map(|x| (half * x) as f32));
+            cloud.position.set_row(1, direction.map(|x| (-half * x) as f32));
+        };
+        let (scales, axes, rows) = merged(apart, &format!("{WIDE} --placement mean"));
+        let long = (0..3).max_by(|&a, &b| scales[a].total_cmp(&scales[b])).unwrap();
+        let along = DVec3::from(direction).normalize();
+        close(format!("axis of {direction:?}"), axes.col(long).dot(along).abs(), 1.0, 1e-6);
+        let own = f64::from(-3.0f32).exp();
+        // Where between both it lies tells what each weighs.
+        let x = f64::from(rows.value(0, "x")) / (half * direction[0]);
+        let between = 3.0 * half * half * (1.0 - x * x);
+        assert!(x.abs() < 0.1, "{x}");
+        close("the long scale", scales[long], (own * own + between).sqrt(), 1e-6);
+        for k in (0..3).filter(|&k| k != long) {
+            close("another scale", scales[k], own, 1e-6);
+        }
+    }
+}
+
+/// Row 24: with its scales it merges as the identity does, and counts.
+#[test]
+fn a_zero_quaternion_is_the_identity_and_flagged() {
+    let score = |turn: [f32; 4]| {
+        let workplace = Workplace::new();
+        let mut cloud = balls(6);
+        cloud.log_scale.planes_mut()[..6].fill(-1.0);
+        cloud.rotation.set_row(2, turn);
+        workplace.ply("cloud.ply", &cloud);
+        workplace.done("score cloud.ply -o rows.npz");
+        let summary = workplace.summary("cloud.ply -o out.ply --dry-run");
+        (arrays(&workplace.path("rows.npz"))["C"].clone(), summary["flags"]["zero_rotation"].as_u64().unwrap())
+    };
+    let ((zero, flagged), (identity, none), (other, _)) =
+        (score([0.0, -0.0, 0.0, 0.0]), score([1.0, 0.0, 0.0, 0.0]), score([1.0, 0.0, 1.0, 0.0]));
+    assert_eq!((&zero, flagged, none), (&identity, 1, 0));
+    assert_ne!(zero, other, "the rotation must matter");
+    let pancakes = |first: [f32; 4]| {
+        merged(
+            |cloud: &mut Gaussians| {
+                (0..2).for_each(|i| cloud.log_scale.set_row(i, [-1.0, -2.0, -3.0]));
+                cloud.rotation.set_row(0, first);
+            },
+            "",
+        )
+    };
+    for name in ["scale_0", "scale_1", "scale_2", "opacity", "x"] {
+        let [zero, identity] = [[0.0; 4], [1.0, 0.0, 0.0, 0.0]].map(|turn| pancakes(turn).2.value(0, name));
+        assert_eq!(zero, identity, "{name}");
+    }
+}
+
+/// Rows 20 and 27: from points to what fills the sky, before, around and behind the camera.
+#[test]
+fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
+    let workplace = Workplace::new();
+    let mut cloud = balls(300);
+    for i in 0..300 {
+        let log = |k: usize| (10f64.powi([-12, -6, -2, 0, 3, 6][(i / (k + 1)) % 6]).ln()) as f32;
+        cloud.log_scale.set_row(i, [log(0), log(1), log(2)]);
+        // The camera stands at z = -3.
+        cloud.position.plane_mut(2)[i] = [-3.3, -3.0, -2.81, -2.79, 0.0, 1e3][i % 6];
+        cloud.opacity_logit.plane_mut(0)[i] = (i % 9) as f32 - 4.0;
+    }
+    workplace.ply("cloud.ply", &cloud);
+    fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
+    for preset in ["paper", "default", "default --coverage projected --no-refine", "strong"] {
+        let request = format!("cloud.ply --cameras cameras.json -o out.ply --overwrite --preset {preset}");
+        let summary = workplace.summary(&request);
+        assert!(summary["gaussians"].as_u64().unwrap() > 0);
+        let rows = PlyRows::read(&workplace.path("out.ply"));
+        for (i, name) in (0..rows.rows.len()).flat_map(|i| rows.names.iter().map(move |name| (i, name))) {
+            assert!(rows.value(i, name).is_finite(), "{preset}: {name} of {i}");
+        }
+        let score = format!("score cloud.ply --cameras cameras.json -o rows.npz --overwrite --preset {preset}");
+        workplace.done(&score.replace(" --no-refine", "").replace("--overwrite", "--force"));
+        for (name, values) in arrays(&workplace.path("rows.npz")) {
+            assert!(values.iter().all(|x| x.is_finite()), "{preset}: {name}");
+            // The picture has so many pixels.
+            assert!(name != "C" || values.iter().all(|&c| (0.0..=64.0 * 64.0).contains(&c)), "{preset}: {values:?}");
+        }
+    }
+}
+
+/// Rows 29 and 30.
+#[test]
+fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing() {
+    let workplace = Workplace::new();
+    let mut cloud = balls(60);
+    for i in 0..60 {
+        cloud.opacity_logit.plane_mut(0)[i] = 9.0;
+        cloud.sh.set_row(i, [0.05 * i as f32 - 1.4, 0.3, 0.0]);
+    }
+    // A wall before the first ten, and behind all a giant.
+    for i in 0..10 {
+        cloud.position.set_row(i, [0.45 + 0.01 * i as f32, 0.5, 8.0]);
+    }
+    for i in 10..20 {
+        cloud.position.set_row(i, [0.5, 0.5, 4.0 + 0.01 * i as f32]);
+        cloud.log_scale.set_row(i, [0.5, 0.5, -5.0]);
+    }
+    cloud.position.set_row(20, [0.5, 0.5, 60.0]);
+    cloud.log_scale.set_row(20, [3.5, 3.5, -2.0]);
+    workplace.ply("cloud.ply", &cloud);
+    fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
+    let request = "cloud.ply --cameras cameras.json -o out.ply --overwrite --no-refine";
+    workplace.done(&format!("compress {request} --prune-only --target-count 50"));
+    let map = index_map(&workplace.path("out.ply.index_map.npy"));
+    assert!((0..10).all(|i| map[i] < 0), "{map:?}");
+    for more in ["", "--merge-only", "--preset paper"] {
+        workplace.done(&format!("compress {request} {more} --tau-static 0"));
+        let map = index_map(&workplace.path("out.ply.index_map.npy"));
+        assert!(map[20] >= 0, "{more}: the background went");
+        assert_eq!(map.iter().filter(|&&place| place == map[20]).count(), 1, "{more}: it swallowed others");
+    }
+}
+
+/// Row 32; ten million points: `ten_million_points_in_one_voxel_cost_bounded_time`, by name.
+#[test]
+fn a_crowd_in_one_voxel_is_cut_and_said_to_be() {
+    const N: usize = 30_000;
+    let workplace = Workplace::new();
+    let mut cloud = balls(1).pick(&vec![0; N]);
+    for i in 0..N {
+        let value = |k: f64| (1e-3 * (i as f64 * k).fract()) as f32;
+        cloud.position.set_row(i, [value(0.618_033_988), value(0.754_877_666), value(0.569_840_290)]);
+    }
+    workplace.ply("crowd.ply", &cloud);
+    let summary = workplace.summary(&format!("crowd.ply -o out.ply {MERGE} --length-unit scene"));
+    let pass = &summary["merge"]["passes"][0];
+    assert_eq!(pass["truncated"], N, "{pass}");
+    // As many pairs at most as neighbours that are looked at.
+    assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
+}
+
+/// Row 33: balls along a line, ordered by size, in which each leads its follower.
+#[test]
+fn a_sorted_chain_merges_as_the_sequential_rule_says() {
+    const N: usize = 4000;
+    let workplace = Workplace::new();
+    let mut cloud = balls(1).pick(&vec![0; N]);
+    for i in 0..N {
+        cloud.position.set_row(i, [i as f32 / 1024.0, 0.0, 0.0]);
+        // Opacities fall along the line, and C with them.
+        cloud.opacity_logit.set_row(i, [4.0 - 6.0 * i as f32 / N as f32]);
+        cloud.log_scale.set_row(i, [-9.0; 3]);
+    }
+    workplace.ply("chain.ply", &cloud);
+    // From afar, so that every ball is as large in the picture.
+    let camera =
+        CAMERA.replace("[0.5, 0.5, -3]", "[2, 0, -400]").replace("\"fx\": 60, \"fy\": 60", "\"fx\": 900, \"fy\": 900");
+    fs::write(workplace.path("cameras.json"), camera).unwrap();
+    // Neighbours lie within reach, and who comes next but one does not.
+    let flags = "--length-unit scene --merge-pass 0.0011,1e9,-1,-1 --cameras cameras.json";
+    let summary = workplace.summary(&format!("chain.ply -o out.ply {MERGE} {flags}"));
+    workplace.done("score chain.ply --coverage projected --cameras cameras.json -o rows.npz");
+    let c = arrays(&workplace.path("rows.npz"))["C"].clone();
+    assert!(c.windows(2).all(|pair| pair[0] > pair[1]), "the chain must be sorted");
+    let map = index_map(&workplace.path("out.ply.index_map.npy"));
+    let expected: Vec<i64> = (0..N as i64).map(|i| i / 2).collect();
+    assert_eq!(map, expected, "who comes first leads who comes second, and so on");
+    assert_eq!(summary["merge"]["passes"][0]["sequential"], true, "{}", summary["merge"]);
+}
+
+/// Row 36: behind the camera C and Vis are 0; opacity × area weighs, and where that is nothing too, all weigh the same.
+#[test]
+fn what_nobody_sees_merges_by_opacity_times_area() {
+    for (logits, weight) in [([2.0f32, -1.0], None), ([-200.0, -200.0], Some(0.5))] {
+        let workplace = Workplace::new();
+        // The third is in view.
+        let mut cloud = balls(1).pick(&[0, 0, 0]);
+        cloud.position.set_row(2, [0.5, 0.5, 0.0]);
+        for (i, logit) in logits.into_iter().enumerate() {
+            cloud.position.set_row(i, [0.01 * i as f32, 0.0, -50.0]);
+            cloud.opacity_logit.set_row(i, [logit]);
+        }
+        workplace.ply("two.ply", &cloud);
+        fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
+        let flags = format!("{MERGE} {WIDE} --placement mean --alpha-min 0 --cameras cameras.json");
+        let summary = workplace.summary(&format!("two.ply -o out.ply {flags}"));
+        assert_eq!((&summary["gaussians"], &summary["flags"]["never_in_view"]), (&2.into(), &2.into()));
+        let opacity = logits.map(|x| 1.0 / (1.0 + (-f64::from(x)).exp()));
+        let second = weight.unwrap_or(opacity[1] / (opacity[0] + opacity[1]));
+        let place = index_map(&workplace.path("out.ply.index_map.npy"))[0] as usize;
+        let found = PlyRows::read(&workplace.path("out.ply")).value(place, "x");
+        close("x of the proxy", f64::from(found), second * f64::from(0.01f32), 1e-8);
+    }
+}

@@ -1,0 +1,211 @@
+//! Statistics of trajectories and lives, from a stream to rows.
+
+use std::f64::consts::TAU;
+
+use splatsieve::model::Columns;
+
+use super::{Rows, Sequence, close};
+
+const ALIVE: f32 = 0.0;
+const DEAD: f32 = -7.0;
+/// Both ways to count motion; rounding noise stays in, as here nothing is noise.
+const RUNS: &str = "--preset default --snap-noise=false";
+const LITERAL: &str = "--preset paper --snap-noise=false";
+
+/// Rows of Gaussians that move along x, `x(i, t)`, with logits `life(i, t)`.
+fn walking(
+    count: usize,
+    frames: usize,
+    flags: &str,
+    x: impl Fn(usize, usize) -> f64 + Send + 'static,
+    life: impl Fn(usize, usize) -> f32 + Send + 'static,
+) -> Rows {
+    Sequence::new(count, frames, Columns::POSITION | Columns::OPACITY).rows(flags, move |t, state| {
+        for i in 0..count {
+            state.position.set_row(i, [x(i, t) as f32, 0.0, 0.0]);
+            state.opacity_logit.set_row(i, [life(i, t)]);
+        }
+    })
+}
+
+/// A statistic of Gaussian `i`.
+fn of(rows: &Rows, name: &str, i: usize) -> f64 {
+    rows[name][i]
+}
+
+/// Row 4.
+#[test]
+fn two_frames_have_one_step_and_no_curvature() {
+    let rows = walking(30, 2, RUNS, |i, t| (i * t) as f64 * 0.25, |_, _| ALIVE);
+    for i in 0..30 {
+        assert_eq!(
+            (of(&rows, "D", i), of(&rows, "kappa", i), of(&rows, "V", i)),
+            (0.25 * i as f64, 0.0, 0.0),
+            "Gaussian {i}"
+        );
+    }
+}
+
+/// Row 5, for a sweep of periods and phases: D to 1e-6 of itself, κ to 1e-6 of the amplitude, which is what rounding
+/// positions to f32 leaves of second differences of 4e-5; against those of the rounded positions κ holds to 1e-6 of itself.
+#[test]
+fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
+    const T: usize = 100_000;
+    const PERIODS: [f64; 8] = [3.0, 10.0, 37.5, 100.0, 333.0, 365.25, 777.7, 1000.0];
+    let x = |i: usize, t: usize| (TAU * t as f64 / PERIODS[i % 8] + i as f64).sin();
+    let count = 2 * PERIODS.len();
+    for (flags, literal) in [(RUNS, false), (LITERAL, true)] {
+        let rows = walking(count, T, flags, x, |_, _| ALIVE);
+        for i in 0..count {
+            let steps: f64 = (1..T).map(|t| (x(i, t) - x(i, t - 1)).powi(2)).sum();
+            // The paper divides by |life|.
+            let d = (steps / (T - usize::from(!literal)) as f64).sqrt();
+            let half = (TAU / PERIODS[i % 8] / 2.0).sin();
+            let turns: f64 = (1..T - 1).map(|t| 4.0 * half * half * x(i, t).abs()).sum();
+            let rounded = |t: usize| f64::from(x(i, t) as f32);
+            let of_rounded: f64 = (1..T - 1).map(|t| (rounded(t + 1) - 2.0 * rounded(t) + rounded(t - 1)).abs()).sum();
+            let what = |name: &str| format!("{name} of period {}, {flags}", PERIODS[i % 8]);
+            close(what("D"), of(&rows, "D", i), d, 1e-6 * d);
+            close(what("kappa"), of(&rows, "kappa", i), turns / (T - 2) as f64, 1e-6);
+            let kappa = of_rounded / (T - 2) as f64;
+            close(what("kappa of what was rounded"), of(&rows, "kappa", i), kappa, 1e-6 * kappa);
+        }
+    }
+}
+
+/// Row 11, for opacities up to the last that f32 tells from 1, stored once and stored anew in every frame.
+#[test]
+fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
+    let logits: [f32; 6] = [-4.0, -0.847_297_9, 0.0, 0.3, 6.9, 16.1];
+    for varying in [Columns::POSITION, Columns::POSITION | Columns::OPACITY] {
+        for flags in [RUNS, LITERAL] {
+            let rows =
+                Sequence::new(logits.len(), 100_000, varying).with_logits(logits.to_vec()).rows(flags, |_, _| ());
+            assert_eq!(rows["V"], [0.0; 6], "{flags}, {varying:?} vary");
+            assert_eq!(rows["life"], [1e5; 6], "{flags}, {varying:?} vary");
+        }
+    }
+}
+
+/// Row 12, for a sweep of distances.
+#[test]
+fn a_teleport_while_dead_changes_no_motion() {
+    let distance = |i: usize| 2f64.powi(i as i32 - 10);
+    let dead = |_: usize, t: usize| if (6..9).contains(&t) { DEAD } else { ALIVE };
+    let walk = move |i: usize, t: usize, jump: f64| 0.125 * t as f64 + if t >= 7 { jump * distance(i) } else { 0.0 };
+    let [still, jumped] = [0.0, 1.0].map(|jump| walking(30, 16, RUNS, move |i, t| walk(i, t, jump), dead));
+    for name in ["D", "kappa"] {
+        for i in 0..30 {
+            close(
+                format!("{name} at {}", distance(i)),
+                of(&jumped, name, i),
+                of(&still, name, i),
+                1e-6 * distance(i).max(1.0) * 1e-1,
+            );
+        }
+        assert!(still["D"].iter().all(|&d| d == 0.125), "{:?}", still["D"]);
+    }
+}
+
+/// Row 13, for a sweep of distances; that it never merges: `merging.rs`.
+#[test]
+fn a_teleport_while_alive_is_motion() {
+    let distance = |i: usize| 2f64.powi(i as i32 - 10);
+    let rows = walking(30, 10, RUNS, move |i, t| if t < 5 { 0.0 } else { distance(i) }, |_, _| ALIVE);
+    for i in 0..30 {
+        close("D", of(&rows, "D", i), distance(i) / 3.0, 1e-12 * distance(i));
+        close("kappa", of(&rows, "kappa", i), 2.0 * distance(i) / 8.0, 1e-12 * distance(i));
+    }
+}
+
+/// Row 14, wherever the life begins.
+#[test]
+fn lives_of_1_2_and_3_frames_have_0_0_and_1_curvature_terms() {
+    // Gaussian 3·b + l − 1 lives for l frames from frame b on.
+    let life = |i: usize, t: usize| if (i / 3..i / 3 + i % 3 + 1).contains(&t) { ALIVE } else { DEAD };
+    for flags in [RUNS, LITERAL] {
+        let rows = walking(21, 9, flags, |_, t| (t * t) as f64, life);
+        for i in 0..21 {
+            assert_eq!(of(&rows, "life", i), (i % 3 + 1) as f64);
+            // The second difference of t² is 2.
+            assert_eq!(of(&rows, "kappa", i), if i % 3 == 2 { 2.0 } else { 0.0 }, "{flags}, Gaussian {i}");
+        }
+    }
+}
+
+/// Row 15, for every pattern without two living frames side by side.
+#[test]
+fn alternating_lives_have_no_interior_triples() {
+    let life = |i: usize, t: usize| if t % (2 + i / 2) == i % 2 { ALIVE } else { DEAD };
+    let rows = walking(12, 19, RUNS, |_, t| (t * t) as f64, life);
+    for i in 0..12 {
+        assert_eq!((of(&rows, "D", i), of(&rows, "kappa", i)), (0.0, 0.0), "Gaussian {i}");
+        assert!(of(&rows, "life", i) >= 2.0, "Gaussian {i} must live");
+    }
+}
+
+/// Row 16, wherever death comes, the end of the sequence included.
+#[test]
+fn the_turn_about_the_last_life_frame_is_discarded() {
+    // Straight until death, then far away: only a turn about the last life frame sees that.
+    let x = |i: usize, t: usize| if t <= i + 2 { t as f64 } else { 50.0 };
+    let life = |i: usize, t: usize| if t <= i + 2 { ALIVE } else { DEAD };
+    for flags in [RUNS, LITERAL] {
+        let rows = walking(8, 10, flags, x, life);
+        assert_eq!(rows["kappa"], [0.0; 8], "{flags}");
+        assert_eq!(rows["life"], [3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]);
+    }
+}
+
+/// Row 19: whatever is not normal is a value like any other.
+#[test]
+fn subnormals_move_as_values_and_minus_0_is_0() {
+    let step = |i: usize| f64::from(f32::from_bits(1)) * (i + 1) as f64;
+    let rows = walking(40, 6, RUNS, move |i, t| step(i) * t as f64, |_, _| ALIVE);
+    for i in 0..40 {
+        close(format!("D of steps of {:e}", step(i)), of(&rows, "D", i), step(i), 1e-12 * step(i));
+    }
+    let signed = |zero: f32| {
+        Sequence::new(40, 4, Columns::POSITION | Columns::OPACITY).rows(RUNS, move |t, state| {
+            for i in 0..40 {
+                state.position.set_row(i, [if (i + t) % 3 == 0 { zero } else { (i % 5) as f32 }, zero, 1.0]);
+                state.opacity_logit.set_row(i, [if i % 2 == 0 { zero } else { 1.0 }]);
+                state.rotation.set_row(i, [1.0, zero, zero, zero]);
+                state.log_scale.set_row(i, [zero, -2.0, zero]);
+            }
+        })
+    };
+    let [plus, minus] = [0.0, -0.0].map(signed);
+    assert!(plus == minus, "the sign of 0 shows");
+}
+
+/// Row 25, for a sweep of offsets: what rests on jittering floats has no motion, and is counted; what moves has the motion of
+/// its rounded positions.
+#[test]
+fn far_from_the_origin_noise_is_snapped_and_counted_and_motion_is_that_of_the_floats() {
+    const RESTING: usize = 30;
+    for exponent in 2..=7 {
+        let offset = 10f64.powi(exponent);
+        let ulp = f64::from((offset as f32).next_up()) - f64::from(offset as f32);
+        // Of every axis a pattern of its own, one ulp high; the others walk in steps of 64 ulps.
+        let x = move |i: usize, t: usize| match i {
+            0..RESTING => offset + ulp * ((t >> (i % 3)) % 2) as f64,
+            _ => offset + 64.0 * ulp * (t * (i - RESTING + 1) % 7) as f64,
+        };
+        let sequence = || Sequence::new(2 * RESTING, 40, Columns::POSITION);
+        let fill = move |t: usize, state: &mut splatsieve::model::Gaussians| {
+            (0..2 * RESTING).for_each(|i| state.position.set_row(i, [x(i, t) as f32, 0.0, 0.0]));
+        };
+        let rows = sequence().rows("--preset default", fill);
+        let summary =
+            sequence().summary("--preset default --coverage projected --prune-only --no-refine --dry-run", fill);
+        assert!(rows.values().flatten().all(|value| value.is_finite()), "offset {offset:e}");
+        for i in 0..2 * RESTING {
+            let at = |t: usize| f64::from(x(i, t) as f32);
+            let steps: f64 = (1..40).map(|t| (at(t) - at(t - 1)).powi(2)).sum();
+            let expected = if i < RESTING { 0.0 } else { (steps / 39.0).sqrt() };
+            close(format!("D of {i} at {offset:e}"), of(&rows, "D", i), expected, 1e-6 * expected);
+        }
+        assert_eq!(summary["flags"]["snapped_d"], RESTING, "offset {offset:e}: {}", summary["flags"]);
+    }
+}

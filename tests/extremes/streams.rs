@@ -1,0 +1,72 @@
+//! Streams whose frames contradict one another.
+
+use super::scene::{Workplace, files};
+use super::{balls, piped};
+use splatsieve::emit::frame_stream::StreamWriter;
+use splatsieve::ingest::frame_stream::StreamHeader;
+use splatsieve::model::Columns;
+use std::path::Path;
+
+/// A stream of five frames of four balls.
+fn stream() -> Vec<u8> {
+    let (mut bytes, state) = (Vec::new(), balls(4));
+    let header = StreamHeader { count: 4, sh_degree: 0, varying: Columns::POSITION };
+    let mut stream = StreamWriter::new(&mut bytes, Path::new("memory"), header, &state).unwrap();
+    (0..5).for_each(|t| stream.frame(f64::from(t), &state).unwrap());
+    stream.finish().unwrap();
+    bytes
+}
+
+/// Where frame `t` begins: header, four balls without their positions, then marks of 24 bytes and positions.
+fn frame(t: usize) -> usize {
+    32 + 4 * 4 * (4 + 3 + 1 + 3) + t * (24 + 4 * 4 * 3)
+}
+
+/// Every verb that reads streams refuses `bytes` with these parts in its message, and leaves nothing.
+fn refused(bytes: &[u8], parts: &[&str]) {
+    for arguments in ["compress - -o out", "pack - -o a.gseq", "score - -o rows.npz", "info -"] {
+        let (workplace, bytes) = (Workplace::new(), bytes.to_owned());
+        let output = piped(&workplace, arguments, move |to| drop(to.write_all(&bytes)));
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{arguments}: {text}");
+        for part in parts {
+            assert!(text.contains(part), "{arguments}: {part:?} is not in {text:?}");
+        }
+        assert!(files(&workplace.path("")).is_empty(), "{arguments}: something was left behind");
+    }
+}
+
+/// Row 41.
+#[test]
+fn time_stamps_that_do_not_increase_are_named() {
+    for (stamp, expected) in [
+        (2.0, "a time stamp above 2, that of frame 2"),
+        (-1e300, "a time stamp above 2, that of frame 2"),
+        (2.0f64.next_down(), "a time stamp above 2, that of frame 2"),
+        (f64::NAN, "a time stamp"),
+        (f64::INFINITY, "a time stamp"),
+        (f64::NEG_INFINITY, "a time stamp"),
+    ] {
+        let mut bytes = stream();
+        bytes[frame(3) + 8..frame(3) + 16].copy_from_slice(&stamp.to_le_bytes());
+        refused(&bytes, &["standard input, frame 3", expected]);
+    }
+}
+
+/// Row 43.
+#[test]
+fn frames_of_another_size_or_columns_are_named() {
+    // (length that frame 3 claims, what the message makes of it)
+    for (length, found) in
+        [(5 * 4 * 3u64, "5 Gaussians"), (0, "0 Gaussians"), (4 * 4 * 7 + 4, "no number of Gaussians")]
+    {
+        let mut bytes = stream();
+        bytes[frame(3) + 16..frame(3) + 24].copy_from_slice(&length.to_le_bytes());
+        refused(&bytes, &["standard input, frame 3", "4 Gaussians of position", found]);
+    }
+    for (index, found) in [(2u32, "frame 2"), (4, "frame 4")] {
+        let mut bytes = stream();
+        bytes[frame(3) + 4..frame(3) + 8].copy_from_slice(&index.to_le_bytes());
+        refused(&bytes, &["standard input, frame 3", "expected frame 3", found]);
+    }
+}
