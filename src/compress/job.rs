@@ -16,6 +16,8 @@ use super::request::{Goal, Only, Quality, Request, decibels};
 use super::rounds::Rounds;
 use super::score::UserOverrides;
 use super::search::Search;
+use super::summary::Saved;
+use super::visible::Visible;
 use crate::budget::{Need, Plan, Workload};
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -214,8 +216,9 @@ impl Job {
         self.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, all))
     }
 
-    /// Writes down the stages that the request leaves out.
-    pub fn write_down(&self, request: &Request, journal: &mut Journal) {
+    /// Writes down the stages that the request leaves out of such a workload.
+    pub fn write_down(&self, request: &Request, work: &Workload, limits: &Limits, journal: &mut Journal) {
+        let saved = |need: Need| Saved::Stage { seconds: need.seconds / work.threads as f64, reads: need.reads };
         if !self.prune.prunes {
             journal.leave_out("pruning", "--merge-only");
         }
@@ -226,7 +229,18 @@ impl Job {
                 _ if request.goal.is_some() => "a quality or a size on disk is found by pruning",
                 _ => "refining what is left gains more at the same count (--no-refine merges)",
             };
-            journal.leave_out("merging, and its pass over the frames", why);
+            let what = "merging, and its pass over the frames";
+            let Request { recipe, .. } = request;
+            let merge = Merge {
+                recipe: recipe.merge.clone(),
+                scan: recipe.scan.clone(),
+                prunes: self.prune.prunes,
+                target: self.prune.target,
+            };
+            match recipe.merge.passes.is_empty() {
+                true => journal.leave_out(what, why),
+                false => journal.spare(what, why, saved(merge.need(work, limits))),
+            }
         }
         let takes = |least: u64| format!("memory: expected at least {}MiB for it (--memory)", least.div_ceil(1 << 20));
         match self.spared {
@@ -236,7 +250,8 @@ impl Job {
         }
         if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
             let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
-            journal.leave_out("visible coverage", why);
+            let visible = Visible { recipe: request.recipe.scan.clone() };
+            journal.spare("visible coverage", why, saved(visible.need(work, limits)));
         }
     }
 }
@@ -310,7 +325,7 @@ mod tests {
             request.input.memory = budget(bytes);
             let job = Job::within(&request, OUTLOOK, &work).unwrap();
             let mut journal = Journal::default();
-            job.write_down(&request, &mut journal);
+            job.write_down(&request, &work, &Limits::NONE, &mut journal);
             let left_out =
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
             let [bands, all] = [left_out("refining of harmonics above the first"), left_out("refinement")];
@@ -355,7 +370,7 @@ mod tests {
         let needs = job.needs(&work(1000), &Limits::NONE);
         assert_eq!(needs.iter().map(|need| need.stage).collect::<Vec<_>>(), ["scan", "score", "emit"]);
         let mut journal = Journal::default();
-        job.write_down(&request, &mut journal);
+        job.write_down(&request, &work(1000), &Limits::NONE, &mut journal);
         assert_eq!(journal.left_out.len(), 1);
         assert_eq!(journal.left_out[0].why, "the recipe has no merge pass");
     }

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use cpu_time::ProcessTime;
 
-use super::summary::{BandsSummary, FieldSummary, LeftOut, Stage};
+use super::summary::{BandsSummary, FieldSummary, LeftOut, Saved, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::emit::atomic::Spill;
 use crate::error::Result;
@@ -84,7 +84,12 @@ impl Journal {
 
     /// Writes down what was not done, and why not.
     pub fn leave_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
-        self.left_out.push(LeftOut { what: what.into(), why: why.into() });
+        self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: None });
+    }
+
+    /// The same of what would have taken so much.
+    pub fn spare(&mut self, what: impl Into<String>, why: impl Into<String>, saved: Saved) {
+        self.left_out.push(LeftOut { what: what.into(), why: why.into(), saved: Some(saved) });
     }
 
     fn add(

@@ -69,6 +69,7 @@ impl Measure {
             scan: Scan { recipe: recipe.scan.clone() },
             visible: Visible::of(&recipe.scan, has_cameras),
             score: Score {
+                rereads: recipe.scan.reread,
                 snap_noise: recipe.scan.snap_noise,
                 non_finite: recipe.scan.non_finite,
                 score: recipe.score.clone(),

@@ -165,7 +165,7 @@ fn reduce(
             (reduction, summary, None)
         }
     };
-    job.write_down(request, &mut journal);
+    job.write_down(request, &work, &scene.limits, &mut journal);
 
     // What the search was given was more.
     if let (Some(goal), Some(Goal::Quality(Quality::Psnr(least)))) = (&mut goal, &request.goal) {

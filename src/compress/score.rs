@@ -4,9 +4,10 @@ use std::borrow::Cow;
 
 use super::journal::Journal;
 use super::statistics::Statistics;
-use super::summary::{FlagSummary, TermSummary};
+use super::summary::{FlagSummary, Saved, TermSummary};
 use crate::budget::{Need, Part, Workload};
 use crate::error::{Error, Result};
+use crate::families::trajectories::state_bytes;
 use crate::limits::Limits;
 use crate::model::{Columns, Flags, Gaussians, Rows};
 use crate::recipe::{self, NonFinite};
@@ -32,6 +33,8 @@ pub fn scored(limits: &Limits) -> Vec<Part> {
 /// The scoring of a run.
 #[derive(Debug, Clone)]
 pub struct Score {
+    /// Whether the scan reads what does not change again.
+    pub rereads: bool,
     /// Whether motion within rounding is taken as none.
     pub snap_noise: bool,
     /// What becomes of Gaussians with NaN or infinity.
@@ -64,6 +67,8 @@ pub struct Scored {
     pub reference: Reference,
     /// Distance between f32 values at the scene's largest coordinate: the noise floor of a position.
     pub position_ulp: f64,
+    /// Whether what does not change is read again all the same.
+    rereads: bool,
 }
 
 /// What the user knows better, before ids are resolved.
@@ -156,6 +161,7 @@ impl Score {
                 protected,
                 reference,
                 position_ulp,
+                rereads: self.rereads,
             };
             scored.write_down(scene, journal);
             progress.advance(info.count as u64);
@@ -279,7 +285,14 @@ impl Scored {
             journal.leave_out("motion, curvature, opacity variance", why);
         } else {
             for column in Columns::all().difference(info.varying).iter() {
-                journal.leave_out(constant(column), format!("{} is the same in every frame", column.name()));
+                let why = format!("{} is the same in every frame", column.name());
+                if self.rereads {
+                    journal.notes.push(format!("{why}, and was read again as asked for (--reread)"));
+                    continue;
+                }
+                let again = (info.times.len() - 1) as u64 * info.count as u64;
+                let bytes = again * state_bytes(info.sh_degree, column);
+                journal.spare(constant(column), why, Saved::Values { bytes });
             }
         }
         if info.sh_degree == 0 {

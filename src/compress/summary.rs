@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
+use bytesize::ByteSize;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::archive::Parts;
@@ -20,6 +21,7 @@ use crate::recipe::ProxyOpacity;
 use crate::scene::Scene;
 use crate::select::Counts;
 use crate::source::Reads;
+use crate::stream::duration;
 
 /// One stage of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,12 +49,53 @@ pub struct Stage {
 }
 
 /// Something the scene did not need.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LeftOut {
     /// What was not done.
     pub what: String,
     /// Why not.
     pub why: String,
+    /// What it would have taken, where that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub saved: Option<Saved>,
+}
+
+/// What something would have taken that was left out.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Saved {
+    /// A stage: about so many seconds on all threads, and full reads of the frames at most.
+    Stage {
+        /// Seconds.
+        seconds: f64,
+        /// Full reads.
+        reads: f64,
+    },
+    /// Values that are the same as before, not read again.
+    Values {
+        /// Their bytes.
+        bytes: u64,
+    },
+}
+
+impl Saved {
+    /// For a person.
+    pub fn text(self) -> String {
+        match self {
+            Saved::Stage { seconds, reads } => format!("about {}, {reads:.2} full reads", duration(seconds)),
+            Saved::Values { bytes } => format!("{} of values", ByteSize(bytes).display().si()),
+        }
+    }
+}
+
+impl LeftOut {
+    /// Why, and what that saved, for a person.
+    pub fn reason(&self) -> String {
+        match self.saved {
+            Some(saved) => format!("{}; saves {}", self.why, saved.text()),
+            None => self.why.clone(),
+        }
+    }
 }
 
 /// What the output's size was found by.
@@ -393,7 +436,7 @@ impl Summary {
             let _ = writeln!(out, "bands: SH degree {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why());
         }
         for left in &self.left_out {
-            let _ = writeln!(out, "  left out: {} ({})", left.what, left.why);
+            let _ = writeln!(out, "  left out: {} ({})", left.what, left.reason());
         }
         for note in &self.notes {
             let _ = writeln!(out, "  note: {note}");

@@ -67,6 +67,7 @@ pub struct Scan {
     pub view_stride: NonZeroU32,
     pub frame_stride: NonZeroU32,
     pub look_pictures: usize,
+    pub reread: bool,
     pub non_finite: NonFinite,
 }
 

@@ -344,7 +344,7 @@ fn left_out(report: &Report, run: &Run) -> String {
     let mut out = String::new();
     if let Some((summary, _)) = &run.summary {
         let mut rows: Vec<[String; 2]> =
-            summary.left_out.iter().map(|left| [escape(&left.what), escape(&left.why)]).collect();
+            summary.left_out.iter().map(|left| [escape(&left.what), escape(&left.reason())]).collect();
         if rows.is_empty() {
             rows.push(["nothing".to_owned(), "every stage and term had something to do".to_owned()]);
         }

@@ -79,6 +79,11 @@ impl<'a> BlockScan<'a> {
         }
     }
 
+    /// See [`ScanPlan::wanted`].
+    pub fn wanted(&self, frame: usize, varying: Columns) -> Columns {
+        self.plan.wanted(frame, varying)
+    }
+
     /// Adds frame `t` with the cameras that see it. `changed` names the columns that may differ from
     /// the previous frame; in frame 0 all but SH count as changed. SH is only searched for NaN, and
     /// only where `changed` names it.

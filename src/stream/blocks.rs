@@ -36,7 +36,7 @@ impl<'a> BlockScans<'a> {
 
     /// What may have changed since the frame before.
     pub(super) fn changed(&self, frame: usize) -> Columns {
-        if frame == 0 { Columns::all() } else { self.source.info().varying }
+        self.plan.wanted(frame, self.source.info().varying)
     }
 
     pub(super) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {

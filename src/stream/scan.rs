@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::blocks::BlockScans;
 use super::{BLOCK, Progress, stages};
 use crate::error::Result;
-use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
+use crate::model::{Camera, Gaussians, Rows, Schedule};
 use crate::source::{FrameSource, Ids};
 use crate::stats::{BlockScan, NEEDED, ScanPlan};
 
@@ -80,7 +80,7 @@ impl<'a> RunningScan<'a> {
                 let mut state = Gaussians::zeros(range.len(), info.sh_degree);
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
-                    let changed = if first + t == 0 { Columns::all() } else { info.varying };
+                    let changed = scan.wanted(first + t, info.varying);
                     // The state is new, though the accumulators know what does not vary.
                     let want = if t == 0 { changed | NEEDED } else { changed };
                     reader.read(t, want, &mut state)?;
@@ -108,5 +108,64 @@ impl<'a> RunningScan<'a> {
             (found.rows, found.largest_coordinate)
         });
         joined(blocks, self.alive_per_frame)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+    use crate::demo::Scene;
+    use crate::model::{Columns, SequenceInfo, Split};
+    use crate::recipe::{self, Recipe};
+    use crate::source::BlockReader;
+
+    /// A scene of which only positions vary, and what was asked of it.
+    struct Asked {
+        scene: Scene,
+        info: SequenceInfo,
+        /// Frames and columns.
+        reads: Mutex<Vec<(usize, Columns)>>,
+    }
+
+    struct AskedReader<'a>(&'a Asked, Box<dyn BlockReader + 'a>);
+
+    impl FrameSource for Asked {
+        fn info(&self) -> &SequenceInfo {
+            &self.info
+        }
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(AskedReader(self, self.scene.open(ids)?)))
+        }
+    }
+
+    impl BlockReader for AskedReader<'_> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            self.0.reads.lock().unwrap().push((frame, want));
+            self.1.read(frame, want & Columns::POSITION, out)?;
+            self.1.read(0, want.difference(Columns::POSITION), out)
+        }
+    }
+
+    #[test]
+    fn what_does_not_vary_is_read_once_and_reading_it_again_changes_no_bit() {
+        let scene = Scene::new(1500, 5);
+        let info = SequenceInfo { varying: Columns::POSITION, ..scene.info().clone() };
+        let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
+        let asked = Asked { scene, info, reads: Mutex::default() };
+        let by = |reread: bool| {
+            let scan_recipe = recipe::Scan { reread, ..Recipe::preset("default").unwrap().scan };
+            let plan = ScanPlan::new(&scan_recipe, &asked.info.times, &schedule).unwrap();
+            let found = scan(&asked, &schedule, &plan).unwrap();
+            (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *asked.reads.lock().unwrap()))
+        };
+        let (skipping, everything) = (by(false), by(true));
+        assert_eq!((&skipping.0, &skipping.1), (&everything.0, &everything.1));
+        for (frame, want) in &skipping.2 {
+            assert_eq!(*want, if *frame == 0 { Columns::all() } else { Columns::POSITION }, "frame {frame}");
+        }
+        assert!(everything.2.iter().all(|(_, want)| *want == Columns::all()));
+        assert_eq!((skipping.2.len(), everything.2.len()), (10, 10), "blocks times frames");
     }
 }
