@@ -1,23 +1,26 @@
 //! Which splats reach which tile, front to back.
 //!
-//! One sort by depth over the whole picture, then a counting sort into tiles that keeps that order, a strip of
+//! One radix sort by depth over the whole picture, then a counting sort into tiles that keeps that order, a strip of
 //! tiles at a time: how many pairs there are depends on the picture alone, how many lie ready does not.
-//! Memory: 8 bytes per splat, 4 per pair of a splat and a tile of the strip.
+//! Memory: 16 bytes per splat, 4 per pair of a splat and a tile of the strip.
 
 use std::ops::Range;
 
-use rayon::slice::ParallelSliceMut;
-
-use super::project::Splats;
+use super::project::{Splats, TileRect};
 
 /// Pairs of a strip, unless one tile alone has more.
 pub(super) const STRIP_PAIRS: usize = 1 << 20;
+
+/// Splats whose tiles are read together: one after the other, each would wait for memory alone.
+const TOGETHER: usize = 64;
 
 /// Indices of splats, grouped by tile, nearest first.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Bins {
     /// (ordered depth bits, splat) of every splat, sorted.
     keys: Vec<u64>,
+    /// Room to sort them.
+    spare: Vec<u64>,
     /// Tiles across.
     across: usize,
     /// End of each tile's pairs among those of the whole picture; tile t begins where t − 1 ends.
@@ -28,23 +31,17 @@ pub(super) struct Bins {
     strip: Range<usize>,
     pairs: Vec<u32>,
     /// Where in `pairs` the next pair of each tile of the strip goes, then the end of all.
-    next: Vec<usize>,
+    next: Vec<u32>,
 }
 
 impl Bins {
-    /// Sorts `splats` and counts their pairs with `tiles` = (across, down) tiles, on all threads of the pool if
-    /// `parallel`; no pairs lie ready yet.
-    pub(super) fn begin(&mut self, splats: &Splats, tiles: [u32; 2], parallel: bool) {
+    /// Sorts `splats` and counts their pairs with `tiles` = (across, down) tiles; no pairs lie ready yet.
+    pub(super) fn begin(&mut self, splats: &Splats, tiles: [u32; 2]) {
         self.keys.clear();
         self.keys.reserve_exact(splats.splats.len());
-        // Ties fall to the lower index.
         let depths = splats.splats.iter().map(|splat| u64::from(ordered_bits(splat.order)));
         self.keys.extend(depths.enumerate().map(|(i, bits)| bits << 32 | i as u64));
-        if parallel {
-            self.keys.par_sort_unstable();
-        } else {
-            self.keys.sort_unstable();
-        }
+        sort_by_depth(&mut self.keys, &mut self.spare);
 
         self.across = tiles[0] as usize;
         self.ends.clear();
@@ -90,21 +87,26 @@ impl Bins {
 
         self.next.clear();
         self.next.push(0);
-        self.next.extend(self.ends[self.strip.clone()].iter().map(|end| end - before));
-        self.pairs.clear();
-        self.pairs.resize(self.next.last().map_or(0, |&total| total), 0);
+        // A strip of more than `most` is one tile, with no more pairs than there are splats.
+        self.next.extend(self.ends[self.strip.clone()].iter().map(|end| (end - before) as u32));
+        // What is there already will be written over.
+        self.pairs.resize(self.next.last().map_or(0, |&total| total as usize), 0);
         let rows = self.strip.start / self.across..self.strip.end.div_ceil(self.across);
-        for &key in &self.keys {
-            let splat = key as u32;
-            let rect = splats.rects[splat as usize];
-            for y in rows.start.max(rect.y0 as usize)..rows.end.min(rect.y1 as usize) {
-                let row = y * self.across;
-                let from = (row + rect.x0 as usize).max(self.strip.start);
-                let to = (row + rect.x1 as usize).min(self.strip.end);
-                for tile in from..to {
-                    let at = &mut self.next[tile - self.strip.start];
-                    self.pairs[*at] = splat;
-                    *at += 1;
+        for keys in self.keys.chunks(TOGETHER) {
+            let mut reached = [(0, TileRect::default()); TOGETHER];
+            for (reached, &key) in reached.iter_mut().zip(keys) {
+                *reached = (key as u32, splats.rects[key as u32 as usize]);
+            }
+            for &(splat, rect) in &reached[..keys.len()] {
+                for y in rows.start.max(rect.y0 as usize)..rows.end.min(rect.y1 as usize) {
+                    let row = y * self.across;
+                    let from = (row + rect.x0 as usize).max(self.strip.start);
+                    let to = (row + rect.x1 as usize).min(self.strip.end);
+                    for tile in from..to {
+                        let at = &mut self.next[tile - self.strip.start];
+                        self.pairs[*at as usize] = splat;
+                        *at += 1;
+                    }
                 }
             }
         }
@@ -141,6 +143,32 @@ impl Bins {
     }
 }
 
+/// Bits of a digit: its counts stay in the first-level cache.
+const DIGIT: u32 = 11;
+
+/// Sorts keys that increase in their lower halves by their upper halves, ties in the order they have; `spare` is room.
+fn sort_by_depth(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
+    spare.clear();
+    spare.resize(keys.len(), 0);
+    for shift in [32, 32 + DIGIT, 32 + 2 * DIGIT] {
+        let digit = |key: u64| (key >> shift) as usize % (1 << DIGIT);
+        let mut places = [0; 1 << DIGIT];
+        for &key in &*keys {
+            places[digit(key)] += 1;
+        }
+        let mut before = 0;
+        for place in &mut places {
+            before += std::mem::replace(place, before);
+        }
+        for &key in &*keys {
+            let place = &mut places[digit(key)];
+            spare[*place] = key;
+            *place += 1;
+        }
+        std::mem::swap(keys, spare);
+    }
+}
+
 /// The bits of an f32, ordered as its values are. (Rounding far from the origin can leave a visible
 /// Gaussian a negative f32 depth.)
 fn ordered_bits(x: f32) -> u32 {
@@ -151,6 +179,18 @@ fn ordered_bits(x: f32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn keys_are_sorted_by_all_their_bits() {
+        let bits = |i: u64| i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
+        for kept in [u64::MAX, 0x7ff, 0x3f_f800, 0xffc0_0000, 0] {
+            let mut keys: Vec<u64> = (0..5000).map(|i| (bits(i) & kept) << 32 | i).collect();
+            let mut expected = keys.clone();
+            expected.sort_unstable();
+            sort_by_depth(&mut keys, &mut Vec::new());
+            assert!(keys == expected, "of depths & {kept:#x}");
+        }
+    }
 
     #[test]
     fn bits_are_ordered_as_their_floats() {

@@ -84,7 +84,7 @@ pub(super) struct Splat {
 }
 
 /// Tiles [x0, x1) × [y0, y1) in which a splat can change a pixel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct TileRect {
     pub(super) x0: u32,
     pub(super) x1: u32,

@@ -18,8 +18,8 @@ use crate::model::{Camera, Gaussians};
 /// Gaussians projected by one task: enough to outweigh handing it out.
 const SPAN: usize = 32 * BLOCK;
 
-/// Memory of a picture in the making per Gaussian it shows: footprint, reach and place in depth.
-pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<TileRect>() + size_of::<u64>();
+/// Memory of a picture in the making per Gaussian it shows: footprint, reach, and place in depth with room to sort it.
+pub const BYTES_PER_VISIBLE: usize = size_of::<Splat>() + size_of::<TileRect>() + 2 * size_of::<u64>();
 /// Memory of a picture in the making for pairs of Gaussians and tiles, with what is summed for each.
 pub const STRIP_BYTES: usize = STRIP_PAIRS * (size_of::<u32>() + size_of::<Weight>());
 
@@ -236,7 +236,7 @@ impl Renderer {
         } else {
             project(gaussians, 0..count, view, coloured, &mut self.splats);
         }
-        self.bins.begin(&self.splats, view.tiles, self.parallel);
+        self.bins.begin(&self.splats, view.tiles);
     }
 }
 
@@ -350,7 +350,7 @@ mod tests {
             for parallel in [false, true] {
                 assert!(made(Renderer { strip_pairs, ..Renderer::with(parallel) }) == whole, "{strip_pairs} at a time");
             }
-            renderer.bins.begin(&renderer.splats, [7, 5], false);
+            renderer.bins.begin(&renderer.splats, [7, 5]);
             let mut at = 0;
             while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {
                 assert!(strip.start == at && (strip.len() == 1 || renderer.bins.pairs().len() <= strip_pairs));
