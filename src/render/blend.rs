@@ -1,10 +1,11 @@
-//! Front-to-back blending of one tile, eight pixels at a time.
+//! Front-to-back blending of one tile, groups of eight pixels at a time.
 //!
 //! Data in: the tile's splats, nearest first. Data out: each pixel's transmittance, and whatever an
-//! [`Ink`] makes of the weights alpha · transmittance. Memory: a tile's pixels, in the first-level cache.
+//! [`Ink`] makes of the weights alpha · transmittance. Memory: a tile's pixels and the rows of [`AHEAD`] splats, in the
+//! first-level cache. `benches/render.rs` measures how far it is from what the arithmetic alone would take.
 
 use super::convention::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
-use super::lanes::{LANES, Lanes, Portable};
+use super::lanes::{LANES, Lanes, Portable, Sums};
 use super::project::Splat;
 
 const SIDE: usize = TILE as usize;
@@ -14,6 +15,9 @@ pub(super) const GROUPS: usize = SIDE * SIDE / LANES;
 /// One f32 per sampled pixel of a tile.
 pub(super) type Plane = [[f32; LANES]; GROUPS];
 
+/// One f32 per row or column of a tile.
+type Line = [[f32; LANES]; SIDE / LANES];
+
 /// The pixels of a tile that are sampled: every `stride`-th of the picture each way.
 ///
 /// Samples are packed towards the tile's corner, so that a stride leaves fewer groups, not emptier ones.
@@ -22,8 +26,8 @@ pub(super) struct Lattice {
     x0: f64,
     y0: f64,
     /// Offsets of the sampled columns and rows from the corner, pixels.
-    xs: [f32; SIDE],
-    ys: [f32; SIDE],
+    xs: Line,
+    ys: Line,
     /// First and last sampled offset of either half of `xs`.
     spans: [[f32; 2]; SIDE / LANES],
     /// Number of sampled columns and rows.
@@ -38,7 +42,7 @@ impl Lattice {
         let (ys, down) = samples(tile[1] * TILE, size[1], stride);
         let spans = std::array::from_fn(|half| {
             let last = across.clamp(half * LANES + 1, (half + 1) * LANES) - 1;
-            [xs[half * LANES], xs[last]]
+            [xs[half][0], xs.as_flattened()[last]]
         });
         let corner = [f64::from(tile[0] * TILE), f64::from(tile[1] * TILE)];
         Lattice { x0: corner[0], y0: corner[1], xs, ys, spans, across, down }
@@ -62,25 +66,25 @@ impl Lattice {
 }
 
 /// Offsets from `start` of the samples among the tile's pixels, and how many there are.
-fn samples(start: u32, size: u32, stride: u32) -> ([f32; SIDE], usize) {
-    let mut offsets = [0.0; SIDE];
+fn samples(start: u32, size: u32, stride: u32) -> (Line, usize) {
+    let mut offsets = Line::default();
     let mut count = 0;
     for offset in 0..TILE.min(size - start) {
         if (start + offset) % stride == stride / 2 {
-            offsets[count] = offset as f32;
+            offsets.as_flattened_mut()[count] = offset as f32;
             count += 1;
         }
     }
     (offsets, count)
 }
 
-/// One splat in one group of pixels.
+/// One splat in one vector of pixels.
 #[derive(Clone, Copy)]
-pub(super) struct Stroke<V> {
+pub(super) struct Stroke<V: Lanes> {
     /// Cut at 0.99.
     pub(super) alpha: V,
     /// Mask of the pixels where it is blended.
-    pub(super) blended: V,
+    pub(super) blended: V::Mask,
     /// alpha · transmittance; 0 where it is not blended.
     pub(super) weight: V,
     /// Transmittance behind it, never 0; where the weight is 0, it may be negative.
@@ -88,7 +92,7 @@ pub(super) struct Stroke<V> {
     /// Offset from the splat's middle of this row, pixels: dx − slope·dy of [`Splat`].
     pub(super) across: V,
     /// Offset of the row from the splat's centre, pixels: dy of [`Splat`].
-    pub(super) down: f32,
+    pub(super) down: V,
 }
 
 /// What becomes of the weights alpha · transmittance.
@@ -97,7 +101,7 @@ pub(super) trait Ink {
     type Drop<V: Lanes>: Copy;
     /// The next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Drop<V>;
-    /// What it does to one group of pixels.
+    /// What it does to `group` and, of a vector of more than one, those after it.
     fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, stroke: Stroke<V>) -> Self::Drop<V>;
     /// The splat, `pair` of the tile, is done.
     fn end<V: Lanes>(&mut self, drop: Self::Drop<V>, pair: usize);
@@ -117,7 +121,7 @@ impl Ink for Colour {
     #[inline(always)]
     fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 3] {
         for (plane, colour) in self.planes.iter_mut().zip(colour) {
-            V::load(&plane[group]).add(colour.mul(weight)).store(&mut plane[group]);
+            V::load(plane, group).add(colour.mul(weight)).store(plane, group);
         }
         colour
     }
@@ -140,20 +144,19 @@ pub(super) struct Weights<'a> {
 }
 
 impl Ink for Weights<'_> {
-    type Drop<V: Lanes> = [V; 2];
+    /// Sum and largest.
+    type Drop<V: Lanes> = (V::Sums, V);
     #[inline(always)]
-    fn begin<V: Lanes>(&self, _: &Splat) -> [V; 2] {
-        [V::splat(0.0); 2]
+    fn begin<V: Lanes>(&self, _: &Splat) -> (V::Sums, V) {
+        (V::Sums::zero(), V::splat(0.0))
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, [sum, max]: [V; 2], _: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 2] {
-        [sum.add(weight), max.max(weight)]
+    fn add<V: Lanes>(&mut self, (sum, max): (V::Sums, V), _: usize, stroke: Stroke<V>) -> (V::Sums, V) {
+        (stroke.weight.add_to(sum), max.max(stroke.weight))
     }
     #[inline(always)]
-    fn end<V: Lanes>(&mut self, [sum, max]: [V; 2], pair: usize) {
-        let mut maxima = [0.0; LANES];
-        max.store(&mut maxima);
-        self.pairs[pair] = Weight { sum: sum.sum(), max: maxima.into_iter().fold(0.0, f32::max) };
+    fn end<V: Lanes>(&mut self, (sum, max): (V::Sums, V), pair: usize) {
+        self.pairs[pair] = Weight { sum: sum.total(), max: max.largest() };
     }
 }
 
@@ -163,16 +166,27 @@ pub(super) enum Blend {
     Portable,
     #[cfg(target_arch = "x86_64")]
     Avx2,
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
 }
 
 impl Blend {
-    /// The fastest this machine has.
-    pub(super) fn detect() -> Self {
+    /// All that this machine has, the fastest last.
+    pub(super) fn all() -> Vec<Self> {
+        let mut all = vec![Blend::Portable];
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") {
-            return Blend::Avx2;
+            all.push(Blend::Avx2);
+            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") {
+                all.push(Blend::Avx512);
+            }
         }
-        Blend::Portable
+        all
+    }
+
+    /// The fastest this machine has.
+    pub(super) fn fastest() -> Self {
+        Self::all().pop().unwrap_or(Blend::Portable)
     }
 
     /// Blends the splats `pairs` front to back over the lattice; gives the transmittance left, its sign
@@ -186,81 +200,132 @@ impl Blend {
                 fn blend_avx2(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
                     blend::<super::lanes::Avx2>(splats, pairs, lattice, ink)
                 }
-                // SAFETY: `Blend::Avx2` is made by `detect` alone, after AVX2 was detected.
+                // SAFETY: `Blend::Avx2` is made by `all` alone, after AVX2 was detected.
                 unsafe { blend_avx2(splats, pairs, lattice, ink) }
+            }
+            #[cfg(target_arch = "x86_64")]
+            Blend::Avx512 => {
+                #[target_feature(enable = "avx2,avx512f,avx512dq")]
+                fn blend_avx512(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
+                    blend::<super::lanes::Avx512>(splats, pairs, lattice, ink)
+                }
+                // SAFETY: `Blend::Avx512` is made by `all` alone, after these were detected.
+                unsafe { blend_avx512(splats, pairs, lattice, ink) }
             }
         }
     }
 }
 
+/// Splats looked at together, before any of them is blended. Which groups one reaches is known late; were it asked right
+/// before blending, every wrong guess of where its groups end would wait for that, and that for memory.
+const AHEAD: usize = 16;
+
+/// Where one splat meets the rows of a tile: along each, the exponent of its alpha is `level − narrow·(x − middle)²`.
+#[derive(Clone, Copy, Default)]
+struct Crossing {
+    /// Place among the tile's pairs.
+    pair: usize,
+    /// Bits of the groups where it may be visible.
+    groups: u32,
+    /// Centre, pixels below the tile's corner.
+    v: f32,
+    middles: Line,
+    levels: Line,
+}
+
+impl Crossing {
+    #[inline(always)]
+    fn new<V: Lanes>(splat: &Splat, pair: usize, lattice: &Lattice) -> Self {
+        // Relative to the tile's corner, f32 keeps a millionth of a pixel wherever the tile lies.
+        let (u, v) = ((splat.u - lattice.x0) as f32, (splat.v - lattice.y0) as f32);
+        let mut crossing = Crossing { pair, v, ..Crossing::default() };
+        let (zero, narrow, floor) = (V::splat(0.0), V::splat(splat.narrow), V::splat(-splat.reach));
+        for first in (0..SIDE / LANES).step_by(V::GROUPS) {
+            let dy = V::load(&lattice.ys, first).sub(V::splat(v));
+            let middle = V::splat(u).add(V::splat(splat.slope).mul(dy));
+            let level = zero.sub(V::splat(splat.fall).mul(dy.mul(dy)));
+            middle.store(&mut crossing.middles, first);
+            level.store(&mut crossing.levels, first);
+            // A group whose nearest point to `middle` lies below the floor holds no visible pixel: f32 subtraction and
+            // multiplication are monotone, so evaluating its pixels one by one would give alpha < 1/255 for each.
+            for (column, [start, end]) in lattice.spans.iter().enumerate() {
+                let gap = V::splat(*start).sub(middle).max(middle.sub(V::splat(*end))).max(zero);
+                let nearest = level.sub(narrow.mul(gap.mul(gap)));
+                crossing.groups |= V::bits(nearest.at_least(floor)) << (column * SIDE + first * LANES);
+            }
+        }
+        crossing
+    }
+}
+
 #[inline(always)]
 fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
-    let halves = |values: &[f32; SIDE]| -> [V; 2] {
-        let (first, second) = values.split_at(LANES);
-        [V::load(first.try_into().unwrap()), V::load(second.try_into().unwrap())]
-    };
-    let (xs, ys) = (halves(&lattice.xs), halves(&lattice.ys));
-    let zero = V::splat(0.0);
+    let xs = lattice.xs.each_ref().map(V::repeat);
+    // Of groups, those that share a vector; a vector is named by its first.
+    let vectors =
+        |groups: u32| (0..V::GROUPS).fold(0, |all, k| all | groups >> k) & (u32::MAX / ((1 << V::GROUPS) - 1));
     let mut transmittance = lattice.clear();
-    let mut live = lattice.groups();
-    for (pair, &index) in pairs.iter().enumerate() {
-        let splat = &splats[index as usize];
-        // Relative to the tile's corner, f32 keeps a millionth of a pixel wherever the tile lies.
-        let (u, v) = (V::splat((splat.u - lattice.x0) as f32), V::splat((splat.v - lattice.y0) as f32));
-        let narrow = V::splat(splat.narrow);
-        let floor = V::splat(-splat.reach);
-
-        // Along each row the exponent is `level − narrow·(x − middle)²`. A group whose nearest point to
-        // `middle` lies below the floor holds no visible pixel: f32 subtraction and multiplication are
-        // monotone, so evaluating its pixels one by one would give alpha < 1/255 for each.
-        let mut middles = [0.0f32; SIDE];
-        let mut levels = [0.0f32; SIDE];
-        let mut downs = [0.0f32; SIDE];
-        let mut reached = 0;
-        for half in 0..SIDE / LANES {
-            let dy = ys[half].sub(v);
-            let middle = u.add(V::splat(splat.slope).mul(dy));
-            let level = zero.sub(V::splat(splat.fall).mul(dy.mul(dy)));
-            for (row, rows) in [(middle, &mut middles), (level, &mut levels), (dy, &mut downs)] {
-                row.store((&mut rows[half * LANES..][..LANES]).try_into().unwrap());
-            }
-            for (column, [first, last]) in lattice.spans.iter().enumerate() {
-                let gap = V::splat(*first).sub(middle).max(middle.sub(V::splat(*last))).max(zero);
-                let nearest = level.sub(narrow.mul(gap.mul(gap)));
-                reached |= nearest.at_least(floor).signs() << (column * SIDE + half * LANES);
-            }
+    let mut live = vectors(lattice.groups());
+    let mut alphas = [[0.0; LANES]; GROUPS];
+    let mut crossings = [Crossing::default(); AHEAD];
+    for (chunk, ahead) in pairs.chunks(AHEAD).enumerate() {
+        for &index in pairs.get((chunk + 1) * AHEAD..).unwrap_or_default().iter().take(AHEAD) {
+            V::fetch(&splats[index as usize]);
         }
-        reached &= live;
-        if reached == 0 {
-            continue;
+        let mut met = 0;
+        for (k, &index) in ahead.iter().enumerate() {
+            let crossing = Crossing::new::<V>(&splats[index as usize], chunk * AHEAD + k, lattice);
+            crossings[met] = Crossing { groups: vectors(crossing.groups) & live, ..crossing };
+            met += usize::from(crossings[met].groups != 0);
         }
-
-        let opacity = V::splat(splat.opacity);
-        let mut drop = ink.begin::<V>(splat);
-        while reached != 0 {
-            let group = reached.trailing_zeros() as usize % GROUPS;
-            reached &= reached - 1;
-            let dx = xs[group / SIDE].sub(V::splat(middles[group % SIDE]));
-            let power = V::splat(levels[group % SIDE]).sub(narrow.mul(dx.mul(dx)));
-            let alpha = opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA));
-            let before = V::load(&transmittance[group]);
-            let after = before.mul(V::splat(1.0).sub(alpha));
-            // An ended pixel's transmittance is negative, so it can only end again.
-            let drawn = alpha.at_least(V::splat(MIN_ALPHA));
-            let blended = drawn.and(after.at_least(V::splat(MIN_TRANSMITTANCE)));
-            let weight = alpha.mul(before).and(blended);
-            let left = blended.select(after, before.or(drawn.and(V::splat(-0.0))));
-            left.store(&mut transmittance[group]);
-            if left.signs() == (1 << LANES) - 1 {
-                live &= !(1 << group);
+        for crossing in &crossings[..met] {
+            let splat = &splats[pairs[crossing.pair] as usize];
+            let mut groups = crossing.groups & live;
+            let (narrow, opacity) = (V::splat(splat.narrow), V::splat(splat.opacity));
+            let mut drop = ink.begin::<V>(splat);
+            // First what hangs on the splat alone: alphas in flight at once, then the pixels that wait for one another.
+            let mut rest = groups;
+            while rest != 0 {
+                let group = rest.trailing_zeros() as usize % GROUPS;
+                rest &= rest - 1;
+                let row = group % SIDE;
+                let dx = xs[group / SIDE].sub(V::spread(&crossing.middles, row));
+                let power = V::spread(&crossing.levels, row).sub(narrow.mul(dx.mul(dx)));
+                opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA)).store(&mut alphas, group);
             }
-            let stroke = Stroke { alpha, blended, weight, left, across: dx, down: downs[group % SIDE] };
-            drop = ink.add::<V>(drop, group, stroke);
+            while groups != 0 {
+                let group = groups.trailing_zeros() as usize % GROUPS;
+                groups &= groups - 1;
+                let row = group % SIDE;
+                let alpha = V::load(&alphas, group);
+                let before = V::load(&transmittance, group);
+                let after = before.mul(V::splat(1.0).sub(alpha));
+                // An ended pixel's transmittance is negative, so it can only end again.
+                let drawn = alpha.at_least(V::splat(MIN_ALPHA));
+                let blended = V::both(drawn, after.at_least(V::splat(MIN_TRANSMITTANCE)));
+                let weight = alpha.mul(before).keep(blended);
+                let left = after.or_else(blended, before.negative(drawn));
+                left.store(&mut transmittance, group);
+                if left.all_negative() {
+                    live = without(live, group);
+                }
+                let across = xs[group / SIDE].sub(V::spread(&crossing.middles, row));
+                let down = V::spread(&lattice.ys, row).sub(V::splat(crossing.v));
+                drop = ink.add::<V>(drop, group, Stroke { alpha, blended, weight, left, across, down });
+            }
+            ink.end::<V>(drop, crossing.pair);
         }
-        ink.end::<V>(drop, pair);
         if live == 0 {
             break;
         }
     }
     transmittance
+}
+
+/// `live` without the vector `group`. Apart, so that it is branched to: worked out for every vector, the groups of the
+/// next splat would wait for the pixels of this one.
+#[cold]
+#[inline(never)]
+fn without(live: u32, group: usize) -> u32 {
+    live & !(1 << group)
 }

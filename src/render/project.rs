@@ -64,7 +64,9 @@ impl View {
 /// With pixel offset (dx, dy) from the centre, the exponent of its alpha is, in powers of two,
 /// `−narrow·(dx − slope·dy)² − fall·dy²`: the quadratic form of the inverse covariance with the square
 /// completed over x, which neither cancels nor goes positive.
+/// Alone in its line of the cache, for splats are read in another order than they lie.
 #[derive(Debug, Clone, Copy)]
+#[repr(align(64))]
 pub(super) struct Splat {
     /// Centre in pixels, pixel centres at integers.
     pub(super) u: f64,

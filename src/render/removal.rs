@@ -6,7 +6,7 @@
 //! the floor under c − b, and ranking in rounds.
 
 use super::blend::{Ink, Plane, Stroke};
-use super::lanes::Lanes;
+use super::lanes::{Lanes, Sums};
 use super::project::Splat;
 
 /// Removal error of N Gaussians over any number of pictures: Σ over pixels of w²·(‖c − b‖² + floor²).
@@ -80,13 +80,18 @@ pub(super) struct Removal<'a> {
 
 impl Ink for Removal<'_> {
     /// Colour and sum.
-    type Drop<V: Lanes> = ([V; 3], V);
+    type Drop<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
-    fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V) {
-        (splat.colour.map(V::splat), V::splat(0.0))
+    fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {
+        (splat.colour.map(V::splat), V::Sums::zero())
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, (colour, sum): ([V; 3], V), group: usize, stroke: Stroke<V>) -> ([V; 3], V) {
+    fn add<V: Lanes>(
+        &mut self,
+        (colour, sum): ([V; 3], V::Sums),
+        group: usize,
+        stroke: Stroke<V>,
+    ) -> ([V; 3], V::Sums) {
         let Stroke { weight, left, .. } = stroke;
         // What lies behind shows with transmittance `left`, and `weight` more without this splat.
         let gain = weight.div(left);
@@ -94,16 +99,16 @@ impl Ink for Removal<'_> {
         let mut squares = floor.mul(floor);
         for (plane, colour) in self.rest.iter_mut().zip(colour) {
             let own = colour.mul(weight);
-            let behind = V::load(&plane[group]).sub(own);
-            behind.store(&mut plane[group]);
+            let behind = V::load(plane, group).sub(own);
+            behind.store(plane, group);
             let change = own.sub(gain.mul(behind));
             squares = squares.add(change.mul(change));
         }
-        (colour, sum.add(squares))
+        (colour, squares.add_to(sum))
     }
     #[inline(always)]
-    fn end<V: Lanes>(&mut self, (_, sum): ([V; 3], V), pair: usize) {
-        self.pairs[pair] = sum.sum();
+    fn end<V: Lanes>(&mut self, (_, sum): ([V; 3], V::Sums), pair: usize) {
+        self.pairs[pair] = sum.total();
     }
 }
 

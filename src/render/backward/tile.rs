@@ -6,7 +6,7 @@
 
 use super::super::blend::{GROUPS, Ink, Plane, Stroke};
 use super::super::convention::{MAX_ALPHA, TILE};
-use super::super::lanes::{LANES, Lanes};
+use super::super::lanes::{LANES, Lanes, Sums as _};
 use super::super::project::Splat;
 use super::super::renderer::Image;
 use super::sums::Sums;
@@ -53,56 +53,55 @@ pub(super) struct Pulled<'a, const SHAPE: bool> {
 
 /// A splat that is walked over.
 #[derive(Clone, Copy)]
-pub(super) struct Walked<V> {
+pub(super) struct Walked<V: Lanes> {
     colour: [V; 3],
-    p: V,
-    first: [V; 2],
-    second: [V; 3],
-    taken: [V; 3],
+    p: V::Sums,
+    first: [V::Sums; 2],
+    second: [V::Sums; 3],
+    taken: [V::Sums; 3],
 }
 
 impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
     type Drop<V: Lanes> = Walked<V>;
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> Walked<V> {
-        let zero = V::splat(0.0);
+        let zero = V::Sums::zero();
         Walked { colour: splat.colour.map(V::splat), p: zero, first: [zero; 2], second: [zero; 3], taken: [zero; 3] }
     }
     #[inline(always)]
     fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Stroke<V>) -> Walked<V> {
         let Stroke { alpha, blended, weight, across, down, .. } = stroke;
-        let by_colour: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c][group])));
+        let by_colour: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c], group)));
         for (taken, by_colour) in walked.taken.iter_mut().zip(by_colour) {
-            *taken = taken.add(by_colour);
+            *taken = by_colour.add_to(*taken);
         }
         if !SHAPE {
             return walked;
         }
         let [red, green, blue] = walked.colour;
         let own = red.mul(by_colour[0]).add(green.mul(by_colour[1])).add(blue.mul(by_colour[2]));
-        let rest = V::load(&self.pull.rest[group]).sub(own);
-        rest.store(&mut self.pull.rest[group]);
+        let rest = V::load(&self.pull.rest, group).sub(own);
+        rest.store(&mut self.pull.rest, group);
         // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing. The division waits
         // for alpha alone.
         let odds = alpha.div(V::splat(1.0).sub(alpha));
-        let moves = blended.and(V::splat(UNCUT).at_least(alpha));
-        let p = own.sub(odds.mul(rest)).and(moves);
-        let down = V::splat(down);
+        let moves = V::both(blended, V::splat(UNCUT).at_least(alpha));
+        let p = own.sub(odds.mul(rest)).keep(moves);
         let (px, py) = (p.mul(across), p.mul(down));
-        walked.p = walked.p.add(p);
-        walked.first = [walked.first[0].add(px), walked.first[1].add(py)];
+        walked.p = p.add_to(walked.p);
+        walked.first = [px.add_to(walked.first[0]), py.add_to(walked.first[1])];
         let [xx, xy, yy] = walked.second;
-        walked.second = [xx.add(px.mul(across)), xy.add(px.mul(down)), yy.add(py.mul(down))];
+        walked.second = [px.mul(across).add_to(xx), px.mul(down).add_to(xy), py.mul(down).add_to(yy)];
         walked
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, walked: Walked<V>, pair: usize) {
         self.pairs[pair] = if SHAPE {
             let ([x, y], [xx, xy, yy], [red, green, blue]) = (walked.first, walked.second, walked.taken);
-            let [x, y, xx, xy, yy, red, green, blue] = V::sums([x, y, xx, xy, yy, red, green, blue]);
-            Sums { p: walked.p.sum(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
+            let [x, y, xx, xy, yy, red, green, blue] = V::Sums::totals([x, y, xx, xy, yy, red, green, blue]);
+            Sums { p: walked.p.total(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
         } else {
-            Sums { colour: walked.taken.map(V::sum), ..Sums::default() }
+            Sums { colour: walked.taken.map(V::Sums::total), ..Sums::default() }
         };
     }
 }

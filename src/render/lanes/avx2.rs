@@ -1,0 +1,143 @@
+//! One AVX2 register.
+
+use std::arch::x86_64::*;
+
+use super::{LANES, Lanes, Sums};
+
+/// One group; a mask is all or no bits of each lane.
+#[derive(Clone, Copy)]
+pub(in super::super) struct Avx2(pub(super) __m256);
+
+// SAFETY of every block below: the instructions need AVX2 (AVX for most), and `Avx2` is named only by
+// `super::super::blend::Blend::tile` and by `super::avx512`, inside functions entered after
+// `is_x86_feature_detected!("avx2")`. Loads and stores are the unaligned forms, over arrays of exactly eight f32; what is
+// fetched is a reference's, and fetching reads nothing.
+macro_rules! avx2 {
+    ($e:expr) => {
+        // SAFETY: as said above the macro.
+        unsafe { $e }
+    };
+}
+
+impl Lanes for Avx2 {
+    type Mask = Self;
+    type Sums = Self;
+    const GROUPS: usize = 1;
+
+    #[inline(always)]
+    fn fetch<T>(of: &T) {
+        avx2!(_mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(of).cast()))
+    }
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        Avx2(avx2!(_mm256_set1_ps(value)))
+    }
+    #[inline(always)]
+    fn repeat(group: &[f32; LANES]) -> Self {
+        Avx2(avx2!(_mm256_loadu_ps(group.as_ptr())))
+    }
+    #[inline(always)]
+    fn spread<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
+        Self::splat(values.as_flattened()[first])
+    }
+    #[inline(always)]
+    fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self {
+        Self::repeat(&from[first])
+    }
+    #[inline(always)]
+    fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize) {
+        avx2!(_mm256_storeu_ps(to[first].as_mut_ptr(), self.0))
+    }
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_add_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_sub_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_mul_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_div_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_min_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_max_ps(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn at_least(self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0)))
+    }
+    #[inline(always)]
+    fn both(a: Self, b: Self) -> Self {
+        Avx2(avx2!(_mm256_and_ps(a.0, b.0)))
+    }
+    #[inline(always)]
+    fn bits(mask: Self) -> u32 {
+        avx2!(_mm256_movemask_ps(mask.0)) as u32
+    }
+    #[inline(always)]
+    fn keep(self, mask: Self) -> Self {
+        Avx2(avx2!(_mm256_and_ps(self.0, mask.0)))
+    }
+    #[inline(always)]
+    fn or_else(self, mask: Self, other: Self) -> Self {
+        Avx2(avx2!(_mm256_blendv_ps(other.0, self.0, mask.0)))
+    }
+    #[inline(always)]
+    fn negative(self, mask: Self) -> Self {
+        Avx2(avx2!(_mm256_or_ps(self.0, _mm256_and_ps(mask.0, _mm256_set1_ps(-0.0)))))
+    }
+    #[inline(always)]
+    fn all_negative(self) -> bool {
+        Self::bits(self) == (1 << LANES) - 1
+    }
+    #[inline(always)]
+    fn largest(self) -> f32 {
+        self.values().into_iter().fold(f32::NEG_INFINITY, f32::max)
+    }
+    #[inline(always)]
+    fn add_to(self, sums: Self) -> Self {
+        sums.add(self)
+    }
+    #[inline(always)]
+    fn scale(self, rounded: Self) -> Self {
+        Avx2(avx2!(_mm256_castsi256_ps(_mm256_add_epi32(
+            _mm256_castps_si256(self.0),
+            _mm256_slli_epi32::<23>(_mm256_castps_si256(rounded.0)),
+        ))))
+    }
+}
+
+impl Sums for Avx2 {
+    #[inline(always)]
+    fn zero() -> Self {
+        Self::splat(0.0)
+    }
+    #[inline(always)]
+    fn values(self) -> [f32; LANES] {
+        let mut values = [[0.0; LANES]];
+        self.store(&mut values, 0);
+        values[0]
+    }
+    /// Halves the number of registers with each addition, so that eight sums cost little more than two.
+    #[inline(always)]
+    fn totals(of: [Self; LANES]) -> [f32; LANES] {
+        let halves = |a: Self, b: Self| {
+            avx2!(_mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a.0, b.0), _mm256_permute2f128_ps::<0x31>(a.0, b.0)))
+        };
+        let quarters = |a, b| avx2!(_mm256_add_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b)));
+        let [a, b, c, d, e, f, g, h] = of;
+        let (ab, cd) = (quarters(halves(a, e), halves(b, f)), quarters(halves(c, g), halves(d, h)));
+        // Pairs of lanes (a, b) and (c, d) of the first sums, then of the second.
+        Avx2(avx2!(_mm256_add_ps(_mm256_shuffle_ps::<0x44>(ab, cd), _mm256_shuffle_ps::<0xee>(ab, cd)))).values()
+    }
+}

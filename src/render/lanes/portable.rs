@@ -1,0 +1,116 @@
+//! The form every machine understands.
+
+use super::{LANES, Lanes, Sums};
+
+/// One group.
+#[derive(Clone, Copy)]
+pub(in super::super) struct Portable([f32; LANES]);
+
+impl Portable {
+    #[inline(always)]
+    fn zip(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
+        Portable(std::array::from_fn(|l| f(self.0[l], other.0[l])))
+    }
+}
+
+impl Lanes for Portable {
+    type Mask = [bool; LANES];
+    type Sums = Self;
+    const GROUPS: usize = 1;
+
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        Portable([value; LANES])
+    }
+    #[inline(always)]
+    fn repeat(group: &[f32; LANES]) -> Self {
+        Portable(*group)
+    }
+    #[inline(always)]
+    fn spread<const N: usize>(values: &[[f32; LANES]; N], first: usize) -> Self {
+        Self::splat(values.as_flattened()[first])
+    }
+    #[inline(always)]
+    fn load<const N: usize>(from: &[[f32; LANES]; N], first: usize) -> Self {
+        Portable(from[first])
+    }
+    #[inline(always)]
+    fn store<const N: usize>(self, to: &mut [[f32; LANES]; N], first: usize) {
+        to[first] = self.0;
+    }
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self.zip(other, |a, b| a + b)
+    }
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.zip(other, |a, b| a - b)
+    }
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self.zip(other, |a, b| a * b)
+    }
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.zip(other, |a, b| a / b)
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        self.zip(other, |a, b| if a < b { a } else { b })
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.zip(other, |a, b| if a > b { a } else { b })
+    }
+    #[inline(always)]
+    fn at_least(self, other: Self) -> [bool; LANES] {
+        std::array::from_fn(|l| self.0[l] >= other.0[l])
+    }
+    #[inline(always)]
+    fn both(a: [bool; LANES], b: [bool; LANES]) -> [bool; LANES] {
+        std::array::from_fn(|l| a[l] && b[l])
+    }
+    #[inline(always)]
+    fn bits(mask: [bool; LANES]) -> u32 {
+        (0..LANES).map(|l| u32::from(mask[l]) << l).sum()
+    }
+    #[inline(always)]
+    fn keep(self, mask: [bool; LANES]) -> Self {
+        self.or_else(mask, Self::splat(0.0))
+    }
+    #[inline(always)]
+    fn or_else(self, mask: [bool; LANES], other: Self) -> Self {
+        Portable(std::array::from_fn(|l| if mask[l] { self.0[l] } else { other.0[l] }))
+    }
+    #[inline(always)]
+    fn negative(self, mask: [bool; LANES]) -> Self {
+        Portable(self.0.map(|value| -value.abs())).or_else(mask, self)
+    }
+    #[inline(always)]
+    fn all_negative(self) -> bool {
+        self.0.iter().all(|value| value.is_sign_negative())
+    }
+    #[inline(always)]
+    fn largest(self) -> f32 {
+        self.0.into_iter().fold(f32::NEG_INFINITY, f32::max)
+    }
+    #[inline(always)]
+    fn add_to(self, sums: Self) -> Self {
+        sums.add(self)
+    }
+    #[inline(always)]
+    fn scale(self, rounded: Self) -> Self {
+        self.zip(rounded, |value, n| f32::from_bits(value.to_bits().wrapping_add(n.to_bits() << 23)))
+    }
+}
+
+impl Sums for Portable {
+    #[inline(always)]
+    fn zero() -> Self {
+        Portable([0.0; LANES])
+    }
+    #[inline(always)]
+    fn values(self) -> [f32; LANES] {
+        self.0
+    }
+}
