@@ -3,11 +3,13 @@
 
     python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
     python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
+    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of README's table
 
 They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along
 these): mass and variance stay. FOLDER gets its views at every frame: the model's own, of which those of
 transforms_test.json are held out again, and some on the way between neighbours. `--compare` refines and prunes FOLDER down
-to a fifth in a gibibyte, and says how close the held-out pictures of both stay. Needs nothing but Python.
+to a fifth in a gibibyte, and says how close the held-out pictures of both stay. `--row` prunes it down to 30% with the options
+behind it and prints what that took and how close 15 frames of the held-out views stay. Needs nothing but Python.
 """
 
 import argparse
@@ -123,6 +125,24 @@ def compare(binary, folder):
             print(f"{name}: {found[-1]:.1f} dB, {seconds:.0f} s, {peak(summary):.0f} MiB", flush=True)
 
 
+def row(binary, folder, options):
+    with tempfile.TemporaryDirectory(dir=folder.parent) as results:
+        output = Path(results) / "small"
+        summary = run(
+            binary, "compress", folder, "--cameras", folder, "-o", output, "--target-ratio", 0.3, "--no-refine", "--json", *options
+        )  # fmt: skip
+        psnr = evaluated(binary, folder, output, folder)["psnr"]
+    stages = summary["stages"]
+    took = {name: sum(s["processor_seconds"] for s in stages if s["name"] == name) for name in ("scan", "visible", "rounds")}
+    whole = sum(stage["processor_seconds"] for stage in stages)
+    parts = " + ".join(f"{seconds:.0f} {name}" for name, seconds in took.items())
+    print(
+        f"| {summary['input']['gaussians']} | {summary['input']['frames']} | {' '.join(options)} | {whole:.0f} ({parts}) "
+        f"| {sum(stage['seconds'] for stage in stages):.0f} | {peak(summary):.0f} | {psnr:.2f} |",
+        flush=True,
+    )
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model", type=Path)
@@ -132,11 +152,14 @@ def main():
     parser.add_argument("--views", type=int, default=18)
     parser.add_argument("--size", type=lambda text: tuple(map(int, text.split("x"))), default=(1352, 1014))
     parser.add_argument("--compare", metavar="SPLATSIEVE")
-    args = parser.parse_args()
+    parser.add_argument("--row", metavar="SPLATSIEVE")
+    args, options = parser.parse_known_args()
     if not args.folder.exists():
         make(args.model, args.folder, args.side, args.frames, args.views, args.size)
     if args.compare:
         compare(args.compare, args.folder)
+    if args.row:
+        row(args.row, args.folder, options)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ pub enum Tell {
     /// Nothing.
     #[default]
     Nothing,
-    /// About how long it will take.
+    /// About how long it will take, and how much memory at most.
     Time,
     /// What takes how much memory, how often frames are read, and about how long it will take.
     Plan,
@@ -340,7 +340,7 @@ impl Plan {
         let fits = plan.excess() == 0;
         match budget.tell {
             Tell::Plan => eprint!("budget: {}\n{}", budget.named(), plan.text()),
-            Tell::Time if fits => eprint!("{}", plan.time()),
+            Tell::Time if fits => eprint!("{}memory: at most {}\n", plan.time(), size(plan.peak())),
             _ => (),
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }

@@ -280,8 +280,10 @@ fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
 }
 
 #[test]
-fn a_dry_run_and_an_explained_one_say_how_long_it_will_take_before_anything_else_is_done() {
+fn a_run_says_what_it_will_take_before_anything_else_is_done() {
     let workplace = Workplace::new();
+    let real = workplace.run("compress {tiny} --cameras {tiny} -o real.gseq --no-refine");
+    assert!(real.stderr.lines().nth(1).is_some_and(|line| line.starts_with("memory: at most ")), "{}", real.stderr);
     let run = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq --dry-run");
     let first = run.stderr.lines().next().unwrap_or_default();
     assert!(first.starts_with("time: about ") && first.contains(" s scan + "), "{}", run.stderr);

@@ -238,7 +238,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
-    if args.dry_run && input.memory.tell == Tell::Nothing && !quiet {
+    if input.memory.tell == Tell::Nothing && !quiet {
         input.memory.tell = Tell::Time;
     }
     // What the command line leaves open is as it was in the run that the recipe was written beside.

@@ -190,10 +190,10 @@ mod tests {
         assert_eq!(
             titles,
             [
-                "look: error added to pictures, parts of the model's own, by time of all processors",
+                "look: error added / error of the model, by time of all processors",
                 "look: relative L2 error of C, by time of all processors",
-                "look: error added to pictures, parts of the model's own, by time on the wall",
-                "look: error added to pictures, parts of the model's own, by peak memory",
+                "look: error added / error of the model, by time on the wall",
+                "look: error added / error of the model, by peak memory",
             ]
         );
         for (title, svg) in &charts {

@@ -125,7 +125,7 @@ pub struct Order {
 
 /// Root mean square error of the pictures judged by, colours from 0 to 1, against the whole model's own.
 pub const PICTURES: &str = "pictures";
-/// See [`meaning`].
+/// What a setting adds to [`PICTURES`] in squares, as a part of what the finest setting has: the model's own.
 pub const ADDED: &str = "added";
 /// See [`meaning`].
 pub const KEPT: &str = "kept";
@@ -143,8 +143,8 @@ const SMALL: f64 = 0.1;
 pub fn meaning(error: &str) -> String {
     match error {
         PICTURES => "root mean square error of pictures".to_owned(),
-        ADDED => "error added to pictures, parts of the model's own".to_owned(),
-        KEPT => "part of the kept set that differs (1 - Jaccard)".to_owned(),
+        ADDED => "error added / error of the model".to_owned(),
+        KEPT => "1 - Jaccard of the kept set".to_owned(),
         STAYING => "relative error of how many stay".to_owned(),
         PERCENTILES => "worst relative error of P1 and P99".to_owned(),
         BYTES => "results of other bytes".to_owned(),
@@ -158,6 +158,8 @@ impl Curve {
         let mut names: Vec<String> = marks.iter().flat_map(|mark| mark.errors.keys().cloned()).collect();
         names.sort_unstable();
         names.dedup();
+        // What pictures lose goes to what the model loses, not to nothing.
+        names.retain(|name| name != PICTURES);
         let order = |of: String| {
             let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&of)?)));
             let expected = expected.iter().find(|(name, _)| *name == of).map(|&(_, order)| order);
