@@ -10,9 +10,9 @@ use scene::{PlyRows, Workplace, by_formula, lasting_files, state, tiny};
 use splatsieve::compress::score::{Scored, UserOverrides};
 use splatsieve::compress::{Only, Request, Target, compress_scene, score_scene};
 use splatsieve::limits::Limits;
-use splatsieve::merge::proxy::merge_state;
+use splatsieve::merge::proxy::{ProxyState, merge_state};
 use splatsieve::model::{Columns, Gaussians, SH_C0};
-use splatsieve::recipe::{Merge, MergePass, Motion, Placement, Recipe, Trajectory};
+use splatsieve::recipe::{Merge, MergePass, Motion, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 /// Tightens a gate.
@@ -216,6 +216,61 @@ fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
     kept.len() - expected.len()
 }
 
+/// Holds a merged state against the definitions over its members, weights w: μ = Σ w x, or the leader's place; covariance
+/// Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colours Σ w c; opacity by its rule, an area being a quarter of an ellipsoid's surface.
+fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &Merge) {
+    let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
+    let mean = match merge.placement {
+        Placement::Leader => position(leader),
+        Placement::Mean => members.iter().map(|&(i, weight)| weight * position(i as usize)).sum(),
+    };
+    let spread: f64 = members.iter().map(|&(i, _)| (position(i as usize) - mean).length()).fold(0.0, f64::max);
+    assert!((merged.position - mean).length() <= 1e-12 * (mean.length() + spread), "{}, {mean}", merged.position);
+
+    let mut expected = DMat3::ZERO;
+    for &(i, weight) in members {
+        let off = position(i as usize) - mean;
+        let outer = DMat3::from_cols(off * off.x, off * off.y, off * off.z);
+        expected += (covariance(states, i as usize) + outer) * weight;
+    }
+    let [w, x, y, z] = merged.rotation;
+    let (axes, scales) = (DMat3::from_quat(DQuat::from_xyzw(x, y, z, w)), DVec3::from(merged.log_scale).exp());
+    let found = axes * DMat3::from_diagonal(scales * scales) * axes.transpose();
+    let trace = expected.x_axis.x + expected.y_axis.y + expected.z_axis.z;
+    let off = (found - expected).to_cols_array().iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+    assert!(off <= 1e-10 * trace, "covariance {found}, expected {expected}");
+
+    // Knud Thomsen's formula, p = 1.6075.
+    let surface = |s: DVec3| {
+        let sections = [s.x * s.y, s.y * s.z, s.z * s.x].map(|area| area.powf(1.6075));
+        4.0 * std::f64::consts::PI * (sections.iter().sum::<f64>() / 3.0).powf(1.0 / 1.6075)
+    };
+    let of = |i: u32| {
+        let scale = DVec3::from(states.log_scale.row::<3>(i as usize).map(|x| f64::from(x).exp()));
+        (1.0 / (1.0 + (-f64::from(states.opacity_logit.plane(0)[i as usize])).exp()), surface(scale))
+    };
+    let opacity = match merge.opacity {
+        ProxyOpacity::Sum => members.iter().map(|&(i, _)| of(i).0).sum::<f64>(),
+        ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - of(i).0).product::<f64>(),
+        ProxyOpacity::Area => members.iter().map(|&(i, _)| of(i).0 * of(i).1).sum::<f64>() / surface(scales),
+    };
+    let found = 1.0 / (1.0 + (-merged.opacity_logit).exp());
+    assert!((found - opacity.min(1.0)).abs() <= 1e-5, "opacity {found}, expected {opacity}");
+
+    let heaviest = members.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap().0;
+    for (k, &found) in merged.sh.iter().enumerate() {
+        let of = |i: u32| f64::from(states.sh.plane(k)[i as usize]);
+        let expected = match merge.sh_high {
+            ShHigh::Heaviest if k >= 3 => of(heaviest),
+            _ => members.iter().map(|&(i, weight)| weight * of(i)).sum::<f64>(),
+        };
+        assert!(
+            (found - expected).abs() <= 1e-12 * (1.0 + expected.abs()),
+            "coefficient {k}: {found}, expected {expected}"
+        );
+    }
+}
+
 /// The raw parameters of a proxy are its merged state at the reference frame minus what the field adds to
 /// its leader there; its quaternion is as long as the leader's in that frame. Then, if it was placed at its
 /// leader, its state at the reference frame is the merged one, and its path the leader's to the bit.
@@ -235,7 +290,9 @@ fn proxies_are_solved_at_their_leaders(
     let at_reference = &whole.frames[whole.reference];
     for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
         let leader = group[0];
-        let merged = merge_state(&weighted(scored, group), at_reference, leader as u32, merge, Columns::all());
+        let members = weighted(scored, group);
+        let merged = merge_state(&members, at_reference, leader as u32, merge, Columns::all());
+        is_the_mixture(&merged, &members, at_reference, leader, merge);
         let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
         // (property, merged state, state of the leader), then the state found in the result.
         let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();
