@@ -88,9 +88,7 @@ fn number(text: &str, before: &str, after: &str) -> f64 {
 fn keeps_to(output: &Output, what: &str, budget: f64) {
     let text = told(output);
     assert!(output.status.success(), "{what}: {text}");
-    if let Some(line) = text.lines().find(|line| line.ends_with(" taken")) {
-        let unit = if line.contains("GiB") { 1024.0 } else { 1.0 };
-        let taken = unit * number(line, "at most ", if unit > 1.0 { "GiB" } else { "MiB" });
+    if let Some(taken) = scene::taken(&text) {
         println!("{what}: {taken} of {budget} MiB");
         assert!(taken <= budget, "{what}: {taken} MiB resident, {budget} promised");
     }

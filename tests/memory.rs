@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use scene::{Workplace, files, lasting_files};
+use scene::{Workplace, files, lasting_files, said};
 use splatsieve::emit::container::write_container;
 use splatsieve::error::Result;
 use splatsieve::model::{Columns, Gaussians, SequenceInfo};
@@ -100,7 +100,7 @@ fn peak(result: &Path) -> Option<u64> {
     let text = std::fs::read_to_string(format!("{}.summary.json", result.display())).unwrap();
     let summary: serde_json::Value = serde_json::from_str(&text).unwrap();
     let stages = summary["stages"].as_array().unwrap();
-    stages.iter().map(|stage| stage["peak_memory_bytes"].as_u64().map(|bytes| bytes >> 20)).max().flatten()
+    said(stages.iter().map(|stage| stage["peak_memory_bytes"].as_u64().map(|bytes| bytes >> 20)).max().flatten())
 }
 
 #[test]
@@ -149,9 +149,7 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
         for part in ["memory: at most", "N x", "full reads of the input"] {
             assert!(run.stderr.contains(part), "{arguments}: {part:?} is not in {:?}", run.stderr);
         }
-        // Where the system says so.
-        if let Some(taken) = run.stderr.lines().last().and_then(|line| line.strip_suffix(" MiB taken")) {
-            let taken: f64 = taken.rsplit(' ').next().unwrap().parse().unwrap();
+        if let Some(taken) = scene::taken(&run.stderr) {
             println!("{arguments}: {taken} of {least} MiB");
             assert!(taken <= least as f64, "{arguments}: {taken} MiB resident, {least} promised");
         }

@@ -146,6 +146,22 @@ impl Workplace {
     }
 }
 
+/// What the system says of a process's memory: Linux always does.
+pub(crate) fn said<T>(memory: Option<T>) -> Option<T> {
+    assert!(memory.is_some() || !cfg!(target_os = "linux"), "nothing is said of memory");
+    memory
+}
+
+/// What a run with `--explain` says at its end that it took, MiB; none where the system does not say.
+pub(crate) fn taken(stderr: &str) -> Option<f64> {
+    let line = stderr.lines().find_map(|line| line.strip_prefix("memory: at most ")?.strip_suffix(" taken"));
+    let words: Option<Vec<&str>> = said(line).map(|line| line.split(' ').collect());
+    words.map(|words| {
+        let unit = ["KiB", "MiB", "GiB"].iter().position(|unit| *unit == words[1]).unwrap();
+        words[0].parse::<f64>().unwrap() * 1024f64.powi(unit as i32 - 1)
+    })
+}
+
 /// Every file below `folder` by its relative path, and its bytes; folders have none.
 pub(crate) fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
