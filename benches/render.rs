@@ -1,18 +1,24 @@
-//! Question: what does one picture cost on one core, and how does that grow from 10,000 to a million
-//! Gaussians? What does scoring one (Gaussian, frame, view) cost, with and without a pixel stride? And what does a
-//! picture cost together with its derivative?
+//! Question: what does one picture cost on one core, where does that go, how far is it from what the machine can do, and
+//! how does it grow from 10,000 to a million Gaussians? What does scoring one (Gaussian, frame, view) cost, with and
+//! without a pixel stride? And what does a picture cost together with its derivative?
 //!
 //! `picture/*` renders and scores a view of each trained model, its state known (skipped where the models
-//! are absent); the bar is 25 ms for `room2_big`. `size/*` does the same for synthetic clouds in a 640×512
+//! are absent); the bar is 25 ms for `room2_big`. `picture/large` is a 1352×1014 view of 200,313 Gaussians:
+//! `room2_dynerf` with each Gaussian split in nine. `size/*` does the same for synthetic clouds in a 640×512
 //! picture. criterion's throughput is Gaussians per second, so for `score` its inverse is the cost of one
 //! (Gaussian, frame, view); before each group the Gaussians, pixels and blend events (pixels that a Gaussian
 //! changed, counted by the tests' oracle) of the picture are printed, and how many of each a second at the
 //! median time of some renders. The rival is the C++ AVX-512 port of the
 //! original rasteriser, measured elsewhere: 26, 14 and 12 ms for `room2_big`, `room2_dynerf`, `deform2`.
 //!
-//! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 2.6 times the
-//! picture alone; before each group the ratio is printed, of medians of pictures and derivatives taken by turns. What
-//! the loss takes to subtract two pictures counts. `picture/demo` is a view of the demo scene.
+//! Then where the time goes: parts are differences of medians taken by turns, of pictures that lack one part after the
+//! other. Beside them stands what they cannot go below: for the blend, [`OPERATIONS`] on every 16 events at two a cycle
+//! of the clock that is measured; for the rest, the bytes that must be moved at the rate at which memory is read here.
+//!
+//! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 3.2 times the
+//! picture alone (2.6 while pictures took 1.8 times as long); before each group the ratio is printed, of medians of
+//! pictures and derivatives taken by turns. What the loss takes to subtract two pictures counts. `picture/demo` is a view
+//! of the demo scene.
 //!
 //! Times are wall-clock: on a busy machine they are several times the cost. Criterion arguments filter:
 //! `cargo bench --bench render -- picture`.
@@ -25,7 +31,7 @@ use std::num::NonZeroU32;
 use std::time::Instant;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec3, Quat, Vec3};
 use splatsieve::demo::Scene;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
@@ -34,6 +40,12 @@ use splatsieve::source::{FrameSource, Ids};
 
 /// Pictures, without and with their derivative, whose median times give the rates and the ratio.
 const PICTURES: usize = 21;
+
+/// Operations of the blend on one vector of pixels, loads and stores apart: 6 from place to exponent, 20 for 2 to its
+/// power, 10 from there to weight and transmittance, 6 for the colour.
+const OPERATIONS: f64 = 42.0;
+/// Pixels of a vector, at the widest.
+const LANES: f64 = 16.0;
 
 /// Renders and scores one view.
 fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians, camera: &Camera) {
@@ -67,6 +79,7 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
         rate(events as f64),
         differentiated / seconds
     );
+    print_parts(&mut renderer, state, camera, events as f64);
     let mut group = criterion.benchmark_group(group);
     group.sample_size(20).throughput(Throughput::Elements(count as u64));
     group.bench_function(BenchmarkId::new("render", name), |b| {
@@ -82,6 +95,77 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
         });
     }
     group.finish();
+}
+
+/// Prints what the parts of a picture with so many blend events cost, and what they cannot go below.
+fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, events: f64) {
+    let grey = Gaussians { sh: Gaussians::zeros(state.len(), 0).sh, ..state.clone() };
+    let empty = Camera { width: 0, height: 0, ..camera.clone() };
+    let mut seen = Contribution::new(state.len());
+    let mut times = [const { Vec::new() }; 4];
+    for _ in 0..PICTURES {
+        for (lacking, times) in times.iter_mut().enumerate() {
+            let start = Instant::now();
+            match lacking {
+                0 => drop(black_box(renderer.render(state, camera, [0.0; 3]))),
+                // No harmonics to read.
+                1 => drop(black_box(renderer.render(&grey, camera, [0.0; 3]))),
+                // No pixel that is looked at.
+                2 => renderer.contribution(state, camera, NonZeroU32::MAX, &mut seen),
+                // No tile.
+                _ => drop(black_box(renderer.render(state, &empty, [0.0; 3]))),
+            }
+            times.push(start.elapsed().as_secs_f64());
+        }
+    }
+    let [whole, grey, unseen, projected] = times.map(median);
+    let blend = grey - unseen;
+    let least = events / LANES * OPERATIONS / 2.0 / clock();
+    let pixels = f64::from(camera.width) * f64::from(camera.height);
+    let bytes = 4.0 * (11 + state.sh.width()) as f64 * state.len() as f64 + 12.0 * pixels;
+    eprintln!(
+        "  project {:.1} ms, sort and bin {:.1}, harmonics {:.1}, blend {:.1}: {:.2} ns an event",
+        1e3 * projected,
+        1e3 * (unseen - projected),
+        1e3 * (whole - grey),
+        1e3 * blend,
+        1e9 * blend / events,
+    );
+    eprintln!(
+        "  at least {:.1} ms for the blend ({:.0}% of what it takes), and {:.1} ms for {:.0} MB of Gaussians and pixels",
+        1e3 * least,
+        100.0 * least / blend,
+        1e3 * bytes / bandwidth(),
+        bytes / 1e6,
+    );
+}
+
+/// Cycles a second: of a chain of exclusive ors and products of integers, which take one and three.
+fn clock() -> f64 {
+    const LINKS: u32 = 10_000_000;
+    fastest(|| {
+        let chain = (0..LINKS).fold(black_box(1u64), |x, k| (x ^ u64::from(k)).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        black_box(chain);
+        4.0 * f64::from(LINKS)
+    })
+}
+
+/// Bytes a second that are read of what no cache holds.
+fn bandwidth() -> f64 {
+    let words = vec![1u64; 1 << 25];
+    fastest(|| {
+        black_box(black_box(&words).iter().fold(0, |sum: u64, word| sum.wrapping_add(*word)));
+        size_of_val(&words[..]) as f64
+    })
+}
+
+/// The highest rate of what `amount` does.
+fn fastest(amount: impl Fn() -> f64) -> f64 {
+    let rate = |_| {
+        let start = Instant::now();
+        amount() / start.elapsed().as_secs_f64()
+    };
+    (0..7).map(rate).fold(0.0, f64::max)
 }
 
 /// The middle one of an odd number of values.
@@ -100,8 +184,44 @@ fn pictures(criterion: &mut Criterion) {
     for name in models::NAMES {
         let model = models::Model::open(&folder, name);
         let (frame, view) = model.renders()[0];
-        measure(criterion, "picture", name, &model.state(frame), &model.camera(frame, view));
+        let (state, camera) = (model.state(frame), model.camera(frame, view));
+        measure(criterion, "picture", name, &state, &camera);
+        if name == "room2_dynerf" {
+            measure(criterion, "picture", "large", &split(&state), &enlarged(&camera, [1352, 1014]));
+        }
     }
+}
+
+/// Every Gaussian in nine, in a grid along its first two axes and about as opaque together.
+fn split(state: &Gaussians) -> Gaussians {
+    /// Distance of the children, standard deviations; √⅓ of one is left to each, so that their variances add up.
+    const APART: f32 = 1.0;
+    let parents: Vec<u32> = (0..9 * state.len() as u32).map(|child| child / 9).collect();
+    let mut children = state.pick(&parents);
+    for child in 0..children.len() {
+        let [w, x, y, z] = children.rotation.row(child);
+        let turn = Quat::from_xyzw(x, y, z, w).normalize();
+        let scale: [f32; 3] = children.log_scale.row(child);
+        let place = [child % 9 / 3, child % 3].map(|k| (k as f32 - 1.0) * APART);
+        let offset = turn * Vec3::new(place[0] * scale[0].exp(), place[1] * scale[1].exp(), 0.0);
+        let position = Vec3::from_array(children.position.row(child)) + offset;
+        children.position.set_row(child, position.to_array());
+        let narrower = 3f32.ln() / 2.0;
+        children.log_scale.set_row(child, [scale[0] - narrower, scale[1] - narrower, scale[2]]);
+        let [logit] = children.opacity_logit.row(child);
+        // What nine add up to in the middle, of what one has at its centre.
+        let overlap = (1.0 + 2.0 * (-1.5f32).exp()).powi(2);
+        let alpha = 1.0 - (1.0 / (1.0 + logit.exp())).powf(1.0 / overlap);
+        children.opacity_logit.set_row(child, [(alpha / (1.0 - alpha)).ln()]);
+    }
+    children
+}
+
+/// The same view in a picture of `size`, as wide a field.
+fn enlarged(camera: &Camera, size: [u32; 2]) -> Camera {
+    let times = f64::from(size[0]) / f64::from(camera.width);
+    let [cx, cy] = size.map(|pixels| f64::from(pixels) / 2.0);
+    Camera { width: size[0], height: size[1], fx: camera.fx * times, fy: camera.fy * times, cx, cy, ..camera.clone() }
 }
 
 /// `count` Gaussians that fill a box before the camera, smaller the more there are, so that the picture
