@@ -144,6 +144,23 @@ mod tests {
     }
 
     #[test]
+    fn frames_are_those_in_the_middle_of_even_parts_of_the_seen_ones() {
+        // Every frame but each third, in which nobody looks.
+        let mut gaps = Schedule::default();
+        (0..50).for_each(|frame| gaps.push(1, if frame % 3 == 0 { &[] } else { &[(0, 0), (1, 1)] }));
+        let seen: Vec<usize> = (0..50).filter(|frame| frame % 3 > 0).collect();
+        for count in [1, 2, 7, 16, 32, 33, 40] {
+            let found: Vec<usize> = spread(&gaps, count, 1).iter().map(|picture| picture.frame).collect();
+            let parts = count.min(seen.len());
+            let expected = (0..parts).map(|k| seen[(2 * k + 1) * seen.len() / (2 * parts)]);
+            let mut frames = found.clone();
+            frames.dedup();
+            assert_eq!(frames, expected.collect::<Vec<_>>(), "{count} pictures");
+            assert_eq!(found.len(), count);
+        }
+    }
+
+    #[test]
     fn short_lives_spread_pictures_over_more_frames() {
         // Of 300 Gaussians three live in 5 frames or less, the others in 12 or more; one never does.
         let life: Vec<u32> = [0, 1, 5, 5].into_iter().chain((0..297).map(|k| 12 + k)).collect();
