@@ -340,7 +340,7 @@ impl Plan {
         let fits = plan.excess() == 0;
         match budget.tell {
             Tell::Plan => eprint!("budget: {}\n{}", budget.named(), plan.text()),
-            Tell::Time if fits => eprint!("{}memory: at most {}\n", plan.time(), size(plan.peak())),
+            Tell::Time if fits => eprintln!("{}memory: at most {}", plan.time(), size(plan.peak())),
             _ => (),
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }

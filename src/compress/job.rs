@@ -269,7 +269,9 @@ impl Stages for Job {
         needs.extend(self.choose.as_ref().map(|stage| stage.need(work, limits, self.left)));
         needs.extend(self.refine.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.field.as_ref().map(|stage| stage.need(work, limits, self.left)));
-        needs.extend(self.bands.as_ref().map(|stage| stage.need(work, limits, self.left)));
+        // Of degree 0 there is no band to drop.
+        let bands = self.bands.as_ref().filter(|_| work.sh_degree > 0);
+        needs.extend(bands.map(|stage| stage.need(work, limits, self.left)));
         needs.extend(self.search.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.archive.as_ref().map(|stage| stage.need(work, limits)));
         needs.push(self.emit.need(work, limits, self.left));

@@ -140,13 +140,13 @@ impl Bench<'_> {
 
     /// Scores by what was scanned and `seen`.
     fn scored(&self, seen: Seen) -> Result<Scored> {
-        let measure = Measure::new(&self.recipe, self.scene.has_cameras, UserOverrides::default());
+        let measure = Measure::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), Some(seen), &mut Journal::default())
     }
 
     /// Rounds of more and of fewer pictures, and of larger and of smaller cuts.
     pub(super) fn rounds(&self) -> Result<Knob> {
-        let scored = self.scored(self.look_by(&self.recipe, 0.0, 0.0)?.seen)?;
+        let scored = self.scored(self.look_by(self.recipe, 0.0, 0.0)?.seen)?;
         let own = &self.recipe.select;
         let most = self.scene.schedule.pairs().min(MOST_IN_ROUNDS);
         let mut counts: Vec<usize> = PICTURES_TRIED
@@ -196,7 +196,7 @@ impl Bench<'_> {
 
     /// Percentiles from one look at the values, by more and fewer bits, beside exact ones.
     pub(super) fn percentiles(&self) -> Result<Knob> {
-        let seen = self.look_by(&self.recipe, 0.0, 0.0)?.seen;
+        let seen = self.look_by(self.recipe, 0.0, 0.0)?.seen;
         let mut rows = self.scanned.rows.clone();
         (rows.c, rows.w) = (seen.coverage, seen.peak);
         if self.recipe.scan.snap_noise {

@@ -173,10 +173,9 @@ impl Decoded {
 /// D, κ and V over `played` frames of Gaussians that live throughout, in numbers T summed by S.
 fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> Statistics {
     let count = states.first().map_or(0, |state| state.opacity.len());
-    let mut found = [vec![0.0; count], vec![0.0; count], vec![0.0; count]];
     let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
     let difference = |a: [T; 3], b: [T; 3]| -> [T; 3] { std::array::from_fn(|axis| a[axis] - b[axis]) };
-    for i in 0..count {
+    let of_gaussian = |i: usize| -> [f64; 3] {
         let at = |k: usize| &states[place(k, states.len())];
         let position = |k: usize| at(k).position[i].map(|x| narrow::<T>(f64::from(x)));
         let first: T = narrow(at(0).opacity[i]);
@@ -196,11 +195,14 @@ fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> Statistics 
             }
         }
         let of = |terms: usize| terms.max(1) as f64;
-        found[0][i] = (steps.total() / of(played - 1)).sqrt();
-        found[1][i] = turns.total() / of(played - 2);
-        found[2][i] = squares.total() / of(played) - (shifted.total() / of(played)).powi(2);
-    }
-    found
+        [
+            (steps.total() / of(played - 1)).sqrt(),
+            turns.total() / of(played - 2),
+            squares.total() / of(played) - (shifted.total() / of(played)).powi(2),
+        ]
+    };
+    let found: Vec<[f64; 3]> = (0..count).map(of_gaussian).collect();
+    std::array::from_fn(|statistic| found.iter().map(|of| of[statistic]).collect())
 }
 
 /// The same by the scan itself, of Gaussians that all count as living.
