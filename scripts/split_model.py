@@ -133,8 +133,8 @@ def row(binary, folder, options):
         )  # fmt: skip
         psnr = evaluated(binary, folder, output, folder)["psnr"]
     stages = summary["stages"]
-    took = {name: sum(s["processor_seconds"] for s in stages if s["name"] == name) for name in ("scan", "visible", "rounds")}
-    whole = sum(stage["processor_seconds"] for stage in stages)
+    took = {name: sum(s["processor_seconds"] or 0 for s in stages if s["name"] == name) for name in ("scan", "visible", "rounds")}
+    whole = sum(stage["processor_seconds"] or 0 for stage in stages)
     parts = " + ".join(f"{seconds:.0f} {name}" for name, seconds in took.items())
     print(
         f"| {summary['input']['gaussians']} | {summary['input']['frames']} | {' '.join(options)} | {whole:.0f} ({parts}) "
@@ -154,6 +154,8 @@ def main():
     parser.add_argument("--compare", metavar="SPLATSIEVE")
     parser.add_argument("--row", metavar="SPLATSIEVE")
     args, options = parser.parse_known_args()
+    if options and not args.row:
+        parser.error(f"unknown: {' '.join(options)}")
     if not args.folder.exists():
         make(args.model, args.folder, args.side, args.frames, args.views, args.size)
     if args.compare:

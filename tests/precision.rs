@@ -5,7 +5,7 @@ mod scene;
 
 use std::fs;
 
-use scene::Workplace;
+use scene::{Workplace, files};
 use serde_json::Value;
 
 fn json(text: &str) -> Value {
@@ -116,6 +116,7 @@ fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
 fn what_cannot_be_turned_is_refused_before_anything_is_written() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 300 --frames 3");
+    let before = files(&place.path(""));
     for (words, expected) in [
         ("precision d/scene.gseq -o diagrams", "give --cameras"),
         ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --target-ratio 0", "--target-ratio"),
@@ -124,6 +125,22 @@ fn what_cannot_be_turned_is_refused_before_anything_is_written() {
     ] {
         let run = place.run(words);
         assert!(run.code == 2 && run.stderr.contains(expected), "{words}: {} {}", run.code, run.stderr);
-        assert!(!place.path("diagrams").exists(), "{words}");
+        assert_eq!(files(&place.path("")), before, "{words}");
+    }
+}
+
+#[test]
+fn a_recipe_that_looks_at_nothing_and_refines_nothing_has_less_to_turn_and_says_so() {
+    let place = Workplace::new();
+    place.done("demo -o d --gaussians 300 --frames 3");
+    let found = json(&place.done(
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs look,rounds,percentiles,refining \
+         --repeat 1 --json",
+    ));
+    let names: Vec<&Value> = found["knobs"].as_array().unwrap().iter().map(|knob| &knob["name"]).collect();
+    assert_eq!(names, ["percentiles"]);
+    let notes = found["notes"].to_string();
+    for words in ["look: left out", "rounds: left out", "refining: left out"] {
+        assert!(notes.contains(words), "{notes}");
     }
 }

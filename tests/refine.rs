@@ -59,7 +59,7 @@ fn who_asks_for_similarity_gets_it_for_decibels() {
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
     let found = ["0", "0.5"].map(|part| {
         workplace.done(&format!(
-            "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio 0.2 --refine-steps 600 \
+            "compress demo/scene.gseq --cameras demo/cameras.json --target-ratio 0.1 --refine-steps 600 \
              --refine-ssim {part} --overwrite -o small.gseq"
         ));
         let told = workplace.done("evaluate demo/scene.gseq small.gseq --cameras demo/cameras.json --json");

@@ -468,7 +468,7 @@ pub(super) struct Precision {
     /// Fraction of the Gaussians that every setting keeps
     #[arg(long, value_name = "FRACTION", default_value_t = 0.3)]
     pub(super) target_ratio: f64,
-    /// Look at pictures of at most this many frames, evenly from first to last
+    /// Look at and rank by pictures of at most this many frames, evenly from first to last; whole runs have all
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) max_frames: u32,
     /// Run every setting up to so often and give median and range; fewer times where that takes 10 s

@@ -72,7 +72,7 @@ impl Args for RecipeFlags {
             );
         command = command.arg(
             Arg::new("effort").long("effort").value_parser(Effort::ALL.map(Effort::name)).help(
-                "How much time to take for how small an error: `fast`, a third of the time; `default`; `best`, three times as long",
+                "How much time to take for how small an error: `fast`, a third of the steps of refinement and a coarser look and rounds; `default`; `best`, three times the steps",
             ),
         );
         for parameter in parameters() {

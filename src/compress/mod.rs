@@ -24,7 +24,7 @@ mod search;
 mod size;
 mod statistics;
 pub mod summary;
-mod visible;
+pub mod visible;
 
 pub use arrival::open_to_measure;
 pub use job::Job;

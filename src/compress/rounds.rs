@@ -60,15 +60,18 @@ impl Rounds {
     /// The ranking, and pictures of all that is left.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
-        let per_gaussian = [scored(limits), vec![("ranking", 32), ("errors", 8 * self.turns as u64)], looking].concat();
         let all = (self.pictures as u64).min(work.pictures);
+        let turns = (self.turns as u64).min(all).max(1);
+        let per_gaussian = [scored(limits), vec![("ranking", 32), ("errors", 8 * turns)], looking].concat();
         let seconds = (0..self.rounds(self.usual) as i32).map(|round| {
             let left = work.count() * self.fraction.powi(round);
-            let pictures = all as f64 / if round == 0 { 1.0 } else { self.turns as f64 };
+            let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
             work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
         });
-        // A frame is read in one of the turns.
-        let reads = self.pictures_of(self.rounds(self.fewest), 1) * work.scattered_reads(all.min(work.frames), limits);
+        // The first round takes all turns, each of its own frames.
+        let frames = all.min(work.frames).div_ceil(turns);
+        let later = (self.rounds(self.fewest) - 1.0).max(0.0);
+        let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
         Need { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
@@ -77,19 +80,14 @@ impl Rounds {
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0)
     }
 
-    /// Pictures that so many rounds look at, of `all`.
-    fn pictures_of(&self, rounds: f64, all: usize) -> f64 {
-        all as f64 * (rounds.min(1.0) + (rounds - 1.0).max(0.0) / self.turns as f64)
-    }
-
-    /// The pictures in as many parts as there are turns, each of some frames.
+    /// The pictures in as many parts as there are turns, each of frames of its own where there are as many.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
         let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
-        let mut turns = vec![Vec::new(); self.turns];
-        for (k, of_frame) in pictures.chunk_by(|a, b| a.frame == b.frame).enumerate() {
-            turns[k % self.turns].extend_from_slice(of_frame);
-        }
-        turns.retain(|turn| !turn.is_empty());
+        let by_frame: Vec<&[Picture]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
+        let parts = if by_frame.len() < self.turns { pictures.chunks(1).collect() } else { by_frame };
+        let mut turns = vec![Vec::new(); self.turns.min(parts.len())];
+        let count = turns.len().max(1);
+        parts.into_iter().enumerate().for_each(|(k, part)| turns[k % count].extend_from_slice(part));
         turns
     }
 
@@ -119,9 +117,10 @@ impl Rounds {
         let mut gone: Vec<u32> = Vec::new();
         let turns = self.turns(scene, scored);
         let mut errors = vec![vec![0u64; scored.count()]; turns.len()];
-        let pictures =
-            self.pictures_of(self.rounds(fewest.max(1) as f64 / first as f64), turns.iter().map(Vec::len).sum());
-        let progress = Progress::new(NAME, "pictures", pictures.ceil() as u64);
+        let later = (self.rounds(fewest.max(1) as f64 / first as f64) - 1.0).max(0.0) as usize;
+        let all: usize = turns.iter().map(Vec::len).sum();
+        let pictures = all + turns.iter().cycle().skip(1).take(later).map(Vec::len).sum::<usize>();
+        let progress = Progress::new(NAME, "pictures", pictures as u64);
         journal.stage(NAME, first, scene.source(), |_| {
             for round in 0.. {
                 if enough(&free) {
@@ -132,10 +131,10 @@ impl Rounds {
                 let mut ids: Vec<u32> = free.iter().chain(protected).copied().collect();
                 ids.sort_unstable();
                 // First all look, then one after the other.
-                let turn = round % turns.len().max(1);
-                let looking = if round == 0 { 0..turns.len() } else { turn..(turn + 1).min(turns.len()) };
-                for turn in looking {
-                    let pictures = (&scene.schedule.cameras[..], &turns[turn][..]);
+                let looking = if round == 0 { turns.len() } else { 1 };
+                for (turn, pictures) in turns.iter().enumerate().cycle().skip(round % turns.len().max(1)).take(looking)
+                {
+                    let pictures = (&scene.schedule.cameras[..], &pictures[..]);
                     let (background, floor) = (scene.background, self.contrast_floor as f32);
                     let advance = || progress.advance(1);
                     let found =
@@ -220,6 +219,26 @@ mod tests {
         kept.sort_unstable();
         assert_eq!(first, kept);
         assert!(worst[5..].iter().all(|id| !rounds.order().contains(id)));
+    }
+
+    #[test]
+    fn turns_part_the_pictures_by_frames_or_one_by_one_where_frames_are_few() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        for (turns, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
+            let rounds = Rounds { turns, ..Rounds::of(&recipe.select, None).unwrap() };
+            let parts = rounds.turns(&scene, &scored);
+            let all = spread_over(&scene.schedule, rounds.pictures, scored.frames_to_see);
+            assert_eq!(parts.len(), turns.min(all.len()));
+            let mut together: Vec<Picture> = parts.concat();
+            together.sort_by_key(|picture| (picture.frame, picture.view));
+            assert_eq!(together, all, "{turns} turns");
+            let frames = |part: &Vec<Picture>| part.chunk_by(|a, b| a.frame == b.frame).count();
+            let read: usize = parts.iter().map(frames).sum();
+            assert_eq!(read == all.chunk_by(|a, b| a.frame == b.frame).count(), frames_apart, "{turns} turns");
+        }
     }
 
     #[test]

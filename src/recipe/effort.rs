@@ -5,11 +5,11 @@ use super::Recipe;
 /// A place on the curves of error against run time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Effort {
-    /// A third of the time.
+    /// A third of the steps of refinement, and a coarser look and rounds.
     Fast,
-    /// As presets have it.
+    /// As the recipe has it.
     Default,
-    /// Three times as long.
+    /// Three times the steps, and a finer look and rounds.
     Best,
 }
 
@@ -58,15 +58,20 @@ impl Recipe {
     /// or fewer of them. What a recipe looks at whole stays so.
     pub fn at_effort(&self, effort: Effort) -> Recipe {
         let Some(knobs) = effort.knobs() else { return self.clone() };
-        let steps = (knobs.steps * f64::from(self.refine.refine_steps)).round() as u32;
-        let mut recipe = self.refining_by(steps);
+        let steps = knobs.steps * f64::from(self.refine.refine_steps);
+        let mut recipe = self.refining_by(steps.ceil() as u32);
+        // Never past what the recipe has by itself.
+        let less = knobs.steps < 1.0;
+        let moved = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };
         if recipe.scan.look_pictures > 0 {
-            recipe.scan.look_pictures = knobs.look_pictures;
+            recipe.scan.look_pictures = moved(recipe.scan.look_pictures, knobs.look_pictures);
         }
         if recipe.select.round_fraction < 1.0 {
             let select = &mut recipe.select;
-            (select.round_pictures, select.round_turns) = (knobs.round_pictures, knobs.round_turns);
-            select.round_fraction = knobs.round_fraction;
+            select.round_pictures = moved(select.round_pictures, knobs.round_pictures);
+            select.round_turns = select.round_turns.min(knobs.round_turns);
+            let own = select.round_fraction;
+            select.round_fraction = if less { own.min(knobs.round_fraction) } else { own.max(knobs.round_fraction) };
         }
         recipe
     }

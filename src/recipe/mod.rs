@@ -462,7 +462,12 @@ impl Recipe {
                 "0.1 to 1",
             ),
             ("select.round_pictures", self.select.round_pictures as f64, self.select.round_pictures > 0, "1 or more"),
-            ("select.round_turns", self.select.round_turns as f64, self.select.round_turns > 0, "1 or more"),
+            (
+                "select.round_turns",
+                self.select.round_turns as f64,
+                (1..=1000).contains(&self.select.round_turns),
+                "1 to 1000",
+            ),
             (
                 "refine.refine_pictures",
                 self.refine.refine_pictures as f64,

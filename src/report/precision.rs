@@ -27,7 +27,7 @@ pub fn page(found: &Precision) -> String {
     let title = format!("{} – error against run time", file_name(&found.path));
     let mut body = format!(
         "<header>\n<h1>Error against run time: {}</h1>\n</header>\n<p class=\"note\">{} Gaussians × {} frames; {} pictures \
-         of {} frames looked at, judged by {} others: {}. Every setting keeps {} Gaussians. {} threads; medians of up to {} \
+         of {} frames looked at, judged by {}: {}. Every setting keeps {} Gaussians. {} threads; medians of up to {} \
          runs, fewer where they took {} s.</p>\n",
         escape(file_name(&found.path)),
         count(found.gaussians),

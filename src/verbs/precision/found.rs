@@ -26,7 +26,7 @@ pub struct Precision {
     pub frames_looked_at: usize,
     /// Pictures of these.
     pub pictures: usize,
-    /// Pictures that results are judged by, which are neither looked at nor ranked by.
+    /// Pictures that rankings are judged by: held-out ones, where there are some.
     pub judged: usize,
     /// File of the cameras.
     pub cameras: String,
@@ -87,9 +87,9 @@ pub struct Curve {
     pub name: String,
     /// What errors are measured against.
     pub against: String,
-    /// From coarse to fine.
+    /// In the order in which they were tried: mostly from coarse to fine.
     pub marks: Vec<Mark>,
-    /// How errors fall with the step.
+    /// How errors go with the step.
     pub orders: Vec<Order>,
     /// The recipe's own value, if it is among the marks.
     pub own: Option<f64>,
@@ -102,7 +102,7 @@ pub struct Curve {
 pub struct Mark {
     /// Value of what is turned.
     pub value: f64,
-    /// Step h of the discretisation that this is: errors of order p fall as h to the p.
+    /// What errors go with as a power, of which the exponent is the order: a step h, or of sums the number of frames.
     pub step: f64,
     /// Time and memory.
     pub cost: Cost,
@@ -112,7 +112,7 @@ pub struct Mark {
     pub psnr: Option<f64>,
 }
 
-/// An observed order of convergence.
+/// An observed order: of convergence, or of sums of growth.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Order {
     /// Of which error.
@@ -155,6 +155,9 @@ pub fn meaning(error: &str) -> String {
 impl Curve {
     /// A curve of `marks`, with the orders of all errors, those in `expected` beside what theory says.
     pub fn new(name: &str, against: &str, marks: Vec<Mark>, own: Option<f64>, expected: &[(&str, f64)]) -> Curve {
+        // JSON has no infinity.
+        let mut marks = marks;
+        marks.iter_mut().for_each(|mark| mark.errors.retain(|_, error| error.is_finite()));
         let mut names: Vec<String> = marks.iter().flat_map(|mark| mark.errors.keys().cloned()).collect();
         names.sort_unstable();
         names.dedup();
@@ -167,7 +170,8 @@ impl Curve {
         };
         let orders = names.into_iter().filter_map(order).collect();
         let is_small = |mark: &Mark| mark.errors.get(ADDED).is_some_and(|&added| added < SMALL);
-        let small = marks.iter().rev().take_while(|mark| is_small(mark)).last();
+        // The finest is measured against itself.
+        let small = marks.iter().rev().take_while(|mark| is_small(mark)).skip(1).last();
         let own = own.filter(|own| marks.iter().any(|mark| mark.value == *own));
         Curve {
             name: name.to_owned(),
@@ -270,7 +274,7 @@ impl Precision {
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "{}: {} Gaussians x {} frames; {} pictures of {} frames looked at, {} others judged by; {} kept",
+            "{}: {} Gaussians x {} frames; {} pictures of {} frames looked at, {} judged by; {} kept",
             self.path, self.gaussians, self.frames, self.pictures, self.frames_looked_at, self.judged, self.kept
         );
         for (knob, curve) in self.curves() {
@@ -295,7 +299,7 @@ impl Precision {
             });
             let orders: Vec<String> = orders.collect();
             if !orders.is_empty() {
-                let _ = writeln!(out, "  order of convergence: {}", orders.join(", "));
+                let _ = writeln!(out, "  order by the step: {}", orders.join(", "));
             }
             if let Some(enough) = curve.enough {
                 let _ = writeln!(out, "  adds less than a tenth of the model's own error to pictures from {enough} on");
@@ -341,6 +345,7 @@ mod tests {
         assert_eq!(of(&[0.5, 0.05, 0.2, 0.09, 0.0]).enough, Some(4.0));
         assert_eq!(of(&[0.5, 0.5]).enough, None);
         assert_eq!((of(&[0.0; 5]).enough, of(&[0.0; 5]).own, of(&[0.0]).own), (Some(1.0), Some(2.0), None));
+        assert_eq!(of(&[0.5, 0.5, 0.0]).enough, None, "the finest tells nothing");
     }
 
     #[test]

@@ -5,7 +5,8 @@
 //! and in f64 against longer ones; threads and memory, which must change nothing. *Model*: fewer Gaussians stand for more,
 //! merged or refined.
 //!
-//! Memory: that of `compress`, and 12 bytes for every pixel of the pictures that results are judged by.
+//! Memory: that of `compress`, and beside it the scene, [`HELD`] bytes a Gaussian, and 12 bytes for every pixel of the pictures
+//! that results are judged by; a budget for whole runs is what that leaves of it.
 
 pub mod found;
 mod judge;
@@ -19,16 +20,19 @@ use std::path::{Path, PathBuf};
 use super::cost::Repeats;
 use super::whole_run::trained;
 use crate::TOOL;
+use crate::budget::{Budget, Tell, Workload};
 use crate::compress::journal::Journal;
 use crate::compress::measure::{Measure, Outlook, Stages};
 use crate::compress::score::UserOverrides;
 use crate::compress::{Job, Request, Target};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
-use crate::model::{Schedule, Split};
+use crate::model::{Rows, Schedule, Split};
 use crate::recipe::Recipe;
 use crate::report::precision::{PAGE, page};
 use crate::scene::{InputOptions, Scene, open_scene};
+use crate::score::Scores;
+use crate::score::sketch::MOST_BITS;
 use crate::stream::{Progress, Scanned};
 use found::{Knob, Precision};
 use judge::Judge;
@@ -77,6 +81,15 @@ impl Turned {
         }
     }
 
+    /// Why there may be nothing to turn.
+    fn needs(self) -> &'static str {
+        match self {
+            Turned::Sums => "sums over frames need three frames",
+            Turned::Refining => "the recipe refines nothing",
+            _ => "the recipe looks at no pictures",
+        }
+    }
+
     /// Whether every one of its settings is a run from beginning to end.
     fn is_of_whole_runs(self) -> bool {
         matches!(self, Turned::Merging | Turned::Refining | Turned::Machine)
@@ -110,11 +123,20 @@ const ENOUGH: f64 = 10.0;
 /// Gaussians times frames up to which whole runs are part of everything.
 const SHORT: u64 = 10_000_000;
 
+/// Bytes of a sketch of the most bits.
+const COUNTS: u64 = 4 << (9 + MOST_BITS);
+
+/// Bytes per Gaussian that are held between settings: statistics twice, two looks and two scores, and sets that were kept.
+const HELD: u64 =
+    (2 * Rows::BYTES_PER_GAUSSIAN + 2 * 16 + 2 * Scores::BYTES_PER_GAUSSIAN + 12 * size_of::<u32>()) as u64;
+
 /// What all knobs are turned on.
 struct Bench<'a> {
     /// As the training cameras see it, at some of its frames.
     scene: &'a Scene,
     input: &'a InputOptions,
+    /// Of all pictures.
+    work: Workload,
     recipe: &'a Recipe,
     scanned: Scanned,
     judge: Judge,
@@ -166,16 +188,24 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     let job = Job::within(&request, Outlook::of(&scene), &scene.workload())?;
     scene.keep_to(input.memory, |work, limits| {
         let mut needs = job.needs(work, limits);
-        needs.iter_mut().for_each(|need| need.fixed.push(("judged", Judge::bytes(work.pixels))));
+        for need in &mut needs {
+            need.per_gaussian.push(("settings", HELD));
+            need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", COUNTS)]);
+        }
         needs
     })?;
+    let work = scene.workload();
+    let beside = work.count() as u64 * (HELD + work.input.per_gaussian) + work.input.fixed + Judge::bytes(work.pixels);
+    let left = input.memory.bytes.map(|bytes| bytes.saturating_sub(beside));
+    let input = InputOptions { memory: Budget { bytes: left, tell: Tell::Nothing }, ..input };
     let mut notes = scene.notes.clone();
     scene.schedule = thin(&scene.schedule, options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
     if scene.rig.shots.iter().all(|shot| shot.split != Split::Test) {
         notes.push("no pictures are held out: those judged by are also looked at".to_owned());
     }
-    let knobs = options.knobs.clone().unwrap_or_else(|| Turned::ALL.to_vec());
+    let mut knobs = Turned::ALL.to_vec();
+    knobs.retain(|knob| options.knobs.as_ref().is_none_or(|asked| asked.contains(knob)));
     let is_long = gaussians as u64 * frames as u64 > SHORT;
     let (left_out, turned): (Vec<Turned>, Vec<Turned>) =
         knobs.into_iter().partition(|knob| options.knobs.is_none() && is_long && knob.is_of_whole_runs());
@@ -190,7 +220,8 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
         scanned: measure.scan.run(&scene, &mut Journal::default())?,
         judge: Judge::new(&scene)?,
         scene: &scene,
-        input: &options.input,
+        input: &input,
+        work,
         recipe: &options.recipe,
         kept,
         repeats: Repeats { most: options.runs, enough: ENOUGH },
@@ -220,7 +251,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     for knob in turned {
         match bench.turn(knob)? {
             Some(knob) => found.knobs.push(knob),
-            None => found.notes.push(format!("{}: nothing to turn, of {frames} frames", knob.name())),
+            None => found.notes.push(format!("{}: left out, as {}", knob.name(), knob.needs())),
         }
     }
     let write = |name: &str, text: String| {
@@ -240,12 +271,12 @@ impl Bench<'_> {
     /// All settings of a knob; none where the scene has nothing to turn it on.
     fn turn(&self, knob: Turned) -> Result<Option<Knob>> {
         match knob {
-            Turned::Look => self.look().map(Some),
-            Turned::Rounds => self.rounds().map(Some),
+            Turned::Look => self.look(),
+            Turned::Rounds => self.rounds(),
             Turned::Percentiles => self.percentiles().map(Some),
             Turned::Sums => self.sums(),
             Turned::Merging => self.merging().map(Some),
-            Turned::Refining => self.refining().map(Some),
+            Turned::Refining => self.refining(),
             Turned::Machine => self.machine().map(Some),
         }
     }

@@ -9,12 +9,12 @@ use crate::compress::journal::Journal;
 use crate::compress::measure::Measure;
 use crate::compress::rounds::Rounds;
 use crate::compress::score::{Scored, UserOverrides};
+use crate::compress::visible::Visible;
 use crate::error::Result;
 use crate::recipe::{self, Recipe};
 use crate::score::sketch::MOST_BITS;
-use crate::score::{Looks, Scores, score_by};
+use crate::score::{Graded, Looks, Scores, score_by};
 use crate::select::{Overrides, select};
-use crate::stats::snap;
 use crate::stream::Seen;
 use crate::verbs::cost::Cost;
 
@@ -27,7 +27,7 @@ const STRIDES: [u32; 4] = [16, 8, 4, 2];
 /// Parts that a round leaves.
 const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
 /// Mantissa bits of a sketch.
-const BITS: [u32; 9] = [1, 2, 3, 5, 7, 9, 11, 13, MOST_BITS];
+const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MOST_BITS];
 
 /// A ranking, and what it took.
 struct Tried {
@@ -39,145 +39,134 @@ struct Tried {
     kept: Vec<u32>,
 }
 
-/// What a look at pictures came to.
-struct Looked {
+/// A way to look: a recipe, and where on a curve it stands.
+struct Way {
     value: f64,
     step: f64,
-    seen: Seen,
-    cost: Cost,
+    recipe: Recipe,
 }
 
 impl Bench<'_> {
-    /// The first look: how many pictures, and every how many-th pixel, view and frame.
-    pub(super) fn look(&self) -> Result<Knob> {
+    /// The first look: how many pictures, and every how many-th pixel, view and frame. None where nothing is looked at.
+    pub(super) fn look(&self) -> Result<Option<Knob>> {
         let all = self.scene.schedule.pairs();
-        let recipe = |change: &dyn Fn(&mut Recipe)| {
+        let way = |value: f64, step: f64, change: &dyn Fn(&mut recipe::Scan)| {
             let mut recipe = self.recipe.clone();
             let one = NonZeroU32::MIN;
             let scan = &mut recipe.scan;
             (scan.look_pictures, scan.pixel_stride, scan.view_stride, scan.frame_stride) = (0, one, one, one);
-            change(&mut recipe);
-            recipe
+            change(scan);
+            Way { value, step, recipe }
         };
-        let finest = self.look_by(&recipe(&|_| ()), all as f64, 1.0 / all.max(1) as f64)?;
-        let mut curves = Vec::new();
-        let mut counts = Vec::new();
-        for count in PICTURES_TRIED.into_iter().filter(|&count| count < all) {
-            let recipe = recipe(&|recipe| recipe.scan.look_pictures = count);
-            counts.push(self.look_by(&recipe, count as f64, 1.0 / count as f64)?);
-        }
-        let own = self.recipe.scan.look_pictures;
-        curves.push(self.looks(
-            "look_pictures",
-            counts,
-            &finest,
-            Some(own).filter(|&own| own < all).unwrap_or(all) as f64,
-        )?);
+        let (finest, cost) = self.seen(&way(1.0, 1.0, &|_| ()).recipe)?;
+        let Some(finest) = finest else { return Ok(None) };
+        let own = Some(self.recipe.scan.look_pictures).filter(|&own| own > 0 && own < all).unwrap_or(all);
+        let counts = tried(PICTURES_TRIED.into_iter().chain([own]).filter(|&count| count < all));
+        let counts =
+            counts.into_iter().map(|n| way(n as f64, 1.0 / n as f64, &|scan| scan.look_pictures = n)).collect();
+        let last = (all as f64, 1.0 / all.max(1) as f64);
+        let mut curves = vec![self.looks("look_pictures", counts, (last, &finest, &cost), Some(own as f64))?];
         let seen = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
         let views = self.scene.schedule.most_views();
-        type Set = fn(&mut Recipe, NonZeroU32);
+        type Set = fn(&mut recipe::Scan, NonZeroU32);
         let strides: [(&str, usize, Set); 3] = [
-            ("pixel_stride", usize::MAX, |recipe, stride| recipe.scan.pixel_stride = stride),
-            ("view_stride", views, |recipe, stride| recipe.scan.view_stride = stride),
-            ("frame_stride", seen, |recipe, stride| recipe.scan.frame_stride = stride),
+            ("pixel_stride", usize::MAX, |scan, stride| scan.pixel_stride = stride),
+            ("view_stride", views, |scan, stride| scan.view_stride = stride),
+            ("frame_stride", seen, |scan, stride| scan.frame_stride = stride),
         ];
         for (name, most, set) in strides {
-            let mut looks = Vec::new();
-            for stride in STRIDES.into_iter().filter_map(NonZeroU32::new).filter(|stride| stride.get() as usize <= most)
-            {
-                let value = f64::from(stride.get());
-                looks.push(self.look_by(&recipe(&|recipe| set(recipe, stride)), value, value)?);
-            }
-            let finest = Looked { value: 1.0, step: 1.0, seen: finest.seen.clone(), cost: finest.cost.clone() };
-            curves.push(self.looks(name, looks, &finest, f64::NAN)?);
+            let strides =
+                STRIDES.into_iter().filter_map(NonZeroU32::new).filter(|stride| stride.get() as usize <= most);
+            let value = |stride: NonZeroU32| f64::from(stride.get());
+            let ways = strides.map(|n| way(value(n), value(n), &|scan| set(scan, n))).collect();
+            curves.push(self.looks(name, ways, ((1.0, 1.0), &finest, &cost), None)?);
         }
-        Ok(Knob {
+        Ok(Some(Knob {
             name: "look".to_owned(),
             about: "The first look: contributions C and W of every Gaussian from some of the pictures, and which Gaussians \
                     the scores of these keep, before any round."
                 .to_owned(),
             source: Source::Discretisation,
             curves,
-        })
+        }))
     }
 
-    /// The look of `recipe`.
-    fn look_by(&self, recipe: &Recipe, value: f64, step: f64) -> Result<Looked> {
+    /// What the look of `recipe` sees, if it looks, and what that takes.
+    fn seen(&self, recipe: &Recipe) -> Result<(Option<Seen>, Cost)> {
         let measure = Measure::new(recipe, self.scene.has_cameras, UserOverrides::default());
-        let look = || match &measure.visible {
-            Some(visible) => visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default()),
-            None => Ok(Seen { coverage: Vec::new(), peak: Vec::new() }),
+        let look = || {
+            let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
+            measure.visible.as_ref().map(look).transpose()
         };
-        let (seen, cost) = self.repeats.measure(look, || Ok(()))?;
-        Ok(Looked { value, step, seen, cost })
+        self.repeats.measure(look, || Ok(()))
     }
 
-    /// A curve of looks beside the `finest` one.
-    fn looks(&self, name: &str, looks: Vec<Looked>, finest: &Looked, own: f64) -> Result<Curve> {
-        let against = "all pixels of all pictures";
-        let best = self.scored(finest.seen.clone())?;
-        let mut tried = Vec::new();
-        for look in looks.iter().chain([finest]) {
-            let scored = self.scored(look.seen.clone())?;
-            let l2 = |of: fn(&Seen) -> &Vec<f64>| {
-                relative_l2(of(&look.seen).iter().copied(), of(&finest.seen).iter().copied())
-            };
-            let errors = [
-                ("C", l2(|seen| &seen.coverage)),
-                ("W", l2(|seen| &seen.peak)),
-                (STAYING, off(scored.selection.counts.kept, best.selection.counts.kept)),
-            ];
-            tried.push(Tried {
-                value: look.value,
-                step: look.step,
-                cost: look.cost.clone(),
-                errors: errors.map(|(of, error)| (of.to_owned(), error)).into(),
-                kept: scored.ranked().take(self.kept),
-            });
+    /// A curve of looks, at the end of which stands the `finest` one.
+    fn looks(
+        &self,
+        name: &str,
+        ways: Vec<Way>,
+        ((value, step), finest, cost): ((f64, f64), &Seen, &Cost),
+        own: Option<f64>,
+    ) -> Result<Curve> {
+        let best = self.scored(Some(finest.clone()))?;
+        let of = |value: f64, step: f64, seen: Seen, cost: Cost| -> Result<Tried> {
+            let l2 = |of: fn(&Seen) -> &Vec<f64>| relative_l2(of(&seen).iter().copied(), of(finest).iter().copied());
+            let [c, w] = [l2(|seen| &seen.coverage), l2(|seen| &seen.peak)];
+            let scored = self.scored(Some(seen))?;
+            let staying = off(scored.selection.counts.kept, best.selection.counts.kept);
+            let errors = [("C", c), ("W", w), (STAYING, staying)].map(|(of, error)| (of.to_owned(), error)).into();
+            Ok(Tried { value, step, cost, errors, kept: scored.ranked().take(self.kept) })
+        };
+        let mut tried = Vec::with_capacity(ways.len() + 1);
+        for Way { value, step, recipe } in ways {
+            if let (Some(seen), cost) = self.seen(&recipe)? {
+                tried.push(of(value, step, seen, cost)?);
+            }
         }
-        self.curve(name, against, tried, own, &[])
+        tried.push(of(value, step, finest.clone(), cost.clone())?);
+        self.curve(name, "all pixels of all these pictures", tried, own, &[])
     }
 
     /// Scores by what was scanned and `seen`.
-    fn scored(&self, seen: Seen) -> Result<Scored> {
+    fn scored(&self, seen: Option<Seen>) -> Result<Scored> {
         let measure = Measure::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
-        measure.score.run(self.scene, self.scanned.clone(), Some(seen), &mut Journal::default())
+        measure.score.run(self.scene, self.scanned.clone(), seen, &mut Journal::default())
     }
 
-    /// Rounds of more and of fewer pictures, and of larger and of smaller cuts.
-    pub(super) fn rounds(&self) -> Result<Knob> {
-        let scored = self.scored(self.look_by(self.recipe, 0.0, 0.0)?.seen)?;
+    /// Rounds of more and of fewer pictures, and of larger and of smaller cuts. None where nothing is looked at.
+    pub(super) fn rounds(&self) -> Result<Option<Knob>> {
+        let (Some(seen), _) = self.seen(self.recipe)? else { return Ok(None) };
+        let scored = self.scored(Some(seen))?;
         let own = &self.recipe.select;
         let most = self.scene.schedule.pairs().min(MOST_IN_ROUNDS);
-        let mut counts: Vec<usize> = PICTURES_TRIED
-            .into_iter()
-            .filter(|&count| count < most)
-            .chain([own.round_pictures.min(most), most])
-            .collect();
-        counts.sort_unstable();
-        counts.dedup();
+        let own_pictures = own.round_pictures.min(most);
         let mut by_pictures = Vec::new();
-        for count in counts {
+        for count in tried(PICTURES_TRIED.into_iter().filter(|&count| count < most).chain([own_pictures, most])) {
             let select = recipe::Select { round_pictures: count, ..own.clone() };
             by_pictures.push(self.ranked(&scored, &select, count as f64, 1.0 / count as f64)?);
         }
+        let mut fractions: Vec<f64> = FRACTIONS.into_iter().chain([own.round_fraction]).filter(|&f| f < 1.0).collect();
+        fractions.sort_unstable_by(f64::total_cmp);
+        fractions.dedup();
         let mut by_fraction = Vec::new();
-        for fraction in FRACTIONS {
+        for fraction in fractions {
             let select = recipe::Select { round_fraction: fraction, ..own.clone() };
             by_fraction.push(self.ranked(&scored, &select, fraction, -fraction.ln())?);
         }
+        let own = (Some(own_pictures as f64), Some(own.round_fraction));
         let curves = vec![
-            self.curve("round_pictures", "the most pictures", by_pictures, own.round_pictures as f64, &[])?,
-            self.curve("round_fraction", "the smallest cuts", by_fraction, own.round_fraction, &[])?,
+            self.curve("round_pictures", "the most pictures", by_pictures, own.0, &[])?,
+            self.curve("round_fraction", "the smallest cuts", by_fraction, own.1, &[])?,
         ];
-        Ok(Knob {
+        Ok(Some(Knob {
             name: "rounds".to_owned(),
             about:
                 "Rounds that rank anew by what pictures would lose: pictures of each, and the part that each leaves."
                     .to_owned(),
             source: Source::Discretisation,
             curves,
-        })
+        }))
     }
 
     /// What rounds of `select` keep.
@@ -196,46 +185,47 @@ impl Bench<'_> {
 
     /// Percentiles from one look at the values, by more and fewer bits, beside exact ones.
     pub(super) fn percentiles(&self) -> Result<Knob> {
-        let seen = self.look_by(self.recipe, 0.0, 0.0)?.seen;
-        let mut rows = self.scanned.rows.clone();
-        (rows.c, rows.w) = (seen.coverage, seen.peak);
-        if self.recipe.scan.snap_noise {
-            snap(&mut rows, self.scanned.largest_coordinate);
-        }
+        let scored = self.scored(self.seen(self.recipe)?.0)?;
+        let rows = scored.rows()?;
         let frames = self.scene.source().info().times.len();
         let by = |looks: Looks| -> Result<(Scores, Cost)> {
             self.repeats.measure(|| Ok(score_by(looks, &rows, frames, &self.recipe.score)), || Ok(()))
         };
         let (exact, cost) = by(Looks::Two)?;
-        let mut tried = Vec::new();
-        let mut looks = Vec::new();
+        let staying = scored.selection.counts.kept;
+        let of = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<Tried> {
+            let selection = select(scores, &self.recipe.select, &Overrides::default())?;
+            let errors = [(PERCENTILES, worst(scores, &exact)), (STAYING, off(selection.counts.kept, staying))];
+            let errors = errors.map(|(of, error)| (of.to_owned(), error)).into();
+            Ok(Tried { value, step, cost, errors, kept: selection.ranking.take(self.kept) })
+        };
+        let mut tried = Vec::with_capacity(BITS.len() + 1);
         for bits in BITS {
             let (scores, cost) = by(Looks::One(bits))?;
-            looks.push((f64::from(bits), 0.5f64.powi(bits as i32), scores, cost));
+            tried.push(of(f64::from(bits), 0.5f64.powi(bits as i32), &scores, cost)?);
         }
-        looks.push((f64::from(MOST_BITS + 1), 0.0, exact.clone(), cost));
-        let select = |scores: &Scores| select(scores, &self.recipe.select, &Overrides::default());
-        let expected = select(&exact)?.counts.kept;
-        for (value, step, scores, cost) in looks {
-            let selection = select(&scores)?;
-            let errors = [(PERCENTILES, worst(&scores, &exact)), (STAYING, off(selection.counts.kept, expected))];
-            let errors = errors.map(|(of, error)| (of.to_owned(), error)).into();
-            tried.push(Tried { value, step, cost, errors, kept: selection.ranking.take(self.kept) });
-        }
-        // Half a bucket at most, and buckets halve with every bit.
-        let expected = [(PERCENTILES, 1.0)];
         let own = f64::from(MOST_BITS + 1);
-        let against = "exact percentiles, as every run has them (the last mark)";
+        tried.push(of(own, 0.0, &exact, cost)?);
+        let against = "exact percentiles from two looks, as every run has them (the last mark)";
+        // Half a bucket at most, and buckets halve with every bit.
+        let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILES, 1.0)])?;
         Ok(Knob {
             name: "percentiles".to_owned(),
             about: "Percentiles from one look at the values: mantissa bits of the histogram's keys.".to_owned(),
             source: Source::Discretisation,
-            curves: vec![self.curve("mantissa bits", against, tried, own, &expected)?],
+            curves: vec![curve],
         })
     }
 
     /// A curve of rankings, of which the last is the finest.
-    fn curve(&self, name: &str, against: &str, tried: Vec<Tried>, own: f64, expected: &[(&str, f64)]) -> Result<Curve> {
+    fn curve(
+        &self,
+        name: &str,
+        against: &str,
+        tried: Vec<Tried>,
+        own: Option<f64>,
+        expected: &[(&str, f64)],
+    ) -> Result<Curve> {
         let mut marks = Vec::with_capacity(tried.len());
         let Some(finest) = tried.last().map(|last| last.kept.clone()) else {
             return Ok(Curve::new(name, against, marks, None, expected));
@@ -250,8 +240,16 @@ impl Bench<'_> {
             marks.push(Mark { value, step, cost, errors, psnr: Some(found.psnr) });
             self.advance();
         }
-        Ok(Curve::new(name, against, marks, Some(own), expected))
+        Ok(Curve::new(name, against, marks, own, expected))
     }
+}
+
+/// Rising, each once.
+fn tried(counts: impl Iterator<Item = usize>) -> Vec<usize> {
+    let mut counts: Vec<usize> = counts.collect();
+    counts.sort_unstable();
+    counts.dedup();
+    counts
 }
 
 /// Relative error of a count.
@@ -262,8 +260,8 @@ fn off(count: usize, expected: usize) -> f64 {
 /// The worst relative error of a percentile that scores are normalised by; those of scores of scores aside, whose values
 /// differ themselves.
 fn worst(scores: &Scores, exact: &Scores) -> f64 {
-    let of_statistics = |scores: &Scores| scores.terms[..scores.terms.len() - 2].to_vec();
-    let pairs = of_statistics(scores).into_iter().zip(of_statistics(exact));
+    let pairs = scores.terms.iter().zip(&exact.terms);
+    let pairs = pairs.filter(|(term, _)| !matches!(term.of, Graded::Static | Graded::Dynamic));
     let errors = pairs.flat_map(|(rough, exact)| {
         [(rough.norm.p1, exact.norm.p1), (rough.norm.p99, exact.norm.p99)]
             .map(|(rough, exact)| if exact == 0.0 { 0.0 } else { (rough / exact - 1.0).abs() })

@@ -28,6 +28,12 @@ const PICTURES_REFINED_BY: [usize; 5] = [32, 65, 130, 260, 520];
 /// Budgets of memory, in parts of the least that works.
 const BUDGETS: [f64; 4] = [1.0, 1.5, 3.0, 10.0];
 
+/// Frames that results of whole runs are compared on at most.
+const FRAMES_COMPARED: usize = 12;
+
+/// What errors of whole runs are measured against.
+const WHOLE: &str = "the whole model's pictures: every held-out view of up to 12 frames";
+
 impl Bench<'_> {
     /// Merging after pruning, to one count.
     pub(super) fn merging(&self) -> Result<Knob> {
@@ -40,15 +46,17 @@ impl Bench<'_> {
             recipe.merge.passes = passes;
             recipe
         };
-        let mut by_radius = vec![self.ran(&merging(Vec::new()), 0.0, 0.0)?];
+        let alone = self.ran(&merging(Vec::new()), 0.0, 0.0)?;
+        let mut by_radius = vec![alone.clone()];
         for part in RADII {
             let epsilon = part * pass.epsilon;
             by_radius.push(self.ran(&merging(vec![MergePass { epsilon, ..pass }]), epsilon, epsilon)?);
         }
-        let mut by_passes = vec![self.ran(&merging(Vec::new()), 0.0, 0.0)?];
+        let mut by_passes = vec![alone];
+        let own = if plain.merge.passes.is_empty() { vec![pass] } else { plain.merge.passes.clone() };
         for passes in PASSES {
-            let steps = passes as f64;
-            by_passes.push(self.ran(&merging(vec![pass; passes]), steps, steps)?);
+            let some: Vec<MergePass> = own.iter().copied().cycle().take(passes).collect();
+            by_passes.push(self.ran(&merging(some), passes as f64, passes as f64)?);
         }
         Ok(Knob {
             name: "merging".to_owned(),
@@ -64,11 +72,17 @@ impl Bench<'_> {
         })
     }
 
-    /// Refining at one count.
-    pub(super) fn refining(&self) -> Result<Knob> {
+    /// Refining at one count. None of a recipe that refines nothing.
+    pub(super) fn refining(&self) -> Result<Option<Knob>> {
         let own = &self.recipe.refine;
+        if own.refine.0.is_empty() || own.refine_steps == 0 {
+            return Ok(None);
+        }
         let mut by_steps = vec![self.ran(&self.unrefined(), 0.0, 0.0)?];
-        for steps in STEPS {
+        let mut steps: Vec<u32> = STEPS.into_iter().chain([own.refine_steps]).collect();
+        steps.sort_unstable();
+        steps.dedup();
+        for steps in steps {
             let recipe = self.recipe.refining_by(steps);
             by_steps.push(self.ran(&recipe, f64::from(steps), 1.0 / f64::from(steps))?);
         }
@@ -78,7 +92,7 @@ impl Bench<'_> {
             recipe.refine.refine_pictures = pictures;
             by_pictures.push(self.ran(&recipe, pictures as f64, 1.0 / pictures as f64)?);
         }
-        Ok(Knob {
+        Ok(Some(Knob {
             name: "refining".to_owned(),
             about: "Refining to one count: steps (0: pruning alone), and the pictures that they go through.".to_owned(),
             source: Source::Model,
@@ -86,7 +100,7 @@ impl Bench<'_> {
                 Curve::new("refine_steps", WHOLE, by_steps, Some(own.refine_steps.into()), &[]),
                 Curve::new("refine_pictures", WHOLE, by_pictures, Some(own.refine_pictures as f64), &[]),
             ],
-        })
+        }))
     }
 
     /// Threads and memory, which must not change a byte.
@@ -109,7 +123,7 @@ impl Bench<'_> {
             ..Request::new(trained(self.input), self.scratch.join(self.name), recipe.clone())
         };
         let job = Job::new(&request, Outlook::of(self.scene))?;
-        let least = Plan::closest(self.scene.workload(), 1, |work, limits| job.needs(work, limits)).peak();
+        let least = Plan::closest(self.work, 1, |work, limits| job.needs(work, limits)).peak();
         let mut by_memory = Vec::new();
         for part in BUDGETS {
             let mebibytes = (part * least as f64 / f64::from(1 << 20)).ceil();
@@ -179,9 +193,3 @@ impl Bench<'_> {
         Ok(ran)
     }
 }
-
-/// Frames that results of whole runs are compared on at most.
-const FRAMES_COMPARED: usize = 12;
-
-/// What errors of whole runs are measured against.
-const WHOLE: &str = "the whole model's pictures";

@@ -24,6 +24,9 @@ const MOST_FRAMES: usize = 240;
 /// Frames that they are played for.
 const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
 
+/// What errors of sums are measured against.
+const AGAINST: &str = "f64, compensated";
+
 /// A running sum.
 trait Sum<T: Float>: Default {
     fn add(&mut self, value: T);
@@ -144,9 +147,6 @@ impl Bench<'_> {
         PLAYED.into_iter().zip(expected).map(mark).collect()
     }
 }
-
-/// What errors of sums are measured against.
-const AGAINST: &str = "f64, compensated";
 
 /// Frame of `count` that is shown as the `k`-th of frames played to and fro.
 fn place(k: usize, count: usize) -> usize {
