@@ -161,15 +161,15 @@ impl Job {
         // What refining gains at a count is more than merging ever did; cuts rank anew, whatever ranked before.
         let prunes_alone = *only == Only::Prune || request.goal.is_some() || (refine.is_some() && prunes);
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
-        let merge = || Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes, target };
+        let prune = Prune { prunes, merges, target };
         let emit = Emit::new(request, outlook.own_output, merges);
         let field = Field::of(request, emit.kind);
         let bands = Bands::of(request, emit.kind);
         Ok(Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             degree: Degree::of(request, refine.as_ref()),
-            prune: Prune { prunes, merges, target },
-            merge: merges.then(merge),
+            merge: merges.then(|| Merge::after(&prune, recipe)),
+            prune,
             choose: (looks && prunes && merges && recipe.select.choose_by_views)
                 .then_some(Choose { has_target: target.is_some() }),
             search: match &goal {
@@ -230,16 +230,12 @@ impl Job {
                 _ => "refining what is left gains more at the same count (--no-refine merges)",
             };
             let what = "merging, and its pass over the frames";
-            let Request { recipe, .. } = request;
-            let merge = Merge {
-                recipe: recipe.merge.clone(),
-                scan: recipe.scan.clone(),
-                prunes: self.prune.prunes,
-                target: self.prune.target,
-            };
-            match recipe.merge.passes.is_empty() {
+            match request.recipe.merge.passes.is_empty() {
                 true => journal.leave_out(what, why),
-                false => journal.spare(what, why, saved(merge.need(work, limits))),
+                false => {
+                    let merge = Merge::after(&self.prune, &request.recipe);
+                    journal.spare(what, why, saved(merge.need(work, limits)));
+                }
             }
         }
         let takes = |least: u64| format!("memory: expected at least {}MiB for it (--memory)", least.div_ceil(1 << 20));

@@ -6,6 +6,7 @@
 use std::borrow::Cow;
 
 use super::journal::Journal;
+use super::prune::Prune;
 use super::score::{Scored, scored};
 use super::summary::MergeSummary;
 use crate::budget::{Need, Workload};
@@ -66,6 +67,11 @@ pub struct Outcome {
 }
 
 impl Merge {
+    /// The merging that `recipe` has follow on `prune`.
+    pub fn after(prune: &Prune, recipe: &recipe::Recipe) -> Merge {
+        Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: prune.prunes, target: prune.target }
+    }
+
     /// What is known of pairs that are measured together and of all that may survive, and the proxies.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
         let pairs = (merge::BYTES_PER_PAIR + motion::BYTES_PER_PAIR) as u64;

@@ -419,6 +419,13 @@ impl Recipe {
         table.try_into().map_err(|e: toml::de::Error| e.to_string())
     }
 
+    /// The same, but that what stays keeps its values.
+    pub fn unrefined(&self) -> Recipe {
+        let mut recipe = self.clone();
+        recipe.refine.refine = Groups(Columns::empty());
+        recipe
+    }
+
     /// The same with so many steps of refinement, and before each cut as many in proportion.
     pub fn refining_by(&self, steps: u32) -> Recipe {
         let mut recipe = self.clone();

@@ -4,8 +4,7 @@
 use super::baseline::Baseline;
 use crate::compress::Only;
 use crate::error::{Error, Result};
-use crate::model::Columns;
-use crate::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm, WhichBands};
+use crate::recipe::{Coverage, Precision, Recipe, StaticTerm, WhichBands};
 
 /// A way to make a model smaller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,11 +72,7 @@ impl Method {
     /// # Errors
     /// None but of presets that do not parse.
     pub(super) fn means(self) -> Result<Means> {
-        let unrefined = || {
-            let mut recipe = Recipe::preset("default")?;
-            recipe.refine.refine = Groups(Columns::empty());
-            Ok::<_, Error>(recipe)
-        };
+        let unrefined = || Ok::<_, Error>(Recipe::preset("default")?.unrefined());
         let pruning = |coverage| {
             let mut recipe = unrefined()?;
             // Pruning and nothing else.

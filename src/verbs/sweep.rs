@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use super::cost::Repeats;
 use super::method::{Means, Method, STEPS, refining_by};
 use super::trade_off::{Knob, Point, Setting, TradeOff};
-use super::whole_run::{WholeRun, trained};
+use super::whole_run::{WholeRun, result_name, trained};
 use crate::TOOL;
 use crate::compress::Target;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
@@ -128,7 +128,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
 /// What all points share, and the name by which a result is of the input's kind.
 fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let scene = open_scene(&trained(&options.input))?;
-    let name = if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" };
+    let name = result_name(&scene)?;
     let found = TradeOff {
         tool: TOOL.to_owned(),
         path: scene.path.display().to_string(),

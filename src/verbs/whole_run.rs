@@ -12,8 +12,8 @@ use crate::compress::{Request, Target, compress};
 use crate::emit::atomic::Replace;
 use crate::error::{Error, Result};
 use crate::model::Split;
-use crate::scene::InputOptions;
 use crate::scene::pictures::PictureSet;
+use crate::scene::{InputOptions, Scene};
 
 /// What all runs that are compared with one another share.
 #[derive(Debug, Clone)]
@@ -79,6 +79,14 @@ impl WholeRun<'_> {
             overwrite: Replace::Never,
         })
     }
+}
+
+/// The name by which a result is of the kind of `scene`'s input.
+///
+/// # Errors
+/// An index of a container that cannot be read.
+pub(super) fn result_name(scene: &Scene) -> Result<&'static str> {
+    Ok(if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" })
 }
 
 /// The same input, scored by its training pictures.

@@ -18,7 +18,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::cost::Repeats;
-use super::whole_run::trained;
+use super::whole_run::{result_name, trained};
 use crate::TOOL;
 use crate::budget::{Budget, Tell, Workload};
 use crate::compress::journal::Journal;
@@ -180,7 +180,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     let info = scene.source().info();
     let (gaussians, frames) = (info.count, info.times.len());
     let kept = options.target.count(gaussians)?;
-    let name = if scene.input.columns()?.is_empty() { "result" } else { "result.gseq" };
+    let name = result_name(&scene)?;
     let request = Request {
         target: Some(options.target),
         ..Request::new(input.clone(), options.output.join(name), options.recipe.clone())

@@ -58,7 +58,7 @@ impl Bench<'_> {
             change(scan);
             Way { value, step, recipe }
         };
-        let (finest, cost) = self.seen(&way(1.0, 1.0, &|_| ()).recipe)?;
+        let (finest, cost) = self.seen_at_cost(&way(1.0, 1.0, &|_| ()).recipe)?;
         let Some(finest) = finest else { return Ok(None) };
         let own = Some(self.recipe.scan.look_pictures).filter(|&own| own > 0 && own < all).unwrap_or(all);
         let counts = tried(PICTURES_TRIED.into_iter().chain([own]).filter(|&count| count < all));
@@ -91,14 +91,16 @@ impl Bench<'_> {
         }))
     }
 
-    /// What the look of `recipe` sees, if it looks, and what that takes.
-    fn seen(&self, recipe: &Recipe) -> Result<(Option<Seen>, Cost)> {
+    /// What the look of `recipe` sees, if it looks.
+    fn seen(&self, recipe: &Recipe) -> Result<Option<Seen>> {
         let measure = Measure::new(recipe, self.scene.has_cameras, UserOverrides::default());
-        let look = || {
-            let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
-            measure.visible.as_ref().map(look).transpose()
-        };
-        self.repeats.measure(look, || Ok(()))
+        let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
+        measure.visible.as_ref().map(look).transpose()
+    }
+
+    /// The same, and what that takes.
+    fn seen_at_cost(&self, recipe: &Recipe) -> Result<(Option<Seen>, Cost)> {
+        self.repeats.measure(|| self.seen(recipe), || Ok(()))
     }
 
     /// A curve of looks, at the end of which stands the `finest` one.
@@ -120,7 +122,7 @@ impl Bench<'_> {
         };
         let mut tried = Vec::with_capacity(ways.len() + 1);
         for Way { value, step, recipe } in ways {
-            if let (Some(seen), cost) = self.seen(&recipe)? {
+            if let (Some(seen), cost) = self.seen_at_cost(&recipe)? {
                 tried.push(of(value, step, seen, cost)?);
             }
         }
@@ -136,7 +138,7 @@ impl Bench<'_> {
 
     /// Rounds of more and of fewer pictures, and of larger and of smaller cuts. None where nothing is looked at.
     pub(super) fn rounds(&self) -> Result<Option<Knob>> {
-        let (Some(seen), _) = self.seen(self.recipe)? else { return Ok(None) };
+        let Some(seen) = self.seen(self.recipe)? else { return Ok(None) };
         let scored = self.scored(Some(seen))?;
         let own = &self.recipe.select;
         let most = self.scene.schedule.pairs().min(MOST_IN_ROUNDS);
@@ -185,7 +187,7 @@ impl Bench<'_> {
 
     /// Percentiles from one look at the values, by more and fewer bits, beside exact ones.
     pub(super) fn percentiles(&self) -> Result<Knob> {
-        let scored = self.scored(self.seen(self.recipe)?.0)?;
+        let scored = self.scored(self.seen(self.recipe)?)?;
         let rows = scored.rows()?;
         let frames = self.scene.source().info().times.len();
         let by = |looks: Looks| -> Result<(Scores, Cost)> {

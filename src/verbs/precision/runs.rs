@@ -10,8 +10,7 @@ use crate::budget::{Budget, Plan};
 use crate::compress::measure::{Outlook, Stages};
 use crate::compress::{Job, Only, Request, Target};
 use crate::error::{Error, Result};
-use crate::model::Columns;
-use crate::recipe::{Groups, MergePass, Recipe};
+use crate::recipe::{MergePass, Recipe};
 use crate::scene::{InputOptions, open_input};
 use crate::verbs::cost::Cost;
 use crate::verbs::method::Means;
@@ -37,7 +36,7 @@ const WHOLE: &str = "the whole model's pictures: every held-out view of up to 12
 impl Bench<'_> {
     /// Merging after pruning, to one count.
     pub(super) fn merging(&self) -> Result<Knob> {
-        let plain = self.unrefined();
+        let plain = self.recipe.unrefined();
         let pass = plain.merge.passes.first().copied();
         let pass = pass.unwrap_or(MergePass { epsilon: 0.005, d0: 1.0, rho: 0.95, tau_m: 0.9 });
         let merging = |passes: Vec<MergePass>| {
@@ -78,7 +77,7 @@ impl Bench<'_> {
         if own.refine.0.is_empty() || own.refine_steps == 0 {
             return Ok(None);
         }
-        let mut by_steps = vec![self.ran(&self.unrefined(), 0.0, 0.0)?];
+        let mut by_steps = vec![self.ran(&self.recipe.unrefined(), 0.0, 0.0)?];
         let mut steps: Vec<u32> = STEPS.into_iter().chain([own.refine_steps]).collect();
         steps.sort_unstable();
         steps.dedup();
@@ -105,7 +104,7 @@ impl Bench<'_> {
 
     /// Threads and memory, which must not change a byte.
     pub(super) fn machine(&self) -> Result<Knob> {
-        let recipe = self.unrefined();
+        let recipe = self.recipe.unrefined();
         let mut expected = None;
         let mut by_threads = Vec::new();
         let most = rayon::current_num_threads();
@@ -142,13 +141,6 @@ impl Bench<'_> {
                 Curve::new("memory, MiB", against, by_memory, None, &[]),
             ],
         })
-    }
-
-    /// The recipe without refining.
-    fn unrefined(&self) -> Recipe {
-        let mut recipe = self.recipe.clone();
-        recipe.refine.refine = Groups(Columns::empty());
-        recipe
     }
 
     fn target(&self) -> Target {
