@@ -26,6 +26,9 @@ pub enum Error {
     /// The request itself makes no sense: change the arguments or the recipe. Exit code 2.
     #[error("{0}")]
     Usage(String),
+    /// A run that was asked for a part of the work has done it. Exit code 0.
+    #[error("{0}")]
+    Stopped(String),
     /// Numbers that must agree do not: a broken build, or a broken machine.
     #[error("selfcheck failed: {0}\n  trust no result of this program on this machine, and report the table above")]
     Unsound(String),

@@ -1,10 +1,12 @@
 //! What is left of an input: which Gaussians stay, which of them stand for several, and what was changed of them.
 
+use serde::{Deserialize, Serialize};
+
 use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians};
 use crate::recipe::{Merge, Precision};
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Reference {
     /// The frame with most Gaussians alive, ties to the first; 0 without frames.
     pub frame: usize,
@@ -13,7 +15,7 @@ pub struct Reference {
 }
 
 /// Several Gaussians of the input that became one of the output, a proxy.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cluster {
     /// Place in the output.
     pub output: u32,
@@ -24,7 +26,7 @@ pub struct Cluster {
 }
 
 /// What proxies are made of, and what is known of them before anything is written.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Proxies {
     /// Raw parameters, one row per cluster, of a family that has such; none where a proxy follows from its members
     /// frame by frame.
@@ -40,7 +42,7 @@ pub struct Proxies {
 ///
 /// A row for every Gaussian of the output, in columns that change; columns that do not are empty. Harmonics may be of
 /// a lower degree than the output's: those above stay.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Change(pub Gaussians);
 
 impl Change {
@@ -98,7 +100,7 @@ impl Change {
 }
 
 /// The Gaussians of the output in terms of those of the input.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Reduction {
     /// For every Gaussian of the output the id of its original, or of its cluster's leader; increasing.
     pub kept: Vec<u32>,

@@ -64,7 +64,7 @@ pub struct Steps {
 }
 
 /// An archive, encoded.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct Encoded {
     /// The file.
     pub bytes: Vec<u8>,

@@ -9,6 +9,7 @@ use crate::emit::atomic::Replace;
 use crate::emit::bounds::MaxError;
 use crate::verbs::method::Method;
 use crate::verbs::precision::Turned;
+use crate::work::Part;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -72,6 +73,8 @@ pub(super) enum Verb {
     Unpack(Unpack),
     /// Save the complete frames of a .gseq container that was cut short
     Recover(Recover),
+    /// Say what is in a work folder, or remove it
+    Work(Work),
     /// Generate a small dynamic scene, compress it, say what happened
     Demo(Demo),
     /// Check the numbers of this program on this machine against closed forms and slow, plain sums; takes no files
@@ -98,6 +101,7 @@ impl Verb {
             | Verb::Precision(_)
             | Verb::Verify(_)
             | Verb::Recover(_)
+            | Verb::Work(_)
             | Verb::Selfcheck(_)
             | Verb::Recipe(_)
             | Verb::Completions(_) => false,
@@ -120,6 +124,18 @@ pub(super) struct Input {
     pub(super) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(super) memory: Memory,
+}
+
+/// Where results of stages stay, so that a run goes on where another was cut short, and several runs share the work.
+#[derive(Debug, Args)]
+pub(super) struct Kept {
+    /// Keep what stages find in this folder, and take from it what is there: a run that was cut short goes on
+    #[arg(long, value_name = "FOLDER")]
+    pub(super) work: Option<PathBuf>,
+    /// Compute part I of N of the next stage that can be divided, in the work folder, and nothing else; a run without
+    /// this joins them and does the rest
+    #[arg(long, value_name = "I/N", requires = "work")]
+    pub(super) part: Option<Part>,
 }
 
 /// What to do with what has the output's name.
@@ -223,6 +239,11 @@ pub(super) struct Compress {
     /// Say what would happen; write nothing
     #[arg(long)]
     pub(super) dry_run: bool,
+    #[command(flatten)]
+    pub(super) kept: Kept,
+    /// List the stages that --part divides, in order, with the units that parts are made of, and do nothing else
+    #[arg(long, conflicts_with = "part")]
+    pub(super) list_stages: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print the summary as JSON
@@ -546,6 +567,19 @@ pub(super) struct Unpack {
     pub(super) stream: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
+}
+
+/// `work`
+#[derive(Debug, Args)]
+pub(super) struct Work {
+    /// The folder
+    pub(super) folder: PathBuf,
+    /// Remove everything that stages have kept in it, and the folder if nothing else is in it
+    #[arg(long, conflicts_with = "json")]
+    pub(super) clean: bool,
+    /// Print what is there as JSON
+    #[arg(long)]
+    pub(super) json: bool,
 }
 
 /// `recover`

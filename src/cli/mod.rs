@@ -13,7 +13,7 @@ use clap::{CommandFactory, Parser};
 use gseq::Compression;
 
 use crate::budget::{self, Budget, Tell};
-use crate::compress::{Only, Request, Run, Target, compress};
+use crate::compress::{Only, Request, Run, Target, compress, divided_stages};
 use crate::emit::atomic::Replace;
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
@@ -32,8 +32,10 @@ use crate::verbs::precision::{PrecisionOptions, Turned};
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::SweepOptions;
 use crate::verbs::{archive, container, demo, evaluate, precision, render, score, sweep};
+use crate::work;
 use args::{
-    CameraFile, Cameras, Cli, Compress, ImageKind, Input, Memory, OutputSize, Render, SideBySide, SplitArg, Sweep, Verb,
+    CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, SideBySide, SplitArg,
+    Sweep, Verb,
 };
 
 /// Runs the program on the arguments of this process.
@@ -59,6 +61,11 @@ pub fn main() -> ExitCode {
         }
         // Whoever read our output has seen enough.
         Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        // What it was asked for is done.
+        Err(Error::Stopped(what)) => {
+            let _ = print(&format!("{what}\n"));
+            ExitCode::SUCCESS
+        }
         Err(error) => {
             tell(&format!("splatsieve: {error}"));
             ExitCode::from(code_of(&error))
@@ -79,8 +86,12 @@ fn run(cli: Cli) -> Result<()> {
     }
     match cli.verb {
         Verb::Compress(args) => {
-            let json = args.json;
-            let summary = compress(&compress_options(*args, cli.quiet)?)?;
+            let (json, list_stages) = (args.json, args.list_stages);
+            let request = compress_options(*args, cli.quiet)?;
+            if list_stages {
+                return print(&divided_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
+            }
+            let summary = compress(&request)?;
             print(&if json { summary.json() } else { summary.text() })
         }
         Verb::Score(args) => {
@@ -199,6 +210,14 @@ fn run(cli: Cli) -> Result<()> {
                 report.tiles_saved
             ))
         }
+        Verb::Work(args) => {
+            if args.clean {
+                let (files, bytes) = work::clean(&args.folder)?;
+                return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.display()));
+            }
+            let listed = work::list(&args.folder)?;
+            print(&if args.json { json(&listed) } else { work::text(&listed) })
+        }
         Verb::Demo(args) => {
             let recipe = args.recipe.recipe()?;
             let output = args.output.as_deref();
@@ -238,6 +257,7 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
+    input.work = work_of(args.kept);
     if input.memory.tell == Tell::Nothing && !quiet {
         input.memory.tell = Tell::Time;
     }
@@ -364,6 +384,10 @@ fn part_of(split: SplitArg) -> PictureSet {
         SplitArg::Test => PictureSet::Split(Split::Test),
         SplitArg::All => PictureSet::All,
     }
+}
+
+fn work_of(kept: Kept) -> Option<work::Asked> {
+    kept.work.map(|folder| work::Asked { folder, part: kept.part })
 }
 
 fn budget_of(memory: Memory) -> Budget {

@@ -9,6 +9,7 @@
 use std::collections::BTreeMap;
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use super::journal::Journal;
 use super::summary::ArchiveSummary;
@@ -23,6 +24,7 @@ use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 use crate::stream::{Batch, Subject, show, spread};
+use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "archive";
@@ -74,7 +76,7 @@ pub struct Archive {
 }
 
 /// What an archive is asked for, beside what its own flag says.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub enum Asked {
     /// Nothing.
     Nothing,
@@ -212,10 +214,12 @@ impl Archive {
         asked: Asked,
         journal: &mut Journal,
     ) -> Result<(Encoded, ArchiveSummary)> {
-        journal.stage(NAME, reduction.len(), scene.source(), |_| {
-            let made = self.make(scene, reduction, asked)?;
-            Ok((made, reduction.len()))
-        })
+        let key = Key::of(&(self.psnr, asked, reduction));
+        let (encoded, summary): (Encoded, String) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+            let (encoded, summary) = self.make(scene, reduction, asked)?;
+            Ok(((encoded, serde_json::to_string(&summary).expect("plain data")), reduction.len()))
+        })?;
+        Ok((encoded, serde_json::from_str(&summary).expect("as it was written")))
     }
 
     fn make(&self, scene: &Scene, reduction: &Reduction, asked: Asked) -> Result<(Encoded, ArchiveSummary)> {

@@ -16,6 +16,7 @@ use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::select::Ranking;
 use crate::stream::{Batch, Progress, Subject, VIEWS_AT_ONCE, View, show, spread};
+use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -89,9 +90,9 @@ impl Choose {
         }
         let pruned = ranked.take(count);
         let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
-        let found = journal
-            .stage(NAME, count, scene.source(), |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
-        let [without, with] = found;
+        let key = Key::of(&(&pruned, reduction, &pictures));
+        let [without, with]: [f64; 2] = journal
+            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
         if with > without {
             return Ok(merged);
         }

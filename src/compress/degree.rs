@@ -60,7 +60,8 @@ impl Degree {
         journal: &mut Journal,
     ) -> Result<Fit> {
         let all = scored.count();
-        journal.stage(NAME, all, scene.source(), |journal| {
+        let key = self.refine.key().and(&(ranked, like, fits));
+        journal.kept_stage(NAME, all, scene, key, |journal| {
             let targets = Targets::new(scene, self.refine.pictures)?;
             let mut tried: Vec<(Fit, f64)> = Vec::new();
             for &fit in fits {

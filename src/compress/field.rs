@@ -19,6 +19,7 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, show, spread};
+use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "field";
@@ -70,7 +71,8 @@ impl Field {
     /// Frames that cannot be read.
     pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
         let count = reduction.len();
-        journal.stage(NAME, count, scene.source(), |journal| Ok((self.round(scene, reduction, journal)?, count)))
+        let key = Key::of(&(self.margin, &reduction));
+        journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, reduction, journal)?, count)))
     }
 
     /// [`Field::run`] of an input that can, as a part of another stage.

@@ -9,20 +9,23 @@ use super::field::Field;
 use super::ids::parse_ids;
 use super::journal::Journal;
 use super::measure::{Measure, Outlook, Stages};
-use super::merge::Merge;
+use super::merge::{self, Merge};
 use super::prune::Prune;
-use super::refine::Refine;
+use super::refine::{self, Refine};
 use super::request::{Goal, Only, Quality, Request, decibels};
 use super::rounds::Rounds;
+use super::scan;
 use super::score::UserOverrides;
 use super::search::Search;
 use super::summary::Saved;
-use super::visible::Visible;
+use super::visible::{self, Visible};
 use crate::budget::{Need, Plan, Workload};
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::recipe::Coverage;
+use crate::scene::Scene;
+use crate::stream::scan_units;
 
 /// The stages of a run, in their order.
 #[derive(Debug, Clone)]
@@ -214,6 +217,33 @@ impl Job {
     /// itself.
     pub fn before_cuts(&self, wanted: usize, all: usize) -> usize {
         self.refine.as_ref().map_or(wanted, |refine| refine.first(wanted, all))
+    }
+
+    /// The stages that can be divided, as a work folder names them, with their units.
+    pub(super) fn divided(&self, scene: &Scene) -> Vec<String> {
+        let count = scene.source().info().count;
+        let mut stages = vec![format!("{}: {} blocks of Gaussians", scan::NAME, scan_units(scene.source().info()))];
+        if let Some(visible) = &self.measure.visible {
+            let most = match visible.recipe.look_pictures {
+                0 => scene.schedule.pairs(),
+                most => most.min(scene.schedule.pairs()),
+            };
+            stages.push(format!("{}: {most} pictures", visible::NAME));
+        }
+        if let Some(rounds) = &self.rounds {
+            let fewest = self.search.as_ref().map_or_else(
+                || self.before_cuts((rounds.fewest * count as f64).ceil() as usize, count),
+                |search| search.fewest(count),
+            );
+            stages.extend(rounds.divided(count, fewest));
+        }
+        if let Some(merge) = &self.merge {
+            stages.extend(merge.recipe.passes.iter().map(|_| format!("{}: pairs of neighbours", merge::PAIRS)));
+        }
+        if self.refines() {
+            stages.push(format!("{}: pictures", refine::targets::NAME));
+        }
+        stages
     }
 
     /// Writes down the stages that the request leaves out of such a workload.

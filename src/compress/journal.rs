@@ -4,12 +4,15 @@
 use std::time::Instant;
 
 use cpu_time::ProcessTime;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 
 use super::summary::{BandsSummary, FieldSummary, LeftOut, Saved, Stage};
 use crate::budget::peak_memory_bytes;
-use crate::emit::atomic::Spill;
-use crate::error::Result;
+use crate::error::{Error, Result};
+use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
+use crate::work::{Key, Spill, Work};
 
 /// When something began.
 #[derive(Debug, Clone, Copy)]
@@ -58,6 +61,16 @@ pub struct Journal {
     pub bands: Option<BandsSummary>,
 }
 
+/// What is written down of a stage that is kept.
+#[derive(Serialize, Deserialize)]
+struct Said {
+    stages: Vec<Stage>,
+    left_out: Vec<LeftOut>,
+    notes: Vec<String>,
+    field: Option<FieldSummary>,
+    bands: Option<BandsSummary>,
+}
+
 impl Journal {
     /// Runs `work` as a stage that reads `source`; it gives its result and the number of Gaussians that left it.
     ///
@@ -75,6 +88,66 @@ impl Journal {
         let (reads, scratch) = (source.reads() - before, Spill::read_back() - scratch);
         self.add(name, [gaussians_in, gaussians_out], start, reads, scratch);
         Ok(value)
+    }
+
+    /// [`Journal::stage`] of which nothing is divided, with its result kept in the scene's work folder for `key`.
+    ///
+    /// # Errors
+    /// Those of `compute` and of the folder; a run of a part ends before it.
+    pub fn kept_stage<T: Serialize + DeserializeOwned>(
+        &mut self,
+        name: &'static str,
+        gaussians_in: usize,
+        scene: &Scene,
+        key: Key,
+        compute: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
+    ) -> Result<T> {
+        self.kept(&scene.work, name, key, |journal| {
+            scene.work.not_divided(name)?;
+            journal.stage(name, gaussians_in, scene.source(), compute)
+        })
+    }
+
+    /// What `compute` finds, as a piece of `work` called `stage`, with all that it writes down.
+    ///
+    /// # Errors
+    /// Those of `compute` and of the folder.
+    pub fn kept<T: Serialize + DeserializeOwned>(
+        &mut self,
+        work: &Work,
+        stage: &str,
+        key: Key,
+        compute: impl FnOnce(&mut Journal) -> Result<T>,
+    ) -> Result<T> {
+        if !work.keeps() {
+            return compute(self);
+        }
+        let mut own = Some(Journal { whole: self.whole, ..Journal::default() });
+        // Summaries are made for JSON.
+        let (found, said): (T, String) = work.known(stage, key, || {
+            let journal = own.get_or_insert_default();
+            let found = compute(journal)?;
+            Ok((found, serde_json::to_string(&journal.said()).expect("plain data")))
+        })?;
+        let mut said: Said =
+            serde_json::from_str(&said).map_err(|error| Error::usage(format!("work folder, {stage}: {error}")))?;
+        if let Some(own) = own.filter(|own| !own.stages.is_empty()) {
+            said.stages = own.stages;
+        } else {
+            said.stages.iter_mut().for_each(|stage| stage.kept = true);
+        }
+        self.stages.extend(said.stages);
+        self.left_out.extend(said.left_out);
+        self.notes.extend(said.notes);
+        self.field = self.field.take().or(said.field);
+        self.bands = self.bands.take().or(said.bands);
+        Ok(found)
+    }
+
+    fn said(&self) -> Said {
+        let Journal { stages, left_out, notes, field, bands, .. } = self;
+        let (stages, left_out, notes) = (stages.clone(), left_out.clone(), notes.clone());
+        Said { stages, left_out, notes, field: field.clone(), bands: bands.clone() }
     }
 
     /// Writes down that opening the input, begun at `start`, gave `gaussians` Gaussians and read so much.
@@ -109,6 +182,7 @@ impl Journal {
             reads,
             full_reads: read as f64 / whole.max(1) as f64,
             scratch_bytes,
+            kept: false,
             seconds: start.seconds(),
             processor_seconds: start.processor_seconds(),
             peak_memory_bytes: peak_memory_bytes(),

@@ -2,7 +2,7 @@
 
 use super::journal::Journal;
 use super::scan::Scan;
-use super::score::{Score, Scored, UserOverrides};
+use super::score::{self, Score, Scored, UserOverrides};
 use super::visible::Visible;
 use crate::budget::{Need, Workload};
 use crate::emit::kind::OutputKind;
@@ -11,6 +11,7 @@ use crate::limits::Limits;
 use crate::recipe::Recipe;
 use crate::scene::Scene;
 use crate::stream::{Scanned, Seen};
+use crate::work::Key;
 
 /// What is known of a scene before its frames are read.
 #[derive(Debug, Clone, Copy)]
@@ -84,6 +85,18 @@ impl Measure {
     /// # Errors
     /// Those of the stages.
     pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
+        let Score { snap_noise, non_finite, score, select, user, .. } = &self.score;
+        let key = Key::of(&(&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user)).and(&(
+            select.keep_fraction,
+            select.tau_static,
+            select.tau_dynamic,
+            select.low_priority,
+        ));
+        let scored = journal.kept(&scene.work, score::NAME, key, |journal| self.measure(scene, arrived, journal))?;
+        scored.within(&scene.limits, &scene.scratch)
+    }
+
+    fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         let Measured { scanned, seen } = match arrived {
             Some(measured) => measured,
             None => Measured { scanned: self.scan.run(scene, journal)?, seen: None },

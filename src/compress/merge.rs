@@ -4,6 +4,11 @@
 //! survivors and candidate pairs, and what [`crate::stream::motion`] says of the pairs it measures together.
 
 use std::borrow::Cow;
+use std::cell::RefCell;
+use std::ops::Range;
+
+use rayon::slice::ParallelSliceMut;
+use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
 use super::prune::Prune;
@@ -13,11 +18,12 @@ use crate::budget::{Need, Workload};
 use crate::error::{Error, Result};
 use crate::families::trajectories::state_bytes;
 use crate::limits::Limits;
-use crate::merge::known::KnownPairs;
+use crate::merge::known::{KnownPairs, Likeness};
 use crate::merge::motion::MotionGate;
 use crate::merge::proxy::{Importance, weights};
-use crate::merge::{self, Merged, Survivors};
-use crate::model::{Columns, Gaussians};
+use crate::merge::voxels::voxel_order;
+use crate::merge::{self, Asked, Merged, Survivors};
+use crate::model::{Column, Columns, Gaussians};
 use crate::recipe;
 use crate::reduction::{Cluster, Reduction};
 use crate::scene::Scene;
@@ -25,9 +31,15 @@ use crate::select::Ranking;
 use crate::source::FrameSource;
 use crate::stream::motion::{self, PairMeter};
 use crate::stream::{BLOCK, gather};
+use crate::work::{Key, Work};
 
 /// What the stage is called.
 const NAME: &str = "merge";
+
+/// What pairs that are measured in parts are called in a work folder.
+pub(super) const PAIRS: &str = "pairs";
+/// Fewest pairs that are measured in parts.
+const DIVIDED: usize = 20_000;
 
 /// Memory of a Gaussian that may survive: its id, its state with base colours only, and whether it may merge. Twice
 /// the ids while merging is tried on some of them.
@@ -59,6 +71,7 @@ pub struct Merge {
 }
 
 /// A reduction, and what merging did to get there.
+#[derive(Serialize, Deserialize)]
 pub struct Outcome {
     /// What is left.
     pub reduction: Reduction,
@@ -113,26 +126,32 @@ impl Merge {
         survivors: usize,
         journal: &mut Journal,
     ) -> Result<Outcome> {
-        journal.stage(NAME, survivors, scene.source(), |_| {
-            let mut trial = Trial::new(scene, scored, self, ranking.take(survivors))?;
-            let mut merged = match self.target {
-                None => trial.merge(&ranking.take(survivors), None)?,
-                Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
-                Some(target) => {
-                    let count = |m| Ok(trial.merge(&ranking.take(m), None)?.reduction.len());
-                    let m = bracket(target, survivors, count)?;
-                    trial.merge_to(&ranking.take(m), target)?
+        let key = Key::of(&(&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors))
+            .and(&(ranking, &scored.protected, scored.reference, scored.position_ulp, scored.importance()?));
+        let run = |journal: &mut Journal| {
+            journal.stage(NAME, survivors, scene.source(), |_| {
+                let mut trial = Trial::new(scene, scored, self, ranking.take(survivors))?;
+                let mut merged = match self.target {
+                    None => trial.merge(&ranking.take(survivors), None)?,
+                    Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
+                    Some(target) => {
+                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.reduction.len());
+                        let m = bracket(target, survivors, count)?;
+                        trial.merge_to(&ranking.take(m), target)?
+                    }
+                };
+                drop(trial);
+                scene.work.not_divided(NAME)?;
+                let Outcome { reduction, summary } = &mut merged;
+                reduction.proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
+                if let Some(summary) = summary {
+                    summary.deviation = reduction.proxies.deviation;
                 }
-            };
-            drop(trial);
-            let Outcome { reduction, summary } = &mut merged;
-            reduction.proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
-            if let Some(summary) = summary {
-                summary.deviation = reduction.proxies.deviation;
-            }
-            let left = reduction.len();
-            Ok((merged, left))
-        })
+                let left = reduction.len();
+                Ok((merged, left))
+            })
+        };
+        journal.kept(&scene.work, NAME, key, run)
     }
 }
 
@@ -176,6 +195,7 @@ struct Trial<'a> {
     /// C and Vis by id.
     importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
+    work: &'a Work,
     /// Pairs measured together.
     pairs_together: usize,
     /// How pairs of the pool move: it does not depend on who else survives.
@@ -204,7 +224,8 @@ impl<'a> Trial<'a> {
         };
         let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
         let importance = scored.importance()?;
-        Ok(Trial { scored, merge, pool, states, mergeable, importance, meter, pairs_together, known })
+        let work = &scene.work;
+        Ok(Trial { scored, merge, pool, states, mergeable, importance, meter, work, pairs_together, known })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -221,7 +242,7 @@ impl<'a> Trial<'a> {
 
     /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
-        let Trial { scored, merge, pool, states, mergeable, importance, meter, pairs_together, known } = self;
+        let Trial { scored, merge, pool, states, mergeable, importance, meter, work, pairs_together, known } = self;
         let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
@@ -235,7 +256,7 @@ impl<'a> Trial<'a> {
             let missing = known.missing(asked.pairs());
             let found = match missing.is_empty() {
                 true => Vec::new(),
-                false => meter.measure(pool, &states.position, missing, asked.reach, asked.is_part)?,
+                false => measure(work, meter, (pool, &states.position), missing, &asked, merge)?,
             };
             let found = KnownPairs::new(found);
             let likeness = |pair| known.likeness(pair).or_else(|| found.likeness(pair)).unwrap_or(f64::NAN);
@@ -245,6 +266,40 @@ impl<'a> Trial<'a> {
         })?;
         Ok(outcome(&survivors, &merged, scored.reference.frame, merge))
     }
+}
+
+/// How alike each of `pairs` moves, in some order. Many of them can be divided, by where they are.
+fn measure(
+    work: &Work,
+    meter: &mut PairMeter<'_>,
+    (pool, reference): (&[u32], &Column),
+    mut pairs: Vec<(u32, u32)>,
+    asked: &Asked<'_>,
+    merge: &recipe::Merge,
+) -> Result<Vec<Likeness>> {
+    if !work.keeps() || pairs.len() < DIVIDED {
+        return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
+    }
+    // Those of one place together, so that few parts read the same Gaussians.
+    let rows: Vec<u32> = (0..pool.len() as u32).collect();
+    let order = voxel_order(&rows, |row| reference.row(row as usize), asked.reach);
+    let mut place = rows;
+    order.iter().zip(0..).for_each(|(&row, k)| place[row as usize] = k);
+    pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
+    let key = Key::of(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
+    let (fresh, meter) = (meter.fresh(), RefCell::new(meter));
+    let compute = |some: Range<usize>| match some.len() == pairs.len() {
+        true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.reach, asked.is_part),
+        // A part of them is read once and by itself.
+        false => fresh.fresh().measure(pool, reference, pairs[some].to_vec(), asked.reach, false),
+    };
+    work.divided(PAIRS, key, pairs.len(), compute, |parts| {
+        let mut all = Vec::with_capacity(pairs.len());
+        for part in parts {
+            all.extend(part?);
+        }
+        Ok(all)
+    })
 }
 
 /// What `merged` leaves of `survivors`.

@@ -38,7 +38,7 @@ use crate::families::Size;
 use crate::model::ALL_HARMONICS;
 use crate::recipe::{Precision, Recipe, WhichBands};
 use crate::reduction::Reduction;
-use crate::scene::Scene;
+use crate::scene::{InputOptions, Scene};
 use crate::select::Ranking;
 use crate::stream::begin_run;
 use archive::{Asked, LEFT_BY_SEARCH};
@@ -74,6 +74,17 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<
     reduce(scene, &job, None, request, Journal::default())
 }
 
+/// The stages of a run that can be divided among several, in order, with what their parts are made of.
+///
+/// # Errors
+/// Those of opening the input; nothing else is read.
+pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
+    let plan = |outlook, work: &Workload| Job::within(request, outlook, work);
+    let input = InputOptions { work: None, ..request.input.clone() };
+    let (scene, job, _) = open_to_measure(&input, plan, &mut Journal::default())?;
+    Ok(job.divided(&scene))
+}
+
 /// Gives a scene that is open already the limits by which the request's budget holds.
 ///
 /// # Errors
@@ -107,7 +118,7 @@ fn reduce(
     // What was measured on arrival is not done again.
     let measured = usize::from(arrived.is_some()) + arrived.iter().filter(|measured| measured.seen.is_some()).count();
     let _numbered = begin_run(stages[measured..].to_vec());
-    let input = InputSummary::of(&*scene.input, &scene.path)?;
+    let input = InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?;
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
@@ -171,6 +182,7 @@ fn reduce(
     if let (Some(goal), Some(Goal::Quality(Quality::Psnr(least)))) = (&mut goal, &request.goal) {
         goal.asked = *least;
     }
+    journal.notes.extend(scene.work.take_notes());
     let archived = match job.archive.as_ref().filter(|_| !request.dry_run) {
         Some(archive) => {
             let asked = match (&goal, &request.goal) {
@@ -221,6 +233,7 @@ fn reduce(
         journal.notes.push("dry run: nothing was written".to_owned());
         return Ok((summarise(journal, None), map));
     }
+    scene.work.not_divided("writing")?;
     let written = |journal, size| summarise(journal, Some(size));
     Ok((job.emit.run(scene, &reduction, (&map, encoded.as_ref()), &recipe, journal, written)?, map))
 }

@@ -6,6 +6,10 @@
 //! does not depend on how many are wanted in the end: a smaller target keeps a subset of a larger one.
 //! Memory: see [`removal_error`].
 
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+
 use super::journal::Journal;
 use super::score::{Scored, scored};
 use crate::budget::{Need, REMOVE, Workload};
@@ -16,6 +20,7 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::select::Ranking;
 use crate::stream::{Progress, removal_error, spread_over};
+use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "rounds";
@@ -80,6 +85,13 @@ impl Rounds {
         (fewest.ln() / self.fraction.ln()).ceil().max(0.0)
     }
 
+    /// The rounds that leave `fewest` of `count` Gaussians, for people.
+    pub(super) fn divided(&self, count: usize, fewest: usize) -> Vec<String> {
+        let of = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
+        let rounds = 0..self.sizes(count, 0, fewest).len();
+        rounds.map(|round| format!("{}: {} pictures at most", name(round), of(round))).collect()
+    }
+
     /// The pictures in as many parts as there are turns, each of frames of its own where there are as many.
     fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
         let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
@@ -107,52 +119,126 @@ impl Rounds {
     ) -> Result<Ranking> {
         let protected = &scored.protected;
         let is_free = |id: &u32| !scored.is_protected(*id);
-        let mut free: Vec<u32> = before.order().iter().copied().filter(is_free).collect();
-        let first = free.len() + protected.len();
-        let enough = |free: &[u32]| free.is_empty() || free.len() + protected.len() <= fewest;
-        if enough(&free) {
+        let mut state = State {
+            free: before.order().iter().copied().filter(is_free).collect(),
+            gone: Vec::new(),
+            errors: Vec::new(),
+        };
+        let first = state.free.len() + protected.len();
+        let sizes = self.sizes(state.free.len(), protected.len(), fewest);
+        if sizes.is_empty() {
             return Ok(before);
         }
-        // Worst last.
-        let mut gone: Vec<u32> = Vec::new();
         let turns = self.turns(scene, scored);
-        let mut errors = vec![vec![0u64; scored.count()]; turns.len()];
-        let later = (self.rounds(fewest.max(1) as f64 / first as f64) - 1.0).max(0.0) as usize;
-        let all: usize = turns.iter().map(Vec::len).sum();
-        let pictures = all + turns.iter().cycle().skip(1).take(later).map(Vec::len).sum::<usize>();
-        let progress = Progress::new(NAME, "pictures", pictures as u64);
-        journal.stage(NAME, first, scene.source(), |_| {
-            for round in 0.. {
-                if enough(&free) {
-                    break;
-                }
-                let seen = free.len() + protected.len();
-                let left = ((seen as f64 * self.fraction) as usize).max(protected.len());
-                let mut ids: Vec<u32> = free.iter().chain(protected).copied().collect();
-                ids.sort_unstable();
-                // First all look, then one after the other.
-                let looking = if round == 0 { turns.len() } else { 1 };
-                for (turn, pictures) in turns.iter().enumerate().cycle().skip(round % turns.len().max(1)).take(looking)
-                {
-                    let pictures = (&scene.schedule.cameras[..], &pictures[..]);
-                    let (background, floor) = (scene.background, self.contrast_floor as f32);
-                    let advance = || progress.advance(1);
-                    let found =
-                        removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?;
-                    ids.iter().zip(found.sum).for_each(|(&id, error)| errors[turn][id as usize] = error);
-                }
-                let error = |id: &u32| errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
-                // Stable: ties keep the order there was.
-                free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
-                let mut worst = free.split_off(left - protected.len());
-                worst.append(&mut gone);
-                gone = worst;
+        state.errors = vec![vec![0; scored.count()]; turns.len()];
+        // What a round leaves does not depend on how many are wanted in the end.
+        let key = Key::of(&(self.fraction, self.contrast_floor, &turns, &before, protected));
+        let mut done = 0;
+        for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
+            if let Some(found) = scene.work.find(&name(round), key.and(&round))? {
+                (state, done) = (found, round + 1);
+                break;
             }
-            Ok(((), free.len() + protected.len()))
+        }
+        let pictures =
+            (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
+        let progress = Progress::new(NAME, "pictures", pictures.sum::<usize>() as u64);
+        let State { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
+            for (round, &left) in sizes.iter().enumerate().skip(done) {
+                state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;
+            }
+            let left = state.free.len() + protected.len();
+            Ok((state, left))
         })?;
-        let order = protected.iter().copied().chain(free).chain(gone).collect();
-        Ok(Ranking::new(order))
+        Ok(Ranking::new(protected.iter().copied().chain(free).chain(gone).collect()))
     }
+
+    /// How many of so many free Gaussians each round leaves, until a round leaves at most `fewest` with those protected.
+    fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
+        let mut sizes = Vec::new();
+        while free > 0 && free + protected > fewest {
+            free = (((free + protected) as f64 * self.fraction) as usize).saturating_sub(protected);
+            sizes.push(free);
+        }
+        sizes
+    }
+
+    /// One round, which leaves `left` free Gaussians. It can be divided by pictures.
+    fn round(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        (mut state, turns): (State, &[Vec<Picture>]),
+        round: usize,
+        (key, left): (Key, usize),
+        progress: &Progress,
+    ) -> Result<State> {
+        let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
+        ids.sort_unstable();
+        let looking: Vec<usize> = looking(turns, round).collect();
+        let (background, floor) = (scene.background, self.contrast_floor as f32);
+        let units = looking.iter().map(|&turn| turns[turn].len()).sum();
+        // Of every turn that looks, what those of its pictures show that are among `some`; nothing, if none is.
+        let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
+            let mut start = 0;
+            let of_turn = |&turn: &usize| {
+                let pictures = &turns[turn];
+                let place = |unit: usize| unit.saturating_sub(start).min(pictures.len());
+                let of = place(some.start)..place(some.end);
+                start += pictures.len();
+                if of.is_empty() {
+                    return Ok(Vec::new());
+                }
+                let pictures = (&scene.schedule.cameras[..], &pictures[of]);
+                let advance = || progress.advance(1);
+                Ok(removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?.sum)
+            };
+            looking.iter().map(of_turn).collect()
+        };
+        scene.work.divided(&name(round), key.and(&round), units, compute, |parts| {
+            for &turn in &looking {
+                ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
+            }
+            for part in parts {
+                for (&turn, found) in looking.iter().zip(part?) {
+                    let errors = &mut state.errors[turn];
+                    for (&id, error) in ids.iter().zip(found) {
+                        errors[id as usize] = errors[id as usize].saturating_add(error);
+                    }
+                }
+            }
+            let error = |id: &u32| state.errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
+            // Stable: ties keep the order there was.
+            state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
+            let mut worst = state.free.split_off(left);
+            worst.append(&mut state.gone);
+            state.gone = worst;
+            Ok(state)
+        })
+    }
+}
+
+/// What a round leaves.
+#[derive(Serialize, Deserialize)]
+struct State {
+    /// Neither protected nor gone, best first.
+    free: Vec<u32>,
+    /// Worst last.
+    gone: Vec<u32>,
+    /// By turn, what its pictures showed of every Gaussian when it last looked.
+    errors: Vec<Vec<u64>>,
+}
+
+/// What a round is called in a work folder.
+fn name(round: usize) -> String {
+    format!("{NAME}-{:02}", round + 1)
+}
+
+/// Which turns look in a round: first all, then one after the other.
+fn looking(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
+    let count = turns.len().max(1);
+    let looking = if round == 0 { turns.len() } else { 1.min(turns.len()) };
+    (0..looking).map(move |k| (round + k) % count)
 }
 
 #[cfg(test)]

@@ -9,9 +9,10 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::stats::{self, ScanPlan};
 use crate::stream::{self, BLOCK, Scanned};
+use crate::work::Key;
 
 /// What the stage is called.
-const NAME: &str = "scan";
+pub(super) const NAME: &str = "scan";
 
 /// Seconds that a state takes to be added to an accumulator, and to be projected to a picture (`benches/scan.rs`,
 /// `benches/projection.rs`).
@@ -51,7 +52,18 @@ impl Scan {
         let source = scene.source();
         let info = source.info();
         let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
-        journal.stage(NAME, info.count, source, |_| Ok((stream::scan(source, &scene.schedule, &plan)?, info.count)))
+        let compute = |blocks| stream::scan_blocks(source, &scene.schedule, &plan, blocks);
+        journal.stage(NAME, info.count, source, |_| {
+            let units = stream::scan_units(info);
+            let found = scene.work.divided(NAME, Key::of(&plan), units, compute, |parts| {
+                let mut all = Scanned { alive_per_frame: vec![0; info.times.len()], ..Scanned::default() };
+                for part in parts {
+                    all.join(part?);
+                }
+                Ok(all)
+            })?;
+            Ok((found, info.count))
+        })
     }
 }
 

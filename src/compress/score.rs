@@ -1,6 +1,9 @@
 //! Stage `score`: statistics to scores, scores to a ranking and to who stays.
 
 use std::borrow::Cow;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
 use super::statistics::Statistics;
@@ -19,7 +22,7 @@ use crate::stats::{RobustBox, fill_anisotropy, snap, ulp};
 use crate::stream::{Progress, Scanned, Seen, frames_to_see, gather};
 
 /// What the stage is called.
-const NAME: &str = "score";
+pub(super) const NAME: &str = "score";
 
 /// Bytes per Gaussian of statistics, scores and a selection: while scores are looked at.
 pub const SCORED: u64 = (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + select::BYTES_PER_GAUSSIAN) as u64;
@@ -48,6 +51,7 @@ pub struct Score {
 }
 
 /// A scene with statistics and a selection of every Gaussian.
+#[derive(Serialize, Deserialize)]
 pub struct Scored {
     /// Statistics, noise snapped as the recipe says.
     statistics: Statistics,
@@ -72,7 +76,7 @@ pub struct Scored {
 }
 
 /// What the user knows better, before ids are resolved.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct UserOverrides {
     /// Ids to keep.
     pub keep: Vec<u32>,
@@ -226,6 +230,19 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
 }
 
 impl Scored {
+    /// The same within `limits`: statistics wait in a scratch file in `folder`, if they are to.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be written.
+    pub(super) fn within(self, limits: &Limits, folder: &Path) -> Result<Scored> {
+        Ok(match self.statistics {
+            Statistics::Memory(rows) if limits.rows_aside => {
+                Scored { statistics: Statistics::aside(rows, folder)?, ..self }
+            }
+            _ => self,
+        })
+    }
+
     /// Whether Gaussian `id` is to stay as it is.
     pub fn is_protected(&self, id: u32) -> bool {
         self.protected.binary_search(&id).is_ok()

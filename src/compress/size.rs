@@ -1,5 +1,7 @@
 //! As many Gaussians as so many bytes hold.
 
+use serde::{Deserialize, Serialize};
+
 use super::archive;
 use super::emit::Emit;
 use super::journal::Journal;
@@ -9,6 +11,7 @@ use crate::error::{Error, Result};
 use crate::reduction::Reduction;
 use crate::scene::Scene;
 use crate::stream::{VIEWS_AT_ONCE, removal_error, spread};
+use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "size";
@@ -30,7 +33,7 @@ pub(super) struct Space<'a> {
 }
 
 /// What fits into so many bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Fit {
     /// Highest SH degree.
     pub(super) sh_degree: usize,
@@ -58,13 +61,18 @@ impl Space<'_> {
         Ok(fits)
     }
 
+    /// What bytes follow from.
+    fn key(&self, reduction: &Reduction) -> Key {
+        Key::of(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
+    }
+
     /// As many of all Gaussians as fit, of any of them, with the rule and the field of `like`.
     ///
     /// # Errors
     /// Not even one fits; frames that cannot be read, a failed write.
     fn count(&self, scene: &Scene, like: &Reduction, journal: &mut Journal) -> Result<usize> {
         let (all, most) = (scene.source().info().count, self.most);
-        journal.stage(NAME, all, scene.source(), |_| {
+        journal.kept_stage(NAME, all, scene, self.key(like), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| (k * all / count) as u32).collect();
                 let some = like.with(kept);
@@ -117,7 +125,8 @@ impl Space<'_> {
         mut reduction: Reduction,
         journal: &mut Journal,
     ) -> Result<Reduction> {
-        journal.stage(NAME, reduction.len(), scene.source(), |_| {
+        let key = self.key(&reduction).and(&scored.protected);
+        journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
             let bytes = |reduction: &Reduction| self.emit.bytes(scene, reduction, self.recipe);
             let empty = bytes(&reduction.pick(&[]))?;
             loop {

@@ -7,10 +7,12 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use bytemuck::{AnyBitPattern, NoUninit};
+use serde::ser::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::emit::atomic::Spill;
 use crate::error::Result;
 use crate::model::{Flags, Rows, Statistic, Values};
+use crate::work::{Spill, Spilling};
 
 /// The rows of N Gaussians.
 pub(super) enum Statistics {
@@ -26,10 +28,22 @@ pub(super) struct Aside {
     columns: Vec<Statistic>,
 }
 
+impl Serialize for Statistics {
+    fn serialize<S: Serializer>(&self, to: S) -> std::result::Result<S::Ok, S::Error> {
+        self.rows().map_err(S::Error::custom)?.serialize(to)
+    }
+}
+
+impl<'de> Deserialize<'de> for Statistics {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> std::result::Result<Statistics, D::Error> {
+        Rows::deserialize(from).map(Statistics::Memory)
+    }
+}
+
 impl Statistics {
     /// Writes `rows` to a file in `folder`.
     pub(super) fn aside(rows: Rows, folder: &Path) -> Result<Statistics> {
-        let mut file = Spill::new(folder)?;
+        let mut file = Spilling::new(folder)?;
         let bytes = |of: &Statistic| -> &[u8] {
             match of.values() {
                 Values::F64(of, _) => bytemuck::cast_slice(of(&rows)),
@@ -39,7 +53,7 @@ impl Statistics {
         let columns: Vec<_> = Statistic::ALL.into_iter().filter(|of| !bytes(of).is_empty()).collect();
         columns.iter().try_for_each(|of| file.write(bytes(of)))?;
         rows.flags.iter().try_for_each(|flags| file.write(&[flags.bits()]))?;
-        file.finish()?;
+        let file = file.finish()?;
         Ok(Statistics::Aside(Aside { file, count: rows.len(), columns }))
     }
 

@@ -39,6 +39,9 @@ pub struct Stage {
     /// Bytes that it read back of scratch files, which are no part of the input.
     #[serde(default)]
     pub scratch_bytes: u64,
+    /// Whether it was found in a work folder: then its times and reads are those of the run that it was found by.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub kept: bool,
     /// Wall-clock time.
     pub seconds: f64,
     /// Time of all processors together, where the system tells.
@@ -163,16 +166,16 @@ pub struct InputSummary {
 }
 
 impl InputSummary {
-    /// Of an open input, whose path is given.
+    /// Of an open input, whose path and digest are given.
     ///
     /// # Errors
     /// A file that cannot be read.
-    pub fn of(input: &dyn Family, path: &Path) -> Result<InputSummary> {
+    pub fn of(input: &dyn Family, path: &Path, digest: String) -> Result<InputSummary> {
         let info = input.source().info();
         Ok(InputSummary {
             path: path.display().to_string(),
             kind: input.kind().to_owned(),
-            digest: input.digest()?,
+            digest,
             gaussians: info.count,
             frames: Some(info.times.len()),
             sh_degree: info.sh_degree,

@@ -1,16 +1,20 @@
 //! Stage `visible`: what every Gaussian adds to the pictures, occlusion included.
 
+use std::ops::Range;
+
 use super::journal::Journal;
 use crate::budget::{LOOK, Need, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Columns, Rows, Statistic};
 use crate::recipe::{self, Coverage};
+use crate::render::Contribution;
 use crate::scene::Scene;
 use crate::stream::{Seen, frames_to_see, looked_at, visible_contribution};
+use crate::work::Key;
 
 /// What the stage is called.
-const NAME: &str = "visible";
+pub(super) const NAME: &str = "visible";
 
 /// The look at the pictures of a run that measures C by them.
 #[derive(Debug, Clone)]
@@ -66,16 +70,19 @@ impl Visible {
         let count = source.info().count;
         let frames = frames_to_see(life, source.info().times.len());
         let pictures = looked_at(&scene.schedule, &self.recipe, frames);
+        let stride = self.recipe.pixel_stride;
+        let cameras = &scene.schedule.cameras[..];
+        let look = |some: Range<usize>| visible_contribution(source, (cameras, &pictures[some]), stride, scene.limits);
         journal.stage(NAME, count, source, |_| {
-            Ok((
-                visible_contribution(
-                    source,
-                    (&scene.schedule.cameras, &pictures),
-                    self.recipe.pixel_stride,
-                    scene.limits,
-                )?,
-                count,
-            ))
+            let key = Key::of(&(&pictures, stride));
+            let found = scene.work.divided(NAME, key, pictures.len(), look, |parts| {
+                let mut sum = Contribution::new(count);
+                for part in parts {
+                    sum.merge(&part?);
+                }
+                Ok(Seen::of(&sum, pictures.len(), stride))
+            })?;
+            Ok((found, count))
         })
     }
 }

@@ -11,10 +11,7 @@ mod named;
 mod workspace;
 
 use std::fs::{self, File};
-use std::io::{BufWriter, Write};
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::error::{Error, Result};
 pub use named::MARKER;
@@ -238,58 +235,6 @@ impl ScratchFolder {
     /// The folder to write into.
     pub fn path(&self) -> &Path {
         self.0.path()
-    }
-}
-
-/// Bytes that this process has read back of all [`Spill`]s.
-static READ_BACK: AtomicU64 = AtomicU64::new(0);
-
-/// A file without a name, written once from its start and read back in pieces: the system removes it with the process.
-#[derive(Debug)]
-pub struct Spill {
-    out: BufWriter<File>,
-    folder: PathBuf,
-}
-
-impl Spill {
-    /// An empty one in `folder`.
-    ///
-    /// # Errors
-    /// A folder that does not exist; the system refuses.
-    pub fn new(folder: &Path) -> Result<Spill> {
-        let file = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
-        Ok(Spill { out: BufWriter::new(file), folder: folder.to_owned() })
-    }
-
-    /// Writes `bytes` behind what is there.
-    ///
-    /// # Errors
-    /// A failed write.
-    pub fn write(&mut self, bytes: &[u8]) -> Result<()> {
-        self.out.write_all(bytes).map_err(Error::io("write a scratch file in", &self.folder))
-    }
-
-    /// Ends writing: only what is written out by then can be read.
-    ///
-    /// # Errors
-    /// A failed write.
-    pub fn finish(&mut self) -> Result<()> {
-        self.out.flush().map_err(Error::io("write a scratch file in", &self.folder))
-    }
-
-    /// Reads as many bytes as `bytes` has from byte `start` on.
-    ///
-    /// # Errors
-    /// A failed read; the end of the file.
-    pub fn read(&self, start: u64, bytes: &mut [u8]) -> Result<()> {
-        READ_BACK.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        let read = self.out.get_ref().read_exact_at(bytes, start);
-        read.map_err(Error::io("read back a scratch file in", &self.folder))
-    }
-
-    /// Bytes that this process has read back so far, of all of them.
-    pub fn read_back() -> u64 {
-        READ_BACK.load(Ordering::Relaxed)
     }
 }
 

@@ -1,9 +1,10 @@
 //! A camera: where it stands and what it shows of the world.
 
 use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// A pinhole camera in OpenCV axes (x right, y down, z forward); pixel centres at half integers.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Picture width in pixels.
     pub width: u32,

@@ -1,12 +1,13 @@
 //! The state of a block of Gaussians at one instant, as planes of f32.
 
 use bitflags::bitflags;
+use serde::{Deserialize, Serialize};
 
 use super::sh_coefficients;
 
 /// One attribute of `len` Gaussians: `width` planes, plane `c` holding component `c` of every
 /// Gaussian. Planes keep the inner loops of projection and statistics contiguous.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Column {
     width: usize,
     len: usize,
@@ -98,7 +99,7 @@ impl Column {
 /// natural log of the scales, opacity logit, spherical harmonics.
 ///
 /// Plane `3·k + channel` of `sh` is coefficient `k` of a channel (red, green, blue).
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Gaussians {
     /// `[3]`, scene units.
     pub position: Column,

@@ -3,10 +3,11 @@
 //! A new statistic is a field of [`Rows`] and a [`Statistic`]: tables, histograms, scratch files and plans follow.
 
 use bitflags::bitflags;
+use serde::{Deserialize, Serialize};
 
 bitflags! {
     /// What was odd about a Gaussian.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
     pub struct Flags: u8 {
         /// Some value in some frame was NaN or infinite.
         const NON_FINITE = 1;
@@ -20,7 +21,7 @@ bitflags! {
 }
 
 /// A statistic of a Gaussian: the one place that says what it is called, where its values are, and what they take.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Statistic {
     /// [`Rows::d`].
     D,
@@ -159,7 +160,7 @@ impl Statistic {
 }
 
 /// Statistics of N Gaussians; every array has N entries, but for a `w` that is empty.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Rows {
     /// D, trajectory magnitude: root mean square step, scene units per frame.
     pub d: Vec<f64>,

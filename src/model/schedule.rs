@@ -1,12 +1,14 @@
 //! Which cameras see which frame.
 
+use serde::{Deserialize, Serialize};
+
 use super::camera::Camera;
 
 /// Which cameras see which frame.
 ///
 /// Memory: 16 bytes for a run of frames that the same cameras see, 8 for each of these: it grows with the pictures that the
 /// cameras name, not with frames.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Schedule {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
@@ -17,7 +19,7 @@ pub struct Schedule {
 }
 
 /// Frames one after the other that have the same pictures; they end where the next run begins.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 struct Run {
     /// Its first frame.
     frame: usize,
@@ -26,7 +28,7 @@ struct Run {
 }
 
 /// A picture to make: what a camera sees at a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Picture {
     /// Frame of the sequence.
     pub frame: usize,

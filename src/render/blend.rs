@@ -189,6 +189,17 @@ impl Blend {
         Self::all().pop().unwrap_or(Blend::Portable)
     }
 
+    /// What its instructions are called.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Blend::Portable => "portable",
+            #[cfg(target_arch = "x86_64")]
+            Blend::Avx2 => "AVX2",
+            #[cfg(target_arch = "x86_64")]
+            Blend::Avx512 => "AVX-512",
+        }
+    }
+
     /// Blends the splats `pairs` front to back over the lattice; gives the transmittance left, its sign
     /// set where the pixel ended early.
     pub(super) fn tile(self, splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {

@@ -1,10 +1,12 @@
 //! How much of the pictures each Gaussian is.
 
+use serde::{Deserialize, Serialize};
+
 /// Visible contribution of N Gaussians over any number of pictures (method.md, section 1: C `visible`, and W).
 ///
 /// Both figures are the same whatever the order of pictures and the number of threads. Memory: 12 bytes
 /// per Gaussian.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Contribution {
     /// `[N]`, Σ over pixels of alpha · transmittance, in units of 2⁻²⁸ pixel ([`Contribution::UNIT`]).
     ///

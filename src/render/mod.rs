@@ -27,3 +27,8 @@ pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 pub use contribution::Contribution;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
+
+/// The instruction set that pictures are made with on this machine.
+pub fn instructions() -> &'static str {
+    blend::Blend::fastest().name()
+}

@@ -5,6 +5,8 @@
 //! nothing however much it covers. Of N removals at once the changes add up, with b changing too; hence
 //! the floor under c − b, and ranking in rounds.
 
+use serde::{Deserialize, Serialize};
+
 use super::blend::{Ink, Plane, Stroke};
 use super::lanes::{Lanes, Sums};
 use super::project::Splat;
@@ -14,7 +16,7 @@ use super::project::Splat;
 /// With a floor of 0, and but for alphas cut at 0.99 and pixels that end early, it is the squared error
 /// of the picture without that Gaussian. The same whatever the order of pictures and the number of threads.
 /// Memory: 8 bytes per Gaussian.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RemovalError {
     /// `[N]`, in units of 2⁻³⁶ ([`RemovalError::UNIT`]); a picture's part is summed per 16×16 tile in f32,
     /// in a fixed order. A sum that would pass 2⁶⁴ stays there.

@@ -114,6 +114,7 @@ mod tests {
             reads: Reads::default(),
             full_reads: 0.0,
             scratch_bytes: 0,
+            kept: false,
             seconds: 0.125,
             processor_seconds: Some(0.25),
             peak_memory_bytes: Some(4096),

@@ -7,6 +7,7 @@ use crate::error::Result;
 use crate::families::{Family, OpenOptions};
 use crate::ingest::cameras::{self, CameraOptions};
 use crate::model::{Rig, Split};
+use crate::work;
 
 /// What to read and from where to look.
 #[derive(Debug, Clone, Default)]
@@ -28,6 +29,8 @@ pub struct InputOptions {
     pub scratch: Option<PathBuf>,
     /// Memory that the run may take.
     pub memory: Budget,
+    /// Where what stages find is kept; none: nowhere.
+    pub work: Option<work::Asked>,
 }
 
 impl InputOptions {

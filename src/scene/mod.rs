@@ -6,6 +6,7 @@ mod open;
 pub mod photographs;
 pub mod pictures;
 mod stream;
+mod work;
 
 use std::path::PathBuf;
 
@@ -15,10 +16,12 @@ use crate::families::Family;
 use crate::limits::Limits;
 use crate::model::{Rig, Schedule, Split};
 use crate::source::{FrameSource, Reads};
+use crate::work::Work;
 
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
 pub use stream::{Room, open_stream, receiving, room_to_pack};
+pub(crate) use work::stamps;
 
 /// An input with the cameras that look at it.
 pub struct Scene {
@@ -41,6 +44,10 @@ pub struct Scene {
     pub planned_reads: Option<f64>,
     /// Folder for scratch files while the run lasts.
     pub scratch: PathBuf,
+    /// Where what stages find is kept, if anywhere.
+    pub work: Work,
+    /// Digest of the input, where it is known already.
+    digest: Option<String>,
     /// Things a person should know.
     pub notes: Vec<String>,
 }
@@ -63,6 +70,8 @@ impl Scene {
             limits: Limits::NONE,
             planned_reads: None,
             scratch: std::env::temp_dir(),
+            work: Work::none(),
+            digest: None,
             notes: Vec::new(),
         })
     }

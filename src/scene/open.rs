@@ -107,7 +107,9 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     if scene.schedule.pairs() == 0 && !scene.source().info().times.is_empty() {
         return Err(Error::usage(format!("{}: no picture in this split (--split)", scene.rig.origin)));
     }
-    Ok(Scene { has_cameras, scratch: options.scratch_folder(), notes, ..scene })
+    let mut scene = Scene { has_cameras, scratch: options.scratch_folder(), notes, ..scene };
+    scene.keep_work(options)?;
+    Ok(scene)
 }
 
 /// Frames of a model for which neither cameras nor the user name any.

@@ -10,6 +10,8 @@ pub mod sketch;
 pub use norm::{Looks, Norm};
 pub use sketch::FloatSketch;
 
+use serde::{Deserialize, Serialize};
+
 use crate::model::{Flags, Rows, Statistic};
 use crate::recipe::{self, StaticTerm};
 
@@ -37,7 +39,7 @@ impl Scores {
 }
 
 /// How a term was normalised.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
     /// What is normalised.
     pub of: Graded,
@@ -46,7 +48,7 @@ pub struct Term {
 }
 
 /// What grades Gaussians: a statistic, or what is made of several.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Graded {
     /// One statistic.
     By(Statistic),

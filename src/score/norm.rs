@@ -1,5 +1,7 @@
 //! Robust min-max normalisation between the 1st and the 99th percentile.
 
+use serde::{Deserialize, Serialize};
+
 use super::FloatSketch;
 use crate::recipe;
 
@@ -8,7 +10,7 @@ use crate::recipe;
 /// Where P99 ≤ P1 (at most 1% of the values stand out) there is no scale to measure by: norm is 1
 /// above P99 and 0 elsewhere, and the term is *inactive*. This holds with ε too: dividing by
 /// ε = 1e-8 would let the few that stand out outweigh every other term a million times.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Norm {
     /// 1st percentile, nearest rank; 0 over no values.
     pub p1: f64,

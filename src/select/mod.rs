@@ -27,7 +27,7 @@ pub struct Overrides {
 }
 
 /// The outcome of stages 1 and 2.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Selection {
     /// For every Gaussian whether it stays.
     pub keep: Vec<bool>,

@@ -2,13 +2,14 @@
 //! exactly by the same two stages with both thresholds moved together.
 
 use rayon::slice::ParallelSliceMut;
+use serde::{Deserialize, Serialize};
 
 use super::hash_id;
 use crate::recipe::{LowPriority, Select};
 use crate::score::Scores;
 
 /// Gaussians from the one to keep first to the one to keep last.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ranking {
     order: Vec<u32>,
 }

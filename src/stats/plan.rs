@@ -1,5 +1,7 @@
 //! What a scan must know before its first frame.
 
+use serde::Serialize;
+
 use crate::error::{Error, Result};
 use crate::model::{Camera, Columns, Schedule};
 use crate::recipe::{Motion, Scan};
@@ -20,7 +22,7 @@ const CONTRIBUTION_BITS: i32 = 51;
 pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 
 /// Everything the scan of any block needs: one plan serves all blocks of a sequence.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScanPlan {
     pub(super) alpha_min: f64,
     pub(super) motion: Motion,

@@ -15,6 +15,8 @@ pub(super) struct BlockScans<'a> {
     /// Cameras, frame by frame.
     pub(super) schedule: &'a Schedule,
     pub(super) plan: &'a ScanPlan,
+    /// Those that are gone through.
+    pub(super) blocks: Range<usize>,
     pub(super) progress: Progress,
     /// Living Gaussians in each frame. Sums of integers: the order in which blocks finish does not show.
     pub(super) alive: Mutex<Vec<u32>>,
@@ -22,15 +24,16 @@ pub(super) struct BlockScans<'a> {
 
 impl<'a> BlockScans<'a> {
     pub(super) fn blocks(&self) -> usize {
-        self.source.info().count.div_ceil(BLOCK)
+        self.blocks.len()
     }
 
     pub(super) fn frames(&self) -> usize {
         self.source.info().times.len()
     }
 
-    /// The Gaussians of a block.
+    /// The Gaussians of a block, counted among those that are gone through.
     pub(super) fn range(&self, block: usize) -> Range<usize> {
+        let block = self.blocks.start + block;
         block * BLOCK..self.source.info().count.min((block + 1) * BLOCK)
     }
 

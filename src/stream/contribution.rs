@@ -5,6 +5,8 @@
 
 use std::num::NonZeroU32;
 
+use serde::{Deserialize, Serialize};
+
 use super::Progress;
 use super::pictures::{Subject, Workers};
 use crate::error::Result;
@@ -17,7 +19,7 @@ use crate::source::{FrameSource, Ids};
 const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
 
 /// What was seen of N Gaussians.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Seen {
     /// `[N]`, C: Σ alpha · transmittance per picture, pixels; a sampled pixel stands for stride² of them.
     pub coverage: Vec<f64>,
@@ -25,7 +27,16 @@ pub struct Seen {
     pub peak: Vec<f64>,
 }
 
-/// Looks at every `pixel_stride`-th pixel each way of `pictures`.
+impl Seen {
+    /// What `found` in so many pictures comes to.
+    pub fn of(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> Seen {
+        let per_pixel = f64::from(pixel_stride.get()).powi(2);
+        let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+        Seen { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
+    }
+}
+
+/// Looks at every `pixel_stride`-th pixel each way of `pictures`; [`Seen::of`] says what that comes to.
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
 /// pictures at all give zeros.
@@ -36,11 +47,11 @@ pub fn visible_contribution(
     (cameras, pictures): (&[Camera], &[Picture]),
     pixel_stride: NonZeroU32,
     limits: Limits,
-) -> Result<Seen> {
+) -> Result<Contribution> {
     let progress = Progress::new("visible", "pictures", pictures.len() as u64);
     let mut running = RunningContribution::new(source.info().count, pixel_stride, limits);
     running.add(source, cameras, pictures, || progress.advance(1))?;
-    Ok(running.finish())
+    Ok(running.sum())
 }
 
 /// Contributions to the pictures so far.
@@ -85,11 +96,14 @@ impl RunningContribution {
 
     /// What was seen in all pictures.
     pub fn finish(self) -> Seen {
+        let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
+        Seen::of(&self.sum(), pictures, pixel_stride)
+    }
+
+    fn sum(self) -> Contribution {
         let mut sum = Contribution::new(self.count);
         self.workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
-        let per_pixel = f64::from(self.pixel_stride.get()).powi(2);
-        let coverage = (0..self.count).map(|i| sum.pixels(i) * per_pixel / self.pictures.max(1) as f64).collect();
-        Seen { coverage, peak: sum.max.iter().map(|&max| f64::from(max)).collect() }
+        sum
     }
 }
 
@@ -143,7 +157,7 @@ mod tests {
             for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
                 let look =
                     || visible_contribution(&scene, (&schedule.cameras, &sample), scan.pixel_stride, limits).unwrap();
-                let seen = on_threads(threads, look);
+                let seen = Seen::of(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
                     let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
@@ -160,8 +174,8 @@ mod tests {
         let total = |pixel| {
             let scan = strides(pixel, 1, 1);
             let sample = (&schedule.cameras[..], &looked_at(&schedule, &scan, 1)[..]);
-            let seen = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
-            seen.coverage.iter().sum::<f64>()
+            let found = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
+            Seen::of(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
         };
         let (all, third) = (total(1), total(3));
         assert!((third / all - 1.0).abs() < 0.02, "got {third}, expected about {all}");
@@ -242,6 +256,7 @@ mod tests {
             Limits::NONE,
         )
         .unwrap();
+        let seen = Seen::of(&seen, sample.len(), recipe.scan.pixel_stride);
         assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
@@ -270,7 +285,9 @@ mod tests {
         schedule.push(2, &[]);
         let look = |source: &dyn FrameSource, schedule: &Schedule| {
             let sample = looked_at(schedule, &strides(1, 1, 1), 1);
-            visible_contribution(source, (&schedule.cameras, &sample), NonZeroU32::MIN, Limits::NONE).unwrap()
+            let sample = (&schedule.cameras[..], &sample[..]);
+            let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE).unwrap();
+            Seen::of(&found, sample.1.len(), NonZeroU32::MIN)
         };
         let seen = look(&scene, &schedule);
         assert_eq!(seen, Seen { coverage: vec![0.0; 300], peak: vec![0.0; 300] });

@@ -29,7 +29,7 @@ pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, View, show};
 pub use progress::{Mode, Progress, begin_run, duration};
 pub use removal::removal_error;
 pub use sample::{Sampler, VIEWS_AT_ONCE, frames_to_see, looked_at, spread, spread_over};
-pub use scan::{RunningScan, Scanned, scan};
+pub use scan::{RunningScan, Scanned, scan, scan_blocks, scan_units};
 pub use states::States;
 
 /// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.

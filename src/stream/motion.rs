@@ -56,6 +56,11 @@ pub struct Gathered {
 }
 
 impl PairMeter<'_> {
+    /// The same, with nothing gathered.
+    pub fn fresh(&self) -> Self {
+        PairMeter { scratch: self.scratch.clone(), gathered: None, ..*self }
+    }
+
     /// How alike each of `pairs` (rows of `ids`, which increase) moves, in some order. `reference` `[3, M]` holds the
     /// positions of `ids` at the reference frame; partners lie within about `reach` of each other there. Both are the
     /// same at every call. `is_part`: other pairs were or will be asked for, so that gathering pays.

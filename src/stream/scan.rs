@@ -1,18 +1,20 @@
 //! The scan: every Gaussian at every frame once, blocks of Gaussians on all threads.
 
+use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::blocks::BlockScans;
 use super::{BLOCK, Progress, stages};
 use crate::error::Result;
-use crate::model::{Camera, Gaussians, Rows, Schedule};
+use crate::model::{Camera, Gaussians, Rows, Schedule, SequenceInfo};
 use crate::source::{FrameSource, Ids};
 use crate::stats::{BlockScan, NEEDED, ScanPlan};
 
 /// What a scan gives.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Scanned {
     /// One row per Gaussian; D and κ before noise is snapped, E not filled.
     pub rows: Rows,
@@ -29,15 +31,43 @@ pub struct Scanned {
 /// with its accumulators ([`crate::stats::BYTES_PER_GAUSSIAN`] each), its state at one frame, and its reader; in stages
 /// two readers.
 pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
+    scan_blocks(source, schedule, plan, 0..scan_units(source.info()))
+}
+
+/// How many blocks of Gaussians [`scan`] goes through.
+pub fn scan_units(info: &SequenceInfo) -> usize {
+    info.count.div_ceil(BLOCK)
+}
+
+/// [`scan`] of consecutive blocks of Gaussians alone; [`Scanned::join`] makes one of several.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub fn scan_blocks(
+    source: &dyn FrameSource,
+    schedule: &Schedule,
+    plan: &ScanPlan,
+    blocks: Range<usize>,
+) -> Result<Scanned> {
     let info = source.info();
     let frames = info.times.len();
-    let progress = Progress::new("scan", "Gaussian frames", info.count as u64 * frames as u64);
-    let scan = BlockScans { source, schedule, plan, progress, alive: Mutex::new(vec![0; frames]) };
+    let gaussians = info.count.min(blocks.end * BLOCK) - info.count.min(blocks.start * BLOCK);
+    let progress = Progress::new("scan", "Gaussian frames", gaussians as u64 * frames as u64);
+    let scan = BlockScans { source, schedule, plan, blocks, progress, alive: Mutex::new(vec![0; frames]) };
     let blocks = match source.ahead() {
         Some(ahead) if frames > 0 => stages::scan_in_stages(&scan, ahead)?,
         _ => (0..scan.blocks()).into_par_iter().map(|block| scan.block(block)).collect::<Result<_>>()?,
     };
     Ok(joined(blocks, scan.alive.into_inner().unwrap_or_else(PoisonError::into_inner)))
+}
+
+impl Scanned {
+    /// Adds what was found of the Gaussians behind these, in the same frames.
+    pub fn join(&mut self, mut other: Scanned) {
+        self.rows.append(&mut other.rows);
+        self.alive_per_frame.iter_mut().zip(other.alive_per_frame).for_each(|(sum, alive)| *sum += alive);
+        self.largest_coordinate = self.largest_coordinate.max(other.largest_coordinate);
+    }
 }
 
 /// The blocks of a sequence, in order, as one.

@@ -19,11 +19,11 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::{BLOCK, Progress};
-use crate::emit::atomic::Spill;
 use crate::emit::container::FRAME_BLOCK;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::source::{FrameSource, Ids, Wanted};
+use crate::work::{Spill, Spilling};
 
 /// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
 pub(super) type Moment = [f32; 4];
@@ -62,7 +62,7 @@ impl Trajectories {
         let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
         let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
         places.par_sort_unstable();
-        let mut file = Spill::new(folder)?;
+        let mut file = Spilling::new(folder)?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
         let progress = Progress::new("merge", "frames", frames as u64);
         let mut values = Vec::new();
@@ -76,7 +76,7 @@ impl Trajectories {
             file.write(bytemuck::cast_slice(&values))?;
             progress.advance(of_block.len() as u64);
         }
-        file.finish()?;
+        let file = file.finish()?;
         let varying = numbers(columns);
         Ok(Trajectories { file, count: ids.len(), frames, block, varying })
     }

@@ -141,7 +141,7 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
     let marker = serde_json::json!({
         "tool": TOOL,
-        "input": InputSummary::of(&*opened.input, &input.path)?,
+        "input": InputSummary::of(&*opened.input, &input.path, opened.input.digest()?)?,
     });
     let path = staged.path().join(MARKER);
     fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
@@ -184,7 +184,7 @@ pub fn info(options: &InputOptions) -> Result<Info> {
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
-    let mut summary = InputSummary::of(&*input, &options.path)?;
+    let mut summary = InputSummary::of(&*input, &options.path, input.digest()?)?;
     if input.timing() == Timing::Continuous {
         summary.frames = None;
     }

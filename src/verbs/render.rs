@@ -94,7 +94,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         job.write(&chosen, |picture| staged.path().join(name(picture)))?;
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::of(&*scene.input, &scene.path)?,
+            "input": InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?,
             "cameras": CameraSummary {
                 origin: scene.rig.origin.clone(),
                 cameras: scene.rig.cameras.len(),

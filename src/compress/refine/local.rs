@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use crate::emit::atomic::Spill;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian};
+use crate::work::{Spill, Spilling};
 
 /// A state, and how it changes with what is stored.
 #[derive(Debug, Clone, Default)]
@@ -39,13 +39,25 @@ pub(super) struct Locals {
     first: Option<Local>,
 }
 
-impl Locals {
+/// [`Locals`] that are being kept.
+pub(super) struct Keeping {
+    file: Spilling,
+    varying: Columns,
+    first: Option<Local>,
+}
+
+impl Keeping {
     /// Of no frames yet; the columns `varying` of states differ from frame to frame.
     ///
     /// # Errors
     /// A scratch file that cannot be made in `scratch`.
-    pub(super) fn new(scratch: &Path, varying: Columns) -> Result<Locals> {
-        Ok(Locals { file: Spill::new(scratch)?, varying, first: None })
+    pub(super) fn new(scratch: &Path, varying: Columns) -> Result<Keeping> {
+        Ok(Keeping { file: Spilling::new(scratch)?, varying, first: None })
+    }
+
+    /// Whether nothing is kept yet.
+    pub(super) fn is_empty(&self) -> bool {
+        self.first.is_none()
     }
 
     /// Keeps the next frame's.
@@ -60,15 +72,16 @@ impl Locals {
         Ok(())
     }
 
-    /// Ends writing: only then can be read.
+    /// Ends keeping: only then can be read.
     ///
     /// # Errors
     /// A scratch file that cannot be written.
-    pub(super) fn finish(mut self) -> Result<Locals> {
-        self.file.finish()?;
-        Ok(self)
+    pub(super) fn finish(self) -> Result<Locals> {
+        Ok(Locals { file: self.file.finish()?, varying: self.varying, first: self.first })
     }
+}
 
+impl Locals {
     /// The first frame's, if there is one.
     pub(super) fn first(&self) -> Option<&Local> {
         self.first.as_ref()

@@ -1,5 +1,7 @@
 //! What refining makes small: how far pictures are from the original's.
 
+use serde::{Deserialize, Serialize};
+
 use super::targets::{mean_square, wide};
 use crate::metrics::{BYTES_PER_PIXEL, BYTES_PER_PIXEL_OF_SLOPE, decibels, ssim, ssim_slope};
 use crate::render::Image;
@@ -8,14 +10,14 @@ use crate::render::Image;
 const SQUARED: f64 = 20.0;
 
 /// A part `ssim` of 1 − SSIM, the rest [`SQUARED`] times the mean square error.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Loss {
     /// From 0 to 1.
     pub(super) ssim: f64,
 }
 
 /// How close pictures are to the original's.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct Closeness {
     /// Mean, dB.
     pub(super) psnr: f64,

@@ -28,6 +28,7 @@ use crate::scene::Scene;
 use crate::scene::between::Dice;
 use crate::source::FrameSource;
 use crate::stream::Progress;
+use crate::work::Key;
 use loss::Loss;
 use moving::{Manner, Moving};
 use targets::{Parted, Targets};
@@ -102,6 +103,15 @@ impl Refine {
     pub fn in_part(&self, part: f64) -> Refine {
         let of = |steps: usize| (part * steps as f64).ceil() as usize;
         Refine { steps: of(self.steps), cut_steps: of(self.cut_steps), ..self.clone() }
+    }
+
+    /// What it does follows from this, and what it is done to.
+    pub(super) fn key(&self) -> Key {
+        Key::of(&(self.columns.bits(), self.sh_degree, self.loss, self.steps, self.cut_steps)).and(&(
+            self.pictures,
+            self.cuts,
+            self.contrast_floor,
+        ))
     }
 
     fn manner(&self) -> Manner {
@@ -200,11 +210,16 @@ impl Refine {
             journal.leave_out("refinement", "nothing went that what stays could stand for");
             return Ok(reduction);
         }
-        journal.stage(NAME, count, scene.source(), |journal| {
-            let targets = Targets::new(scene, self.pictures)?;
-            let mut walk = Walk::new(NAME, self, scene, scored, &targets, targets.parted(false));
-            Ok((walk.all(&reduction, wanted, steps, journal)?.0, wanted))
-        })
+        let key = self.key().and(&(&reduction, wanted, steps, &scored.protected));
+        let run = |journal: &mut Journal| {
+            journal.stage(NAME, count, scene.source(), |journal| {
+                let targets = Targets::new(scene, self.pictures)?;
+                scene.work.not_divided(NAME)?;
+                let mut walk = Walk::new(NAME, self, scene, scored, &targets, targets.parted(false));
+                Ok((walk.all(&reduction, wanted, steps, journal)?.0, wanted))
+            })
+        };
+        journal.kept(&scene.work, NAME, key, run)
     }
 
     /// How close to the original's, dB, pictures kept apart come that way, as a part of `stage`.

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::local::{Local, Locals};
+use super::local::{Keeping, Local, Locals};
 use super::loss::{Closeness, Loss};
 use super::targets::Targets;
 use crate::error::{Error, Result};
@@ -83,7 +83,7 @@ impl<'a> Moving<'a> {
             scene,
             targets,
             deformation,
-            locals: Locals::new(&scene.scratch, varying)?,
+            locals: Keeping::new(&scene.scratch, varying)?.finish()?,
             stored: deformation.map_or(nothing.clone(), |deformation| deformation.stored().clone()),
             before: Change::default(),
             descent: Descent::new(&nothing, columns, sh_degree, &[]),
@@ -101,7 +101,7 @@ impl<'a> Moving<'a> {
         } else {
             let wanted = Wanted::of(moving.frames.clone()).holding(scene.limits.frames_held);
             let mut states = States::open(result, &wanted)?;
-            let mut locals = Locals::new(&scene.scratch, varying)?;
+            let mut locals = Keeping::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
                 locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::none(of_state) })?;
             }
@@ -137,9 +137,9 @@ impl<'a> Moving<'a> {
     pub(super) fn find(&mut self) -> Result<()> {
         let Some(deformation) = self.deformation else { return Ok(()) };
         self.settle();
-        let mut locals = Locals::new(&self.scene.scratch, self.varying)?;
+        let mut locals = Keeping::new(&self.scene.scratch, self.varying)?;
         for &frame in &self.frames {
-            let want = if locals.first().is_none() { Columns::all() } else { self.varying };
+            let want = if locals.is_empty() { Columns::all() } else { self.varying };
             deformation.state(frame, &self.stored, want, &mut self.now.state)?;
             self.now.jacobian = deformation.jacobian(frame, &self.stored, self.manner.columns)?;
             locals.push(&mut self.now)?;
@@ -175,7 +175,7 @@ impl<'a> Moving<'a> {
     /// # Errors
     /// A scratch file that cannot be read or written.
     pub(super) fn pick(&mut self, places: &[u32]) -> Result<()> {
-        let mut locals = Locals::new(&self.scene.scratch, self.varying)?;
+        let mut locals = Keeping::new(&self.scene.scratch, self.varying)?;
         let mut now = std::mem::take(&mut self.now);
         for k in 0..self.frames.len() {
             self.show(k, &mut now)?;

@@ -1,15 +1,19 @@
 //! The original's pictures that what is left is to come close to.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
-use crate::emit::atomic::Spill;
 use crate::error::Result;
 use crate::model::{Camera, Picture};
 use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::scene::between::{Dice, between};
-use crate::stream::{Batch, Subject, VIEWS_AT_ONCE, show, spread};
+use crate::stream::{Batch, Subject, VIEWS_AT_ONCE, View, show, spread};
+use crate::work::{Key, Spill, Spilling};
 
+/// What they are called in a work folder.
+pub(in crate::compress) const NAME: &str = "targets";
 /// Parts of the pictures that are of the scene's cameras, and of cameras in between, in 26ths.
 const PARTS: [usize; 2] = [3, 23];
 /// Bytes that they may take in a scratch file, as long as there are [`FEWEST`].
@@ -44,9 +48,8 @@ pub(in crate::compress) struct Targets {
     pub(in crate::compress) cameras: Vec<Camera>,
     /// By frame.
     pub(in crate::compress) pictures: Vec<Picture>,
-    /// Of every picture its values from 0 to 1 as 16 bits, one after the other from its place.
-    values: Spill,
-    places: Vec<u64>,
+    /// Of consecutive pictures their values from 0 to 1 as 16 bits, one after the other.
+    values: Vec<(Range<usize>, Spill)>,
 }
 
 impl Targets {
@@ -56,18 +59,17 @@ impl Targets {
     /// Frames that cannot be read; a scratch file that cannot be written.
     pub(in crate::compress) fn new(scene: &Scene, most: usize) -> Result<Targets> {
         let (cameras, pictures) = looked_at(scene, most);
-        let (mut values, mut places, mut end) = (Spill::new(&scene.scratch)?, Vec::new(), 0);
-        show([Subject::all(scene.source())], &cameras, &pictures, Batch::of_frame(&scene.limits), |views| {
-            let made: Vec<Vec<u16>> =
-                views.par_iter().map(|view| narrow(&render(view.states[0], view.camera, scene.background))).collect();
-            made.iter().try_for_each(|picture| {
-                places.push(end);
-                end += 2 * picture.len() as u64;
-                values.write(bytemuck::cast_slice(picture))
+        let make = |some: Range<usize>, values: &mut Spilling| {
+            let subject = [Subject::all(scene.source())];
+            show(subject, &cameras, &pictures[some], Batch::of_frame(&scene.limits), |views| {
+                let picture = |view: &View<'_, 1>| narrow(&render(view.states[0], view.camera, scene.background));
+                let made: Vec<Vec<u16>> = views.par_iter().map(picture).collect();
+                made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
             })
-        })?;
-        values.finish()?;
-        Ok(Targets { cameras, pictures, values, places })
+        };
+        let key = Key::of(&(&cameras, &pictures));
+        let values = scene.work.divided_spill(NAME, key, pictures.len(), &scene.scratch, make)?;
+        Ok(Targets { cameras, pictures, values })
     }
 
     /// What each picture is for; every fourth for nothing but the figure that is reported, if some are to be `held`.
@@ -84,14 +86,22 @@ impl Targets {
         &self.cameras[self.pictures[k].camera as usize]
     }
 
+    /// How many values picture `k` has.
+    fn len(&self, k: usize) -> usize {
+        let camera = self.camera(k);
+        3 * camera.width as usize * camera.height as usize
+    }
+
     /// The values of picture `k`.
     ///
     /// # Errors
     /// A scratch file that cannot be read.
     pub(in crate::compress) fn values(&self, k: usize) -> Result<Vec<u16>> {
-        let camera = self.camera(k);
-        let mut values = vec![0u16; 3 * camera.width as usize * camera.height as usize];
-        self.values.read(self.places[k], bytemuck::cast_slice_mut(&mut values))?;
+        let mut values = vec![0u16; self.len(k)];
+        for (some, spill) in self.values.iter().filter(|(some, _)| some.contains(&k)) {
+            let before: usize = (some.start..k).map(|k| self.len(k)).sum();
+            spill.read(2 * before as u64, bytemuck::cast_slice_mut(&mut values))?;
+        }
         Ok(values)
     }
 }

@@ -25,8 +25,10 @@ use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{PictureSet, pictures};
+use crate::scene::stamps;
 use crate::select::Ranking;
 use crate::source::FrameSource;
+use crate::work::Key;
 use gauge::{Gauge, With};
 
 /// What the stage is called.
@@ -122,7 +124,8 @@ impl Search {
         journal: &mut Journal,
     ) -> Result<(Reduction, GoalSummary)> {
         let all = ranked.order().len();
-        journal.stage(NAME, all, scene.source(), |journal| {
+        let key = self.key(scored, ranked, like)?;
+        let found = journal.kept_stage(NAME, all, scene, key, |journal| {
             let photographs = self.photographs(scene)?;
             let targets = Targets::new(scene, self.pictures)?;
             let parts = targets.parted(photographs.is_none());
@@ -151,8 +154,25 @@ impl Search {
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             journal.notes.push(note(&summary, gauge.searched(), count, does));
-            Ok(((best.reduction, summary), count))
-        })
+            Ok(((best.reduction, serde_json::to_string(&summary).expect("plain data")), count))
+        });
+        let (reduction, summary): (Reduction, String) = found?;
+        Ok((reduction, serde_json::from_str(&summary).expect("as it was written")))
+    }
+
+    /// What the search follows from.
+    fn key(&self, scored: &Scored, ranked: &Ranking, like: &Reduction) -> Result<Key> {
+        let (asked, folder) = match &self.quality {
+            Quality::Psnr(least) => (*least, None),
+            Quality::Loss { most, photographs } => (*most, Some(photographs)),
+        };
+        let mut files = Vec::new();
+        if let Some(folder) = folder {
+            stamps(folder, &mut files)?;
+        }
+        let (field, bands) = (self.field.as_ref().map(|of| of.margin), self.bands.as_ref().map(|of| of.margin));
+        let key = Key::of(&(asked, files, self.pictures, field, bands));
+        Ok(key.and(&self.refine.as_ref().map(Refine::key)).and(&(&scored.protected, ranked, like)))
     }
 
     /// Confirms, before any work, that there are photographs, where a loss is asked for.

@@ -1,0 +1,50 @@
+//! Digests of all that a result follows from.
+
+use std::io::{self, Write};
+
+use serde::Serialize;
+use xxhash_rust::xxh3::Xxh3;
+
+/// The digest of everything that a result follows from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Key(u128);
+
+impl Key {
+    /// Of `value`, by its bits.
+    pub fn of(value: &impl Serialize) -> Key {
+        let mut hash = Hash(Xxh3::new());
+        // Nothing that is hashed here has a part that cannot be written down.
+        postcard::to_io(value, &mut hash).expect("plain data");
+        Key(hash.0.digest128())
+    }
+
+    /// Of what this stands for, and `value`.
+    pub fn and(self, value: &impl Serialize) -> Key {
+        Key::of(&(self.0, Key::of(value).0))
+    }
+
+    /// In 32 digits.
+    pub(super) fn text(self) -> String {
+        format!("{:032x}", self.0)
+    }
+}
+
+impl Serialize for Key {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        self.0.serialize(to)
+    }
+}
+
+/// Takes bytes in.
+struct Hash(Xxh3);
+
+impl Write for Hash {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}

@@ -1,0 +1,290 @@
+//! A work folder: what stages found, kept so that a run that was cut short goes on and that several runs share the work.
+//!
+//! Every result of a stage is a *piece*, a file named after the stage and the digest of all that the result follows from:
+//! input, cameras, parameters, this program's version and the machine's instructions. So a piece is never out of date; a
+//! changed recipe asks for pieces of other names. A stage that can be divided has *units* (blocks of Gaussians, pictures,
+//! frame blocks); part `i` of `n` of it is a run of consecutive units, and parts join to what the whole would have been,
+//! bit for bit. Pieces appear whole or not at all, and one that is damaged is computed again.
+//!
+//! Without a folder nothing is kept: the same calls compute what they are asked for.
+
+mod folder;
+mod key;
+mod part;
+mod piece;
+mod place;
+mod spill;
+
+use std::collections::BTreeSet;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::error::{Error, Result};
+pub use folder::{Listed, clean, list, text};
+pub use key::Key;
+use part::MOST_PARTS;
+pub use part::Part;
+use piece::Name;
+use place::Place;
+pub use spill::{Spill, Spilling};
+
+/// What a user asks for.
+#[derive(Debug, Clone)]
+pub struct Asked {
+    /// The work folder.
+    pub folder: PathBuf,
+    /// Of the next stage that can be divided this part is computed and nothing else; none: everything.
+    pub part: Option<Part>,
+}
+
+/// Where the results of stages are kept, if anywhere, and which part of the work is this run's.
+#[derive(Debug, Default)]
+pub struct Work {
+    place: Option<Place>,
+    part: Option<Part>,
+    said: Mutex<Vec<String>>,
+}
+
+impl Work {
+    /// Nothing is kept.
+    pub fn none() -> Work {
+        Work::default()
+    }
+
+    /// As `asked`, in a folder that is created if it is not there. `about` says in words what the pieces belong to.
+    ///
+    /// # Errors
+    /// A folder that cannot be created, or is none.
+    pub fn open(asked: &Asked, about: String) -> Result<Work> {
+        Ok(Work { place: Some(Place::at(&asked.folder, about)?), part: asked.part, said: Mutex::default() })
+    }
+
+    /// From now on everything follows from what `context` stands for, too.
+    pub fn follow_from(&mut self, context: Key) {
+        if let Some(place) = &mut self.place {
+            place.follow_from(context);
+        }
+    }
+
+    /// Whether anything is kept.
+    pub fn keeps(&self) -> bool {
+        self.place.is_some()
+    }
+
+    /// Things a person should know, said once.
+    pub fn take_notes(&self) -> Vec<String> {
+        std::mem::take(&mut self.said.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn say(&self, note: String) {
+        self.said.lock().unwrap_or_else(PoisonError::into_inner).push(note);
+    }
+
+    /// What `stage` found earlier for `key`, if that is there.
+    ///
+    /// # Errors
+    /// A folder that cannot be read. A damaged piece counts as none, with a note.
+    pub fn find<T: DeserializeOwned>(&self, stage: &str, key: Key) -> Result<Option<T>> {
+        self.find_part(stage, key, Part::WHOLE)
+    }
+
+    /// Keeps what `stage` found for `key`.
+    ///
+    /// # Errors
+    /// A folder that cannot be written.
+    pub fn keep<T: Serialize>(&self, stage: &str, key: Key, found: &T) -> Result<()> {
+        self.keep_part(stage, key, Part::WHOLE, found)
+    }
+
+    /// What `compute` finds as `stage` for `key`, or found earlier. A stage that is not divided is nothing for a run of a
+    /// part.
+    ///
+    /// # Errors
+    /// Those of `compute`, and of the folder; [`Error::Stopped`] in a run of a part.
+    pub fn whole<T: Serialize + DeserializeOwned>(
+        &self,
+        stage: &str,
+        key: Key,
+        compute: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
+        self.known(stage, key, || {
+            self.not_divided(stage)?;
+            compute()
+        })
+    }
+
+    /// [`Work::whole`] of what hardly takes time, or what everything else follows from: a run of a part does it too.
+    ///
+    /// # Errors
+    /// Those of `compute`, and of the folder.
+    pub fn known<T: Serialize + DeserializeOwned>(
+        &self,
+        stage: &str,
+        key: Key,
+        compute: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
+        if let Some(found) = self.find(stage, key)? {
+            return Ok(found);
+        }
+        let found = compute()?;
+        self.keep(stage, key, &found)?;
+        Ok(found)
+    }
+
+    /// Ends a run of a part before `stage`, which cannot be divided.
+    ///
+    /// # Errors
+    /// [`Error::Stopped`] in a run of a part.
+    pub fn not_divided(&self, stage: &str) -> Result<()> {
+        match self.part {
+            None => Ok(()),
+            Some(part) => Err(Error::Stopped(format!(
+                "part {part}: nothing to do; what comes next, {stage}, is not divided: run without --part"
+            ))),
+        }
+    }
+
+    /// What `join` makes of what `compute` finds for consecutive runs of all `units` of `stage`, in order; here or in other
+    /// runs. However often they are cut, the same must come out.
+    ///
+    /// # Errors
+    /// Those of `compute` and `join`, and of the folder; [`Error::Stopped`] in a run of a part, which has computed it then
+    /// if it was not there.
+    pub fn divided<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
+        &self,
+        stage: &str,
+        key: Key,
+        units: usize,
+        compute: impl Fn(Range<usize>) -> Result<T>,
+        join: impl FnOnce(&mut dyn Iterator<Item = Result<T>>) -> Result<U>,
+    ) -> Result<U> {
+        if let Some(whole) = self.find(stage, key)? {
+            return Ok(whole);
+        }
+        let find = |part| self.find_part(stage, key, part);
+        let make = |part: Part| -> Result<T> {
+            let found = compute(part.of_units(units))?;
+            self.keep_part(stage, key, part, &found)?;
+            Ok(found)
+        };
+        let of = self.divide(stage, key, &find, &make)?;
+        let whole = match of {
+            1 => join(&mut std::iter::once_with(|| compute(0..units)))?,
+            _ => join(&mut Part::all(of).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
+        };
+        self.keep(stage, key, &whole)?;
+        match self.part {
+            Some(Part::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Part::WHOLE))),
+            _ => Ok(whole),
+        }
+    }
+
+    /// The same of content that stays on the disk, written by `write`; in `scratch`, where nothing is kept. Gives the
+    /// units of every part, and their content.
+    ///
+    /// # Errors
+    /// Those of [`Work::divided`].
+    pub fn divided_spill(
+        &self,
+        stage: &str,
+        key: Key,
+        units: usize,
+        scratch: &Path,
+        write: impl Fn(Range<usize>, &mut Spilling) -> Result<()>,
+    ) -> Result<Vec<(Range<usize>, Spill)>> {
+        let find = |part| match &self.place {
+            None => Ok(None),
+            Some(place) => place.open(&Name::new(stage, place.key(key), part), |note| self.say(note)),
+        };
+        let make = |part: Part| -> Result<Spill> {
+            let mut spilling = match &self.place {
+                None => Spilling::new(scratch)?,
+                Some(place) => place.begin(&Name::new(stage, place.key(key), part))?,
+            };
+            write(part.of_units(units), &mut spilling)?;
+            spilling.finish()
+        };
+        if let Some(whole) = find(Part::WHOLE)? {
+            return Ok(vec![(0..units, whole)]);
+        }
+        let of = self.divide(stage, key, &find, &make)?;
+        let spill = |part: Part| Ok((part.of_units(units), find(part)?.map_or_else(|| make(part), Ok)?));
+        let spills = Part::all(of).map(spill).collect::<Result<_>>()?;
+        match self.part {
+            Some(Part::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Part::WHOLE))),
+            _ => Ok(spills),
+        }
+    }
+
+    /// In how many parts `stage`, of which the whole is not there, is to be taken: they are there or to be made; 1: the
+    /// whole is to be made. A run of one of several parts makes that and ends.
+    fn divide<T>(
+        &self,
+        stage: &str,
+        key: Key,
+        find: &dyn Fn(Part) -> Result<Option<T>>,
+        make: &dyn Fn(Part) -> Result<T>,
+    ) -> Result<usize> {
+        let Some(place) = &self.place else { return Ok(1) };
+        // By the number of parts, those that are there.
+        let there = place.parts(stage, key)?;
+        if let Some((&of, _)) = there.iter().find(|(of, parts)| parts.len() == **of) {
+            return Ok(of);
+        }
+        let Some(part) = self.part else {
+            let Some((&of, parts)) = there.iter().max_by_key(|(of, parts)| parts.len() * MOST_PARTS / **of) else {
+                return Ok(1);
+            };
+            self.say(format!("{stage}: missing of {of} parts, and computed here: {}", missing(parts, of)));
+            return Ok(of);
+        };
+        let (_, of) = part.numbers();
+        if of == 1 {
+            return Ok(1);
+        }
+        // One that has its name may be damaged.
+        let done = match find(part)? {
+            Some(_) => "is there already",
+            None => {
+                make(part)?;
+                "is done"
+            }
+        };
+        let there = place.parts(stage, key)?.remove(&of).unwrap_or_default();
+        Err(Error::Stopped(match there.len() == of {
+            true => format!("{stage}: part {part} {done}; all parts are there"),
+            false => format!("{stage}: part {part} {done}; missing: {}", missing(&there, of)),
+        }))
+    }
+
+    fn find_part<T: DeserializeOwned>(&self, stage: &str, key: Key, part: Part) -> Result<Option<T>> {
+        let Some(place) = &self.place else { return Ok(None) };
+        place.read(&Name::new(stage, place.key(key), part), |note| self.say(note))
+    }
+
+    fn keep_part<T: Serialize>(&self, stage: &str, key: Key, part: Part, found: &T) -> Result<()> {
+        let Some(place) = &self.place else { return Ok(()) };
+        place.write(&Name::new(stage, place.key(key), part), found)
+    }
+}
+
+/// Which of `of` parts are not `there`.
+fn missing(there: &BTreeSet<usize>, of: usize) -> String {
+    ranges(&(1..=of).filter(|index| !there.contains(index)).collect::<Vec<_>>())
+}
+
+/// Increasing numbers as a list with ranges, such as `3, 10-20`.
+fn ranges(numbers: &[usize]) -> String {
+    let texts = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match (run[0], run[run.len() - 1]) {
+        (first, last) if first == last => first.to_string(),
+        (first, last) => format!("{first}-{last}"),
+    });
+    texts.collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests;

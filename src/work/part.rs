@@ -1,0 +1,54 @@
+//! Parts of the work of a stage.
+
+use std::fmt;
+use std::ops::Range;
+use std::str::FromStr;
+
+/// Most parts that a stage is divided into: each is a file.
+pub(super) const MOST_PARTS: usize = 100_000;
+
+/// Part `index`, counted from 1, of `of`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Part {
+    index: usize,
+    of: usize,
+}
+
+impl Part {
+    /// All there is.
+    pub(super) const WHOLE: Part = Part { index: 1, of: 1 };
+
+    /// Every part of `of`.
+    pub(super) fn all(of: usize) -> impl Iterator<Item = Part> {
+        (1..=of).map(move |index| Part { index, of })
+    }
+
+    /// Its number, and how many there are.
+    pub(super) fn numbers(self) -> (usize, usize) {
+        (self.index, self.of)
+    }
+
+    /// Which of `units` are its own.
+    pub(super) fn of_units(self, units: usize) -> Range<usize> {
+        let end = |parts: usize| (units as u128 * parts as u128 / self.of as u128) as usize;
+        end(self.index - 1)..end(self.index)
+    }
+}
+
+impl fmt::Display for Part {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.index, self.of)
+    }
+}
+
+impl FromStr for Part {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Part, String> {
+        let numbers = text.split_once('/').and_then(|(index, of)| Some((index.parse().ok()?, of.parse().ok()?)));
+        match numbers {
+            Some((index, of)) if (1..=of).contains(&index) && of <= MOST_PARTS => Ok(Part { index, of }),
+            _ => Err(format!("expected i/n with 1 <= i <= n <= {MOST_PARTS}, such as 3/8")),
+        }
+    }
+}

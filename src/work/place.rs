@@ -1,0 +1,118 @@
+//! The folder that pieces are in.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::key::Key;
+use super::part::MOST_PARTS;
+use super::piece::{Name, Piece, names};
+use super::spill::{Spill, Spilling};
+use crate::error::{Error, Result};
+
+/// A work folder that is written to.
+#[derive(Debug)]
+pub(super) struct Place {
+    folder: PathBuf,
+    /// What all keys begin with.
+    context: Key,
+    about: String,
+}
+
+impl Place {
+    /// `folder`, created if it is not there.
+    pub(super) fn at(folder: &Path, about: String) -> Result<Place> {
+        match fs::create_dir(folder) {
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+                return Err(Error::io("create the work folder", folder)(error));
+            }
+            _ if !folder.is_dir() => return Err(Error::usage(format!("{}: is no folder", folder.display()))),
+            _ => Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about }),
+        }
+    }
+
+    /// What is read and written from now on follows from this, too.
+    pub(super) fn follow_from(&mut self, context: Key) {
+        self.context = self.context.and(&context);
+    }
+
+    /// `key` in this context.
+    pub(super) fn key(&self, key: Key) -> Key {
+        self.context.and(&key)
+    }
+
+    /// Which of several parts of `stage` are there, by how many there are in all.
+    pub(super) fn parts(&self, stage: &str, key: Key) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
+        let key = self.key(key).text();
+        let mut found: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
+        for name in names(&self.folder)? {
+            let (index, of) = name.part;
+            if name.stage == stage && name.key == key && (1..=of).contains(&index) && (2..=MOST_PARTS).contains(&of) {
+                found.entry(of).or_default().insert(index);
+            }
+        }
+        Ok(found)
+    }
+
+    /// What is in a piece, if it is there. `damaged` is told of one that is not as it was written; it counts as none.
+    pub(super) fn read<T: DeserializeOwned>(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<T>> {
+        let path = self.folder.join(name.file());
+        let Some(piece) = self.open_piece(&path, name, &damaged)? else { return Ok(None) };
+        match postcard::from_bytes(piece.content()) {
+            Ok(found) => Ok(Some(found)),
+            Err(error) => {
+                damaged(format!("{} does not hold what it should ({error}): computed again", path.display()));
+                Ok(None)
+            }
+        }
+    }
+
+    /// The content of a piece, if it is there and as it was written.
+    pub(super) fn open(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<Spill>> {
+        let path = self.folder.join(name.file());
+        let Some(piece) = self.open_piece(&path, name, &damaged)? else { return Ok(None) };
+        // Somebody may have removed it meanwhile, or another run put the same in its place.
+        match File::open(&path) {
+            Ok(file) => Ok(Some(Spill::of(file, piece.start(), path))),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(Error::io("open", &path)(error)),
+        }
+    }
+
+    fn open_piece(&self, path: &Path, name: &Name, damaged: &impl Fn(String)) -> Result<Option<Piece>> {
+        if !path.exists() {
+            return self.is_there().map(|()| None);
+        }
+        match Piece::open(path, Some(&name.key))? {
+            Ok(piece) => Ok(Some(piece)),
+            Err(why) => {
+                damaged(format!("{} is damaged ({why}): computed again", path.display()));
+                Ok(None)
+            }
+        }
+    }
+
+    /// A folder that has vanished is not one without pieces.
+    fn is_there(&self) -> Result<()> {
+        fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
+    }
+
+    /// Writes a piece.
+    pub(super) fn write<T: Serialize>(&self, name: &Name, found: &T) -> Result<()> {
+        let mut spilling = self.begin(name)?;
+        spilling.write_value(found)?;
+        spilling.finish()?;
+        Ok(())
+    }
+
+    /// A piece in the making.
+    pub(super) fn begin(&self, name: &Name) -> Result<Spilling> {
+        self.is_there()?;
+        let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();
+        Spilling::named(&self.folder.join(name.file()), key, &self.about)
+    }
+}

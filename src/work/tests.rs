@@ -1,0 +1,217 @@
+use std::cell::RefCell;
+use std::fs;
+
+use super::*;
+
+fn asked(folder: &Path, part: Option<&str>) -> Asked {
+    Asked { folder: folder.join("work"), part: part.map(|part| part.parse().unwrap()) }
+}
+
+fn open(folder: &Path, part: Option<&str>) -> Work {
+    Work::open(&asked(folder, part), "a test".to_owned()).unwrap()
+}
+
+/// Squares of the first `units` numbers, divided; and which units were computed.
+fn squares(work: &Work, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
+    let computed = RefCell::new(Vec::new());
+    let compute = |some: Range<usize>| {
+        computed.borrow_mut().extend(some.clone());
+        Ok(some.map(|unit| (unit * unit) as u64).collect::<Vec<u64>>())
+    };
+    let join = |parts: &mut dyn Iterator<Item = Result<Vec<u64>>>| {
+        let mut all = Vec::new();
+        for part in parts {
+            all.extend(part?);
+        }
+        Ok(all)
+    };
+    let found = work.divided("squares", Key::of(&units), units, compute, join);
+    (found, computed.into_inner())
+}
+
+fn plainly(units: usize) -> Vec<u64> {
+    (0..units as u64).map(|unit| unit * unit).collect()
+}
+
+fn names_in(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn parts_of_any_number_in_any_order_and_twice_join_to_the_whole_and_are_computed_once() {
+    for (units, of) in [(10, 1), (10, 2), (10, 7), (10, 64), (0, 3), (1, 2)] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut computed = Vec::new();
+        for index in (1..=of).rev().chain([1, of]).take(if of == 1 { 1 } else { 2 * of }) {
+            if of > 1 && names_in_work(folder.path()) == of {
+                break;
+            }
+            let (found, units) = squares(&open(folder.path(), Some(&format!("{index}/{of}"))), units);
+            let message = found.unwrap_err().to_string();
+            assert!(message.contains(&format!("part {index}/{of} is done")), "{message}");
+            computed.extend(units);
+        }
+        computed.sort_unstable();
+        assert_eq!(computed, (0..units).collect::<Vec<_>>(), "{of} parts");
+        let (found, again) = squares(&open(folder.path(), None), units);
+        assert_eq!((found.unwrap(), again), (plainly(units), Vec::new()), "{of} parts");
+    }
+}
+
+fn names_in_work(folder: &Path) -> usize {
+    let work = folder.join("work");
+    if work.exists() { names_in(&work).len() } else { 0 }
+}
+
+#[test]
+fn a_part_that_is_there_is_not_computed_again_and_missing_ones_are_named_and_then_computed() {
+    let folder = tempfile::tempdir().unwrap();
+    for index in [2, 3, 5] {
+        _ = squares(&open(folder.path(), Some(&format!("{index}/6"))), 12);
+    }
+    let (found, computed) = squares(&open(folder.path(), Some("3/6")), 12);
+    assert_eq!(found.unwrap_err().to_string(), "squares: part 3/6 is there already; missing: 1, 4, 6");
+    assert!(computed.is_empty());
+    let work = open(folder.path(), None);
+    let (found, computed) = squares(&work, 12);
+    assert_eq!((found.unwrap(), computed), (plainly(12), vec![0, 1, 6, 7, 10, 11]));
+    assert_eq!(work.take_notes(), ["squares: missing of 6 parts, and computed here: 1, 4, 6"]);
+    // From now on the whole is there.
+    assert!(squares(&open(folder.path(), Some("1/2")), 12).0.is_ok());
+}
+
+#[test]
+fn other_inputs_and_parameters_find_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let key = |number: f64| Key::of(&("stage", number));
+    let mut work = open(folder.path(), None);
+    work.follow_from(Key::of(&"an input"));
+    work.keep("stage", key(0.0), &7u32).unwrap();
+    assert_eq!(work.find("stage", key(0.0)).unwrap(), Some(7u32));
+    assert_eq!(work.find::<u32>("stage", key(-0.0)).unwrap(), None);
+    assert_eq!(work.find::<u32>("another", key(0.0)).unwrap(), None);
+    let mut other = open(folder.path(), None);
+    assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
+    other.follow_from(Key::of(&"another input"));
+    assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
+}
+
+#[test]
+fn a_piece_cut_short_flipped_or_renamed_is_computed_again_with_a_note() {
+    let folder = tempfile::tempdir().unwrap();
+    _ = squares(&open(folder.path(), None), 40).0.unwrap();
+    let (work, [name]) = (folder.path().join("work"), &names_in(&folder.path().join("work"))[..]) else {
+        panic!("one piece is kept")
+    };
+    let whole = fs::read(work.join(name)).unwrap();
+    let lengths = [0, 1, 47, 48, whole.len() - 1];
+    let cut = lengths.map(|length| whole[..length].to_vec());
+    let flipped = (0..whole.len()).map(|byte| {
+        let mut flipped = whole.clone();
+        flipped[byte] ^= 1 << (byte % 8);
+        flipped
+    });
+    let longer = [&whole[..], &[0]].concat();
+    for (case, damaged) in cut.into_iter().chain(flipped).chain([longer]).enumerate() {
+        fs::write(work.join(name), damaged).unwrap();
+        let kept = open(folder.path(), None);
+        let (found, computed) = squares(&kept, 40);
+        assert_eq!((found.unwrap(), computed.len()), (plainly(40), 40), "case {case}");
+        assert!(kept.take_notes()[0].contains("is damaged"), "case {case}");
+        assert_eq!(fs::read(work.join(name)).unwrap(), whole, "case {case}");
+    }
+    let other = name.replace("squares", "cubes");
+    fs::rename(work.join(name), work.join(&other)).unwrap();
+    assert_eq!(squares(&open(folder.path(), None), 40).1.len(), 40);
+}
+
+#[test]
+fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
+    let write =
+        |some: Range<usize>, to: &mut Spilling| some.map(|unit| unit as u8).try_for_each(|byte| to.write(&[byte]));
+    let read = |spills: Vec<(Range<usize>, Spill)>| -> Vec<u8> {
+        let of_spill = |(some, spill): &(Range<usize>, Spill)| {
+            let mut bytes = vec![0; some.len()];
+            spill.read(0, &mut bytes).unwrap();
+            bytes
+        };
+        spills.iter().flat_map(of_spill).collect()
+    };
+    let expected: Vec<u8> = (0..50).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let spilled = |work: &Work| work.divided_spill("bytes", Key::of(&1), 50, folder.path(), write);
+    assert_eq!(read(spilled(&Work::none()).unwrap()), expected);
+    assert!(names_in(folder.path()).is_empty());
+    for index in 1..=3 {
+        assert!(spilled(&open(folder.path(), Some(&format!("{index}/3")))).is_err());
+    }
+    let found = spilled(&open(folder.path(), None)).unwrap();
+    assert_eq!(found.len(), 3);
+    assert_eq!(read(found), expected);
+    // One of them is damaged.
+    let work = folder.path().join("work");
+    fs::write(work.join(&names_in(&work)[1]), b"SPLSPIEC").unwrap();
+    assert_eq!(read(spilled(&open(folder.path(), None)).unwrap()), expected);
+}
+
+#[test]
+fn what_is_not_divided_ends_a_run_of_a_part() {
+    let folder = tempfile::tempdir().unwrap();
+    let of_part = |work: &Work| work.whole("alone", Key::of(&1), || Ok(5u8));
+    let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
+    assert!(message.contains("what comes next, alone, is not divided"), "{message}");
+    assert_eq!(of_part(&open(folder.path(), None)).unwrap(), 5);
+    assert_eq!(of_part(&open(folder.path(), Some("1/2"))).unwrap(), 5);
+}
+
+#[test]
+fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
+    let folder = tempfile::tempdir().unwrap();
+    let work = folder.path().join("work");
+    _ = squares(&open(folder.path(), Some("2/3")), 9);
+    open(folder.path(), None).keep("stage", Key::of(&1), &[1u64, 2]).unwrap();
+    let listed = list(&work).unwrap();
+    assert_eq!(listed.len(), 2);
+    let [squares, stage] = [0, 1].map(|k| &listed[k]);
+    assert_eq!((&squares.stage[..], squares.parts, &squares.missing[..]), ("squares", 3, &[1, 3][..]));
+    assert_eq!((&stage.stage[..], stage.parts, stage.missing.len(), stage.damaged.len()), ("stage", 1, 0, 0));
+    assert!(listed.iter().all(|of| of.belongs_to == "a test" && of.bytes > 48));
+    assert!(text(&listed).contains("3 parts, missing: 1, 3"), "{}", text(&listed));
+    fs::write(work.join("mine.txt"), "kept").unwrap();
+    assert_eq!(clean(&work).unwrap().0, 2);
+    assert_eq!(names_in(&work), ["mine.txt"]);
+    fs::remove_file(work.join("mine.txt")).unwrap();
+    clean(&work).unwrap();
+    assert!(!work.exists() && list(&work).is_err());
+}
+
+#[test]
+fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("work"), "a file").unwrap();
+    let message = Work::open(&asked(folder.path(), None), String::new()).unwrap_err().to_string();
+    assert!(message.contains("is no folder"), "{message}");
+    fs::remove_file(folder.path().join("work")).unwrap();
+    let work = open(folder.path(), None);
+    fs::remove_dir(folder.path().join("work")).unwrap();
+    for message in
+        [work.keep("stage", Key::of(&1), &1).unwrap_err(), work.find::<i32>("stage", Key::of(&1)).unwrap_err()]
+    {
+        assert!(message.to_string().contains("work"), "{message}");
+    }
+    let message = Work::open(&asked(&folder.path().join("nowhere"), None), String::new()).unwrap_err().to_string();
+    assert!(message.contains("nowhere"), "{message}");
+}
+
+#[test]
+fn parts_are_named_by_two_numbers() {
+    for good in ["1/1", "3/8", "64/64"] {
+        assert_eq!(good.parse::<Part>().unwrap().to_string(), good);
+    }
+    for bad in ["", "1", "0/3", "4/3", "1/0", "a/b", "1/2/3", "-1/2", "1/100001"] {
+        assert!(bad.parse::<Part>().is_err(), "{bad}");
+    }
+}
