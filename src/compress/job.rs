@@ -232,7 +232,7 @@ impl Job {
         }
         if let Some(rounds) = &self.rounds {
             let fewest = self.search.as_ref().map_or_else(
-                || self.before_cuts((rounds.fewest * count as f64).ceil() as usize, count),
+                || self.before_cuts((rounds.usual * count as f64).ceil() as usize, count),
                 |search| search.fewest(count),
             );
             stages.extend(rounds.divided(count, fewest));

@@ -13,7 +13,11 @@ const PIECE: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.
 pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
-    let mut file = File::open(path).map_err(Error::io("open", path))?;
+    hash_rest(&mut File::open(path).map_err(Error::io("open", path))?, path, hash)
+}
+
+/// Adds the bytes of `file`, which is at `path`, from where it is to its end.
+pub(crate) fn hash_rest(file: &mut File, path: &Path, hash: &mut Xxh3) -> Result<()> {
     let mut piece = vec![0; PIECE];
     loop {
         match file.read(&mut piece).map_err(Error::io("read", path))? {

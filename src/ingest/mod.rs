@@ -5,6 +5,6 @@ pub mod container;
 pub(crate) mod digest;
 pub mod frame_stream;
 pub mod image;
-pub(crate) mod map;
+mod map;
 pub mod ply;
 pub mod ply_sequence;

@@ -5,6 +5,7 @@
 //! correction but its own. Memory: [`bytes_per_gaussian`].
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
 use crate::reduction::Change;
@@ -19,7 +20,7 @@ const WARM_UP: usize = 10;
 const FULL_ERROR: f64 = 0.045;
 
 /// How rates change from step to step.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Schedule {
     steps: usize,
     last: f32,
@@ -103,6 +104,16 @@ impl Descent {
             means.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         }
         self.done = 0;
+    }
+
+    /// How far it is: the change, the means, and the steps done, from which [`Descent::go_on`] goes on.
+    pub fn standing(&self) -> (&Change, &[Gaussians; 2], usize) {
+        (&self.change, &self.means, self.done)
+    }
+
+    /// Goes on from where another descent of the same start was.
+    pub fn go_on(&mut self, (change, means, done): (Change, [Gaussians; 2], usize)) {
+        (self.change, self.means, self.done) = (change, means, done);
     }
 
     /// One step against `gradients`, at rates of `schedule`.

@@ -51,8 +51,8 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
         });
         listed.missing.retain(|&missing| missing != index);
         listed.bytes += fs::metadata(&path).map_err(Error::io("read the size of", &path))?.len();
-        match Piece::open(&path, Some(&key))? {
-            Ok(piece) => listed.belongs_to = piece.about(),
+        match Piece::open(&path, &key)? {
+            Ok(piece) => piece.about().clone_into(&mut listed.belongs_to),
             Err(_) => listed.damaged.push(index),
         }
     }

@@ -16,15 +16,16 @@
 //! Its name: `<stage>.<key, 32 hexadecimal digits>.piece`, of a part `<stage>.<key>.<i>-of-<n>.piece`.
 
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
+use serde::de::DeserializeOwned;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::key::Key;
 use super::part::Part;
 use crate::error::{Error, Result};
-use crate::ingest::map::FileMap;
+use crate::ingest::digest::hash_rest;
 
 const MAGIC: [u8; 8] = *b"SPLSPIEC";
 const VERSION: u32 = 1;
@@ -32,6 +33,8 @@ const VERSION: u32 = 1;
 const HEADER: usize = 48;
 /// Ends the names of pieces.
 const ENDING: &str = ".piece";
+/// Bytes of all texts in a piece, at most.
+const MOST_TEXT: u64 = 8 << 20;
 
 /// What a piece is called.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -151,58 +154,87 @@ fn again(error: &io::Error) -> io::Error {
     error.raw_os_error().map_or_else(|| io::Error::new(error.kind(), error.to_string()), io::Error::from_raw_os_error)
 }
 
-/// A piece that was written.
+/// A piece that was written, open for reading at its content.
 pub(super) struct Piece {
-    map: FileMap,
-    start: usize,
+    file: File,
+    about: String,
+    start: u64,
+    length: u64,
+}
+
+/// Numbers of a header.
+struct Header {
+    text: u64,
+    content: u64,
+    hash: u64,
+    key: u128,
+}
+
+impl Header {
+    fn of(bytes: &[u8; HEADER]) -> std::result::Result<Header, String> {
+        let number = |start: usize, length: usize| {
+            bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
+        };
+        if bytes[..8] != MAGIC {
+            return Err("it is no piece".to_owned());
+        }
+        if number(8, 4) != u128::from(VERSION) {
+            return Err(format!("version {}, expected {VERSION}", number(8, 4)));
+        }
+        let [text, content, hash] = [(12, 4), (16, 8), (24, 8)].map(|(start, length)| number(start, length) as u64);
+        Ok(Header { text, content, hash, key: number(32, 16) })
+    }
 }
 
 impl Piece {
     /// Opens a piece and looks at every byte of it; of a damaged one what is wrong. `key`: the one it should have.
-    pub(super) fn open(path: &Path, key: Option<&str>) -> Result<std::result::Result<Piece, String>> {
-        let length = fs::metadata(path).map_err(Error::io("read the size of", path))?.len();
+    ///
+    /// Plain reads: a map of a large piece would count as memory of this process.
+    pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<Piece, String>> {
+        let failed = |error| Error::io("read", path)(error);
+        let mut file = File::open(path).map_err(Error::io("open", path))?;
+        let length = file.metadata().map_err(failed)?.len();
         if length < HEADER as u64 {
             return Ok(Err(format!("{length} bytes, of a header of {HEADER}")));
         }
-        let map = FileMap::open(path)?;
-        Ok(check(&map, key).map(|start| Piece { map, start }))
+        let mut bytes = [0; HEADER];
+        file.read_exact(&mut bytes).map_err(failed)?;
+        let Header { text, content, hash, key: own } = match Header::of(&bytes) {
+            Ok(header) => header,
+            Err(why) => return Ok(Err(why)),
+        };
+        let start = HEADER as u64 + text;
+        if u128::from(start) + u128::from(content) != u128::from(length) {
+            return Ok(Err(format!("{length} bytes, expected {}", u128::from(start) + u128::from(content))));
+        }
+        if key != format!("{own:032x}") {
+            return Ok(Err("it is another piece than its name says".to_owned()));
+        }
+        let mut found = Xxh3::new();
+        hash_rest(&mut file, path, &mut found)?;
+        if found.digest() != hash {
+            return Ok(Err("its bytes are not those that were written".to_owned()));
+        }
+        let mut about = vec![0; text as usize];
+        file.seek(SeekFrom::Start(HEADER as u64)).and_then(|_| file.read_exact(&mut about)).map_err(failed)?;
+        let about = String::from_utf8_lossy(&about).into_owned();
+        Ok(Ok(Piece { file, about, start, length: content }))
     }
 
-    /// Where its content begins.
-    pub(super) fn start(&self) -> u64 {
-        self.start as u64
+    /// Its file, and where its content begins.
+    pub(super) fn into_file(self) -> (File, u64) {
+        (self.file, self.start)
     }
 
-    pub(super) fn content(&self) -> &[u8] {
-        &self.map[self.start..]
+    /// What it holds.
+    pub(super) fn value<T: DeserializeOwned>(self) -> postcard::Result<T> {
+        // Texts are read into it one after the other.
+        let mut texts = vec![0; self.length.min(MOST_TEXT) as usize];
+        postcard::from_io((BufReader::new(self.file), &mut texts)).map(|(value, _)| value)
     }
 
     /// What it belongs to.
-    pub(super) fn about(&self) -> String {
-        String::from_utf8_lossy(&self.map[HEADER..self.start]).into_owned()
+    pub(super) fn about(&self) -> &str {
+        &self.about
     }
-}
-
-/// Where the content of a piece begins.
-fn check(bytes: &[u8], key: Option<&str>) -> std::result::Result<usize, String> {
-    let number = |start: usize, length: usize| {
-        bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
-    };
-    if bytes[..8] != MAGIC {
-        return Err("it is no piece".to_owned());
-    }
-    if number(8, 4) != u128::from(VERSION) {
-        return Err(format!("version {}, expected {VERSION}", number(8, 4)));
-    }
-    let (text, content) = (number(12, 4), number(16, 8));
-    if HEADER as u128 + text + content != bytes.len() as u128 {
-        return Err(format!("{} bytes, expected {}", bytes.len(), HEADER as u128 + text + content));
-    }
-    if u128::from(xxhash_rust::xxh3::xxh3_64(&bytes[HEADER..])) != number(24, 8) {
-        return Err("its bytes are not those that were written".to_owned());
-    }
-    if key.is_some_and(|key| key != format!("{:032x}", number(32, 16))) {
-        return Err("it is another piece than its name says".to_owned());
-    }
-    Ok(HEADER + text as usize)
 }

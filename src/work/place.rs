@@ -1,7 +1,7 @@
 //! The folder that pieces are in.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File};
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -60,39 +60,36 @@ impl Place {
 
     /// What is in a piece, if it is there. `damaged` is told of one that is not as it was written; it counts as none.
     pub(super) fn read<T: DeserializeOwned>(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<T>> {
-        let path = self.folder.join(name.file());
-        let Some(piece) = self.open_piece(&path, name, &damaged)? else { return Ok(None) };
-        match postcard::from_bytes(piece.content()) {
-            Ok(found) => Ok(Some(found)),
-            Err(error) => {
-                damaged(format!("{} does not hold what it should ({error}): computed again", path.display()));
-                Ok(None)
-            }
-        }
+        let Some(piece) = self.open_piece(name, &damaged)? else { return Ok(None) };
+        let found = piece.value();
+        let wrong = |error| damaged(format!("{} holds something else ({error}): computed again", name.file()));
+        Ok(found.map_err(wrong).ok())
     }
 
     /// The content of a piece, if it is there and as it was written.
     pub(super) fn open(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<Spill>> {
-        let path = self.folder.join(name.file());
-        let Some(piece) = self.open_piece(&path, name, &damaged)? else { return Ok(None) };
-        // Somebody may have removed it meanwhile, or another run put the same in its place.
-        match File::open(&path) {
-            Ok(file) => Ok(Some(Spill::of(file, piece.start(), path))),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(Error::io("open", &path)(error)),
-        }
+        let at = self.folder.join(name.file());
+        let spill = |piece: Piece| {
+            let (file, start) = piece.into_file();
+            Spill::of(file, start, at)
+        };
+        Ok(self.open_piece(name, &damaged)?.map(spill))
     }
 
-    fn open_piece(&self, path: &Path, name: &Name, damaged: &impl Fn(String)) -> Result<Option<Piece>> {
+    fn open_piece(&self, name: &Name, damaged: &impl Fn(String)) -> Result<Option<Piece>> {
+        let path = self.folder.join(name.file());
         if !path.exists() {
             return self.is_there().map(|()| None);
         }
-        match Piece::open(path, Some(&name.key))? {
-            Ok(piece) => Ok(Some(piece)),
-            Err(why) => {
+        match Piece::open(&path, &name.key) {
+            Ok(Ok(piece)) => Ok(Some(piece)),
+            Ok(Err(why)) => {
                 damaged(format!("{} is damaged ({why}): computed again", path.display()));
                 Ok(None)
             }
+            // Somebody removed it meanwhile.
+            Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
         }
     }
 

@@ -14,6 +14,10 @@ mod loss;
 mod moving;
 pub(super) mod targets;
 
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
 use super::journal::Journal;
 use super::score::{Scored, scored};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload, of_left};
@@ -29,7 +33,7 @@ use crate::scene::between::Dice;
 use crate::source::FrameSource;
 use crate::stream::Progress;
 use crate::work::Key;
-use loss::Loss;
+use loss::{Closeness, Loss};
 use moving::{Manner, Moving};
 use targets::{Parted, Targets};
 
@@ -38,6 +42,10 @@ const NAME: &str = "refine";
 
 /// Steps between two looks at the pictures kept apart: a third of all, within these.
 const JUDGE_EVERY: [usize; 2] = [100, 500];
+/// Time after which it is kept where a way is: so many times what keeping took, ...
+const KEEP_AFTER: u32 = 40;
+/// ... within these: of a run that is cut short less than a minute is lost.
+const KEEP_EVERY: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(30)];
 /// Decibels beyond which nothing is to be gained: less than a quarter of a step of 8 bits.
 pub(super) const CLOSE_ENOUGH: f64 = 60.0;
 /// Part of the rates to go on with, where they led away from the pictures kept apart.
@@ -237,7 +245,9 @@ impl Refine {
     ) -> Result<f64> {
         let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
         let mut walk = Walk::new(stage, self, scene, scored, targets, targets.parted(false));
-        Ok(walk.all(reduction, wanted, steps, &mut Journal::default())?.1)
+        let key = walk.key(reduction, wanted, wanted).and(&steps);
+        let all = || Ok(walk.all(reduction, wanted, steps, &mut Journal::default())?.1);
+        scene.work.known(&format!("{stage}-size"), key, all)
     }
 }
 
@@ -256,11 +266,13 @@ struct Turns {
     pictures: Vec<usize>,
     at: usize,
     dice: Dice,
+    /// How many were taken.
+    taken: usize,
 }
 
 impl Turns {
     fn of(pictures: Vec<usize>) -> Turns {
-        Turns { at: pictures.len(), pictures, dice: Dice(1) }
+        Turns { at: pictures.len(), pictures, dice: Dice(1), taken: 0 }
     }
 
     fn next(&mut self) -> usize {
@@ -269,7 +281,15 @@ impl Turns {
             self.at = 0;
         }
         self.at += 1;
+        self.taken += 1;
         self.pictures[self.at - 1]
+    }
+
+    /// Goes on as if so many had been taken.
+    fn skip_to(&mut self, taken: usize) {
+        while self.taken < taken {
+            self.next();
+        }
     }
 }
 
@@ -285,6 +305,42 @@ pub(super) struct Walk<'a> {
     /// The stage that goes it.
     stage: &'static str,
     progress: Progress,
+    /// What every way of it follows from.
+    key: Key,
+}
+
+/// A way in the going, leg after leg: where it is, is kept from time to time, so that one that was cut short goes on.
+struct Trail {
+    /// What it follows from.
+    key: Key,
+    leg: usize,
+    /// When it was kept last, and after how long it is again.
+    kept: Instant,
+    every: Duration,
+}
+
+/// Where a way was within a leg.
+#[derive(Serialize, Deserialize)]
+struct Kept<Standing, End> {
+    leg: usize,
+    /// Steps of it that are done.
+    steps: usize,
+    taken: usize,
+    schedule: Schedule,
+    standing: Standing,
+    /// Of the last leg.
+    end: Option<End>,
+}
+
+/// What the last leg knows beside where it is.
+#[derive(Clone, Serialize, Deserialize)]
+struct End<Best> {
+    before: Closeness,
+    best: Closeness,
+    /// What is to be added for the best.
+    kept: Best,
+    /// Of the rates.
+    part: f32,
 }
 
 impl<'a> Walk<'a> {
@@ -297,9 +353,11 @@ impl<'a> Walk<'a> {
         targets: &'a Targets,
         parts: Parted,
     ) -> Walk<'a> {
+        let key = refine.key().and(&(&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart));
+        let key = key.and(&scored.protected);
         let (turns, apart) = (Turns::of(parts.stepped), parts.apart);
         let progress = Progress::new(stage, "steps", 0);
-        Walk { refine, scene, scored, targets, turns, apart, stage, progress }
+        Walk { refine, scene, scored, targets, turns, apart, stage, progress, key }
     }
 
     /// Shows how far it is of so many steps.
@@ -316,6 +374,15 @@ impl<'a> Walk<'a> {
         Moving::new(self.scene, result, self.targets, self.refine.manner(), fixed)
     }
 
+    /// What a way from `reduction` to `size`, on the way to `wanted`, follows from.
+    fn key(&self, reduction: &Reduction, size: usize, wanted: usize) -> Key {
+        self.key.and(&(reduction, size, wanted, self.turns.taken))
+    }
+
+    fn trail(&self, key: Key) -> Trail {
+        Trail { key, leg: 0, kept: Instant::now(), every: KEEP_EVERY[0] }
+    }
+
     /// Goes all the way: cuts `reduction` down to `wanted`, and `steps` steps at the end. Also gives how close to the
     /// original's, dB, pictures kept apart are then.
     fn all(
@@ -325,6 +392,7 @@ impl<'a> Walk<'a> {
         steps: usize,
         journal: &mut Journal,
     ) -> Result<(Reduction, f64)> {
+        let mut trail = self.trail(self.key(reduction, wanted, wanted).and(&steps));
         let result = self.scene.input.reduced(reduction)?;
         let mut moving = self.begin(reduction, &*result)?;
         let sizes = sizes(reduction.len(), wanted);
@@ -332,33 +400,44 @@ impl<'a> Walk<'a> {
         self.expect(of_cuts + steps);
         let mut left = reduction.clone();
         for pair in sizes.windows(2) {
-            left = left.pick(&self.cut(&mut moving, self.refine.steps_before(pair[0], wanted), pair[1])?);
+            let steps = self.refine.steps_before(pair[0], wanted);
+            left = left.pick(&self.cut(&mut moving, &mut trail, steps, pair[1])?);
         }
-        let (change, psnr) = self.finish(&mut moving, steps, journal)?;
+        let (change, psnr) = self.finish(&mut moving, &mut trail, steps, journal)?;
         left.change = left.change.and(change);
         Ok((left, psnr))
     }
 
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
     pub(super) fn cut_down(&mut self, reduction: &Reduction, size: usize, wanted: usize) -> Result<Reduction> {
-        let result = self.scene.input.reduced(reduction)?;
-        let mut moving = self.begin(reduction, &*result)?;
-        let steps = self.refine.steps_before(reduction.len(), wanted);
-        self.expect(steps);
-        let mut left = reduction.pick(&self.cut(&mut moving, steps, size)?);
-        left.change = left.change.and(moving.change());
+        let key = self.key(reduction, size, wanted);
+        let (left, taken) = self.scene.work.known(&format!("{}-cut", self.stage), key, || {
+            let mut trail = self.trail(key);
+            let result = self.scene.input.reduced(reduction)?;
+            let mut moving = self.begin(reduction, &*result)?;
+            let steps = self.refine.steps_before(reduction.len(), wanted);
+            self.expect(steps);
+            let mut left = reduction.pick(&self.cut(&mut moving, &mut trail, steps, size)?);
+            left.change = left.change.and(moving.change());
+            Ok((left, self.turns.taken))
+        })?;
+        self.turns.skip_to(taken);
         Ok(left)
     }
 
     /// `reduction` at its best: as the last steps leave it.
     pub(super) fn best_of(&mut self, mut reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
         let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.count().max(1) as f64);
-        self.expect(steps);
-        let change = {
+        let (key, work) = (self.key(&reduction, reduction.len(), reduction.len()), &self.scene.work);
+        let (change, taken) = journal.kept(work, &format!("{}-best", self.stage), key, |journal| {
+            self.expect(steps);
+            let mut trail = self.trail(key);
             let result = self.scene.input.reduced(&reduction)?;
             let mut moving = self.begin(&reduction, &*result)?;
-            self.finish(&mut moving, steps, journal)?.0
-        };
+            let change = self.finish(&mut moving, &mut trail, steps, journal)?.0;
+            Ok((change, self.turns.taken))
+        })?;
+        self.turns.skip_to(taken);
         reduction.change = reduction.change.and(change);
         Ok(reduction)
     }
@@ -369,56 +448,130 @@ impl<'a> Walk<'a> {
         Ok(())
     }
 
+    /// What a leg that goes on from where it was kept is called.
+    fn name(&self) -> String {
+        format!("{}-steps", self.stage)
+    }
+
+    /// Goes to where the leg was when it was kept last, if it was.
+    fn go_on(
+        &mut self,
+        moving: &mut Moving<'_>,
+        trail: &Trail,
+    ) -> Result<Option<(usize, Schedule, Option<End<Change>>)>> {
+        let kept: Option<Kept<moving::Kept, End<Change>>> = self.scene.work.find(&self.name(), trail.key)?;
+        let Some(kept) = kept.filter(|kept| kept.leg == trail.leg) else { return Ok(None) };
+        moving.go_on(kept.standing)?;
+        self.turns.skip_to(kept.taken);
+        self.progress.advance(kept.steps as u64);
+        Ok(Some((kept.steps, kept.schedule, kept.end)))
+    }
+
+    /// Keeps where the leg is after so many steps, if it is time to.
+    fn keep(
+        &self,
+        moving: &Moving<'_>,
+        trail: &mut Trail,
+        (steps, schedule): (usize, Schedule),
+        end: Option<End<&Change>>,
+    ) -> Result<()> {
+        if !self.scene.work.keeps() || trail.kept.elapsed() < trail.every {
+            return Ok(());
+        }
+        let (leg, taken) = (trail.leg, self.turns.taken);
+        let kept = Kept { leg, steps, taken, schedule, standing: moving.standing(), end };
+        let start = Instant::now();
+        self.scene.work.keep(&self.name(), trail.key, &kept)?;
+        trail.kept = Instant::now();
+        trail.every = (KEEP_AFTER * (trail.kept - start)).clamp(KEEP_EVERY[0], KEEP_EVERY[1]);
+        Ok(())
+    }
+
     /// Takes `steps` steps, and lets go of all but the `size` Gaussians that pictures would lose most with; gives their
     /// places.
-    fn cut(&mut self, moving: &mut Moving<'_>, steps: usize, size: usize) -> Result<Vec<u32>> {
-        let some = self.apart.iter().step_by(self.apart.len().div_ceil(LOOKED_AT).max(1));
-        let error = moving.closeness(&some.copied().collect::<Vec<_>>())?.error;
-        let schedule = Schedule::new(steps, LAST_RATE[0], error);
-        for _ in 0..steps {
-            self.step(moving, &schedule)?;
-        }
-        let of: Vec<usize> = (0..RANKED_ON).map(|_| self.turns.next()).collect();
-        let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?;
-        let left = errors.most_missed(size, |place| moving.fixed()[place]);
+    fn cut(&mut self, moving: &mut Moving<'_>, trail: &mut Trail, steps: usize, size: usize) -> Result<Vec<u32>> {
+        let (name, key, work) = (format!("{}-cut-{:02}", self.stage, trail.leg + 1), trail.key, &self.scene.work);
+        let kept: Option<(moving::Kept, Vec<u32>, usize)> = work.find(&name, key)?;
+        let left = match kept {
+            Some((standing, left, taken)) => {
+                moving.go_on(standing)?;
+                self.turns.skip_to(taken);
+                self.progress.advance(steps as u64);
+                left
+            }
+            None => {
+                let (done, schedule) = match self.go_on(moving, trail)? {
+                    Some((done, schedule, _)) => (done, schedule),
+                    None => {
+                        let some = self.apart.iter().step_by(self.apart.len().div_ceil(LOOKED_AT).max(1));
+                        let error = moving.closeness(&some.copied().collect::<Vec<_>>())?.error;
+                        (0, Schedule::new(steps, LAST_RATE[0], error))
+                    }
+                };
+                for step in done..steps {
+                    self.step(moving, &schedule)?;
+                    self.keep(moving, trail, (step + 1, schedule), None)?;
+                }
+                let of: Vec<usize> = (0..RANKED_ON).map(|_| self.turns.next()).collect();
+                let errors = moving.removal_error(&of, self.refine.contrast_floor as f32)?;
+                let left = errors.most_missed(size, |place| moving.fixed()[place]);
+                work.keep(&name, key, &(moving.standing(), &left, self.turns.taken))?;
+                left
+            }
+        };
+        trail.leg += 1;
         moving.pick(&left)?;
         Ok(left)
     }
 
     /// Takes `steps` steps; gives what is to be added to what is stored for the state that the pictures kept apart like
     /// best, and how close they are then, dB.
-    fn finish(&mut self, moving: &mut Moving<'_>, steps: usize, journal: &mut Journal) -> Result<(Change, f64)> {
-        moving.find()?;
-        let before = moving.closeness(&self.apart)?;
+    fn finish(
+        &mut self,
+        moving: &mut Moving<'_>,
+        trail: &mut Trail,
+        steps: usize,
+        journal: &mut Journal,
+    ) -> Result<(Change, f64)> {
         let count = self.apart.len();
-        if before.psnr >= CLOSE_ENOUGH {
-            journal.leave_out("refinement", format!("{count} pictures kept apart keep {:.2} dB without", before.psnr));
-            return Ok((moving.change(), before.psnr));
-        }
-        let mut schedule = Schedule::new(steps, LAST_RATE[1], before.error);
-        let (mut best, mut kept, mut part) = (before, moving.change(), 1.0);
+        let (done, mut schedule, mut end) = match self.go_on(moving, trail)? {
+            Some((done, schedule, Some(end))) => (done, schedule, end),
+            _ => {
+                moving.find()?;
+                let before = moving.closeness(&self.apart)?;
+                if before.psnr >= CLOSE_ENOUGH {
+                    let why = format!("{count} pictures kept apart keep {:.2} dB without", before.psnr);
+                    journal.leave_out("refinement", why);
+                    return Ok((moving.change(), before.psnr));
+                }
+                let schedule = Schedule::new(steps, LAST_RATE[1], before.error);
+                (0, schedule, End { before, best: before, kept: moving.change(), part: 1.0 })
+            }
+        };
         let judge_every = steps.div_ceil(3).clamp(JUDGE_EVERY[0], JUDGE_EVERY[1]);
-        for step in 1..=steps {
+        for step in done + 1..=steps {
             self.step(moving, &schedule)?;
             if step % judge_every == 0 || step == steps {
                 moving.find()?;
                 let now = moving.closeness(&self.apart)?;
-                if self.refine.loss.is_closer(&now, &best) {
-                    (best, kept) = (now, moving.change());
+                if self.refine.loss.is_closer(&now, &end.best) {
+                    (end.best, end.kept) = (now, moving.change());
                 } else if step < steps {
-                    part *= TOO_FAST;
-                    moving.turn_back(&kept)?;
-                    schedule = Schedule::new(steps - step, LAST_RATE[1], best.error).times(part);
+                    end.part *= TOO_FAST;
+                    moving.turn_back(&end.kept)?;
+                    schedule = Schedule::new(steps - step, LAST_RATE[1], end.best.error).times(end.part);
                 }
             }
+            let End { before, best, ref kept, part } = end;
+            self.keep(moving, trail, (step, schedule), Some(End { before, best, kept, part }))?;
         }
-        let [start, end] = [before.psnr, best.psnr];
-        if self.refine.loss.is_closer(&best, &before) {
-            journal.notes.push(format!("refined: {count} pictures kept apart keep {end:.2} dB, not {start:.2}"));
+        let [start, best] = [end.before.psnr, end.best.psnr];
+        if self.refine.loss.is_closer(&end.best, &end.before) {
+            journal.notes.push(format!("refined: {count} pictures kept apart keep {best:.2} dB, not {start:.2}"));
         } else {
             journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
         }
-        Ok((kept, end))
+        Ok((end.kept, best))
     }
 }
 
@@ -433,6 +586,7 @@ mod tests {
     use crate::render::render;
     use crate::scene::{InputOptions, open_scene};
     use crate::stream::gather_all;
+    use crate::work::Asked;
 
     /// The first `count` of the ranking of `scene`, refined in `steps` steps; `keep` are protected.
     fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Reduction, Journal) {
@@ -493,6 +647,67 @@ mod tests {
                 (0..of.width()).any(|c| of.plane(c)[place] != 0.0)
             };
             assert!(!Columns::all().iter().any(moved), "Gaussian {id} is protected and moved");
+        }
+    }
+
+    #[test]
+    fn a_way_that_is_cut_short_anywhere_goes_on_and_ends_where_it_would_have() {
+        let folder = tempfile::tempdir().unwrap();
+        let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
+        // States that follow from what is stored by a sum, and by a field.
+        for (number, field) in [(0, false), (1, true)] {
+            let open = |work: Option<Asked>| {
+                let options = match field {
+                    true => {
+                        InputOptions { path: model.clone(), cameras: Some(model.clone()), work, ..Default::default() }
+                    }
+                    false => InputOptions { path: folder.path().join("scene.gseq"), work, ..Default::default() },
+                };
+                let mut opened = open_scene(&options).unwrap();
+                opened.has_cameras = true;
+                opened
+            };
+            drop(scene(folder.path()));
+            let run = |scene: &Scene| -> Result<Reduction> {
+                let recipe = Recipe::preset("default").unwrap();
+                let scored = crate::compress::score_scene(scene, &recipe, &UserOverrides::default())?;
+                let count = scored.count();
+                let reduction = Reduction::pruned(scored.ranked().take(2 * count / 5), &recipe.merge);
+                let few =
+                    Refine { steps: 120, cut_steps: 40, pictures: 60, ..Refine::of(&recipe, None, true).unwrap() };
+                few.run(scene, &scored, reduction, count / 4, &mut Journal::default())
+            };
+            let start = Instant::now();
+            let expected = run(&open(None)).unwrap();
+            let whole = start.elapsed();
+            let (place, away) = (folder.path().join(format!("work{number}")), folder.path().join("away"));
+            let asked = || Some(Asked { folder: place.clone(), part: None });
+            let (mut cuts, mut found) = (0, None);
+            for delay in (0..40).map(|k| whole.mul_f64(0.1 * 1.15f64.powi(k))) {
+                let scene = open(asked());
+                // Whoever keeps something now finds no folder, and ends.
+                let ended = std::thread::scope(|scope| {
+                    scope.spawn(|| {
+                        std::thread::sleep(delay);
+                        std::fs::rename(&place, &away).unwrap();
+                    });
+                    run(&scene)
+                });
+                std::fs::rename(&away, &place).unwrap();
+                match ended {
+                    Ok(reduction) => {
+                        found = Some(reduction);
+                        break;
+                    }
+                    Err(error) => {
+                        assert!(error.to_string().contains("work"), "{error}");
+                        cuts += 1;
+                    }
+                }
+            }
+            let found = found.expect("it ends").change;
+            assert!(cuts > 1, "it was cut short {cuts} times");
+            assert!(found == expected.change && !found.is_empty(), "field: {field}, cut short {cuts} times");
         }
     }
 

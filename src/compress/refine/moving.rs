@@ -1,6 +1,7 @@
 //! What is left, on the move: the states that its pictures show.
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use super::local::{Keeping, Local, Locals};
 use super::loss::{Closeness, Loss};
@@ -58,7 +59,16 @@ pub(super) struct Moving<'a> {
     renderer: Renderer,
     /// Steps since states were found.
     steps: usize,
+    /// Whether that was since some were let go of last, or since the beginning.
+    found: bool,
 }
+
+/// What states follow from: what was stored when they were found last and what had been added by then, none as long as
+/// that is what a leg began with; what the descent added, with its means and steps; and the steps since states were found.
+type Standing<Stored, Added, Means> = (Option<(Stored, Added)>, (Added, Means, usize), usize);
+
+/// A [`Standing`] that was kept.
+pub(super) type Kept = Standing<Gaussians, Change, [Gaussians; 2]>;
 
 impl<'a> Moving<'a> {
     /// What `result` shows of `targets`, to move in that manner but for those `fixed`.
@@ -91,6 +101,7 @@ impl<'a> Moving<'a> {
             now: Local::none(of_state),
             renderer: Renderer::on_all_threads(),
             steps: 0,
+            found: false,
             frames,
             varying,
             fixed,
@@ -113,6 +124,7 @@ impl<'a> Moving<'a> {
 
     /// Begins to descend from here.
     fn begin(&mut self) {
+        self.found = false;
         let Some(Local { state, .. }) = self.locals.first() else { return };
         let Manner { columns, sh_degree, .. } = self.manner;
         self.descent = Descent::new(state, columns, sh_degree, &self.fixed);
@@ -145,7 +157,29 @@ impl<'a> Moving<'a> {
             locals.push(&mut self.now)?;
         }
         self.locals = locals.finish()?;
-        self.steps = 0;
+        (self.steps, self.found) = (0, true);
+        Ok(())
+    }
+
+    /// What is needed to go on from here, for [`Moving::go_on`].
+    pub(super) fn standing(&self) -> impl Serialize + '_ {
+        let found = self.found.then_some((&self.stored, &self.before));
+        let standing: Standing<&Gaussians, &Change, &[Gaussians; 2]> = (found, self.descent.standing(), self.steps);
+        standing
+    }
+
+    /// Goes on from where another was that had begun as this one did, and had let go of the same.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be written.
+    pub(super) fn go_on(&mut self, (found, descent, steps): Kept) -> Result<()> {
+        if let Some((stored, before)) = found {
+            self.descent.take();
+            (self.stored, self.before) = (stored, before);
+            self.find()?;
+        }
+        self.descent.go_on(descent);
+        self.steps = steps;
         Ok(())
     }
 
