@@ -5,6 +5,7 @@
     python3 scripts/refine_table.py target/release/splatsieve DATA [RATIO ...]
     python3 scripts/refine_table.py target/release/splatsieve DATA --steps [STEPS ...]
     python3 scripts/refine_table.py target/release/splatsieve DATA --degrees [RATIO ...]
+    python3 scripts/refine_table.py target/release/splatsieve DATA --efforts [RATIO ...]
 
 DATA/<name>/ is a 4DGaussians model folder with its cameras inside and, if there are any, held-out photographs in test/;
 DATA/static/<name>.ply is a model without cameras, for which an orbit of 12 to score by and 4 to compare by is made.
@@ -12,7 +13,9 @@ Prints a Markdown table: pruned alone (--no-refine --prune-only) → `default`, 
 view against the unpruned model's own pictures, SSIM, and PSNR against the photographs; wall seconds of the whole run and
 those before refinement; the largest peak of both. With --steps error against run time instead: a tenth of every model
 by as many steps (cuts take 8% of them each), against pruning alone. With --degrees as many Gaussians of every SH degree as
-take the bytes of that part of the cloud, refined (models without an SH head). Standard library only.
+take the bytes of that part of the cloud, refined (models without an SH head). With --efforts what `--effort` fast, default
+and best come to: 30% kept unrefined, then refined at every ratio; wall and processor seconds are those of all stages.
+Standard library only.
 """
 
 import json
@@ -57,12 +60,14 @@ def point(binary, model, cameras, ratio, output, *options):
     )
     wall = time.monotonic() - start
     quality = evaluated(binary, model, output, cameras)
+    processor = sum(stage["processor_seconds"] or 0 for stage in summary["stages"])
     refining = sum(stage["seconds"] for stage in summary["stages"] if stage["name"] == "refine")
     return {
         "psnr": quality["psnr"],
         "ssim": quality["ssim"],
         "photos": photographs(quality),
         "wall": wall,
+        "processor": processor,
         "before": wall - refining,
         "peak": peak(summary),
     }
@@ -106,6 +111,24 @@ def degrees(binary, models, ratios):
                 print(f"| {model.stem} | {100 * float(ratio):.0f}% | {' | '.join(row)} |", flush=True)
 
 
+def efforts(binary, models, ratios):
+    """Every effort: quality, and seconds."""
+    names = ["fast", "default", "best"]
+    print(f"| model | kept | {' | '.join(f'{name}: PSNR dB | s (processor s)' for name in names)} |")
+    print(f"|{'---|' * (2 + 2 * len(names))}")
+    with tempfile.TemporaryDirectory() as folder:
+        for model in models:
+            cameras = model if model.is_dir() else orbit(model, Path(folder) / f"{model.stem}.json")
+            for ratio, more in [("0.3", ["--no-refine"]), *((ratio, []) for ratio in ratios)]:
+                cells = []
+                for name in names:
+                    output = Path(folder) / f"{model.stem}{ratio}{name}{'' if model.is_dir() else '.ply'}"
+                    found = point(binary, model, cameras, ratio, output, "--effort", name, *more)
+                    cells.append(f"{found['psnr']:.2f} | {found['wall']:.0f} ({found['processor']:.0f})")
+                kept = f"{100 * float(ratio):.0f}%{', unrefined' if more else ''}"
+                print(f"| {model.stem} | {kept} | {' | '.join(cells)} |", flush=True)
+
+
 def main():
     if len(sys.argv) < 3:
         print(__doc__)
@@ -117,6 +140,9 @@ def main():
         return
     if sys.argv[3:4] == ["--degrees"]:
         degrees(binary, models, sys.argv[4:] or ["0.2", "0.1", "0.05"])
+        return
+    if sys.argv[3:4] == ["--efforts"]:
+        efforts(binary, models, sys.argv[4:] or ["0.2", "0.1"])
         return
     ratios = sys.argv[3:] or ["0.4", "0.2", "0.1", "0.05"]
     print("| model | kept | PSNR dB to the original | SSIM | PSNR dB to photographs (unpruned) | s (before refining) | MiB |")

@@ -4,6 +4,7 @@
     python3 scripts/split_model.py MODEL FOLDER [--side 3] [--frames 30] [--views 18] [--size 1352x1014]
     python3 scripts/split_model.py MODEL FOLDER --compare target/release/splatsieve   # README's figures of refining it
     python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve [OPTION ...]   # a row of README's table
+    python3 scripts/split_model.py MODEL FOLDER --row target/release/splatsieve --look-pictures 0   # having looked at all
 
 They stand in a grid of SIDE x SIDE along a Gaussian's two longest axes (of nine a standard deviation apart, √⅓ as wide along
 these): mass and variance stay. FOLDER gets its views at every frame: the model's own, of which those of
