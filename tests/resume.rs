@@ -116,7 +116,7 @@ fn a_run_killed_at_some_moments_goes_on_and_writes_the_same_bytes() {
 #[test]
 #[ignore = "slow: some minutes"]
 fn slow_a_run_killed_at_50_moments_goes_on_and_writes_the_same_bytes() {
-    killed(8000, 50);
+    killed(4000, 50);
 }
 
 #[cfg(unix)]

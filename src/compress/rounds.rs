@@ -67,7 +67,8 @@ impl Rounds {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);
-        let per_gaussian = [scored(limits), vec![("ranking", 32), ("errors", 8 * turns)], looking].concat();
+        let per_gaussian =
+            [scored(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking].concat();
         let seconds = (0..self.rounds(self.usual) as i32).map(|round| {
             let left = work.count() * self.fraction.powi(round);
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };

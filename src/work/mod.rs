@@ -100,24 +100,8 @@ impl Work {
         self.keep_part(stage, key, Part::WHOLE, found)
     }
 
-    /// What `compute` finds as `stage` for `key`, or found earlier. A stage that is not divided is nothing for a run of a
-    /// part.
-    ///
-    /// # Errors
-    /// Those of `compute`, and of the folder; [`Error::Stopped`] in a run of a part.
-    pub fn whole<T: Serialize + DeserializeOwned>(
-        &self,
-        stage: &str,
-        key: Key,
-        compute: impl FnOnce() -> Result<T>,
-    ) -> Result<T> {
-        self.known(stage, key, || {
-            self.not_divided(stage)?;
-            compute()
-        })
-    }
-
-    /// [`Work::whole`] of what hardly takes time, or what everything else follows from: a run of a part does it too.
+    /// What `compute` finds as `stage` for `key`, or found earlier. A run of a part computes it too, unless `compute` says
+    /// that it is [not divided](Work::not_divided).
     ///
     /// # Errors
     /// Those of `compute`, and of the folder.

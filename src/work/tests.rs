@@ -160,7 +160,7 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
 #[test]
 fn what_is_not_divided_ends_a_run_of_a_part() {
     let folder = tempfile::tempdir().unwrap();
-    let of_part = |work: &Work| work.whole("alone", Key::of(&1), || Ok(5u8));
+    let of_part = |work: &Work| work.known("alone", Key::of(&1), || work.not_divided("alone").map(|()| 5u8));
     let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
     assert!(message.contains("what comes next, alone, is not divided"), "{message}");
     assert_eq!(of_part(&open(folder.path(), None)).unwrap(), 5);
