@@ -1,0 +1,238 @@
+#!/usr/bin/env python3
+"""Measures what the parts of a run cost, one after the other, and says from it how long many nodes would take.
+
+    python3 scripts/scaling.py target/release/splatsieve MODEL --parts 1 2 7 --json room.json -- --no-refine
+    python3 scripts/scaling.py --of large.json --gaussians 1000000 --frames 10000      # the same tables of what was measured
+
+MODEL is a folder with its cameras; behind -- stands what else `compress` takes. Every part is a process of its own on one
+thread. Of each: processor and wall seconds, bytes that it read and wrote by calls (mapped pages are none), peak memory.
+What a part costs that has nothing to do is measured by starting one again that is done. Prints three tables: stage by
+stage, the longest chain, and the estimate; `--check` makes it exit 1 where the sum of the parts is above 1.15 of a plain
+run's stage though each part works 5 s or more. Needs nothing but Python.
+"""
+
+import argparse
+import json
+import math
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+MOST, FROM = 1.15, 5.0
+MB = 1e6
+
+
+def measured(command):
+    """What a run prints and what it cost."""
+    begun = time.monotonic()
+    child = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Both are short: neither fills its pipe.
+    printed, complaints = child.stdout.read(), child.stderr.read()
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+    # It has ended and nobody has asked after it: the system still has its accounts.
+    io = dict(line.split(": ") for line in Path(f"/proc/{child.pid}/io").read_text().splitlines())
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        sys.exit(f"failed: {' '.join(map(str, command))}\n{complaints}")
+    cost = {"processor": usage.ru_utime + usage.ru_stime, "wall": time.monotonic() - begun, "peak": usage.ru_maxrss * 1024}
+    return printed, cost | {"read": int(io["rchar"]), "written": int(io["wchar"])}
+
+
+def units(command):
+    """Units of the stages that are divided: blocks of Gaussians, pictures; none where nobody knows before."""
+    found = {}
+    for line in measured([*command, "--list-stages"])[0].splitlines():
+        name, what = line.split(": ", 1)
+        number = re.match(r"\d+", what)
+        found[name] = int(number[0]) if number else None
+    return found
+
+
+def in_parts(command, of, work, program):
+    """Stage by stage the cost of every part of `of`, of one that has nothing to do, and bytes of pieces; and the rest."""
+    command = [*command, "--work", work]
+    stages = []
+    while True:
+        parts, again = [], None
+        for index in range(1, of + 1):
+            said, cost = measured([*command, "--part", f"{index}/{of}"])
+            if "nothing to do" in said:
+                break
+            parts.append(cost)
+            if index == 1 < of:
+                # Done already: it opens the input and what earlier stages found, and ends.
+                again = measured([*command, "--part", f"1/{of}"])[1]
+            name = said.split(":")[0]
+        if not parts:
+            break
+        stages.append({"stage": name, "parts": parts, "again": again})
+        print(f"{of} parts, {name}: {sum(part['processor'] for part in parts):.1f} s", file=sys.stderr, flush=True)
+    printed, cost = measured([*command, "--json"])
+    pieces = json.loads(measured([program, "work", work, "--json"])[0])
+    for stage in stages:
+        for kind, wanted in (("part_bytes", of), ("whole_bytes", 1)):
+            stage[kind] = sum(piece["bytes"] for piece in pieces if (piece["stage"], piece["parts"]) == (stage["stage"], wanted))
+    return {"of": of, "stages": stages, "rest": cost, "summary": json.loads(printed)}
+
+
+def measure(args, options):
+    command = [args.program, "compress", args.model, "--cameras", args.cameras or args.model, "--threads", 1, "--quiet", *options]
+    with tempfile.TemporaryDirectory(dir=args.scratch) as folder:
+        folder = Path(folder)
+        found = {"units": units([*command, "-o", folder / "small"]), "options": options, "model": Path(args.model).name, "machine": machine()}
+        printed, cost = measured([*command, "-o", folder / "small", "--json"])
+        found["plain"] = cost | {"summary": json.loads(printed)}
+        print(f"one run: {cost['processor']:.1f} s", file=sys.stderr, flush=True)
+        found["runs"] = [
+            in_parts([*command, "-o", folder / f"small{of}"], of, folder / f"work{of}", args.program) for of in args.parts
+        ]
+    return found
+
+
+def machine():
+    names = [line.split(": ")[1] for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} processors"
+
+
+def family(name):
+    """rounds-03 is one of the rounds."""
+    return name.split("-")[0]
+
+
+def plain_seconds(found):
+    """Processor seconds of the stages of a run in one piece."""
+    seconds = {}
+    for stage in found["plain"]["summary"]["stages"]:
+        seconds[stage["name"]] = seconds.get(stage["name"], 0) + (stage["processor_seconds"] or 0)
+    return seconds
+
+
+def stage_table(found):
+    """A row for every stage and number of parts; and what is above its bound."""
+    yield "| stage | parts | processor s, all parts | of a plain run's | longest part, s | a part of nothing, s | read, MB | written, MB | pieces, MB | peak, MiB |"
+    yield "|" + "---|" * 10
+    plain, over = plain_seconds(found), []
+    for name in dict.fromkeys(family(stage["stage"]) for run in found["runs"] for stage in run["stages"]):
+        # Pairs are what merging looks at first.
+        whole = plain.get({"pairs": "merge", "targets": "refine"}.get(name, name), 0)
+        for run in found["runs"]:
+            stages = [stage for stage in run["stages"] if family(stage["stage"]) == name]
+            parts = [part for stage in stages for part in stage["parts"]]
+            total = sum(part["processor"] for part in parts)
+            longest = sum(max(part["processor"] for part in stage["parts"]) for stage in stages)
+            again = [stage["again"]["processor"] for stage in stages if stage["again"]]
+            ratio = total / whole if whole and name not in ("pairs", "targets") else None
+            if ratio and ratio > MOST and min(part["processor"] for part in parts) >= FROM:
+                over.append(f"{name} in {run['of']}: {ratio:.2f}")
+            yield (
+                f"| {name}{f' ({len(stages)})' if len(stages) > 1 else ''} | {run['of']} | {total:.2f} | {f'{ratio:.2f}' if ratio else '–'} "
+                f"| {longest:.2f} | {f'{sum(again) / len(again):.2f}' if again else '–'} | {sum(part['read'] for part in parts) / MB:.1f} "
+                f"| {sum(part['written'] for part in parts) / MB:.1f} | {sum(stage['part_bytes'] for stage in stages) / MB:.1f} "
+                f"| {max(part['peak'] for part in parts) / 2**20:.0f} |"
+            )
+    found["over"] = over
+
+
+def chain_table(found):
+    """Sum and longest chain of whole runs: what one node, and one node a part, would take."""
+    yield "| parts | sum of all parts, s | the rest, s | together, of a plain run's | longest chain, s | of a plain run's |"
+    yield "|" + "---|" * 6
+    plain = found["plain"]["processor"]
+    for run in found["runs"]:
+        total = sum(part["processor"] for stage in run["stages"] for part in stage["parts"])
+        longest = sum(max(part["processor"] for part in stage["parts"]) for stage in run["stages"])
+        rest = run["rest"]["processor"]
+        yield (
+            f"| {run['of']} | {total:.1f} | {rest:.1f} | {(total + rest) / plain:.2f} | {longest + rest:.1f} "
+            f"| {(longest + rest) / plain:.2f} |"
+        )
+    yield f"\nA plain run takes {plain:.1f} s of one processor."
+
+
+def estimate(found, args):
+    """Seconds on several nodes of a scene of another size, stage by stage."""
+    source = found["plain"]["summary"]["input"]
+    gaussians, frames = source["gaussians"], source["frames"]
+    more, longer = args.gaussians / gaussians, args.frames / frames
+    run = found["runs"][-1]
+    # What the model has for all stages: opening, and what a part reads before it begins, grow with the Gaussians.
+    opening = {family(s["stage"]): s["again"]["processor"] for s in run["stages"] if s["again"]}
+    work, counts, shared, limit = {}, {}, {}, {}
+    for stage in run["stages"]:
+        name = family(stage["stage"])
+        own = sum(part["processor"] for part in stage["parts"]) - len(stage["parts"]) * opening[name]
+        work[name] = work.get(name, 0) + max(own, 0)
+        counts[name] = counts.get(name, 0) + 1
+        # Every part of the next stage reads the parts of this one.
+        shared[name] = max(shared.get(name, 0), stage["part_bytes"])
+        limit.setdefault(name, found["units"].get(stage["stage"]) or math.inf)
+    rest = run["rest"]["processor"]
+    cores = args.cores
+    rows, totals = [], [0.0] * len(args.nodes)
+    for name in work:
+        # Only the scan goes over every frame; looks and rounds see a number of pictures that does not grow with them.
+        grown = work[name] * more * (longer if name == "scan" else 1)
+        blocks = limit[name] * (more if name == "scan" else 1)
+        cells = []
+        for k, nodes in enumerate(args.nodes):
+            # A node has at least one unit.
+            least = grown / cores / min(nodes, blocks)
+            start = counts[name] * (opening[name] * more + (args.barrier if nodes > 1 else 0))
+            # All nodes read the pieces of the stage before at the same moment, and the model as they open it.
+            moved = counts[name] * nodes * (shared[name] * more + source["bytes"] * more) / args.bandwidth
+            seconds = least + start + (moved if nodes > 1 else 0)
+            totals[k] += seconds
+            cells.append(f"{seconds:.0f} ({least:.0f} + {start:.0f} + {moved if nodes > 1 else 0:.0f})")
+        rows.append(f"| {name}{f' ({counts[name]} times)' if counts[name] > 1 else ''} | {grown:.0f} | {' | '.join(cells)} |")
+    alone = rest * more / cores
+    rows.append(f"| the rest, on one node | {rest * more:.0f} | {' | '.join([f'{alone:.0f}'] * len(args.nodes))} |")
+    totals = [total + alone for total in totals]
+    heads = [f"{nodes} node{'s' * (nodes > 1)}" for nodes in args.nodes]
+    yield f"| stage | processor s | {' | '.join(heads)} |"
+    yield "|" + "---|" * (2 + len(args.nodes))
+    yield from rows
+    yield f"| together, s | | {' | '.join(f'**{total:.0f}**' for total in totals)} |"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("program", nargs="?", type=os.path.abspath)
+    parser.add_argument("model", nargs="?", type=os.path.abspath)
+    parser.add_argument("--cameras", type=os.path.abspath)
+    parser.add_argument("--parts", nargs="+", type=int, default=[1, 2, 7])
+    parser.add_argument("--json", type=Path, help="where to write all that was measured")
+    parser.add_argument("--of", type=Path, help="what was measured before, instead of a program and a model")
+    parser.add_argument("--scratch", help="folder for results and work folders while it lasts")
+    parser.add_argument("--check", action="store_true", help="exit 1 if parts cost more than they may")
+    parser.add_argument("--gaussians", type=float, default=1e6)
+    parser.add_argument("--frames", type=float, default=1e4)
+    parser.add_argument("--nodes", nargs="+", type=int, default=[1, 16, 256])
+    parser.add_argument("--cores", type=int, default=16, help="processors of a node")
+    parser.add_argument("--barrier", type=float, default=10, help="seconds that a scheduler takes from one array to the next")
+    parser.add_argument("--bandwidth", type=float, default=2e9, help="bytes a second of the shared file system, for all nodes")
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    args = parser.parse_args(words[:cut])
+    if not (args.of or args.model):
+        parser.error("expected a program and a model, or --of")
+    found = json.loads(args.of.read_text()) if args.of else measure(args, words[cut + 1 :])
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
+    source = found["plain"]["summary"]["input"]
+    print(f"{found['model']}: {source['gaussians']:,} Gaussians x {source['frames']} frames, {' '.join(found['options'])}; {found['machine']}\n")
+    print(*stage_table(found), "", *chain_table(found), "", sep="\n")
+    print(f"{args.gaussians:,.0f} Gaussians x {args.frames:,.0f} frames, nodes of {args.cores} processors:\n")
+    print(*estimate(found, args), sep="\n")
+    for line in found["over"]:
+        print(f"FAILED: above {MOST}: {line}")
+    sys.exit(args.check and bool(found["over"]))
+
+
+if __name__ == "__main__":
+    main()

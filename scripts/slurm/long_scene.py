@@ -1,0 +1,97 @@
+#!/usr/bin/env python3
+"""Prints, or submits, the Slurm jobs that compress one long scene: an array for every stage that can be divided, each
+when the one before is done, and a job for the rest.
+
+    scripts/slurm/long_scene.py --parts 8 --work WORK -- MODEL --cameras DATA -o SMALL            # prints the commands
+    scripts/slurm/long_scene.py --parts 8 --work WORK --submit --partition=short --time=1:00:00 --cpus-per-task=4 \\
+        --mem=8G -- MODEL --cameras DATA -o SMALL --target-ratio 0.3
+
+Options that it does not know are handed to every sbatch; behind -- stands what `splatsieve compress` takes. Paths are as
+from the folder it is called in, which must be the same folder, with the same files, on all nodes. A task that is
+preempted, or loses its node, starts again and loses at most the part in work; the same command a second time takes up
+what is in WORK. How many stages there will be (rounds above all) is known only at most: an array for a stage that does
+not come to pass takes the next one that does, or finds nothing to do. `--arrays` submits fewer; the last job does what
+they have left.
+"""
+
+import argparse
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+TASK = Path(__file__).resolve().with_name("task.sh")
+OPTIONS = ["--parsable", "--requeue", "--signal=B:TERM@60", "--open-mode=append", "--kill-on-invalid-dep=yes"]
+
+
+def found(program):
+    """The program by a path that holds in every folder."""
+    path = shutil.which(program)
+    if path is None:
+        sys.exit(f"no program {program} (--program names another)")
+    return os.path.abspath(path)
+
+
+def quoted(words):
+    return shlex.join(map(str, words))
+
+
+def stages(compress):
+    """Stages that --part divides."""
+    listed = subprocess.run([*compress, "--list-stages"], stdout=subprocess.PIPE, text=True, check=False)
+    if listed.returncode != 0:
+        sys.exit(listed.returncode)
+    return [line.split(":")[0] for line in listed.stdout.splitlines()]
+
+
+def lines(args, sbatch, compress):
+    """A script that submits it all and prints the number of the last job."""
+    common = ["sbatch", *OPTIONS, f"--chdir={os.getcwd()}", *sbatch]
+    names = stages(compress)[: args.arrays]
+    compress = [*compress, "--work", args.work]
+    # What the job has, unless its user says otherwise.
+    for option, value in (("--threads", "@THREADS@"), ("--memory", "@MEMORY@")):
+        if not any(word.split("=")[0] == option for word in compress):
+            compress.append(f"{option}={value}")
+    yield "set -euo pipefail"
+    yield f"mkdir -p {quoted([args.logs])}"
+    after = ""
+    for number, name in enumerate(names):
+        words = [*common, f"--job-name={args.name}-{name}", f"--output={args.logs}/%x.%A_%a.log", f"--array=1-{args.parts}"]
+        part = [TASK, *compress, "--part", f"@TASK@/{args.parts}"]
+        yield f"job{number}=$({quoted(words)}{after} {quoted(part)})"
+        # --parsable prints JOB or JOB;CLUSTER.
+        after = f' "--dependency=afterok:${{job{number}%%;*}}"'
+    words = [*common, f"--job-name={args.name}", f"--output={args.logs}/%x.%j.log"]
+    yield f"{quoted(words)}{after} {quoted([TASK, *compress, '@AGAIN@'])}"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser.add_argument("--parts", type=int, required=True, help="tasks of every array")
+    parser.add_argument("--work", required=True, help="work folder, on a file system that all nodes share")
+    parser.add_argument("--submit", action="store_true", help="submit the jobs; print the number of the last one")
+    parser.add_argument("--arrays", type=int, help="at most so many arrays before the last job [default: one a stage]")
+    parser.add_argument("--name", default="splatsieve", help="first word of the jobs' names [default: splatsieve]")
+    parser.add_argument("--logs", help="folder of their logs [default: WORK.logs]")
+    parser.add_argument("--program", default="splatsieve", help="splatsieve [default: the one on the PATH]")
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    args, sbatch = parser.parse_known_args(words[:cut])
+    compress = words[cut + 1 :]
+    if not compress or args.parts < 1:
+        parser.error("expected at least one part and, behind --, what splatsieve compress takes")
+    if taken := [word for word in compress if word.split("=")[0] in ("--work", "--part", "--list-stages", "--dry-run")]:
+        parser.error(f"{taken[0]} is this script's own")
+    args.work, args.logs = os.path.abspath(args.work), os.path.abspath(args.logs or args.work.rstrip("/") + ".logs")
+    script = "\n".join(lines(args, sbatch, [found(args.program), "compress", *compress])) + "\n"
+    if not args.submit:
+        print(script, end="")
+        return
+    sys.exit(subprocess.run(["bash", "-c", script], check=False).returncode)
+
+
+if __name__ == "__main__":
+    main()
