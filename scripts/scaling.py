@@ -156,48 +156,44 @@ def chain_table(found):
 
 
 def estimate(found, args):
-    """Seconds on several nodes of a scene of another size, stage by stage."""
+    """Seconds on several nodes of a scene of another size, stage by stage: work + starts of parts + shared files.
+
+    Work is that of the fewest parts, over nodes and their processors, of which no node has less than one unit. A start
+    is what the most parts cost above that, each, and a barrier. Every node reads what a part reads by calls as it opens
+    the model, the whole of all stages before, and the parts of the last one. All of it grows with the Gaussians, and
+    the scan's work with the frames as well; looks and rounds see a number of pictures that grows with neither.
+    """
     source = found["plain"]["summary"]["input"]
-    gaussians, frames = source["gaussians"], source["frames"]
-    more, longer = args.gaussians / gaussians, args.frames / frames
-    run = found["runs"][-1]
-    # What the model has for all stages: opening, and what a part reads before it begins, grow with the Gaussians.
-    opening = {family(s["stage"]): s["again"]["processor"] for s in run["stages"] if s["again"]}
-    work, counts, shared, limit = {}, {}, {}, {}
-    for stage in run["stages"]:
-        name = family(stage["stage"])
-        own = sum(part["processor"] for part in stage["parts"]) - len(stage["parts"]) * opening[name]
-        work[name] = work.get(name, 0) + max(own, 0)
-        counts[name] = counts.get(name, 0) + 1
-        # Every part of the next stage reads the parts of this one.
-        shared[name] = max(shared.get(name, 0), stage["part_bytes"])
-        limit.setdefault(name, found["units"].get(stage["stage"]) or math.inf)
-    rest = run["rest"]["processor"]
-    cores = args.cores
-    rows, totals = [], [0.0] * len(args.nodes)
-    for name in work:
-        # Only the scan goes over every frame; looks and rounds see a number of pictures that does not grow with them.
-        grown = work[name] * more * (longer if name == "scan" else 1)
-        blocks = limit[name] * (more if name == "scan" else 1)
-        cells = []
-        for k, nodes in enumerate(args.nodes):
-            # A node has at least one unit.
-            least = grown / cores / min(nodes, blocks)
-            start = counts[name] * (opening[name] * more + (args.barrier if nodes > 1 else 0))
-            # All nodes read the pieces of the stage before at the same moment, and the model as they open it.
-            moved = counts[name] * nodes * (shared[name] * more + source["bytes"] * more) / args.bandwidth
-            seconds = least + start + (moved if nodes > 1 else 0)
-            totals[k] += seconds
-            cells.append(f"{seconds:.0f} ({least:.0f} + {start:.0f} + {moved if nodes > 1 else 0:.0f})")
-        rows.append(f"| {name}{f' ({counts[name]} times)' if counts[name] > 1 else ''} | {grown:.0f} | {' | '.join(cells)} |")
-    alone = rest * more / cores
-    rows.append(f"| the rest, on one node | {rest * more:.0f} | {' | '.join([f'{alone:.0f}'] * len(args.nodes))} |")
-    totals = [total + alone for total in totals]
+    more, longer = args.gaussians / source["gaussians"], args.frames / source["frames"]
+    few, many = found["runs"][0], found["runs"][-1]
+    stages, before = {}, 0
+    for one, cut in zip(few["stages"], many["stages"]):
+        name = family(one["stage"])
+        sums = [sum(part["processor"] for part in stage["parts"]) for stage in (one, cut)]
+        start = max(sums[1] - sums[0], 0) / (many["of"] - few["of"])
+        units = found["units"].get(one["stage"]) or math.inf
+        grows = more * (longer if name == "scan" else 1)
+        work = grows * max(sums[0] - few["of"] * start, 0) / args.cores
+        moved = more * (cut["again"]["read"] + before) / args.bandwidth
+        before += cut["whole_bytes"]
+        costs = stages.setdefault(name, [0, 0.0, [[0.0] * 3 for _ in args.nodes]])
+        costs[0] += 1
+        costs[1] += work * args.cores
+        for nodes, sums in zip(args.nodes, costs[2]):
+            sums[0] += work / min(nodes, units * (more if name == "scan" else 1))
+            sums[1] += start * more + args.barrier * (nodes > 1)
+            # The parts that are joined are as large as the whole.
+            sums[2] += nodes * (moved + more * cut["part_bytes"] / args.bandwidth)
     heads = [f"{nodes} node{'s' * (nodes > 1)}" for nodes in args.nodes]
     yield f"| stage | processor s | {' | '.join(heads)} |"
     yield "|" + "---|" * (2 + len(args.nodes))
-    yield from rows
-    yield f"| together, s | | {' | '.join(f'**{total:.0f}**' for total in totals)} |"
+    for name, (count, work, costs) in stages.items():
+        cells = [f"{sum(cost):.0f} ({cost[0]:.0f} + {cost[1]:.0f} + {cost[2]:.0f})" for cost in costs]
+        yield f"| {name}{f' ({count} times)' if count > 1 else ''} | {work:.0f} | {' | '.join(cells)} |"
+    rest = many["rest"]["processor"] * more
+    yield f"| the rest, on one node | {rest:.0f} | {' | '.join([f'{rest / args.cores:.0f}'] * len(args.nodes))} |"
+    together = [rest / args.cores + sum(sum(costs[2][k]) for costs in stages.values()) for k in range(len(args.nodes))]
+    yield f"| together, s | | {' | '.join(f'**{seconds:.0f}**' for seconds in together)} |"
 
 
 def main():

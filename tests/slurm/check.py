@@ -68,21 +68,22 @@ class Bench:
 
             wait(f"a task of {job_name}", 150, works)
             number, node = found[0]
-            before = self.restarts(number)
+            before = int(self.one(number)["Restarts"])
             # It has opened the model, and is at the stage itself.
             time.sleep(0.5)
             try:
                 act(number, node)
-                wait(f"the end of {number}", 60, lambda: self.cluster.state(number)[0]["JobState"] != "RUNNING")
+                wait(f"the end of {number}", 60, lambda: self.one(number)["JobState"] != "RUNNING")
             except RuntimeError as error:
                 # Slurm's word for one that has just ended.
                 assert "now" in str(error) or "completing" in str(error) or "Invalid job" in str(error), error
-            if self.restarts(number) > before or once:
+            if int(self.one(number)["Restarts"]) > before or once:
                 return number
         raise AssertionError(f"no task of {job_name} was met at work")
 
-    def restarts(self, number):
-        return sum(int(one["Restarts"]) for one in self.cluster.state(number) if one["JobId"] == number)
+    def one(self, number):
+        """A task by its own number, which that of its array may be."""
+        return next(task for task in self.cluster.state(number) if task["JobId"] == number)
 
     def logs(self, folder):
         return "".join(f"--- {path.name}\n{path.read_text()}" for path in sorted(folder.iterdir()))
@@ -125,7 +126,7 @@ def a_lost_node_is_replaced(bench):
     assert states[0]["JobState"] == "COMPLETED", bench.logs(Path(f"{work}.logs"))
     for node in lost:
         bench.cluster.node(node)
-    assert bench.restarts(number) == 1
+    assert bench.one(number)["Restarts"] == "1"
     same(bench, output, "slow", bench.slow, job)
 
 

@@ -1,0 +1,25 @@
+//! `scripts/slurm` against a real Slurm: `tests/slurm/check.py` starts one of its own, with several nodes on this machine.
+#![cfg(target_os = "linux")]
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+#[test]
+#[ignore = "needs Slurm"]
+fn slurm_runs_parts_and_scenes_to_the_same_bytes() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    // The optimised program where its path is given: the debug one takes several times as long.
+    let program = std::env::var_os("SPLATSIEVE_PROGRAM")
+        .map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from);
+    let data = std::env::var_os("SPLATSIEVE_DATA").map_or_else(|| root.join("../shared/data"), PathBuf::from);
+    let model = data.join("room2_big");
+    let mut command = Command::new(std::env::var_os("PYTHON").unwrap_or_else(|| "python3".into()));
+    command.arg(root.join("tests/slurm/check.py")).arg(program);
+    if model.is_dir() {
+        command.arg(model);
+    }
+    let output = command.output().unwrap();
+    let [said, complaints] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
+    println!("{said}");
+    assert!(output.status.success(), "{said}{complaints}");
+}
