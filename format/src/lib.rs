@@ -46,6 +46,7 @@ mod reader;
 mod record;
 mod recover;
 mod verify;
+mod waiting;
 mod writer;
 
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};

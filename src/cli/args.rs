@@ -529,6 +529,8 @@ pub(super) struct Pack {
     #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
     pub(super) level: Option<i32>,
     #[command(flatten)]
+    pub(super) kept: Kept,
+    #[command(flatten)]
     pub(super) earlier: Earlier,
 }
 

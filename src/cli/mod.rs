@@ -146,7 +146,8 @@ fn run(cli: Cli) -> Result<()> {
                 (_, asked) if asked.is_empty() => Storing::Exact(Compression::Zstd(args.level.unwrap_or(1))),
                 (_, asked) => Storing::Within(asked, args.level.unwrap_or(15)),
             };
-            let input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            input.work = work_of(args.kept);
             let packed = container::pack(&input, &args.output, &storing, args.earlier.replace())?;
             notes(&packed.notes);
             print(&format!(

@@ -15,6 +15,7 @@ use super::bounds::Bounds;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::source::{FrameSource, Ids};
+use crate::work::{Key, Spill, Spilling};
 
 /// Gaussians per tile: what one task of a scan reads. Fixed, so that the bytes depend on nothing but
 /// the content.
@@ -49,6 +50,28 @@ impl Packing {
         if self.bounds == Bounds::default() { FRAME_BLOCK } else { BOUNDED_FRAME_BLOCK }
     }
 
+    /// How many frame blocks `source` has.
+    pub fn frame_blocks(&self, source: &dyn FrameSource) -> usize {
+        source.info().times.len().div_ceil(self.frame_block())
+    }
+
+    /// Frames of one of them.
+    pub fn frames(&self, source: &dyn FrameSource, block: usize) -> Range<usize> {
+        let start = block * self.frame_block();
+        start..source.info().times.len().min(start + self.frame_block())
+    }
+
+    /// What tiles follow from, beside their values.
+    pub fn key(&self) -> Key {
+        let of_column = |column| match self.column(column) {
+            Compression::Raw => (0, 0.0, 0),
+            Compression::Zstd(level) => (1, 0.0, level),
+            Compression::Bounded { max_error, level } => (2, max_error, level),
+        };
+        let columns: Vec<(u8, f64, i32)> = Columns::all().iter().map(of_column).collect();
+        Key::of(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
+    }
+
     /// How a column is encoded.
     fn column(&self, column: Columns) -> Compression {
         match (self.compression, self.bounds.column(column)) {
@@ -67,12 +90,61 @@ pub fn write_container(
     attributes: BTreeMap<String, String>,
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
-    let (info, packing) = (source.info(), packing.into());
-    let together = packing.frame_block();
-    let mut writer = ContainerWriter::create(path, info.count, info.sh_degree, together, packing, attributes)?;
-    for start in (0..info.times.len()).step_by(together) {
-        let end = info.times.len().min(start + together);
-        writer.append(source, start..end, &advance)?;
+    let packing = packing.into();
+    let mut writer = ContainerWriter::of(source, path, packing, attributes)?;
+    for block in 0..packing.frame_blocks(source) {
+        writer.append(source, packing.frames(source, block), &advance)?;
+    }
+    writer.finish()
+}
+
+/// Encodes some frame blocks of `source` and writes them to `to`, for [`join_container`]: a record of every tile, in
+/// order, which is empty if it is the tile of the block before.
+///
+/// # Errors
+/// Frames that cannot be read; a failed write.
+pub fn spill_blocks(
+    source: &dyn FrameSource,
+    packing: Packing,
+    blocks: Range<usize>,
+    to: &mut Spilling,
+    advance: impl Fn(u64) + Sync,
+) -> Result<()> {
+    for block in blocks {
+        encode_frames(source, packing.frames(source, block), block == 0, &packing, &advance, |_, _, tile| {
+            to.write_record(&tile.map_or(Vec::new(), EncodedTile::to_bytes))
+        })?;
+    }
+    Ok(())
+}
+
+/// The container that [`write_container`] writes, of all frame blocks, encoded by [`spill_blocks`]. Memory: a tile, and
+/// what a container has.
+///
+/// # Errors
+/// What cannot be read back; a failed write.
+pub fn join_container(
+    source: &dyn FrameSource,
+    path: &Path,
+    packing: Packing,
+    attributes: BTreeMap<String, String>,
+    spills: &[(Range<usize>, Spill)],
+) -> Result<()> {
+    let info = source.info();
+    let mut writer = ContainerWriter::of(source, path, packing, attributes)?;
+    let mut bytes = Vec::new();
+    for (blocks, spill) in spills {
+        let mut at = 0;
+        for block in blocks.clone() {
+            writer.begin(&info.times[packing.frames(source, block)])?;
+            for gaussian_block in 0..info.count.div_ceil(GAUSSIAN_BLOCK) {
+                for column in 0..Columns::all().iter().count() {
+                    at = spill.read_record(at, &mut bytes)?;
+                    let tile = if bytes.is_empty() { None } else { Some(EncodedTile::from_bytes(&bytes)?) };
+                    writer.put(gaussian_block as u32, column as u32, tile.as_ref())?;
+                }
+            }
+        }
     }
     writer.finish()
 }
@@ -110,6 +182,17 @@ impl ContainerWriter {
         Ok(ContainerWriter { writer: Writer::create(path, layout)?, packing, frame_blocks: 0 })
     }
 
+    /// Starts that of `source`.
+    fn of(
+        source: &dyn FrameSource,
+        path: &Path,
+        packing: Packing,
+        attributes: BTreeMap<String, String>,
+    ) -> Result<ContainerWriter> {
+        let info = source.info();
+        ContainerWriter::create(path, info.count, info.sh_degree, packing.frame_block(), packing, attributes)
+    }
+
     /// Adds the next frame block: `frames` of `source`, as many as a block has; fewer end the sequence.
     /// Columns that do not vary must hold what they held in the blocks before.
     pub fn append(
@@ -138,33 +221,18 @@ impl ContainerWriter {
         frames: Range<usize>,
         advance: impl Fn(u64) + Sync,
     ) -> Result<()> {
-        let info = source.info();
-        let frame_block = self.frame_blocks as u32 - 1;
-        // A column that never varies is encoded for the first block alone.
-        let columns = if frame_block == 0 { Columns::all() } else { info.varying };
-        let first = (first / GAUSSIAN_BLOCK) as u32;
-        let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
-        // One batch of blocks at a time bounds the tiles that wait for the writer.
-        for batch in blocks.chunks(2 * rayon::current_num_threads()) {
-            let tiles: Vec<Vec<Option<EncodedTile>>> = batch
-                .par_iter()
-                .map(|&block| {
-                    let start = block as usize * GAUSSIAN_BLOCK;
-                    let end = (start + GAUSSIAN_BLOCK).min(info.count);
-                    let tiles = encode_block(source, start..end, frames.clone(), columns, &self.packing);
-                    advance(((end - start) * frames.len()) as u64);
-                    tiles
-                })
-                .collect::<Result<_>>()?;
-            for (&block, tiles) in batch.iter().zip(&tiles) {
-                for (column, tile) in tiles.iter().enumerate() {
-                    let at = TileId { column: column as u32, gaussian_block: first + block, frame_block };
-                    match tile {
-                        Some(tile) => self.writer.write_tile(at, tile)?,
-                        None => self.writer.repeat_tile(at)?,
-                    }
-                }
-            }
+        let (first, packing) = ((first / GAUSSIAN_BLOCK) as u32, self.packing);
+        encode_frames(source, frames, self.frame_blocks == 1, &packing, advance, |gaussian_block, column, tile| {
+            self.put(first + gaussian_block, column, tile)
+        })
+    }
+
+    /// Adds a tile to the frame block; none: it is that of the block before.
+    fn put(&mut self, gaussian_block: u32, column: u32, tile: Option<&EncodedTile>) -> Result<()> {
+        let at = TileId { column, gaussian_block, frame_block: self.frame_blocks as u32 - 1 };
+        match tile {
+            Some(tile) => self.writer.write_tile(at, tile)?,
+            None => self.writer.repeat_tile(at)?,
         }
         Ok(())
     }
@@ -174,6 +242,41 @@ impl ContainerWriter {
         self.writer.finish()?;
         Ok(())
     }
+}
+
+/// Encodes `source` at the `frames` of a block, which is the first one or not, and hands every tile to `each` in the order of
+/// the container, with its block of Gaussians and its column; none: it is that of the block before.
+fn encode_frames(
+    source: &dyn FrameSource,
+    frames: Range<usize>,
+    is_first: bool,
+    packing: &Packing,
+    advance: impl Fn(u64) + Sync,
+    mut each: impl FnMut(u32, u32, Option<&EncodedTile>) -> Result<()>,
+) -> Result<()> {
+    let info = source.info();
+    // A column that never varies is encoded for the first block alone.
+    let columns = if is_first { Columns::all() } else { info.varying };
+    let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
+    // One batch of blocks at a time bounds the tiles that wait for the writer.
+    for batch in blocks.chunks(2 * rayon::current_num_threads()) {
+        let tiles: Vec<Vec<Option<EncodedTile>>> = batch
+            .par_iter()
+            .map(|&block| {
+                let start = block as usize * GAUSSIAN_BLOCK;
+                let end = (start + GAUSSIAN_BLOCK).min(info.count);
+                let tiles = encode_block(source, start..end, frames.clone(), columns, packing);
+                advance(((end - start) * frames.len()) as u64);
+                tiles
+            })
+            .collect::<Result<_>>()?;
+        for (&block, tiles) in batch.iter().zip(&tiles) {
+            for (column, tile) in tiles.iter().enumerate() {
+                each(block, column as u32, tile.as_ref())?;
+            }
+        }
+    }
+    Ok(())
 }
 
 /// The tiles of one block of Gaussians over `frames`, one entry per column; none for those not in `columns`.

@@ -20,8 +20,14 @@ const STANDARD_INPUT: &str = "standard input";
 /// Opens standard input as a stream.
 ///
 /// # Errors
-/// A terminal; what is no stream; options that only models have.
+/// A terminal; what is no stream; options that only models have, or inputs that can be read again.
 pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
+    if options.work.is_some() {
+        return Err(Error::usage(
+            "--work: expected an input that can be read again, found a stream on standard input\n  \
+             write it to a container first: splatsieve pack - -o NAME.gseq",
+        ));
+    }
     if options.frames.is_some() || options.iteration.is_some() {
         return Err(Error::usage("--frames and --iteration are for models, not for a stream"));
     }

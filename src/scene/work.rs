@@ -8,8 +8,9 @@ use super::Scene;
 use super::input::InputOptions;
 use crate::TOOL;
 use crate::error::{Error, Result};
+use crate::families::Family;
 use crate::render;
-use crate::work::{Asked, Key, Work};
+use crate::work::{Key, Work};
 
 /// Under what the digest of an input is kept.
 const DIGEST: &str = "input";
@@ -17,11 +18,8 @@ const DIGEST: &str = "input";
 impl Scene {
     /// Opens the work folder that `options` name.
     pub(super) fn keep_work(&mut self, options: &InputOptions) -> Result<()> {
-        let Some(asked) = &options.work else { return Ok(()) };
-        self.work = open_work(asked, options)?;
-        let digest = self.work.known(DIGEST, stamp(options)?, || self.input.digest())?;
-        self.work.follow_from(self.key(&digest));
-        self.digest = Some(digest);
+        (self.work, self.digest) = kept_work(options, &*self.input)?;
+        self.work.follow_from(self.key());
         Ok(())
     }
 
@@ -33,35 +31,57 @@ impl Scene {
         self.digest.clone().map_or_else(|| self.input.digest(), Ok)
     }
 
-    /// This program and this machine, the input's content as it was opened, and its cameras; not where anything lies.
-    fn key(&self, digest: &str) -> Key {
-        let info = self.source().info();
+    /// Digest of another input, opened from `path`, which is kept, too.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and those of the work folder.
+    pub fn digest_of(&self, path: &Path, input: &dyn Family) -> Result<String> {
+        known_digest(&self.work, path, None, input)
+    }
+
+    /// From where the input is looked at.
+    fn key(&self) -> Key {
         let shots: Vec<_> = self.rig.shots.iter().map(|of| (of.view, of.camera, of.time, of.split)).collect();
-        Key::of(&(TOOL, render::instructions(), digest))
-            .and(&(info.count, &info.times, info.sh_degree, info.varying.bits(), self.input.kind()))
-            .and(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
+        Key::of(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
     }
 }
 
-/// The work folder that is asked for, for an input that can be read again.
-fn open_work(asked: &Asked, options: &InputOptions) -> Result<Work> {
-    if options.is_stream() {
-        return Err(Error::usage(
-            "--work: expected an input that can be read again, found a stream on standard input\n  \
-             write it to a container first: splatsieve pack - -o NAME.gseq",
-        ));
+/// The work folder that `options` name, and the digest of `input`, from which all in it follows; without a folder neither.
+///
+/// # Errors
+/// A file that cannot be read, and those of the work folder.
+pub fn kept_work(options: &InputOptions, input: &dyn Family) -> Result<(Work, Option<String>)> {
+    let Some(asked) = &options.work else { return Ok((Work::none(), None)) };
+    let instructions = render::instructions();
+    let mut work = Work::open(asked, format!("{} ({TOOL}, {instructions})", options.path.display()))?;
+    let digest = known_digest(&work, &options.path, options.iteration, input)?;
+    // This program and this machine, the input's content as it was opened; not where it lies.
+    let info = input.source().info();
+    work.follow_from(Key::of(&(TOOL, instructions, &digest)).and(&(
+        info.count,
+        &info.times,
+        info.sh_degree,
+        info.varying.bits(),
+        input.kind(),
+    )));
+    Ok((work, Some(digest)))
+}
+
+/// Digest of `input`, which is read for it only if it may have changed since.
+fn known_digest(work: &Work, path: &Path, iteration: Option<u32>, input: &dyn Family) -> Result<String> {
+    match work.keeps() {
+        true => work.known(DIGEST, stamp(path, iteration)?, || input.digest()),
+        false => input.digest(),
     }
-    let path = options.path.display();
-    Work::open(asked, format!("{path} ({TOOL}, {})", render::instructions()))
 }
 
 /// What says, without reading it, that an input is the one that it was: its path, and of all of its files names, lengths
 /// and times of their last change.
-fn stamp(options: &InputOptions) -> Result<Key> {
-    let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
+fn stamp(path: &Path, iteration: Option<u32>) -> Result<Key> {
+    let path = fs::canonicalize(path).map_err(Error::io("find", path))?;
     let mut files = Vec::new();
     stamps(&path, &mut files)?;
-    Ok(Key::of(&(TOOL, path, options.iteration, files)))
+    Ok(Key::of(&(TOOL, path, iteration, files)))
 }
 
 /// Of every file at `path` and below, in order: name, length, and when it was last changed, ns.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::Write;
+use std::ops::Range;
 use std::path::Path;
 
 use gseq::{Compression, Reader, RecoverReport, VerifyReport};
@@ -14,7 +15,9 @@ use crate::compress::emit::ENCODING;
 use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::bounds::{Bounds, MaxError};
-use crate::emit::container::{BOUNDED_FRAME_BLOCK, FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, write_container};
+use crate::emit::container::{
+    BOUNDED_FRAME_BLOCK, FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, join_container, spill_blocks, write_container,
+};
 use crate::emit::frame_stream::StreamWriter;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -25,9 +28,13 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::Limits;
 use crate::model::Columns;
-use crate::scene::{InputOptions, Opened, first_box, open_input, open_stream, room_to_pack};
+use crate::scene::{InputOptions, Opened, first_box, kept_work, open_input, open_stream, room_to_pack};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
+use crate::work::{Key, Spilling};
+
+/// What packing is called.
+const PACK: &str = "pack";
 
 /// What `pack` wrote.
 #[derive(Debug)]
@@ -90,18 +97,34 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
     let opened = open_input(input)?;
     let source = opened.input.source();
     Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?;
-    let packing = storing.packing(|| Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent())))?;
-    let staged = StagedFile::new(output, overwrite)?;
-    let work = source.info().count as u64 * source.info().times.len() as u64;
-    let progress = Progress::new("pack", "Gaussian frames", work);
-    let attributes = BTreeMap::from([("source_digest".to_owned(), opened.input.digest()?)]);
-    write_container(source, staged.path(), packing, attributes, |done| progress.advance(done))?;
-    drop(progress);
+    let (work, digest) = kept_work(input, &*opened.input)?;
+    let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
+    let packing = storing.packing(|| work.known("extent", Key::of(&()), extent))?;
+    let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
+    let progress = |frames: usize| Progress::new(PACK, "Gaussian frames", (source.info().count * frames) as u64);
+    let staged = if work.keeps() {
+        let encode = |blocks: Range<usize>, to: &mut Spilling| {
+            let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
+            spill_blocks(source, packing, blocks, to, |done| progress.advance(done))
+        };
+        let spills =
+            work.divided_spill(PACK, packing.key(), packing.frame_blocks(source), &input.scratch_folder(), encode)?;
+        work.not_divided("writing")?;
+        let staged = StagedFile::new(output, overwrite)?;
+        join_container(source, staged.path(), packing, attributes, &spills)?;
+        staged
+    } else {
+        let staged = StagedFile::new(output, overwrite)?;
+        let progress = progress(source.info().times.len());
+        write_container(source, staged.path(), packing, attributes, |done| progress.advance(done))?;
+        staged
+    };
     let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
     staged.commit()?;
     let info = opened.input.source().info();
     let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
-    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, larger, notes: opened.notes })
+    let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
+    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, larger, notes })
 }
 
 /// Writes any input as a frame stream; gives the input.
@@ -212,7 +235,7 @@ fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
     let tables = zstd_tables(level, (GAUSSIAN_BLOCK * together) as u64 * widest);
     let per_gaussian = vec![("positions", positions)];
     let fixed = [work.writing_together(together), vec![("zstd", work.threads * tables)]].concat();
-    vec![Need { stage: "pack", reads: 1.0, seconds, per_gaussian, fixed }]
+    vec![Need { stage: PACK, reads: 1.0, seconds, per_gaussian, fixed }]
 }
 
 /// Bytes of the tables by which zstd, at a level, finds matches in `bytes` bytes: at most those of each level's group, and

@@ -47,6 +47,19 @@ impl Spill {
         self.file.read_exact_at(bytes, self.start + start).map_err(Error::io("read back values from", &self.at))
     }
 
+    /// Reads into `bytes` what [`Spilling::write_record`] wrote at `start`; gives where the next one is.
+    ///
+    /// # Errors
+    /// Those of [`Spill::read`].
+    pub fn read_record(&self, start: u64, bytes: &mut Vec<u8>) -> Result<u64> {
+        let mut length = [0; 8];
+        self.read(start, &mut length)?;
+        let length = u64::from_le_bytes(length);
+        bytes.resize(length as usize, 0);
+        self.read(start + 8, bytes)?;
+        Ok(start + 8 + length)
+    }
+
     /// Bytes that this process has read back so far, of all of them.
     pub fn read_back() -> u64 {
         READ_BACK.load(Ordering::Relaxed)
@@ -79,6 +92,15 @@ impl Spilling {
     /// A failed write.
     pub fn write(&mut self, bytes: &[u8]) -> Result<()> {
         self.writer.write_all(bytes).map_err(Error::io("write values to", &self.at))
+    }
+
+    /// Writes the length of `bytes`, then these, behind what is there.
+    ///
+    /// # Errors
+    /// A failed write.
+    pub fn write_record(&mut self, bytes: &[u8]) -> Result<()> {
+        self.write(&(bytes.len() as u64).to_le_bytes())?;
+        self.write(bytes)
     }
 
     /// Writes `value` behind what is there.
