@@ -427,6 +427,8 @@ pub(super) struct Evaluate {
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
     #[command(flatten)]
+    pub(super) kept: Kept,
+    #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print JSON
     #[arg(long)]

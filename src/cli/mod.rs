@@ -114,9 +114,11 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
-            let options =
+            let mut options =
                 EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models) };
+            options.original.work = work_of(args.kept);
             let found = evaluate::evaluate(&options)?;
+            notes(&found.work_notes);
             print(&if as_json { json(&found) } else { found.text() })
         }
         Verb::Sweep(args) => {

@@ -94,7 +94,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let traits = traits(side.scene.source(), &scored, recipe.scan.alpha_min)?;
     let rows = scored.rows()?;
     let members = members(&rows, &traits, run.fates.as_deref());
-    let (evaluation, seen) = side.evaluate(|state, camera, taken| observe(state, &traits, camera, taken))?;
+    let (evaluation, seen) = side.observe(|state, camera, taken| observe(state, &traits, camera, taken))?;
     let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
         Kind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();

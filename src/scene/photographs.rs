@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use hashbrown::HashMap;
 
+use super::work::stamps;
 use crate::error::{Error, Result};
 use crate::ingest::image::read_png;
 use crate::model::{Camera, Picture, Rig};
@@ -69,6 +70,21 @@ impl Photographs {
         let found: Vec<(Picture, PathBuf)> = pictures.into_iter().filter_map(file).collect();
         let pictures = found.iter().map(|(picture, _)| *picture).collect();
         Ok((pictures, Photographs::at(folder, found.into_iter().map(Ok))?))
+    }
+
+    /// What says, without reading them, that the photographs of `pictures` are those that they were: of each its name,
+    /// length, and when it was last changed, ns.
+    ///
+    /// # Errors
+    /// A file that is not there any more.
+    pub fn stamps(&self, pictures: &[Picture]) -> Result<Vec<(String, u64, u128)>> {
+        let mut files = Vec::with_capacity(pictures.len());
+        for picture in pictures {
+            if let Some(file) = self.files.get(&(picture.frame, picture.view)) {
+                stamps(&fs::canonicalize(file).map_err(Error::io("find", file))?, &mut files)?;
+            }
+        }
+        Ok(files)
     }
 
     /// The photograph of `picture`, which `camera` takes, before `background` where it has transparency.

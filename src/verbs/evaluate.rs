@@ -2,9 +2,10 @@
 //!
 //! Frames stream: at a time one state of either model, and per thread one picture of each. For the error
 //! of what moves, the last pictures of every view that is seen again stay: 12 bytes per pixel, two or,
-//! with ground truth, three pictures per view.
+//! with ground truth, three pictures per view. A part of the pictures begins by making these of the views before it again.
 
 use std::fs;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use hashbrown::{HashMap, HashSet};
@@ -25,6 +26,10 @@ use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, PictureSet, background, pictures, thin};
 use crate::scene::{InputOptions, Scene, open_scene};
 use crate::stream::{Batch, Progress, Subject, View, show};
+use crate::work::Key;
+
+/// What comparing pictures is called.
+const NAME: &str = "evaluate";
 
 /// What to compare.
 #[derive(Debug, Clone)]
@@ -59,7 +64,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
     }
     let mut side = SideBySide::open(options)?;
     side.keep_to(options.original.memory, needs)?;
-    let (evaluation, _) = side.evaluate(|_, _, _| ())?;
+    let evaluation = side.evaluate()?;
     if let Some(csv) = &options.csv {
         let staged = StagedFile::new(csv, options.overwrite)?;
         fs::write(staged.path(), evaluation.csv()).map_err(Error::io("write", csv))?;
@@ -71,7 +76,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
 /// What it takes to make pictures of two models, each of as many Gaussians at most, and to compare them.
 pub fn needs(work: &Workload, limits: &Limits) -> Vec<Need> {
     // Both models' and the photograph, and what they are compared with.
-    let mut need = pictures::need(work, limits, "evaluate", 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
+    let mut need = pictures::need(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
     need.fixed.push(("scores", size_of::<PictureScores>() as u64 * work.pictures));
     need.fixed.push(("pictures before", 3 * 12 * work.viewpoints * work.pixels));
@@ -141,16 +146,49 @@ impl SideBySide {
         Ok(())
     }
 
-    /// Compares all pictures; `observe` sees each of them too, with the original's state, from any thread.
-    /// Gives what it made of them in the order of [`Evaluation::pictures`].
+    /// Compares all pictures; in parts, if the scene's work folder has some.
+    ///
+    /// # Errors
+    /// A source or a photograph that cannot be read; those of the work folder.
+    pub fn evaluate(&self) -> Result<Evaluation> {
+        let work = &self.scene.work;
+        let key = if work.keeps() { self.key()? } else { Key::of(&()) };
+        let compute = |some| Ok(self.scores(some, |_, _, _| ())?.0);
+        let scores = work.divided(NAME, key, self.pictures.len(), compute, |parts| {
+            let mut all = Vec::with_capacity(self.pictures.len());
+            for part in parts {
+                all.extend(part?);
+            }
+            Ok(all)
+        })?;
+        work.not_divided("averaging")?;
+        self.evaluation(scores)
+    }
+
+    /// [`SideBySide::evaluate`], undivided, of which `observe` sees every picture too, with the original's state, from any
+    /// thread. Gives what it made of them in the order of [`Evaluation::pictures`].
     ///
     /// # Errors
     /// A source or a photograph that cannot be read.
-    pub fn evaluate<O: Send>(
+    pub fn observe<O: Send>(
         &self,
         observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
     ) -> Result<(Evaluation, Vec<O>)> {
-        let (scores, observed) = self.scores(observe)?;
+        let (scores, observed) = self.scores(0..self.pictures.len(), observe)?;
+        Ok((self.evaluation(scores)?, observed))
+    }
+
+    /// What the scores of all pictures say.
+    fn evaluation(&self, scores: Vec<Scores>) -> Result<Evaluation> {
+        let times = &self.scene.source().info().times;
+        let of_picture = |(&Picture { frame, view, .. }, (loss, truth))| PictureScores {
+            frame,
+            time: times[frame],
+            view,
+            loss,
+            truth,
+        };
+        let scores: Vec<PictureScores> = self.pictures.iter().zip(scores).map(of_picture).collect();
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.display().to_string(),
@@ -163,7 +201,7 @@ impl SideBySide {
         let path =
             Both { original: scene.path.display().to_string(), compressed: self.compressed_path.display().to_string() };
         let size = Both { original: scene.input.size()?, compressed: self.compressed.size()? };
-        let evaluation = Evaluation {
+        Ok(Evaluation {
             tool: TOOL.to_owned(),
             path,
             count: Both { original: count(&*scene.input), compressed: count(&*self.compressed) },
@@ -178,9 +216,16 @@ impl SideBySide {
             loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
             ground_truth,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
+            work_notes: scene.work.take_notes(),
             pictures: scores,
-        };
-        Ok((evaluation, observed))
+        })
+    }
+
+    /// What scores follow from, beside the original and its cameras.
+    fn key(&self) -> Result<Key> {
+        let compressed = self.scene.digest_of(&self.compressed_path, &*self.compressed)?;
+        let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.pictures)).transpose()?;
+        Ok(Key::of(&(compressed, photographs, &self.pictures, self.background, self.flip)))
     }
 
     /// Makes the pictures numbered `places` among [`Evaluation::pictures`] again (to keep all of them would
@@ -218,35 +263,47 @@ impl SideBySide {
         show(subjects, &self.scene.rig.cameras, pictures, Batch::of_frame(&self.scene.limits), visit)
     }
 
+    /// Scores of `some` of the pictures. The last ones before them of their views are made again.
     fn scores<O: Send>(
         &self,
+        some: Range<usize>,
         observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
-    ) -> Result<(Vec<PictureScores>, Vec<O>)> {
-        let pictures = &self.pictures;
-        let times = &self.scene.source().info().times;
+    ) -> Result<(Vec<Scores>, Vec<O>)> {
+        let mut chosen = last_before(&self.pictures, some.start, &self.pictures[some.clone()]);
+        let again = chosen.len();
+        chosen.extend_from_slice(&self.pictures[some]);
         let mut last_frame: HashMap<u32, usize> = HashMap::new();
-        for picture in pictures {
+        for picture in &chosen {
             last_frame.insert(picture.view, picture.frame);
         }
         let mut before: HashMap<u32, Taken> = HashMap::new();
-        let mut all = Vec::with_capacity(pictures.len());
-        let mut observed = Vec::with_capacity(pictures.len());
-        let progress = Progress::new("evaluate", "pictures", pictures.len() as u64);
-        self.show(pictures, |views| {
+        let mut all = Vec::with_capacity(chosen.len() - again);
+        let mut observed = Vec::with_capacity(chosen.len() - again);
+        let mut shown = 0;
+        let progress = Progress::new(NAME, "pictures", (chosen.len() - again) as u64);
+        self.show(&chosen, |views| {
+            let first = shown;
+            shown += views.len();
             let taken: Vec<_> = views
                 .par_iter()
-                .map(|view| {
+                .enumerate()
+                .map(|(k, view)| {
                     let taken = self.take(view)?;
+                    if first + k < again {
+                        return Ok((taken, None));
+                    }
                     let scores = taken.scores(before.get(&view.picture.view), self.flip);
                     let seen = observe(view.states[0], view.camera, &taken);
                     progress.advance(1);
-                    Ok((taken, scores, seen))
+                    Ok((taken, Some((scores, seen))))
                 })
                 .collect::<Result<_>>()?;
-            for (shown, (taken, (loss, truth), seen)) in views.iter().zip(taken) {
+            for (shown, (taken, found)) in views.iter().zip(taken) {
                 let Picture { frame, view, .. } = shown.picture;
-                all.push(PictureScores { frame, time: times[frame], view, loss, truth });
-                observed.push(seen);
+                if let Some((scores, seen)) = found {
+                    all.push(scores);
+                    observed.push(seen);
+                }
                 if last_frame.get(&view).is_some_and(|&last| last > frame) {
                     before.insert(view, taken);
                 } else {
@@ -265,6 +322,15 @@ impl SideBySide {
             truth: self.truth.as_ref().map(|truth| truth.read(picture, camera, self.background)).transpose()?,
         })
     }
+}
+
+/// Of every view of `these` the last of the first `start` of `pictures`, in their order.
+fn last_before(pictures: &[Picture], start: usize, these: &[Picture]) -> Vec<Picture> {
+    let mut views: HashSet<u32> = these.iter().map(|picture| picture.view).collect();
+    let mut last: Vec<Picture> =
+        pictures[..start].iter().rev().filter(|picture| views.remove(&picture.view)).copied().collect();
+    last.reverse();
+    last
 }
 
 /// Most that time stamps of the same frame may differ, in parts of the time span: files round them.
@@ -298,6 +364,9 @@ fn open_compressed(path: &Path, original: &Scene) -> Result<Box<dyn Family>> {
     }
 }
 
+/// Of a picture: compressed against original, and each against the ground truth, where that is given.
+type Scores = (Score, Option<Both<Score>>);
+
 /// The pictures of one (frame, view), all of one size.
 pub struct Taken {
     /// Render of the original.
@@ -310,7 +379,7 @@ pub struct Taken {
 
 impl Taken {
     /// Scores, with those of motion from the pictures `before` of the same view.
-    fn scores(&self, before: Option<&Taken>, with_flip: bool) -> (Score, Option<Both<Score>>) {
+    fn scores(&self, before: Option<&Taken>, with_flip: bool) -> Scores {
         let size = |taken: &Taken| (taken.original.width, taken.original.height);
         // A view whose camera changed may have another size, and nothing to be compared with.
         let before = before.filter(|before| size(before) == size(self));

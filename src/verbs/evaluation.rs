@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::csv::{known, table};
 use crate::compress::summary::CameraSummary;
@@ -14,7 +14,7 @@ use crate::families::Size;
 use crate::families::size::of;
 
 /// One value for the model before compression and one for the model after it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Both<T> {
     /// Before.
     pub original: T,
@@ -23,7 +23,7 @@ pub struct Both<T> {
 }
 
 /// How close two pictures are.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// [`crate::metrics::psnr`], dB.
     pub psnr: f64,
@@ -138,6 +138,9 @@ pub struct Evaluation {
     pub ground_truth: Option<TruthComparison>,
     /// Things a person should know.
     pub notes: Vec<String>,
+    /// The same of the work folder, which are no part of the result.
+    #[serde(skip)]
+    pub work_notes: Vec<String>,
     /// Every picture; for the CSV.
     #[serde(skip)]
     pub pictures: Vec<PictureScores>,
@@ -295,6 +298,7 @@ mod tests {
                 original: of,
             }),
             notes: Vec::new(),
+            work_notes: Vec::new(),
             pictures,
         }
     }
