@@ -353,6 +353,8 @@ pub(super) struct Render {
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     #[command(flatten)]
+    pub(super) kept: Kept,
+    #[command(flatten)]
     pub(super) earlier: Earlier,
 }
 

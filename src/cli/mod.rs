@@ -319,6 +319,7 @@ fn render_options(args: Render) -> RenderOptions {
     };
     let mut input = input_options(args.input, None, Some(&args.output));
     input.use_cameras(args.cameras);
+    input.work = work_of(args.kept);
     RenderOptions {
         input,
         wanted,

@@ -45,21 +45,24 @@ impl ImageFormat {
 /// A failed write; a PNG without pixels, which the format does not know.
 pub fn write_image(image: &Image, format: ImageFormat, path: &Path) -> Result<()> {
     let mut out = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
-    let written = match format {
-        ImageFormat::Png => write_png(&mut out, image),
-        ImageFormat::Npy => write_npy(&mut out, image),
-    };
-    written.and_then(|()| out.flush()).map_err(Error::io("write", path))
+    write(&mut out, image, format).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-/// The PNG of `image`, 8 bits per channel, clamped.
+/// The bytes that [`write_image`] writes.
 ///
 /// # Errors
-/// A picture without pixels, which the format does not know.
-pub fn png_bytes(image: &Image) -> io::Result<Vec<u8>> {
+/// A PNG without pixels, which the format does not know.
+pub fn image_bytes(image: &Image, format: ImageFormat) -> io::Result<Vec<u8>> {
     let mut out = Vec::new();
-    write_png(&mut out, image)?;
+    write(&mut out, image, format)?;
     Ok(out)
+}
+
+fn write(out: &mut impl Write, image: &Image, format: ImageFormat) -> io::Result<()> {
+    match format {
+        ImageFormat::Png => write_png(out, image),
+        ImageFormat::Npy => write_npy(out, image),
+    }
 }
 
 fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {

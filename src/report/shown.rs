@@ -9,7 +9,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use crate::emit::image::png_bytes;
+use crate::emit::image::{ImageFormat, image_bytes};
 use crate::error::{Error, Result};
 use crate::render::Image;
 use crate::verbs::evaluate::Taken;
@@ -118,7 +118,8 @@ pub fn show(choice: &Choice, taken: &Taken) -> Result<Shown> {
 /// # Errors
 /// A picture without pixels.
 pub fn data_uri(image: &Image) -> Result<String> {
-    let bytes = png_bytes(image).map_err(|e: io::Error| Error::usage(format!("a picture cannot be shown: {e}")))?;
+    let bytes = image_bytes(image, ImageFormat::Png)
+        .map_err(|e: io::Error| Error::usage(format!("a picture cannot be shown: {e}")))?;
     Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
 }
 

@@ -1,6 +1,7 @@
 //! Pictures of an input, as files.
 
 use std::fs;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
@@ -9,15 +10,19 @@ use crate::TOOL;
 use crate::budget::{Need, Workload};
 use crate::compress::summary::{CameraSummary, InputSummary};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
-use crate::emit::image::{ImageFormat, write_image};
+use crate::emit::image::{ImageFormat, image_bytes, write_image};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture};
-use crate::render;
+use crate::render::{self, Image};
 use crate::scene::pictures::{self, PictureSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, View, show};
+use crate::work::{Key, Spill, Spilling};
+
+/// What rendering is called.
+const NAME: &str = "render";
 
 /// Which pictures to render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,8 +79,11 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
     check_target(output, kind, &inputs, options.overwrite)?;
+    if options.input.work.is_some() && kind == Kind::File {
+        return Err(Error::usage("--work: one picture is not divided; expected --all"));
+    }
     let mut scene = open_scene(&InputOptions { split: None, ..options.input.clone() })?;
-    scene.keep_to(options.input.memory, needs)?;
+    scene.keep_to(options.input.memory, |work, limits| needs(work, limits, options.input.work.is_some()))?;
     let source = scene.source();
     let times = &source.info().times;
     let background = background(options.background, &scene)?;
@@ -89,9 +97,22 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         job.write(&chosen, |_| staged.path().to_owned())?;
         staged.commit()?;
     } else {
-        let staged = StagedFolder::new(output, options.overwrite)?;
         let name = |picture: &Picture| format!("{}.{}", picture.name(), format.extension());
-        job.write(&chosen, |picture| staged.path().join(name(picture)))?;
+        let staged = if scene.work.keeps() {
+            let key = Key::of(&(&chosen, background, format.extension()));
+            let make = |some: Range<usize>, to: &mut Spilling| job.spill(&chosen[some], to);
+            let spills = scene.work.divided_spill(NAME, key, chosen.len(), &scene.scratch, make)?;
+            scene.work.not_divided("writing")?;
+            let staged = StagedFolder::new(output, options.overwrite)?;
+            for (some, spill) in spills {
+                write_spilled(&chosen[some], &spill, |picture| staged.path().join(name(picture)))?;
+            }
+            staged
+        } else {
+            let staged = StagedFolder::new(output, options.overwrite)?;
+            job.write(&chosen, |picture| staged.path().join(name(picture)))?;
+            staged
+        };
         let marker = serde_json::json!({
             "tool": TOOL,
             "input": InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?,
@@ -106,12 +127,13 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
         staged.commit()?;
     }
-    Ok(Rendered { pictures: chosen.len(), notes: scene.notes })
+    let notes = scene.notes.into_iter().chain(scene.work.take_notes()).collect();
+    Ok(Rendered { pictures: chosen.len(), notes })
 }
 
-/// What it takes to make pictures of a model.
-fn needs(work: &Workload, limits: &Limits) -> Vec<Need> {
-    vec![pictures::need(work, limits, "render", 1, 12)]
+/// What it takes to make pictures of a model; `waiting`: the files of those that are made together wait to be written.
+fn needs(work: &Workload, limits: &Limits, waiting: bool) -> Vec<Need> {
+    vec![pictures::need(work, limits, NAME, 1, if waiting { 24 } else { 12 })]
 }
 
 fn format_of(output: &Path) -> Result<ImageFormat> {
@@ -134,15 +156,45 @@ struct Job<'a> {
 
 impl Job<'_> {
     fn write(&self, pictures: &[Picture], path: impl Fn(&Picture) -> PathBuf + Sync) -> Result<()> {
-        let progress = Progress::new("render", "pictures", pictures.len() as u64);
+        self.make(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
+    }
+
+    /// Writes a record of the file of each of `pictures`, in order.
+    fn spill(&self, pictures: &[Picture], to: &mut Spilling) -> Result<()> {
+        let encode = |picture: Picture, image: &Image| {
+            let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
+            image_bytes(image, self.format).map_err(Error::io("make", &named))
+        };
+        self.make(pictures, encode, |bytes| to.write_record(&bytes))
+    }
+
+    /// Has `of_each` do something with each of `pictures`, from any thread, and `then` with what comes of it, in order.
+    fn make<T: Send>(
+        &self,
+        pictures: &[Picture],
+        of_each: impl Fn(Picture, &Image) -> Result<T> + Sync,
+        mut then: impl FnMut(T) -> Result<()>,
+    ) -> Result<()> {
+        let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
         show([Subject::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
-            views.par_iter().try_for_each(|View { picture, camera, states: [state] }| {
-                let image = render::render(state, camera, self.background);
-                write_image(&image, self.format, &path(picture))?;
+            let made = views.par_iter().map(|&View { picture, camera, states: [state] }| {
+                let made = of_each(picture, &render::render(state, camera, self.background))?;
                 progress.advance(1);
-                Ok(())
-            })
+                Ok(made)
+            });
+            made.collect::<Result<Vec<T>>>()?.into_iter().try_for_each(&mut then)
         })
     }
+}
+
+/// Writes the files that [`Job::spill`] has made of `pictures`, one at a time.
+fn write_spilled(pictures: &[Picture], spill: &Spill, path: impl Fn(&Picture) -> PathBuf) -> Result<()> {
+    let (mut at, mut bytes) = (0, Vec::new());
+    for picture in pictures {
+        at = spill.read_record(at, &mut bytes)?;
+        let path = path(picture);
+        fs::write(&path, &bytes).map_err(Error::io("write", &path))?;
+    }
+    Ok(())
 }
