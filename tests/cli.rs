@@ -55,9 +55,15 @@ fn help_opens_with_examples_on_stdout() {
     let workplace = Workplace::new();
     let help = workplace.done("--help");
     assert!(help.starts_with("Examples:\n  splatsieve demo"), "{help}");
-    for verb in ["compress", "score", "pack", "info", "verify", "unpack", "recover", "demo", "recipe", "completions"] {
+    for verb in
+        ["compress", "score", "pack", "info", "verify", "unpack", "recover", "work", "demo", "recipe", "completions"]
+    {
         assert!(help.contains(verb), "{verb} is not in the help");
         workplace.done(&format!("{verb} --help"));
+    }
+    for verb in ["compress", "evaluate", "render", "pack"] {
+        let help = workplace.done(&format!("{verb} --help"));
+        assert!(help.contains("--work <FOLDER>") && help.contains("--part <I/N>"), "{verb}: {help}");
     }
     assert!(workplace.done("--version").starts_with("splatsieve "));
 }
