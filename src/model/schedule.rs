@@ -61,6 +61,11 @@ impl Schedule {
         self.frames += count;
     }
 
+    /// Bytes of `runs` runs of at most `views` pictures a frame, twice over, as vectors grow.
+    pub const fn bytes(runs: u64, views: u64) -> u64 {
+        2 * runs * (size_of::<Run>() as u64 + views * size_of::<(u32, u32)>() as u64)
+    }
+
     /// T, the number of frames.
     pub fn frames(&self) -> usize {
         self.frames
@@ -114,12 +119,14 @@ mod tests {
 
     #[test]
     fn frames_have_what_was_pushed_and_equal_ones_share_a_run() {
-        let pushed: [(usize, &[(u32, u32)]); 7] = [
+        let pushed: [(usize, &[(u32, u32)]); 8] = [
             (0, &[(9, 9)]),
             (2, &[]),
             (1, &[(0, 0), (1, 1)]),
             (3, &[(0, 0), (1, 1)]),
             (1, &[(1, 1)]),
+            // As many views, but others.
+            (1, &[(1, 0)]),
             (0, &[(3, 3)]),
             (2, &[]),
         ];
@@ -131,8 +138,25 @@ mod tests {
         }
         assert_eq!(schedule.iter().collect::<Vec<_>>(), expected);
         assert!(expected.iter().enumerate().all(|(frame, views)| schedule.views(frame) == *views));
-        assert_eq!((schedule.frames(), schedule.pairs(), schedule.most_views()), (9, 9, 2));
-        assert_eq!((schedule.runs.len(), schedule.used()), (4, vec![0, 1]));
+        assert_eq!((schedule.frames(), schedule.pairs(), schedule.most_views()), (10, 10, 2));
+        assert_eq!((schedule.runs.len(), schedule.used()), (5, vec![0, 1]));
         assert_eq!((Schedule::default().frames(), Schedule::default().pairs()), (0, 0));
+    }
+
+    #[test]
+    fn what_a_camera_of_its_own_for_every_frame_takes_is_counted() {
+        for (frames, views) in [(1, 1), (1000, 1), (1025, 3), (70_000, 2)] {
+            let mut schedule = Schedule::default();
+            for frame in 0..frames {
+                let of_frame: Vec<(u32, u32)> = (0..views).map(|view| (view, frame)).collect();
+                schedule.push(1, &of_frame);
+            }
+            let held =
+                schedule.runs.capacity() * size_of::<Run>() + schedule.views.capacity() * size_of::<(u32, u32)>();
+            // A vector begins with room for four.
+            let counted = Schedule::bytes(frames.max(4).into(), views.into());
+            assert!(held as u64 <= counted, "{frames} frames of {views}: {held} bytes, counted {counted}");
+            assert!(schedule.runs.len() == frames as usize && counted <= 2 * (held as u64).max(96), "{held} {counted}");
+        }
     }
 }

@@ -191,6 +191,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
         for need in &mut needs {
             need.per_gaussian.push(("settings", HELD));
             need.fixed.extend([("judged", Judge::bytes(work.pixels)), ("counts", COUNTS)]);
+            need.fixed.push(("thinned", thinned_bytes(work, options.max_frames)));
         }
         needs
     })?;
@@ -199,7 +200,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     let left = input.memory.bytes.map(|bytes| bytes.saturating_sub(beside));
     let input = InputOptions { memory: Budget { bytes: left, tell: Tell::Nothing }, ..input };
     let mut notes = scene.notes.clone();
-    scene.schedule = thin(&scene.schedule, options.max_frames);
+    scene.schedule = thin(std::mem::take(&mut scene.schedule), options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
     if scene.rig.shots.iter().all(|shot| shot.split != Split::Test) {
         notes.push("no pictures are held out: those judged by are also looked at".to_owned());
@@ -283,21 +284,34 @@ impl Bench<'_> {
 }
 
 /// The same with the pictures of at most `most` (at least one) of the frames that have some, evenly from first to last.
-fn thin(schedule: &Schedule, most: usize) -> Schedule {
-    let seen: Vec<usize> =
-        schedule.iter().enumerate().filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect();
-    let most = most.clamp(1, seen.len().max(1));
-    let kept: Vec<usize> = (0..most.min(seen.len())).map(|k| seen[(2 * k + 1) * seen.len() / (2 * most)]).collect();
-    let mut thinned = Schedule::new(schedule.cameras.clone());
-    for (frame, views) in schedule.iter().enumerate() {
-        thinned.push(1, if kept.binary_search(&frame).is_ok() { views } else { &[] });
+fn thin(mut schedule: Schedule, most: usize) -> Schedule {
+    let seen = schedule.iter().filter(|views| !views.is_empty()).count();
+    let most = most.max(1);
+    if seen <= most {
+        return schedule;
+    }
+    let mut thinned = Schedule::new(std::mem::take(&mut schedule.cameras));
+    let (mut place, mut kept) = (0, 0);
+    for views in schedule.iter() {
+        let wanted = !views.is_empty() && kept < most && place == (2 * kept + 1) * seen / (2 * most);
+        thinned.push(1, if wanted { views } else { &[] });
+        kept += usize::from(wanted);
+        place += usize::from(!views.is_empty());
     }
     thinned
+}
+
+/// Bytes of what [`thin`] makes: of every frame it keeps one run, and of those up to the next another.
+fn thinned_bytes(work: &Workload, most: usize) -> u64 {
+    let most = most.max(1) as u64;
+    if work.frames <= most { 0 } else { Schedule::bytes(2 * most, work.views) }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::families::Residence;
+    use crate::model::{Columns, SequenceInfo};
 
     #[test]
     fn thinned_schedules_keep_frames_evenly_and_all_of_their_pictures() {
@@ -306,12 +320,22 @@ mod tests {
             for frame in 0..frames {
                 schedule.push(1, if frame % 2 == 0 { &[(0, 0), (1, 1)] } else { &[] });
             }
-            let thinned = thin(&schedule, most);
+            let thinned = thin(schedule, most);
             assert_eq!(thinned.frames(), frames);
             assert!(thinned.iter().all(|views| views.is_empty() || views.len() == 2));
             thinned.iter().enumerate().filter(|(_, views)| !views.is_empty()).map(|(frame, _)| frame).collect()
         };
         assert_eq!(of(12, 3), [2, 6, 10]);
         assert_eq!((of(5, 100), of(5, 0), of(0, 5)), (vec![0, 2, 4], vec![2], vec![]));
+    }
+
+    #[test]
+    fn what_thinning_makes_is_counted_and_what_stays_as_it_is_takes_nothing() {
+        let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Columns::empty() };
+        let work = Workload { views: 3, ..Workload::new(&info, Residence::of_tiles(1)) };
+        assert_eq!((thinned_bytes(&work, 1000), thinned_bytes(&work, 5000)), (0, 0));
+        // Two runs of 16 bytes, and a pair of 8 for every view.
+        assert!(thinned_bytes(&work, 60) >= 60 * (2 * 16 + 3 * 8));
+        assert!(thinned_bytes(&work, 0) > 0);
     }
 }
