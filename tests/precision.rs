@@ -6,10 +6,27 @@ mod scene;
 use std::fs;
 
 use scene::{Workplace, files};
-use serde_json::Value;
+use serde_json::{Value, json};
 
-fn json(text: &str) -> Value {
+fn read(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
+}
+
+/// Cameras as 3DGS writes them, the last of them held out.
+fn held_out(cameras: &Value) -> Value {
+    let cameras = cameras.as_array().unwrap();
+    let frame = |(view, camera): (usize, &Value)| {
+        let row = |axis: usize| -> [f64; 4] {
+            let along = [0, 1, 2].map(|k| camera["rotation"][k][axis].as_f64().unwrap());
+            let eye = [0, 1, 2].map(|k| camera["position"][k].as_f64().unwrap());
+            let [x, y, z] = along;
+            [x, y, z, -(x * eye[0] + y * eye[1] + z * eye[2])]
+        };
+        json!({"v": view, "split": if view + 1 == cameras.len() { "test" } else { "train" },
+               "width": camera["width"], "height": camera["height"], "fx": camera["fx"], "fy": camera["fy"],
+               "cx": 128.0, "cy": 96.0, "w2c": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]})
+    };
+    json!({"frames": cameras.iter().enumerate().map(frame).collect::<Vec<_>>()})
 }
 
 /// The curves of a knob.
@@ -33,13 +50,17 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
     let place = Workplace::new();
     let demo = "demo -o d --gaussians 1000 --frames 5";
     place.done(demo);
+    let cameras = read(&fs::read_to_string(place.path("d/cameras.json")).unwrap());
+    fs::write(place.path("d/cameras.json"), held_out(&cameras).to_string()).unwrap();
     let run = place.run(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs look,rounds,percentiles,sums --repeat 1 --json",
     );
     assert_eq!(run.code, 0, "{}", run.stderr);
-    let found = json(&run.stdout);
-    assert_eq!(found, json(&fs::read_to_string(place.path("diagrams/precision.json")).unwrap()));
+    let found = read(&run.stdout);
+    assert_eq!(found, read(&fs::read_to_string(place.path("diagrams/precision.json")).unwrap()));
     assert_eq!(found["kept"], 300);
+    // 5 frames of 6 cameras, of which one is held out.
+    assert_eq!((&found["pictures"], &found["judged"]), (&25.into(), &5.into()));
 
     for curve in curves(&found, "look") {
         for of in ["C", "W", "kept", "staying", "added"] {
@@ -47,6 +68,8 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
         }
         let of_c = errors(curve, "C");
         assert!(of_c[0] > 0.0, "{}: nothing is sampled", curve["name"]);
+        assert_ne!(of_c[0], of_c[of_c.len() - 2], "{}: nothing is turned", curve["name"]);
+        assert!(curve["name"] != "look_pictures" || errors(curve, "staying")[0] > 0.0, "as many stay");
         let costs = curve["marks"].as_array().unwrap().iter().map(|mark| &mark["cost"]);
         for cost in costs {
             let seconds = ["least", "median", "most"].map(|of| cost["seconds"][of].as_f64().unwrap());
@@ -54,9 +77,16 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
         }
     }
     let rounds = curves(&found, "rounds");
-    assert!(errors(&rounds[0], "kept").first() > Some(&0.0), "rounds of fewer pictures rank alike");
+    for curve in rounds {
+        let of = errors(curve, "kept");
+        assert!(of[0] > 0.0 && of[0] > of[of.len() - 2] && of.last() == Some(&0.0), "{}: {of:?}", curve["name"]);
+    }
 
     let percentiles = &curves(&found, "percentiles")[0];
+    // So few pictures are all looked at: exact percentiles keep what the finest look does.
+    let [exact, finest] = [percentiles, &curves(&found, "look")[0]]
+        .map(|curve| &curve["marks"].as_array().unwrap().last().unwrap()["psnr"]);
+    assert!(exact.is_number() && exact == finest, "{exact} {finest}");
     let of = errors(percentiles, "percentiles");
     // Half a bucket of 2⁻ᵇⁱᵗˢ at most; the exact ones have no error.
     for (mark, error) in percentiles["marks"].as_array().unwrap().iter().zip(&of) {
@@ -94,22 +124,30 @@ fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
 fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 1500 --frames 4");
-    let found = json(&place.done(
+    let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --target-ratio 0.4 --repeat 1 --json",
     ));
     for curve in curves(&found, "machine") {
         let of = errors(curve, "bytes");
         assert!(!of.is_empty() && of.iter().all(|&error| error == 0.0), "{curve}");
     }
-    // Radius 0: pruning alone.
-    let mark = &curves(&found, "merging")[0]["marks"][0];
-    place.done(
-        "compress d/scene.gseq --cameras d/cameras.json -o small.gseq --target-ratio 0.4 --no-refine --prune-only",
-    );
-    let evaluated =
-        json(&place.done("evaluate d/scene.gseq small.gseq --cameras d/cameras.json --max-frames 12 --json"));
-    let [got, expected] = [&mark["psnr"], &evaluated["psnr"]].map(|psnr| psnr.as_f64().unwrap());
-    assert!((got - expected).abs() < 1e-9, "{got} {expected}");
+    let marks = curves(&found, "merging")[0]["marks"].as_array().unwrap();
+    let ran = |options: &str| {
+        place.done(&format!(
+            "compress d/scene.gseq --cameras d/cameras.json -o small.gseq --overwrite --target-ratio 0.4 --no-refine {options}"
+        ));
+        let evaluated =
+            read(&place.done("evaluate d/scene.gseq small.gseq --cameras d/cameras.json --max-frames 12 --json"));
+        evaluated["psnr"].as_f64().unwrap()
+    };
+    // Radius 0: pruning alone. The largest: four times the recipe's own, whatever pictures say of it.
+    let [alone, widest] = [&marks[0], &marks[4]];
+    assert_eq!((&alone["value"], &widest["value"]), (&0.0.into(), &0.02.into()));
+    for (mark, options) in [(alone, "--prune-only"), (widest, "--choose-by-views=false --merge-pass 0.02,1,0.95,0.9")] {
+        let (got, expected) = (mark["psnr"].as_f64().unwrap(), ran(options));
+        assert!((got - expected).abs() < 1e-9, "{options}: {got} {expected}");
+    }
+    assert_ne!(alone["psnr"], widest["psnr"], "nothing merges");
 }
 
 #[test]
@@ -133,7 +171,7 @@ fn what_cannot_be_turned_is_refused_before_anything_is_written() {
 fn a_recipe_that_looks_at_nothing_and_refines_nothing_has_less_to_turn_and_says_so() {
     let place = Workplace::new();
     place.done("demo -o d --gaussians 300 --frames 3");
-    let found = json(&place.done(
+    let found = read(&place.done(
         "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs look,rounds,percentiles,refining \
          --repeat 1 --json",
     ));

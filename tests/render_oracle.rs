@@ -199,10 +199,16 @@ fn what_is_nearer_than_0_2_or_behind_is_not_drawn() {
 // EXTREMES 27.
 #[test]
 fn a_giant_across_the_near_plane_covers_the_image_and_no_more() {
-    let mut giant = single(0.21, 1.0, 0.9);
-    giant.log_scale.set_row(0, [80.0f32; 3]);
-    let seen = seen(&giant, &plain_camera(40), 1);
-    assert!((seen.pixels(0) - 0.9 * 1600.0).abs() < 1e-2, "got {} pixels, expected {}", seen.pixels(0), 0.9 * 1600.0);
+    for log_scale in [7.0, 14.0, 80.0, 1e3, 3e38] {
+        let mut giant = single(0.21, 1.0, 0.9);
+        giant.log_scale.set_row(0, [log_scale; 3]);
+        let pixels = seen(&giant, &plain_camera(40), 1).pixels(0);
+        assert!(
+            (pixels - 0.9 * 1600.0).abs() < 1e-2,
+            "scale e^{log_scale}: {pixels} pixels, expected {}",
+            0.9 * 1600.0
+        );
+    }
 }
 
 // EXTREMES 29.

@@ -51,6 +51,19 @@ fn any_part() -> impl Strategy<Value = f64> {
     prop_oneof![(-2i32..12).prop_map(|x| f64::from(x) / 8.0), Just(-0.0), Just(0.05), Just(0.05f64.next_down())]
 }
 
+/// By the rule too, of what no stage keeps.
+#[test]
+fn the_sign_of_a_zero_changes_no_ranking() {
+    let parts = |zero: f64| -> Vec<(f64, f64)> {
+        (0..60).map(|i| if i % 3 == 0 { (zero, zero) } else { ([0.0, 0.5][i % 2], 0.0) }).collect()
+    };
+    for low_priority in [LowPriority::Drop, LowPriority::Rescue] {
+        let recipe = rule(low_priority, 0.8, 0.05, 0.05);
+        let [plus, minus] = [0.0, -0.0].map(|zero| free(&scores(&parts(zero)), &recipe));
+        assert_eq!((plus.keep, plus.ranking.order()), (minus.keep, minus.ranking.order()));
+    }
+}
+
 fn any_rule() -> impl Strategy<Value = Select> {
     let tau = || prop_oneof![Just(0.0), Just(0.05), Just(0.5), Just(1.25)];
     let fraction = prop_oneof![Just(0.0), Just(1.0), 0.0..=1.0f64];

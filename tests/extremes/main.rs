@@ -21,8 +21,8 @@
 //! | 16 | death at the last frame | `motion::the_turn_about_the_last_life_frame_is_discarded` |
 //! | 17 | disjoint lives | `merging::what_moves_or_lives_otherwise_never_merges` |
 //! | 18 | NaN, infinity | `clouds::not_finite_gaussians_are_refused_dropped_or_kept_as_asked` |
-//! | 19 | subnormals, −0 | `motion::subnormals_move_as_values_and_minus_0_is_0`; selfcheck "motion of any size" |
-//! | 20 | scales 1e-12, 1e6 | `merging::scales_from_1e_minus_12_to_1e6_overflow_nothing` |
+//! | 19 | subnormals, −0 | `motion::subnormals_move_as_values_and_minus_0_is_0`, `merging::duplicates_that_differ_in_the_sign_of_0_…`; selfcheck "motion of any size" |
+//! | 20 | scales 1e-12, 1e6 | `merging::scales_from_1e_minus_12_to_1e6_overflow_nothing`, `merging::balls_of_1e_minus_12_and_of_1e6_merge_…` |
 //! | 21 | needle with its duplicate | selfcheck "needle and its twin" (1e-12), `merging::a_needle_keeps_its_smallest_scale_through_a_ply` |
 //! | 22 | coplanar pancakes | `merging::coplanar_pancakes_stay_flat` |
 //! | 23 | equal diagonal | `merging::a_covariance_with_equal_diagonal_has_its_axes`; selfcheck "mixture" |

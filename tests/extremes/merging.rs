@@ -65,6 +65,26 @@ fn what_moves_or_lives_otherwise_never_merges() {
     }
 }
 
+/// Row 19: equal but for the signs of zeros, no two of them alike, duplicates are duplicates, whatever their number.
+#[test]
+fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
+    const N: usize = 200;
+    let workplace = Workplace::new();
+    let mut cloud = balls(1).pick(&[0; N + 1]);
+    for i in 0..N {
+        let zero = |bit: usize| if i >> bit & 1 == 0 { 0.0 } else { -0.0 };
+        cloud.position.set_row(i, [0, 1, 2].map(zero));
+        cloud.rotation.set_row(i, [1.0, zero(3), zero(4), zero(5)]);
+        cloud.sh.set_row(i, [zero(6), zero(7), 0.5]);
+    }
+    cloud.position.set_row(N, [3.0, 2.0, 1.0]);
+    workplace.ply("cloud.ply", &cloud);
+    let summary = workplace.summary(&format!("cloud.ply -o out.ply {MERGE}"));
+    assert_eq!(summary["gaussians"], 2, "{summary}");
+    let map = index_map(&workplace.path("out.ply.index_map.npy"));
+    assert!(map[..N].iter().all(|&place| place == map[0]), "{map:?}");
+}
+
 /// Row 35: coefficients of one direction, of which one is black.
 #[test]
 fn what_looks_otherwise_never_merges() {
@@ -200,6 +220,30 @@ fn a_zero_quaternion_is_the_identity_and_flagged() {
     }
 }
 
+/// Row 20: half a standard deviation apart they are one, whatever their size, and three apart they are two.
+#[test]
+fn balls_of_1e_minus_12_and_of_1e6_merge_with_what_is_near_for_their_size() {
+    for size in [1e-12, 1e-9, 1e-6, 1e-3, 1e3, 1e6f64] {
+        let far: &[f64] = if size < 0.1 { &[3.0] } else { &[] };
+        for &apart in [0.5].iter().chain(far) {
+            let workplace = Workplace::new();
+            let mut cloud = balls(1).pick(&[0, 0]);
+            (0..2).for_each(|i| cloud.log_scale.set_row(i, [size.ln() as f32; 3]));
+            cloud.position.set_row(1, [(apart * size.min(1.0)) as f32, 0.0, 0.0]);
+            workplace.ply("two.ply", &cloud);
+            let flags = format!("{MERGE} --length-unit scene --merge-pass 1,1,-1,-1");
+            workplace.done(&format!("compress two.ply -o out.ply {flags}"));
+            let rows = PlyRows::read(&workplace.path("out.ply"));
+            assert_eq!(rows.rows.len(), if apart < 1.0 { 1 } else { 2 }, "size {size:e}, {apart} apart");
+            for k in 0..3 {
+                let scale = f64::from(rows.value(0, &format!("scale_{k}"))).exp();
+                // What lies apart makes it longer along one axis.
+                assert!((0.999_99..1.2).contains(&(scale / size)), "{scale:e} of {size:e}, {apart} apart");
+            }
+        }
+    }
+}
+
 /// Rows 20 and 27: from points to what fills the sky, before, around and behind the camera.
 #[test]
 fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
@@ -209,11 +253,18 @@ fn scales_from_1e_minus_12_to_1e6_overflow_nothing() {
         let log = |k: usize| (10f64.powi([-12, -6, -2, 0, 3, 6][(i / (k + 1)) % 6]).ln()) as f32;
         cloud.log_scale.set_row(i, [log(0), log(1), log(2)]);
         // The camera stands at z = -3.
-        cloud.position.plane_mut(2)[i] = [-3.3, -3.0, -2.81, -2.79, 0.0, 1e3][i % 6];
+        cloud.position.plane_mut(2)[i] = [-3.3, -3.0, -2.81, -2.79, 0.0, 1e3][(i / 7) % 6];
         cloud.opacity_logit.plane_mut(0)[i] = (i % 9) as f32 - 4.0;
     }
     workplace.ply("cloud.ply", &cloud);
-    fs::write(workplace.path("cameras.json"), CAMERA).unwrap();
+    // The second as through a telescope: squares of what it shows of the largest pass 1e38.
+    let [near, far] = [CAMERA.to_owned(), CAMERA.replace("fx\": 60, \"fy\": 60", "fx\": 6000, \"fy\": 6000")];
+    let far = far.replace("\"id\": 0, \"img_name\": \"a\"", "\"id\": 1, \"img_name\": \"b\"");
+    fs::write(
+        workplace.path("cameras.json"),
+        format!("{},{}", near.trim_end_matches(']'), far.trim_start_matches('[')),
+    )
+    .unwrap();
     for preset in ["paper", "default", "default --coverage projected --no-refine", "strong"] {
         let request = format!("cloud.ply --cameras cameras.json -o out.ply --overwrite --preset {preset}");
         let summary = workplace.summary(&request);
@@ -244,6 +295,8 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
     // A wall before the first ten, and behind all a giant.
     for i in 0..10 {
         cloud.position.set_row(i, [0.45 + 0.01 * i as f32, 0.5, 8.0]);
+        // Larger than what stands around the wall: only that they are hidden is against them.
+        cloud.log_scale.set_row(i, [-1.0; 3]);
     }
     for i in 10..20 {
         cloud.position.set_row(i, [0.5, 0.5, 4.0 + 0.01 * i as f32]);
@@ -262,6 +315,18 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
         let map = index_map(&workplace.path("out.ply.index_map.npy"));
         assert!(map[20] >= 0, "{more}: the background went");
         assert_eq!(map.iter().filter(|&&place| place == map[20]).count(), 1, "{more}: it swallowed others");
+    }
+    // Detail of its colour at its centre: only by its size does the giant differ.
+    for i in 50..60 {
+        cloud.position.set_row(i, [0.5 + 1e-3 * (i - 50) as f32, 0.5, 60.0]);
+        cloud.sh.set_row(i, cloud.sh.row::<3>(20));
+    }
+    workplace.ply("cloud.ply", &cloud);
+    for (preset, expected) in [("default", 1), ("strong", 1), ("default --max-scale-ratio inf", 11)] {
+        workplace.done(&format!("compress {request} --merge-only --choose-by-views=false --preset {preset}"));
+        let map = index_map(&workplace.path("out.ply.index_map.npy"));
+        let with_giant = map.iter().filter(|&&place| place == map[20]).count();
+        assert_eq!(with_giant, expected, "{preset}: Gaussians that are one with the background");
     }
 }
 

@@ -81,6 +81,17 @@ fn llff_row(eye: [f64; 3], height: f64, width: f64, focal: f64) -> [f64; 17] {
 }
 
 #[test]
+fn poses_that_differ_in_the_sign_of_a_zero_are_one_camera() {
+    let frame = |zero: f64, time: f64| {
+        json!({"v": 4, "time": time, "width": 80, "height": 60, "fx": 70.0, "fy": 71.0, "cx": 39.0, "cy": zero,
+               "w2c": [[1, zero, zero, zero], [0, 1, zero, 0], [0, 0, 1, 3], [0, 0, 0, 1]]})
+    };
+    let rig = load_json("cameras.json", &json!({"frames": [frame(0.0, 0.0), frame(-0.0, 0.5), frame(1e-300, 1.0)]}));
+    let cameras: Vec<u32> = rig.unwrap().shots.iter().map(|shot| shot.camera).collect();
+    assert_eq!(cameras, [0, 0, 1]);
+}
+
+#[test]
 #[ignore = "needs the trained models"]
 fn transforms_and_cameras_json_of_the_trained_models_give_the_same_cameras() {
     for model in shared_models() {

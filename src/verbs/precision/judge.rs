@@ -87,3 +87,16 @@ fn made(scene: &Scene, subject: Subject<'_>, pictures: &[Picture], mut take: imp
         Ok(())
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_of_pictures_add_up_in_squares_and_decibels_are_their_mean() {
+        // A tenth and a hundredth of the range.
+        let Closeness { error, psnr } = Closeness::of(&[20.0, 40.0]);
+        assert!((error - (0.5f64 * (0.01 + 0.0001)).sqrt()).abs() < 1e-15, "{error}");
+        assert_eq!((psnr, Closeness::of(&[f64::INFINITY]).error), (30.0, 0.0));
+    }
+}
