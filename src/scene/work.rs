@@ -19,7 +19,9 @@ impl Scene {
     /// Opens the work folder that `options` name.
     pub(super) fn keep_work(&mut self, options: &InputOptions) -> Result<()> {
         (self.work, self.digest) = kept_work(options, &*self.input)?;
-        self.work.follow_from(self.key());
+        if self.work.keeps() {
+            self.work.follow_from(self.key());
+        }
         Ok(())
     }
 
