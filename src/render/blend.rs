@@ -5,7 +5,7 @@
 //! first-level cache. `benches/render.rs` measures how far it is from what the arithmetic alone would take.
 
 use super::convention::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
-use super::lanes::{LANES, Lanes, Portable, Sums};
+use super::lanes::{Aligned, LANES, Lanes, Portable, Sums};
 use super::project::Splat;
 
 const SIDE: usize = TILE as usize;
@@ -13,10 +13,10 @@ const SIDE: usize = TILE as usize;
 pub(super) const GROUPS: usize = SIDE * SIDE / LANES;
 
 /// One f32 per sampled pixel of a tile.
-pub(super) type Plane = [[f32; LANES]; GROUPS];
+pub(super) type Plane = Aligned<[[f32; LANES]; GROUPS]>;
 
 /// One f32 per row or column of a tile.
-type Line = [[f32; LANES]; SIDE / LANES];
+type Line = Aligned<[[f32; LANES]; SIDE / LANES]>;
 
 /// The pixels of a tile that are sampled: every `stride`-th of the picture each way.
 ///
@@ -56,12 +56,9 @@ impl Lattice {
 
     /// Transmittance before any splat: 1, negative (ended) where no pixel is sampled.
     fn clear(&self) -> Plane {
-        std::array::from_fn(|group| {
-            std::array::from_fn(|lane| {
-                let sampled = group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
-                if sampled { 1.0 } else { -1.0 }
-            })
-        })
+        let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
+        let of = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
+        Aligned(std::array::from_fn(of))
     }
 }
 
@@ -177,7 +174,10 @@ impl Blend {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") {
             all.push(Blend::Avx2);
-            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") {
+            if is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512vl")
+            {
                 all.push(Blend::Avx512);
             }
         }
@@ -216,7 +216,7 @@ impl Blend {
             }
             #[cfg(target_arch = "x86_64")]
             Blend::Avx512 => {
-                #[target_feature(enable = "avx2,avx512f,avx512dq")]
+                #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
                 fn blend_avx512(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
                     blend::<super::lanes::Avx512>(splats, pairs, lattice, ink)
                 }
@@ -277,7 +277,7 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
         |groups: u32| (0..V::GROUPS).fold(0, |all, k| all | groups >> k) & (u32::MAX / ((1 << V::GROUPS) - 1));
     let mut transmittance = lattice.clear();
     let mut live = vectors(lattice.groups());
-    let mut alphas = [[0.0; LANES]; GROUPS];
+    let mut alphas = Plane::default();
     let mut crossings = [Crossing::default(); AHEAD];
     for (chunk, ahead) in pairs.chunks(AHEAD).enumerate() {
         for &index in pairs.get((chunk + 1) * AHEAD..).unwrap_or_default().iter().take(AHEAD) {
@@ -304,6 +304,7 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
                 let power = V::spread(&crossing.levels, row).sub(narrow.mul(dx.mul(dx)));
                 opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA)).store(&mut alphas, group);
             }
+            let mut ended = 0;
             while groups != 0 {
                 let group = groups.trailing_zeros() as usize % GROUPS;
                 groups &= groups - 1;
@@ -317,12 +318,13 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
                 let weight = alpha.mul(before).keep(blended);
                 let left = after.or_else(blended, before.negative(drawn));
                 left.store(&mut transmittance, group);
-                if left.all_negative() {
-                    live = without(live, group);
-                }
+                ended |= u32::from(left.all_negative()) << group;
                 let across = xs[group / SIDE].sub(V::spread(&crossing.middles, row));
                 let down = V::spread(&lattice.ys, row).sub(V::splat(crossing.v));
                 drop = ink.add::<V>(drop, group, Stroke { alpha, blended, weight, left, across, down });
+            }
+            if ended != 0 {
+                live = without(live, ended);
             }
             ink.end::<V>(drop, crossing.pair);
         }
@@ -333,10 +335,10 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
     transmittance
 }
 
-/// `live` without the vector `group`. Apart, so that it is branched to: worked out for every vector, the groups of the
-/// next splat would wait for the pixels of this one.
+/// `live` without the vectors `ended`. Apart, so that it is branched to: worked out for every splat, the groups of the
+/// next one would wait for the pixels of this.
 #[cold]
 #[inline(never)]
-fn without(live: u32, group: usize) -> u32 {
-    live & !(1 << group)
+fn without(live: u32, ended: u32) -> u32 {
+    live & !ended
 }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::backward::sums::Taken;
 use super::bin::{Bins, STRIP_PAIRS};
-use super::blend::{Blend, Colour, GROUPS, Lattice, Plane, Weight, Weights};
+use super::blend::{Blend, Colour, Lattice, Plane, Weight, Weights};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
 use super::lanes::LANES;
@@ -274,7 +274,7 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
 
 /// The colours of one tile's sampled pixels.
 fn paint(blend: Blend, splats: &[Splat], pairs: &[u32], lattice: &Lattice, background: [f32; 3]) -> [Plane; 3] {
-    let mut colour = Colour { planes: [[[0.0; LANES]; GROUPS]; 3] };
+    let mut colour = Colour { planes: [Plane::default(); 3] };
     let left = blend.tile(splats, pairs, lattice, &mut colour);
     for (plane, background) in colour.planes.iter_mut().zip(background) {
         for (pixel, left) in plane.as_flattened_mut().iter_mut().zip(left.as_flattened()) {

@@ -27,8 +27,7 @@ impl Pull {
     pub(super) fn new(picture: &Image, pull: &Image, tile: [u32; 2]) -> Self {
         // Copied first: the copies wait for memory together, one pixel after the other would wait alone.
         let (colours, pulls) = (picture.tile(tile), pull.tile(tile));
-        let zero = [[0.0; LANES]; GROUPS];
-        let (mut pixel, mut rest) = ([zero; 3], zero);
+        let (mut pixel, mut rest) = ([Plane::default(); 3], Plane::default());
         for group in 0..GROUPS {
             let (v, first) = (group % TILE as usize, group / TILE as usize * LANES);
             for lane in 0..LANES {

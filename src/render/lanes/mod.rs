@@ -13,6 +13,8 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 
+use std::ops::{Deref, DerefMut};
+
 #[cfg(target_arch = "x86_64")]
 pub(super) use avx2::Avx2;
 #[cfg(target_arch = "x86_64")]
@@ -21,6 +23,26 @@ pub(super) use portable::Portable;
 
 /// Lanes of one group.
 pub(super) const LANES: usize = 8;
+
+/// Values that begin with a line of the cache, so that no vector of them lies in two.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(align(64))]
+pub(super) struct Aligned<T>(pub(super) T);
+
+impl<T> Deref for Aligned<T> {
+    type Target = T;
+    #[inline(always)]
+    fn deref(&self) -> &T {
+        &self.0
+    }
+}
+
+impl<T> DerefMut for Aligned<T> {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut T {
+        &mut self.0
+    }
+}
 
 /// 1.5 · 2²³: adding it rounds an f32 of magnitude below 2²² to an integer kept in the low bits.
 const ROUND: f32 = 12_582_912.0;
