@@ -73,12 +73,8 @@ impl Bins {
         if self.is_last_strip() {
             return None;
         }
-        let first = self.after;
-        let before = self.start(first);
-        let fitting = self.ends[first..].partition_point(|&end| end - before <= most);
-        let end = first + fitting.max(1);
-        let whole_rows = end - end % self.across;
-        let strip = first..if whole_rows > first { whole_rows } else { end };
+        let strip = self.first_part(self.after..self.ends.len(), most);
+        let before = self.start(strip.start);
         self.after = strip.end;
         if strip == self.strip {
             return Some(strip);
@@ -113,29 +109,48 @@ impl Bins {
         Some(self.strip.clone())
     }
 
+    /// Of `tiles`, which are some: whole rows with at most `most` pairs from the first, else part of a row, else one tile.
+    fn first_part(&self, tiles: Range<usize>, most: usize) -> Range<usize> {
+        let Range { start: first, end: last } = tiles;
+        let before = self.start(first);
+        let fitting = self.ends[first..last].partition_point(|&end| end - before <= most);
+        let end = first + fitting.max(1);
+        let whole_rows = end - end % self.across;
+        first..if whole_rows > first && end < last { whole_rows } else { end }
+    }
+
+    /// `tiles` in parts of at most `most` pairs, else of one tile.
+    pub(super) fn parts(&self, mut tiles: Range<usize>, most: usize) -> impl Iterator<Item = Range<usize>> {
+        std::iter::from_fn(move || {
+            let part = (!tiles.is_empty()).then(|| self.first_part(tiles.clone(), most))?;
+            tiles.start = part.end;
+            Some(part)
+        })
+    }
+
     /// Whether no tiles come after those handed out.
     pub(super) fn is_last_strip(&self) -> bool {
         self.after == self.ends.len()
     }
 
-    /// The splats of every (splat, tile) pair of the strip, tile after tile.
-    pub(super) fn pairs(&self) -> &[u32] {
-        &self.pairs
+    /// The splats of every (splat, tile) pair of `tiles` of the strip, tile after tile.
+    pub(super) fn pairs(&self, tiles: Range<usize>) -> &[u32] {
+        let before = self.start(self.strip.start);
+        &self.pairs[self.start(tiles.start) - before..self.start(tiles.end) - before]
     }
 
-    /// The rows of tiles of which the strip has some, each with the part it has, as tiles across.
-    pub(super) fn rows(&self) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
-        let (across, strip) = (self.across, self.strip.clone());
-        (strip.start / across.max(1)..strip.end.div_ceil(across.max(1))).map(move |y| {
+    /// The rows of which `tiles` has some, each with the part it has, as tiles across.
+    pub(super) fn rows(&self, tiles: Range<usize>) -> impl Iterator<Item = (usize, Range<usize>)> + use<> {
+        let across = self.across;
+        (tiles.start / across.max(1)..tiles.end.div_ceil(across.max(1))).map(move |y| {
             let row = y * across;
-            (y, strip.start.max(row) - row..strip.end.min(row + across) - row)
+            (y, tiles.start.max(row) - row..tiles.end.min(row + across) - row)
         })
     }
 
-    /// Where in [`Bins::pairs`] tiles `x` of row `y`, of the strip, lie.
-    pub(super) fn range(&self, y: usize, x: Range<usize>) -> Range<usize> {
-        let (row, before) = (y * self.across, self.start(self.strip.start));
-        self.start(row + x.start) - before..self.start(row + x.end) - before
+    /// The splats of tiles `x` of row `y`, of the strip.
+    pub(super) fn pairs_of(&self, y: usize, x: Range<usize>) -> &[u32] {
+        self.pairs(y * self.across + x.start..y * self.across + x.end)
     }
 
     fn start(&self, tile: usize) -> usize {

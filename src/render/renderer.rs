@@ -129,13 +129,13 @@ impl Renderer {
         let mut data = vec![0.0; row_len * height as usize];
         // Without pixels there are no rows, and chunks must not be empty.
         let tile_row_len = (row_len * TILE as usize).max(1);
-        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+        while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            let first = bins.rows().next().map_or(0, |(y, _)| y);
+            let first = bins.rows(strip.clone()).next().map_or(0, |(y, _)| y);
             let paint_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
                 for x in tiles {
                     let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
-                    let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+                    let pairs = bins.pairs_of(y, x..x + 1);
                     let planes = paint(blend, splats, pairs, &lattice, background);
                     for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
                         let start = x * TILE as usize;
@@ -149,7 +149,7 @@ impl Renderer {
                     }
                 }
             };
-            let rows = bins.rows().zip(data[first * tile_row_len..].chunks_mut(tile_row_len));
+            let rows = bins.rows(strip).zip(data[first * tile_row_len..].chunks_mut(tile_row_len));
             if self.parallel {
                 rows.collect::<Vec<_>>().into_par_iter().for_each(paint_row);
             } else {
@@ -173,13 +173,13 @@ impl Renderer {
         assert_eq!(seen.len(), gaussians.len(), "contribution of another model");
         let view = View::new(camera);
         self.prepare(gaussians, &view, false);
-        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+        while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            fill_pairs(bins, self.parallel, &mut self.weights, |tile, pairs, weights| {
+            fill_pairs(bins, strip.clone(), self.parallel, &mut self.weights, |tile, pairs, weights| {
                 let lattice = Lattice::new(tile, view.size, stride.get());
                 blend.tile(splats, pairs, &lattice, &mut Weights { pairs: weights });
             });
-            for (&splat, weight) in bins.pairs().iter().zip(&self.weights) {
+            for (&splat, weight) in bins.pairs(strip).iter().zip(&self.weights) {
                 if weight.max > 0.0 {
                     seen.add(splats[splat as usize].id as usize, weight.sum, weight.max);
                 }
@@ -202,10 +202,10 @@ impl Renderer {
         let view = View::new(camera);
         self.prepare(gaussians, &view, true);
         let mut sums = Vec::new();
-        while self.bins.next_strip(&self.splats, self.strip_pairs).is_some() {
+        while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats) = (&self.bins, &self.splats.splats);
-            for (y, x) in bins.rows().flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
-                let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+            for (y, x) in bins.rows(strip).flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
+                let pairs = bins.pairs_of(y, x..x + 1);
                 let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
                 let rest = paint(self.blend, splats, pairs, &lattice, background);
                 sums.clear();
@@ -240,26 +240,27 @@ impl Renderer {
     }
 }
 
-/// Makes `sums` one default value for every pair of the strip, and has `of_tile` change those of each tile, given its
+/// Makes `sums` one default value for every pair of `tiles` of the strip, and has `of_tile` change those of each tile, given its
 /// place and its pairs; tiles at once if `parallel`.
 pub(super) fn fill_pairs<T: Copy + Default + Send>(
     bins: &Bins,
+    tiles: Range<usize>,
     parallel: bool,
     sums: &mut Vec<T>,
     of_tile: impl Fn([u32; 2], &[u32], &mut [T]) + Sync,
 ) {
     sums.clear();
-    sums.resize(bins.pairs().len(), T::default());
+    sums.resize(bins.pairs(tiles.clone()).len(), T::default());
     let mut rest = &mut sums[..];
     let mut rows = Vec::new();
-    for (y, tiles) in bins.rows() {
-        let (row, after) = rest.split_at_mut(bins.range(y, tiles.clone()).len());
+    for (y, tiles) in bins.rows(tiles) {
+        let (row, after) = rest.split_at_mut(bins.pairs_of(y, tiles.clone()).len());
         rows.push((y, tiles, row));
         rest = after;
     }
     let fill_row = |(y, tiles, mut sums): (usize, Range<usize>, &mut [T])| {
         for x in tiles {
-            let pairs = &bins.pairs()[bins.range(y, x..x + 1)];
+            let pairs = bins.pairs_of(y, x..x + 1);
             let (of_pairs, after) = sums.split_at_mut(pairs.len());
             of_tile([x as u32, y as u32], pairs, of_pairs);
             sums = after;
@@ -345,7 +346,7 @@ mod tests {
         let mut renderer = Renderer::new();
         renderer.prepare(&scene, &View::new(&camera), true);
         let tiles = renderer.bins.next_strip(&renderer.splats, usize::MAX).unwrap();
-        let pairs = renderer.bins.pairs().len();
+        let pairs = renderer.bins.pairs(0..7 * 5).len();
         assert_eq!(tiles, 0..7 * 5);
         for strip_pairs in [1, pairs / 20, pairs / 3, pairs] {
             for parallel in [false, true] {
@@ -354,7 +355,9 @@ mod tests {
             renderer.bins.begin(&renderer.splats, [7, 5]);
             let mut at = 0;
             while let Some(strip) = renderer.bins.next_strip(&renderer.splats, strip_pairs) {
-                assert!(strip.start == at && (strip.len() == 1 || renderer.bins.pairs().len() <= strip_pairs));
+                assert!(
+                    strip.start == at && (strip.len() == 1 || renderer.bins.pairs(strip.clone()).len() <= strip_pairs)
+                );
                 at = strip.end;
             }
             assert_eq!(at, 35);

@@ -29,7 +29,7 @@ const SPAN: usize = 32 * BLOCK;
 
 /// Memory of a picture that is differentiated per Gaussian it shows.
 pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<Sums<f64>>();
-/// Pairs of splats and tiles whose sums lie ready at a time: of small pictures all.
+/// Pairs of splats and tiles whose sums lie ready at a time: of small pictures all, of others a part of the strip.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
 /// Memory of a picture that is differentiated for pairs of Gaussians and tiles.
@@ -90,25 +90,27 @@ impl Renderer {
             false => totals.len().max(1),
         };
         self.bins.rewind();
-        while self.bins.next_strip(&self.splats, self.strip_pairs.min(SUMMED_PAIRS)).is_some() {
+        while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
-            fill_pairs(bins, self.parallel, of_pairs, |tile, pairs, sums| {
-                let lattice = Lattice::new(tile, view.size, 1);
-                let mut ink = Pulled::<SHAPE> { pull: Pull::new(picture, pull, tile), pairs: sums };
-                blend.tile(splats, pairs, &lattice, &mut ink);
-            });
-            let add = |(k, totals): (usize, &mut [Sums<f64>])| {
-                for (&splat, sums) in bins.pairs().iter().zip(&*of_pairs) {
-                    // Of another part it wraps or lies beyond.
-                    if let Some(total) = totals.get_mut((splat as usize).wrapping_sub(k * part)) {
-                        total.add(sums);
+            for tiles in bins.parts(strip, self.strip_pairs.min(SUMMED_PAIRS)) {
+                fill_pairs(bins, tiles.clone(), self.parallel, of_pairs, |tile, pairs, sums| {
+                    let lattice = Lattice::new(tile, view.size, 1);
+                    let mut ink = Pulled::<SHAPE> { pull: Pull::new(picture, pull, tile), pairs: sums };
+                    blend.tile(splats, pairs, &lattice, &mut ink);
+                });
+                let add = |(k, totals): (usize, &mut [Sums<f64>])| {
+                    for (&splat, sums) in bins.pairs(tiles.clone()).iter().zip(&*of_pairs) {
+                        // Of another part it wraps or lies beyond.
+                        if let Some(total) = totals.get_mut((splat as usize).wrapping_sub(k * part)) {
+                            total.add(sums);
+                        }
                     }
+                };
+                if self.parallel {
+                    totals.par_chunks_mut(part).enumerate().for_each(add);
+                } else {
+                    totals.chunks_mut(part).enumerate().for_each(add);
                 }
-            };
-            if self.parallel {
-                totals.par_chunks_mut(part).enumerate().for_each(add);
-            } else {
-                totals.chunks_mut(part).enumerate().for_each(add);
             }
         }
     }
