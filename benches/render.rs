@@ -15,8 +15,8 @@
 //! other. Beside them stands what they cannot go below: for the blend, [`OPERATIONS`] on every 16 events at two a cycle
 //! of the clock that is measured; for the rest, the bytes that must be moved at the rate at which memory is read here.
 //!
-//! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 3.2 times the
-//! picture alone (2.6 while pictures took 1.8 times as long); before each group the ratio is printed, of medians of
+//! The bar for `gradient`, a picture with the derivative of its squared error by every stored value, is 2.6 times the
+//! picture alone; `picture/large` misses it with 2.7. Before each group the ratio is printed, of medians of
 //! pictures and derivatives taken by turns. What the loss takes to subtract two pictures counts. `picture/demo` is a view
 //! of the demo scene.
 //!

@@ -12,6 +12,9 @@ const SIDE: usize = TILE as usize;
 /// Groups of eight pixels in a tile: group `row + 16 · column` covers eight neighbours of one row.
 pub(super) const GROUPS: usize = SIDE * SIDE / LANES;
 
+/// Bits of the groups of even rows.
+const EVEN: u32 = 0x5555_5555;
+
 /// One f32 per sampled pixel of a tile.
 pub(super) type Plane = Aligned<[[f32; LANES]; GROUPS]>;
 
@@ -100,6 +103,13 @@ pub(super) trait Ink {
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Drop<V>;
     /// What it does to `group` and, of a vector of more than one, those after it.
     fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, stroke: Stroke<V>) -> Self::Drop<V>;
+    /// Whether all even groups are to come before the odd ones, with [`Ink::turn`] after either.
+    const TURNS: bool = false;
+    /// What [`Lanes`] of one group do between the even and the odd ones, and once more in the end.
+    #[inline(always)]
+    fn turn<V: Lanes>(&self, drop: Self::Drop<V>) -> Self::Drop<V> {
+        drop
+    }
     /// The splat, `pair` of the tile, is done.
     fn end<V: Lanes>(&mut self, drop: Self::Drop<V>, pair: usize);
 }
@@ -204,12 +214,12 @@ impl Blend {
     /// set where the pixel ended early.
     pub(super) fn tile(self, splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
         match self {
-            Blend::Portable => blend::<Portable>(splats, pairs, lattice, ink),
+            Blend::Portable => blend::<Portable, _>(splats, pairs, lattice, ink),
             #[cfg(target_arch = "x86_64")]
             Blend::Avx2 => {
                 #[target_feature(enable = "avx2")]
                 fn blend_avx2(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
-                    blend::<super::lanes::Avx2>(splats, pairs, lattice, ink)
+                    blend::<super::lanes::Avx2, _>(splats, pairs, lattice, ink)
                 }
                 // SAFETY: `Blend::Avx2` is made by `all` alone, after AVX2 was detected.
                 unsafe { blend_avx2(splats, pairs, lattice, ink) }
@@ -218,7 +228,7 @@ impl Blend {
             Blend::Avx512 => {
                 #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
                 fn blend_avx512(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
-                    blend::<super::lanes::Avx512>(splats, pairs, lattice, ink)
+                    blend::<super::lanes::Avx512, _>(splats, pairs, lattice, ink)
                 }
                 // SAFETY: `Blend::Avx512` is made by `all` alone, after these were detected.
                 unsafe { blend_avx512(splats, pairs, lattice, ink) }
@@ -270,7 +280,7 @@ impl Crossing {
 }
 
 #[inline(always)]
-fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
+fn blend<V: Lanes, I: Ink>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut I) -> Plane {
     let xs = lattice.xs.each_ref().map(V::repeat);
     // Of groups, those that share a vector; a vector is named by its first.
     let vectors =
@@ -291,7 +301,7 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
         }
         for crossing in &crossings[..met] {
             let splat = &splats[pairs[crossing.pair] as usize];
-            let mut groups = crossing.groups & live;
+            let groups = crossing.groups & live;
             let (narrow, opacity) = (V::splat(splat.narrow), V::splat(splat.opacity));
             let mut drop = ink.begin::<V>(splat);
             // First what hangs on the splat alone: alphas in flight at once, then the pixels that wait for one another.
@@ -305,23 +315,27 @@ fn blend<V: Lanes>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut
                 opacity.mul(power.exp2()).min(V::splat(MAX_ALPHA)).store(&mut alphas, group);
             }
             let mut ended = 0;
-            while groups != 0 {
-                let group = groups.trailing_zeros() as usize % GROUPS;
-                groups &= groups - 1;
-                let row = group % SIDE;
-                let alpha = V::load(&alphas, group);
-                let before = V::load(&transmittance, group);
-                let after = before.mul(V::splat(1.0).sub(alpha));
-                // An ended pixel's transmittance is negative, so it can only end again.
-                let drawn = alpha.at_least(V::splat(MIN_ALPHA));
-                let blended = V::both(drawn, after.at_least(V::splat(MIN_TRANSMITTANCE)));
-                let weight = alpha.mul(before).keep(blended);
-                let left = after.or_else(blended, before.negative(drawn));
-                left.store(&mut transmittance, group);
-                ended |= u32::from(left.all_negative()) << group;
-                let across = xs[group / SIDE].sub(V::spread(&crossing.middles, row));
-                let down = V::spread(&lattice.ys, row).sub(V::splat(crossing.v));
-                drop = ink.add::<V>(drop, group, Stroke { alpha, blended, weight, left, across, down });
+            let parts = if I::TURNS && V::GROUPS == 1 { [groups & EVEN, groups & !EVEN] } else { [groups, 0] };
+            for mut groups in parts {
+                while groups != 0 {
+                    let group = groups.trailing_zeros() as usize % GROUPS;
+                    groups &= groups - 1;
+                    let row = group % SIDE;
+                    let alpha = V::load(&alphas, group);
+                    let before = V::load(&transmittance, group);
+                    let after = before.mul(V::splat(1.0).sub(alpha));
+                    // An ended pixel's transmittance is negative, so it can only end again.
+                    let drawn = alpha.at_least(V::splat(MIN_ALPHA));
+                    let blended = V::both(drawn, after.at_least(V::splat(MIN_TRANSMITTANCE)));
+                    let weight = alpha.mul(before).keep(blended);
+                    let left = after.or_else(blended, before.negative(drawn));
+                    left.store(&mut transmittance, group);
+                    ended |= u32::from(left.all_negative()) << group;
+                    let across = xs[group / SIDE].sub(V::spread(&crossing.middles, row));
+                    let down = V::spread(&lattice.ys, row).sub(V::splat(crossing.v));
+                    drop = ink.add::<V>(drop, group, Stroke { alpha, blended, weight, left, across, down });
+                }
+                drop = ink.turn::<V>(drop);
             }
             if ended != 0 {
                 live = without(live, ended);

@@ -6,7 +6,7 @@
 
 use super::super::blend::{GROUPS, Ink, Plane, Stroke};
 use super::super::convention::{MAX_ALPHA, TILE};
-use super::super::lanes::{LANES, Lanes, Sums as _};
+use super::super::lanes::{LANES, Lanes, Sums as _, Twins};
 use super::super::project::Splat;
 use super::super::renderer::Image;
 use super::sums::Sums;
@@ -54,17 +54,17 @@ pub(super) struct Pulled<'a, const SHAPE: bool> {
 #[derive(Clone, Copy)]
 pub(super) struct Walked<V: Lanes> {
     colour: [V; 3],
-    p: V::Sums,
-    first: [V::Sums; 2],
-    second: [V::Sums; 3],
-    taken: [V::Sums; 3],
+    p: V::Twins,
+    first: [V::Twins; 2],
+    second: [V::Twins; 3],
+    taken: [V::Twins; 3],
 }
 
 impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
     type Drop<V: Lanes> = Walked<V>;
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> Walked<V> {
-        let zero = V::Sums::zero();
+        let zero = V::Twins::zero();
         Walked { colour: splat.colour.map(V::splat), p: zero, first: [zero; 2], second: [zero; 3], taken: [zero; 3] }
     }
     #[inline(always)]
@@ -72,7 +72,7 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
         let Stroke { alpha, blended, weight, across, down, .. } = stroke;
         let by_colour: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c], group)));
         for (taken, by_colour) in walked.taken.iter_mut().zip(by_colour) {
-            *taken = by_colour.add_to(*taken);
+            *taken = by_colour.add_to_own(*taken);
         }
         if !SHAPE {
             return walked;
@@ -87,20 +87,36 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
         let moves = V::both(blended, V::splat(UNCUT).at_least(alpha));
         let p = own.sub(odds.mul(rest)).keep(moves);
         let (px, py) = (p.mul(across), p.mul(down));
-        walked.p = p.add_to(walked.p);
-        walked.first = [px.add_to(walked.first[0]), py.add_to(walked.first[1])];
+        walked.p = p.add_to_own(walked.p);
+        walked.first = [px.add_to_own(walked.first[0]), py.add_to_own(walked.first[1])];
         let [xx, xy, yy] = walked.second;
-        walked.second = [px.mul(across).add_to(xx), px.mul(down).add_to(xy), py.mul(down).add_to(yy)];
+        walked.second = [px.mul(across).add_to_own(xx), px.mul(down).add_to_own(xy), py.mul(down).add_to_own(yy)];
         walked
+    }
+    const TURNS: bool = true;
+    #[inline(always)]
+    fn turn<V: Lanes>(&self, walked: Walked<V>) -> Walked<V> {
+        // Not `array::map`, here and below: it is compiled apart, for the plainest machine.
+        let Walked { colour, p, first: [x, y], second: [xx, xy, yy], taken: [red, green, blue] } = walked;
+        Walked {
+            colour,
+            p: p.turned(),
+            first: [x.turned(), y.turned()],
+            second: [xx.turned(), xy.turned(), yy.turned()],
+            taken: [red.turned(), green.turned(), blue.turned()],
+        }
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, walked: Walked<V>, pair: usize) {
+        let Walked { p, first: [x, y], second: [xx, xy, yy], taken: [red, green, blue], .. } = walked;
         self.pairs[pair] = if SHAPE {
-            let ([x, y], [xx, xy, yy], [red, green, blue]) = (walked.first, walked.second, walked.taken);
+            let (x, y, xx, xy, yy) = (x.together(), y.together(), xx.together(), xy.together(), yy.together());
+            let (red, green, blue) = (red.together(), green.together(), blue.together());
             let [x, y, xx, xy, yy, red, green, blue] = V::Sums::totals([x, y, xx, xy, yy, red, green, blue]);
-            Sums { p: walked.p.total(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
+            Sums { p: p.together().total(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
         } else {
-            Sums { colour: walked.taken.map(V::Sums::total), ..Sums::default() }
+            let colour = [red.together().total(), green.together().total(), blue.together().total()];
+            Sums { colour, ..Sums::default() }
         };
     }
 }

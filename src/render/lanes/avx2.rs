@@ -22,6 +22,7 @@ macro_rules! avx2 {
 impl Lanes for Avx2 {
     type Mask = Self;
     type Sums = Self;
+    type Twins = [Self; 2];
     const GROUPS: usize = 1;
 
     #[inline(always)]
@@ -109,6 +110,10 @@ impl Lanes for Avx2 {
         sums.add(self)
     }
     #[inline(always)]
+    fn add_to_own(self, [own, other]: [Self; 2]) -> [Self; 2] {
+        [own.add(self), other]
+    }
+    #[inline(always)]
     fn scale(self, rounded: Self) -> Self {
         Avx2(avx2!(_mm256_castsi256_ps(_mm256_add_epi32(
             _mm256_castps_si256(self.0),
@@ -121,6 +126,10 @@ impl Sums for Avx2 {
     #[inline(always)]
     fn zero() -> Self {
         Self::splat(0.0)
+    }
+    #[inline(always)]
+    fn and(self, other: Self) -> Self {
+        self.add(other)
     }
     #[inline(always)]
     fn values(self) -> [f32; LANES] {

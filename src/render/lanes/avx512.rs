@@ -3,15 +3,15 @@
 use std::arch::x86_64::*;
 
 use super::avx2::Avx2;
-use super::{LANES, Lanes};
+use super::{LANES, Lanes, Twins};
 
 /// Two groups.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx512(__m512);
 
-// SAFETY of every block below: the instructions need AVX-512 F and DQ, and `Avx512` is named only by
-// `super::super::blend::Blend::tile`, inside a function entered after both were detected (with AVX2, for `Avx2`).
-// Loads and stores are the unaligned forms, over arrays of exactly two, eight or sixteen f32; what is fetched is a
+// SAFETY of every block below: the instructions need AVX-512 F and DQ (VL lets narrower ones use all registers), and
+// `Avx512` is named only by `super::super::blend::Blend::tile`, inside a function entered after all were detected (with
+// AVX2, for `Avx2`). Loads and stores are the unaligned forms, over arrays of exactly two, eight or sixteen f32; what is fetched is a
 // reference's, and fetching reads nothing.
 macro_rules! avx512 {
     ($e:expr) => {
@@ -23,6 +23,7 @@ macro_rules! avx512 {
 impl Lanes for Avx512 {
     type Mask = __mmask16;
     type Sums = Avx2;
+    type Twins = Self;
     const GROUPS: usize = 2;
 
     #[inline(always)]
@@ -119,11 +120,32 @@ impl Lanes for Avx512 {
         sums.add(first).add(second)
     }
     #[inline(always)]
+    fn add_to_own(self, sums: Self) -> Self {
+        sums.add(self)
+    }
+    #[inline(always)]
     fn scale(self, rounded: Self) -> Self {
         Avx512(avx512!(_mm512_castsi512_ps(_mm512_add_epi32(
             _mm512_castps_si512(self.0),
             _mm512_slli_epi32::<23>(_mm512_castps_si512(rounded.0)),
         ))))
+    }
+}
+
+impl Twins for Avx512 {
+    type Sums = Avx2;
+    #[inline(always)]
+    fn zero() -> Self {
+        Self::splat(0.0)
+    }
+    #[inline(always)]
+    fn turned(self) -> Self {
+        self
+    }
+    #[inline(always)]
+    fn together(self) -> Avx2 {
+        let [even, odd] = self.groups();
+        even.add(odd)
     }
 }
 

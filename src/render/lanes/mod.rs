@@ -4,7 +4,7 @@
 //! All give the same bits: every operation is a single IEEE one, and no multiply-add is fused, because
 //! a fused one would make pictures depend on the machine (and its software form is slow where the
 //! hardware has none). The two groups of an AVX-512 vector are added to sums one after the other, as those of two
-//! narrower vectors are.
+//! narrower vectors are, or each to its own ([`Twins`]), as narrower vectors are in two goes.
 
 mod portable;
 
@@ -60,6 +60,8 @@ pub(super) trait Lanes: Copy {
     type Mask: Copy;
     /// Sums of one group.
     type Sums: Sums;
+    /// Sums of two groups, those at even and those at odd places.
+    type Twins: Twins<Sums = Self::Sums>;
     /// Groups in one vector; a power of two.
     const GROUPS: usize;
 
@@ -99,6 +101,8 @@ pub(super) trait Lanes: Copy {
     fn largest(self) -> f32;
     /// `sums` with each group added in turn.
     fn add_to(self, sums: Self::Sums) -> Self::Sums;
+    /// `sums` with each group added to its own, one alone to the first.
+    fn add_to_own(self, sums: Self::Twins) -> Self::Twins;
     /// `self · 2ⁿ` with n the low bits of `rounded`, as left there by adding [`ROUND`].
     fn scale(self, rounded: Self) -> Self;
 
@@ -117,9 +121,39 @@ pub(super) trait Lanes: Copy {
     }
 }
 
+/// Sums of two groups, each of its own: half the additions, of which none waits for another of the same vector.
+///
+/// Vectors of one group are added to the first of both, and the two change places when all of the even ones are.
+pub(super) trait Twins: Copy {
+    type Sums: Sums;
+    fn zero() -> Self;
+    /// With the two in each other's place, where vectors are of one group.
+    fn turned(self) -> Self;
+    /// The sums of the odd added to those of the even.
+    fn together(self) -> Self::Sums;
+}
+
+/// Of vectors of one group, turned as often as added to.
+impl<V: Sums> Twins for [V; 2] {
+    type Sums = V;
+    #[inline(always)]
+    fn zero() -> Self {
+        [V::zero(); 2]
+    }
+    #[inline(always)]
+    fn turned(self) -> Self {
+        [self[1], self[0]]
+    }
+    #[inline(always)]
+    fn together(self) -> V {
+        self[0].and(self[1])
+    }
+}
+
 /// Eight sums side by side.
 pub(super) trait Sums: Copy {
     fn zero() -> Self;
+    fn and(self, other: Self) -> Self;
     fn values(self) -> [f32; LANES];
 
     /// Sum of all, in a fixed order.

@@ -16,6 +16,7 @@ impl Portable {
 impl Lanes for Portable {
     type Mask = [bool; LANES];
     type Sums = Self;
+    type Twins = [Self; 2];
     const GROUPS: usize = 1;
 
     #[inline(always)]
@@ -99,6 +100,10 @@ impl Lanes for Portable {
         sums.add(self)
     }
     #[inline(always)]
+    fn add_to_own(self, [own, other]: [Self; 2]) -> [Self; 2] {
+        [own.add(self), other]
+    }
+    #[inline(always)]
     fn scale(self, rounded: Self) -> Self {
         self.zip(rounded, |value, n| f32::from_bits(value.to_bits().wrapping_add(n.to_bits() << 23)))
     }
@@ -108,6 +113,10 @@ impl Sums for Portable {
     #[inline(always)]
     fn zero() -> Self {
         Portable([0.0; LANES])
+    }
+    #[inline(always)]
+    fn and(self, other: Self) -> Self {
+        self.add(other)
     }
     #[inline(always)]
     fn values(self) -> [f32; LANES] {
