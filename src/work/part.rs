@@ -4,8 +4,8 @@ use std::fmt;
 use std::ops::Range;
 use std::str::FromStr;
 
-/// Most parts that a stage is divided into: each is a file.
-pub(super) const MOST_PARTS: usize = 100_000;
+/// Most parts that a stage is divided into: each is a file, and of pictures all may be open at once.
+pub(super) const MOST_PARTS: usize = 900;
 
 /// Part `index`, counted from 1, of `of`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

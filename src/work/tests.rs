@@ -211,7 +211,7 @@ fn parts_are_named_by_two_numbers() {
     for good in ["1/1", "3/8", "64/64"] {
         assert_eq!(good.parse::<Part>().unwrap().to_string(), good);
     }
-    for bad in ["", "1", "0/3", "4/3", "1/0", "a/b", "1/2/3", "-1/2", "1/100001"] {
+    for bad in ["", "1", "0/3", "4/3", "1/0", "a/b", "1/2/3", "-1/2", "1/901"] {
         assert!(bad.parse::<Part>().is_err(), "{bad}");
     }
 }
