@@ -28,9 +28,9 @@ impl Place {
     pub(super) fn at(folder: &Path, about: String) -> Result<Place> {
         match fs::create_dir(folder) {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
-                return Err(Error::io("create the work folder", folder)(error));
+                Err(Error::io("create the work folder", folder)(error))
             }
-            _ if !folder.is_dir() => return Err(Error::usage(format!("{}: is no folder", folder.display()))),
+            _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.display()))),
             _ => Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about }),
         }
     }

@@ -343,6 +343,9 @@ struct End<Best> {
     part: f32,
 }
 
+/// Steps of a leg that are done, their rates, and what the last leg knows beside.
+type Reached = (usize, Schedule, Option<End<Change>>);
+
 impl<'a> Walk<'a> {
     /// Of `stage`, along the pictures of `parts`.
     pub(super) fn new(
@@ -454,11 +457,7 @@ impl<'a> Walk<'a> {
     }
 
     /// Goes to where the leg was when it was kept last, if it was.
-    fn go_on(
-        &mut self,
-        moving: &mut Moving<'_>,
-        trail: &Trail,
-    ) -> Result<Option<(usize, Schedule, Option<End<Change>>)>> {
+    fn go_on(&mut self, moving: &mut Moving<'_>, trail: &Trail) -> Result<Option<Reached>> {
         let kept: Option<Kept<moving::Kept, End<Change>>> = self.scene.work.find(&self.name(), trail.key)?;
         let Some(kept) = kept.filter(|kept| kept.leg == trail.leg) else { return Ok(None) };
         moving.go_on(kept.standing)?;
