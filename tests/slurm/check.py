@@ -11,13 +11,14 @@ import argparse
 import csv
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from cluster import Cluster, missing, wait
+from cluster import Cluster, end, missing, wait
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts/slurm"
 
@@ -33,8 +34,6 @@ class Bench:
         if model is None:
             self.here("demo", "-o", folder / "large", "--gaussians", 20000, "--frames", 100, "--quiet")
             self.scene = [folder / "large/scene.gseq", "--cameras", folder / "large/cameras.json", "--no-refine"]
-        # More is looked at, so that a part works for seconds and can be met at work.
-        self.slow = [*self.scene, "--look-pictures", "240"]
         self.plain = {}
 
     def here(self, *words):
@@ -62,21 +61,26 @@ class Bench:
             found = []
 
             def works():
-                lines = self.cluster.run("squeue", "-h", "-r", "-t", "RUNNING", "-n", job_name, "-o", "%A %N").splitlines()
-                found[:] = [line.split() for line in lines if len(line.split()) == 2]
-                return bool(found)
+                for pid, name, variables in self.cluster.processes():
+                    if name == "splatsieve" and variables.get("SLURM_JOB_NAME") == job_name:
+                        found[:] = [pid, variables["SLURM_JOB_ID"], variables["SLURMD_NODENAME"]]
+                        # It does not end before it is met, however fast the machine is.
+                        end(pid, signal.SIGSTOP)
+                        return True
+                return False
 
-            wait(f"a task of {job_name}", 150, works)
-            number, node = found[0]
+            wait(f"a task of {job_name}", 150, works, every=0.02)
+            pid, number, node = found
             before = int(self.one(number)["Restarts"])
-            # It has opened the model, and is at the stage itself.
-            time.sleep(0.5)
             try:
                 act(number, node)
+                wait(f"SIGTERM to {number}", 60, lambda: told(pid))
+                end(pid, signal.SIGCONT)
                 wait(f"the end of {number}", 60, lambda: self.one(number)["JobState"] != "RUNNING")
             except RuntimeError as error:
-                # Slurm's word for one that has just ended.
+                # Slurm's words for one that has just ended.
                 assert "now" in str(error) or "completing" in str(error) or "Invalid job" in str(error), error
+                end(pid, signal.SIGCONT)
             if int(self.one(number)["Restarts"]) > before or once:
                 return number
         raise AssertionError(f"no task of {job_name} was met at work")
@@ -87,6 +91,15 @@ class Bench:
 
     def logs(self, folder):
         return "".join(f"--- {path.name}\n{path.read_text()}" for path in sorted(folder.iterdir()))
+
+
+def told(pid):
+    """Whether a stopped process has been told to end, or has."""
+    try:
+        status = dict(line.split(":\t") for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    except OSError:
+        return True
+    return status["State"][0] == "Z" or int(status["ShdPnd"], 16) >> signal.SIGTERM - 1 & 1
 
 
 def contents(path):
@@ -114,7 +127,7 @@ def arrays_of_eight_give_the_bytes_of_one_process(bench):
 
 def a_lost_node_is_replaced(bench):
     work, output = bench.folder / "work of lost", bench.folder / "small of lost"
-    job = bench.long(work, output, bench.slow, "--parts", 4, "--arrays", 2, "--name", "lost")
+    job = bench.long(work, output, bench.scene, "--parts", 4, "--arrays", 2, "--name", "lost")
     lost = []
 
     def lose(number, node):
@@ -127,12 +140,12 @@ def a_lost_node_is_replaced(bench):
     for node in lost:
         bench.cluster.node(node)
     assert bench.one(number)["Restarts"] == "1"
-    same(bench, output, "slow", bench.slow, job)
+    same(bench, output, "plain", bench.scene, job)
 
 
 def what_is_told_to_end_goes_back_into_the_queue(bench):
     work, output = bench.folder / "work of told", bench.folder / "small of told"
-    job = bench.long(work, output, bench.slow, "--parts", 4, "--arrays", 2, "--name", "told")
+    job = bench.long(work, output, bench.scene, "--parts", 4, "--arrays", 2, "--name", "told")
     run = bench.cluster.run
     # As a time limit tells it; put back by an administrator; turned out by what is more urgent.
     bench.meet("told-visible", lambda number, node: run("scancel", "--signal=TERM", "--batch", number))
@@ -143,12 +156,12 @@ def what_is_told_to_end_goes_back_into_the_queue(bench):
     logs = bench.logs(Path(f"{work}.logs"))
     assert states[0]["JobState"] == "COMPLETED", logs
     assert "told to end; back into the queue" in logs, logs
-    same(bench, output, "slow", bench.slow, job)
+    same(bench, output, "plain", bench.scene, job)
 
 
 def what_is_cancelled_stays_so(bench):
     work, output = bench.folder / "work of cancelled", bench.folder / "small of cancelled"
-    job = bench.long(work, output, bench.slow, "--parts", 1, "--arrays", 1, "--name", "cancelled")
+    job = bench.long(work, output, bench.scene, "--parts", 1, "--arrays", 1, "--name", "cancelled")
     number = bench.meet("cancelled-scan", lambda number, node: bench.cluster.run("scancel", number), once=True)
     time.sleep(2)
     states = bench.cluster.ended(number, 30) + bench.cluster.ended(job, 30)

@@ -144,26 +144,39 @@ class Cluster:
         for pid in self.of_jobs(name):
             end(pid, signal.SIGKILL)
 
-    def of_jobs(self, node=None):
-        """Processes of jobs, and what watches over them; on one node or on all. First the watchers, who would tell."""
-        jobs, watchers = set(), set()
+    def processes(self):
+        """Everything that runs by this Slurm: number, name, environment."""
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit():
                 continue
             try:
-                variables = dict(line.partition("=")[::2] for line in read(entry / "environ").split("\0") if "=" in line)
-                if variables.get("SLURM_CONF") != str(self.folder / "slurm.conf"):
-                    continue
-                if read(entry / "comm").startswith("slurmstepd") and node is None:
-                    watchers.add(int(entry.name))
-                if "SLURMD_NODENAME" in variables and node in (None, variables["SLURMD_NODENAME"]):
-                    jobs.add(int(entry.name))
-                    parent = int(read(entry / "stat").rsplit(")", 1)[1].split()[1])
-                    if read(Path(f"/proc/{parent}/comm")).startswith("slurmstepd"):
-                        watchers.add(parent)
+                variables = dict(line.partition("=")[::2] for line in read(entry / "environ").split("\0"))
+                if variables.get("SLURM_CONF") == str(self.folder / "slurm.conf"):
+                    yield int(entry.name), read(entry / "comm").strip(), variables
+            except OSError:
+                # It has ended meanwhile.
+                continue
+
+    def of_jobs(self, node=None):
+        """Processes of jobs on one node or on all; first those that watch over them, who would tell."""
+        watchers, jobs = [], []
+        for pid, name, variables in self.processes():
+            if "SLURMD_NODENAME" in variables and node in (None, variables["SLURMD_NODENAME"]):
+                jobs.append(pid)
+            elif name.startswith("slurmstepd") and node in (None, self.node_of(pid)):
+                watchers.append(pid)
+        return watchers + jobs
+
+    def node_of(self, watcher):
+        """The node of a slurmstepd, by one of its children."""
+        for pid, _, variables in self.processes():
+            try:
+                parent = int(read(Path(f"/proc/{pid}/stat")).rsplit(")", 1)[1].split()[1])
             except OSError:
                 continue
-        return [*watchers, *jobs - watchers]
+            if parent == watcher and "SLURMD_NODENAME" in variables:
+                return variables["SLURMD_NODENAME"]
+        return None
 
     def run(self, *command, check=True, **options):
         """What a command prints with this Slurm as its own."""
@@ -205,10 +218,10 @@ def end(pid, how):
         pass
 
 
-def wait(what, seconds, condition):
+def wait(what, seconds, condition, every=0.2):
     """Until a condition holds."""
     until = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > until:
             raise TimeoutError(f"{what}: not within {seconds} s")
-        time.sleep(0.2)
+        time.sleep(every)
