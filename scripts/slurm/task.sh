@@ -52,7 +52,8 @@ job=${SLURM_ARRAY_JOB_ID:+${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID}
 job=${job:-${SLURM_JOB_ID:-}}
 [[ -n $job ]] || exit 143
 # scancel, or a preemption that has put the job back already, tells it to end too. That stays as it is.
-state=$(squeue --noheader --states=all --jobs="$SLURM_JOB_ID" --format=%T | head -n 1)
+# By the array's number and the task's: one of the tasks has the array's own number, which stands for all of them.
+state=$(squeue --noheader --states=all --jobs="$job" --format=%T)
 [[ $state == RUNNING ]] || exit 143
 if ((restarts >= most)); then
     echo "told to end at start $((restarts + 1)), and not put back: is --time too short for one part?" >&2

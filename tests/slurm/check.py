@@ -55,14 +55,14 @@ class Bench:
         options = ["--work", work, "--program", self.program, *options]
         return self.submit("long_scene.py", *options, "--", *words, "-o", output)
 
-    def meet(self, job_name, act, once=False):
+    def meet(self, job_name, act, which=lambda _: True, once=False):
         """Does something to a task of an array while it works, until one is put back into the queue by it."""
         for _ in range(12):
             found = []
 
             def works():
                 for pid, name, variables in self.cluster.processes():
-                    if name == "splatsieve" and variables.get("SLURM_JOB_NAME") == job_name:
+                    if name == "splatsieve" and variables.get("SLURM_JOB_NAME") == job_name and which(variables):
                         found[:] = [pid, variables["SLURM_JOB_ID"], variables["SLURMD_NODENAME"]]
                         # It does not end before it is met, however fast the machine is.
                         end(pid, signal.SIGSTOP)
@@ -147,8 +147,10 @@ def what_is_told_to_end_goes_back_into_the_queue(bench):
     work, output = bench.folder / "work of told", bench.folder / "small of told"
     job = bench.long(work, output, bench.scene, "--parts", 4, "--arrays", 2, "--name", "told")
     run = bench.cluster.run
-    # As a time limit tells it; put back by an administrator; turned out by what is more urgent.
-    bench.meet("told-visible", lambda number, node: run("scancel", "--signal=TERM", "--batch", number))
+    # As a time limit tells it; put back by an administrator; turned out by what is more urgent. First the task that has
+    # the array's own number, by which Slurm's commands mean all of them.
+    tell = lambda number, node: run("scancel", "--signal=TERM", "--batch", f"{number}_4")  # noqa: E731
+    bench.meet("told-visible", tell, which=lambda variables: variables["SLURM_JOB_ID"] == variables["SLURM_ARRAY_JOB_ID"])
     bench.meet("told-visible", lambda number, node: run("scontrol", "requeue", number))
     urgent = ["sbatch", "-p", "urgent", "-o", "/dev/null", "--wrap", "sleep 1"]
     bench.meet("told-visible", lambda number, node: run(*urgent, "-w", node))
