@@ -167,7 +167,8 @@ def task(folder, number, threads, memory):
     printed.unlink()
     write(record_path, record)
     if status == 0 and not run["keep_work"]:
-        subprocess.run([run["program"], "work", command[command.index("--work") + 1], "--clean", "--quiet"], check=False, stdout=2)
+        clean = [run["program"], "work", folder / "work" / scene["name"], "--clean", "--quiet"]
+        subprocess.run(clean, check=False, stdout=subprocess.DEVNULL)
     return status
 
 
@@ -175,8 +176,8 @@ def quality(summary):
     """How close the pictures are to the original's, where the run has looked at that; in words."""
     goal, archive, bands, field = (summary.get(key) or {} for key in ("goal", "archive", "bands", "field"))
     if goal:
-        loses = "less than" if goal["name"] == "max_loss" else "to"
-        return f"{goal['searched']:.1f} dB {loses} the {'photographs' if goal['name'] == 'max_loss' else 'original'}, {goal['asked']:g} asked for"
+        what = {"max_loss": "lost against the photographs"}.get(goal["name"], "to the original")
+        return f"{goal['searched']:.1f} dB {what}, {goal['asked']:g} asked for"
     for psnr in (archive.get("level", 0) - archive.get("loss", 0), bands.get("result"), field.get("result")):
         if psnr:
             return f"{psnr:.1f} dB to the original"
@@ -227,7 +228,8 @@ def page(title, rows, failed):
         return "–" if value in (None, "") else html.escape(form.format(value))
 
     failures = "".join(
-        f"<h2 class=failed>{escaped(row['scene'])} failed</h2><p>{escaped(row['message'])}</p><pre>{escaped(row['command'])}</pre>\n"
+        f"<h2 class=failed>{escaped(row['scene'])} failed</h2>"
+        f"<p>{escaped(row['message'])}</p><pre>{escaped(row['command'])}</pre>\n"
         for row in failed
     )
     lines = []

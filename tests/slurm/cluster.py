@@ -116,7 +116,8 @@ class Cluster:
         self.daemon("slurmctld", ["slurmctld", "-D", "-i"])
         for name in self.names:
             self.node(name)
-        wait("the nodes", 40, lambda: self.run("sinfo", "-h", "-N", "-p", "all", "-o", "%T").split() == ["idle"] * len(self.names))
+        states = ["sinfo", "-h", "-N", "-p", "all", "-o", "%T"]
+        wait("the nodes", 40, lambda: self.run(*states).split() == ["idle"] * len(self.names))
 
     def node(self, name):
         """Starts the daemon of a node."""
@@ -197,7 +198,8 @@ class Cluster:
         found = []
         for line in self.run("scontrol", "-o", "show", "job", job).splitlines():
             fields = dict(word.partition("=")[::2] for word in line.split())
-            found.append({key: fields.get(key, "") for key in ("JobId", "ArrayTaskId", "JobState", "Reason", "Restarts", "ExitCode", "NodeList")})
+            wanted = ("JobId", "ArrayTaskId", "JobState", "Reason", "Restarts", "ExitCode", "NodeList")
+            found.append({key: fields.get(key, "") for key in wanted})
         return found
 
     def ended(self, job, seconds):
