@@ -4,7 +4,7 @@
     python3 tests/slurm/check.py target/release/splatsieve [MODEL] [--only NAME ...]
 
 MODEL is room2_big; without it, scenes of `splatsieve demo` do. Needs Slurm and MUNGE (Debian: slurm-wlm, munge) and
-nothing but Python. Exits 1 if a claim fails.
+nothing but Python. Exits 1 if a claim fails. `--start` says whether a Slurm of one's own can be started here at all.
 """
 
 import argparse
@@ -223,10 +223,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("program")
     parser.add_argument("model", nargs="?", type=Path)
+    parser.add_argument("--start", action="store_true", help="start a Slurm, stop it, and do nothing else")
     parser.add_argument("--only", nargs="+", choices=[case.__name__ for case in CASES])
     args = parser.parse_args()
     if lacks := missing():
         sys.exit(f"no {', '.join(lacks)}: Debian has them in slurm-wlm and munge")
+    if args.start:
+        with Cluster(1):
+            return
     failed = 0
     with tempfile.TemporaryDirectory() as folder, Cluster(4) as cluster:
         model = args.model and args.model.resolve()
