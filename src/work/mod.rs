@@ -221,6 +221,7 @@ impl Work {
         }
         let Some(part) = self.part else {
             let Some((&of, parts)) = there.iter().max_by_key(|(of, parts)| parts.len() * MOST_PARTS / **of) else {
+                self.say_of_others(place, stage, key)?;
                 return Ok(1);
             };
             self.say(format!("{stage}: missing of {of} parts, and computed here: {}", missing(parts, of)));
@@ -238,11 +239,27 @@ impl Work {
                 "is done"
             }
         };
+        if there.is_empty() {
+            self.say_of_others(place, stage, key)?;
+        }
         let there = place.parts(stage, key)?.remove(&of).unwrap_or_default();
-        Err(Error::Stopped(match there.len() == of {
+        let mut said = match there.len() == of {
             true => format!("{stage}: part {part} {done}; all parts are there"),
             false => format!("{stage}: part {part} {done}; missing: {}", missing(&there, of)),
-        }))
+        };
+        self.take_notes().iter().for_each(|note| said += &format!("\n  note: {note}"));
+        Err(Error::Stopped(said))
+    }
+
+    /// Says that there are parts of `stage` that are none of this run's.
+    fn say_of_others(&self, place: &Place, stage: &str, key: Key) -> Result<()> {
+        for other in place.others(stage, key)? {
+            self.say(format!(
+                "{stage}: parts that are there are of another input, recipe, version or kind of processor, and are not \
+                 used; they belong to {other}"
+            ));
+        }
+        Ok(())
     }
 
     fn find_part<T: DeserializeOwned>(&self, stage: &str, key: Key, part: Part) -> Result<Option<T>> {

@@ -1,5 +1,6 @@
 //! The folder that pieces are in.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io;
@@ -56,6 +57,21 @@ impl Place {
             }
         }
         Ok(found)
+    }
+
+    /// To what parts of `stage` belong that follow from something else.
+    pub(super) fn others(&self, stage: &str, key: Key) -> Result<BTreeSet<String>> {
+        let key = self.key(key).text();
+        let is_other = |name: &Name| name.stage == stage && name.key != key && name.part.1 > 1;
+        let mut found = BTreeMap::new();
+        for name in names(&self.folder)?.into_iter().filter(is_other) {
+            // One of each is enough; one that is damaged belongs to nobody.
+            if let Entry::Vacant(new) = found.entry(name.key.clone()) {
+                let piece = Piece::open(&self.folder.join(name.file()), &name.key)?;
+                new.insert(piece.map_or_else(|_| "nobody knows".to_owned(), |piece| piece.about().to_owned()));
+            }
+        }
+        Ok(found.into_values().collect())
     }
 
     /// What is in a piece, if it is there. `damaged` is told of one that is not as it was written; it counts as none.

@@ -84,6 +84,23 @@ fn a_part_that_is_there_is_not_computed_again_and_missing_ones_are_named_and_the
 }
 
 #[test]
+fn parts_of_another_input_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let of = |about: &str, part: Option<&str>| {
+        let mut work = Work::open(&asked(folder.path(), part), about.to_owned()).unwrap();
+        work.follow_from(Key::of(&about));
+        work
+    };
+    _ = squares(&of("the first", Some("1/2")), 8);
+    let message = squares(&of("the second", Some("2/2")), 8).0.unwrap_err().to_string();
+    assert!(message.contains("missing: 1") && message.contains("they belong to the first"), "{message}");
+    let third = of("the third", None);
+    assert_eq!(squares(&third, 8).0.unwrap(), plainly(8));
+    let notes = third.take_notes().join("\n");
+    assert!(notes.contains("belong to the first") && notes.contains("belong to the second"), "{notes}");
+}
+
+#[test]
 fn other_inputs_and_parameters_find_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let key = |number: f64| Key::of(&("stage", number));
