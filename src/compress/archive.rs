@@ -24,7 +24,6 @@ use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 use crate::stream::{Batch, Subject, show, spread};
-use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "archive";
@@ -214,7 +213,7 @@ impl Archive {
         asked: Asked,
         journal: &mut Journal,
     ) -> Result<(Encoded, ArchiveSummary)> {
-        let key = Key::of(&(self.psnr, asked, reduction));
+        let key = scene.work.key(&(self.psnr, asked, reduction));
         let (encoded, summary): (Encoded, String) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
             let (encoded, summary) = self.make(scene, reduction, asked)?;
             Ok(((encoded, serde_json::to_string(&summary).expect("plain data")), reduction.len()))

@@ -19,7 +19,6 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, show, spread};
-use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "bands";
@@ -86,7 +85,7 @@ impl Bands {
     /// Frames that cannot be read.
     pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
         let count = reduction.len();
-        let key = Key::of(&(self.margin, &reduction));
+        let key = scene.work.key(&(self.margin, &reduction));
         journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, reduction, journal)?, count)))
     }
 

@@ -16,7 +16,6 @@ use crate::render::{self, Image, render};
 use crate::scene::Scene;
 use crate::select::Ranking;
 use crate::stream::{Batch, Progress, Subject, VIEWS_AT_ONCE, View, show, spread};
-use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "choose";
@@ -90,7 +89,7 @@ impl Choose {
         }
         let pruned = ranked.take(count);
         let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
-        let key = Key::of(&(&pruned, reduction, &pictures));
+        let key = scene.work.key(&(&pruned, reduction, &pictures));
         let [without, with]: [f64; 2] = journal
             .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
         if with > without {

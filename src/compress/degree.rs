@@ -60,7 +60,7 @@ impl Degree {
         journal: &mut Journal,
     ) -> Result<Fit> {
         let all = scored.count();
-        let key = self.refine.key().and(&(ranked, like, fits));
+        let key = scene.work.key(&(self.refine.key(), ranked, like, fits));
         journal.kept_stage(NAME, all, scene, key, |journal| {
             let targets = Targets::new(scene, self.refine.pictures)?;
             let mut tried: Vec<(Fit, f64)> = Vec::new();

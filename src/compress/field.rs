@@ -19,7 +19,6 @@ use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, show, spread};
-use crate::work::Key;
 
 /// What the stage is called.
 const NAME: &str = "field";
@@ -71,7 +70,7 @@ impl Field {
     /// Frames that cannot be read.
     pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
         let count = reduction.len();
-        let key = Key::of(&(self.margin, &reduction));
+        let key = scene.work.key(&(self.margin, &reduction));
         journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, reduction, journal)?, count)))
     }
 

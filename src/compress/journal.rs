@@ -44,10 +44,11 @@ fn processor_seconds() -> Option<f64> {
     ProcessTime::try_now().ok().map(|time| time.as_duration().as_secs_f64())
 }
 
-/// The record of a run so far.
-#[derive(Debug, Default)]
+/// The record of a run so far, or of a stage that is kept.
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Journal {
     /// What reading every frame once reads.
+    #[serde(skip)]
     pub whole: Reads,
     /// Everything done, in order.
     pub stages: Vec<Stage>,
@@ -59,16 +60,6 @@ pub struct Journal {
     pub field: Option<FieldSummary>,
     /// What was found about the bands of spherical harmonics.
     pub bands: Option<BandsSummary>,
-}
-
-/// What is written down of a stage that is kept.
-#[derive(Serialize, Deserialize)]
-struct Said {
-    stages: Vec<Stage>,
-    left_out: Vec<LeftOut>,
-    notes: Vec<String>,
-    field: Option<FieldSummary>,
-    bands: Option<BandsSummary>,
 }
 
 impl Journal {
@@ -122,32 +113,23 @@ impl Journal {
         if !work.keeps() {
             return compute(self);
         }
-        let mut own = Some(Journal { whole: self.whole, ..Journal::default() });
+        let mut is_new = false;
         // Summaries are made for JSON.
-        let (found, said): (T, String) = work.known(stage, key, || {
-            let journal = own.get_or_insert_default();
-            let found = compute(journal)?;
-            Ok((found, serde_json::to_string(&journal.said()).expect("plain data")))
+        let (found, written): (T, String) = work.known(stage, key, || {
+            is_new = true;
+            let mut own = Journal { whole: self.whole, ..Journal::default() };
+            let found = compute(&mut own)?;
+            Ok((found, serde_json::to_string(&own).expect("plain data")))
         })?;
-        let mut said: Said =
-            serde_json::from_str(&said).map_err(|error| Error::usage(format!("work folder, {stage}: {error}")))?;
-        if let Some(own) = own.filter(|own| !own.stages.is_empty()) {
-            said.stages = own.stages;
-        } else {
-            said.stages.iter_mut().for_each(|stage| stage.kept = true);
-        }
-        self.stages.extend(said.stages);
-        self.left_out.extend(said.left_out);
-        self.notes.extend(said.notes);
-        self.field = self.field.take().or(said.field);
-        self.bands = self.bands.take().or(said.bands);
+        let mut own: Journal =
+            serde_json::from_str(&written).map_err(|error| Error::usage(format!("work folder, {stage}: {error}")))?;
+        own.stages.iter_mut().for_each(|stage| stage.kept |= !is_new);
+        self.stages.extend(own.stages);
+        self.left_out.extend(own.left_out);
+        self.notes.extend(own.notes);
+        self.field = self.field.take().or(own.field);
+        self.bands = self.bands.take().or(own.bands);
         Ok(found)
-    }
-
-    fn said(&self) -> Said {
-        let Journal { stages, left_out, notes, field, bands, .. } = self;
-        let (stages, left_out, notes) = (stages.clone(), left_out.clone(), notes.clone());
-        Said { stages, left_out, notes, field: field.clone(), bands: bands.clone() }
     }
 
     /// Writes down that opening the input, begun at `start`, gave `gaussians` Gaussians and read so much.

@@ -11,7 +11,6 @@ use crate::limits::Limits;
 use crate::recipe::Recipe;
 use crate::scene::Scene;
 use crate::stream::{Scanned, Seen};
-use crate::work::Key;
 
 /// What is known of a scene before its frames are read.
 #[derive(Debug, Clone, Copy)]
@@ -86,11 +85,9 @@ impl Measure {
     /// Those of the stages.
     pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         let Score { snap_noise, non_finite, score, select, user, .. } = &self.score;
-        let key = Key::of(&(&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user)).and(&(
-            select.keep_fraction,
-            select.tau_static,
-            select.tau_dynamic,
-            select.low_priority,
+        let key = scene.work.key(&(
+            (&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user),
+            (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
         ));
         let scored = journal.kept(&scene.work, score::NAME, key, |journal| self.measure(scene, arrived, journal))?;
         scored.within(&scene.limits, &scene.scratch)

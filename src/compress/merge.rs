@@ -31,7 +31,7 @@ use crate::select::Ranking;
 use crate::source::FrameSource;
 use crate::stream::motion::{self, PairMeter};
 use crate::stream::{BLOCK, gather};
-use crate::work::{Key, Work};
+use crate::work::Work;
 
 /// What the stage is called.
 const NAME: &str = "merge";
@@ -126,8 +126,12 @@ impl Merge {
         survivors: usize,
         journal: &mut Journal,
     ) -> Result<Outcome> {
-        let key = Key::of(&(&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors))
-            .and(&(ranking, &scored.protected, scored.reference, scored.position_ulp, scored.importance()?));
+        // Importances are read back from the disk only for it.
+        let importance = scene.work.keeps().then(|| scored.importance()).transpose()?;
+        let key = scene.work.key(&(
+            (&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors),
+            (ranking, &scored.protected, scored.reference, scored.position_ulp, importance),
+        ));
         let run = |journal: &mut Journal| {
             journal.stage(NAME, survivors, scene.source(), |_| {
                 let mut trial = Trial::new(scene, scored, self, ranking.take(survivors))?;
@@ -286,7 +290,7 @@ fn measure(
     let mut place = rows;
     order.iter().zip(0..).for_each(|(&row, k)| place[row as usize] = k);
     pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
-    let key = Key::of(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
+    let key = work.key(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
     let (fresh, meter) = (meter.fresh(), RefCell::new(meter));
     let compute = |some: Range<usize>| match some.len() == pairs.len() {
         true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.reach, asked.is_part),

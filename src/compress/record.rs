@@ -11,7 +11,7 @@ use super::request::{Goal, Only, Quality, Request, Target, decibels};
 use super::score::UserOverrides;
 use crate::TOOL;
 use crate::emit::kind::OutputKind;
-use crate::model::Split;
+use crate::model::{Split, ranges};
 
 /// Where a recipe comes from.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -119,7 +119,7 @@ impl Record {
                 (run.max_loss, run.ground_truth) = (Some(*most), Some(photographs.clone()));
             }
         }
-        let ids = |ids: &[u32]| (!ids.is_empty()).then(|| ranges(ids));
+        let ids = |ids: &[u32]| (!ids.is_empty()).then(|| ranges(ids).join(","));
         let input = &request.input;
         let run = Run {
             mode: request.only,
@@ -159,16 +159,6 @@ impl Record {
     }
 }
 
-/// Increasing ids as a list with ranges, such as `3,10-20`.
-fn ranges(ids: &[u32]) -> String {
-    let runs = ids.chunk_by(|a, b| a + 1 == *b);
-    let texts = runs.map(|run| match (run[0], run[run.len() - 1]) {
-        (first, last) if first == last => first.to_string(),
-        (first, last) => format!("{first}-{last}"),
-    });
-    texts.collect::<Vec<_>>().join(",")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -205,7 +195,7 @@ mod tests {
     #[test]
     fn ranges_parse_into_the_ids_they_stand_for() {
         for ids in [&[][..], &[7], &[0, 1, 2], &[1, 3, 4, 5, 9, 11, 12]] {
-            assert_eq!(parse_ids(&ranges(ids), 20).unwrap(), ids);
+            assert_eq!(parse_ids(&ranges(ids).join(","), 20).unwrap(), ids);
         }
     }
 }

@@ -133,7 +133,7 @@ impl Rounds {
         let turns = self.turns(scene, scored);
         state.errors = vec![vec![0; scored.count()]; turns.len()];
         // What a round leaves does not depend on how many are wanted in the end.
-        let key = Key::of(&(self.fraction, self.contrast_floor, &turns, &before, protected));
+        let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
         let mut done = 0;
         for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
             if let Some(found) = scene.work.find(&name(round), key.and(&round))? {

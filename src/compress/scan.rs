@@ -9,7 +9,6 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::stats::{self, ScanPlan};
 use crate::stream::{self, BLOCK, Scanned};
-use crate::work::Key;
 
 /// What the stage is called.
 pub(super) const NAME: &str = "scan";
@@ -55,7 +54,7 @@ impl Scan {
         let compute = |blocks| stream::scan_blocks(source, &scene.schedule, &plan, blocks);
         journal.stage(NAME, info.count, source, |_| {
             let units = stream::scan_units(info);
-            let found = scene.work.divided(NAME, Key::of(&plan), units, compute, |parts| {
+            let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {
                 let mut all = Scanned { alive_per_frame: vec![0; info.times.len()], ..Scanned::default() };
                 for part in parts {
                     all.join(part?);

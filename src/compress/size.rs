@@ -62,8 +62,8 @@ impl Space<'_> {
     }
 
     /// What bytes follow from.
-    fn key(&self, reduction: &Reduction) -> Key {
-        Key::of(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
+    fn key(&self, scene: &Scene, reduction: &Reduction) -> Key {
+        scene.work.key(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
     }
 
     /// As many of all Gaussians as fit, of any of them, with the rule and the field of `like`.
@@ -72,7 +72,7 @@ impl Space<'_> {
     /// Not even one fits; frames that cannot be read, a failed write.
     fn count(&self, scene: &Scene, like: &Reduction, journal: &mut Journal) -> Result<usize> {
         let (all, most) = (scene.source().info().count, self.most);
-        journal.kept_stage(NAME, all, scene, self.key(like), |_| {
+        journal.kept_stage(NAME, all, scene, self.key(scene, like), |_| {
             let bytes = |count: usize| {
                 let kept = (0..count).map(|k| (k * all / count) as u32).collect();
                 let some = like.with(kept);
@@ -125,7 +125,7 @@ impl Space<'_> {
         mut reduction: Reduction,
         journal: &mut Journal,
     ) -> Result<Reduction> {
-        let key = self.key(&reduction).and(&scored.protected);
+        let key = self.key(scene, &reduction).and(&scored.protected);
         journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
             let bytes = |reduction: &Reduction| self.emit.bytes(scene, reduction, self.recipe);
             let empty = bytes(&reduction.pick(&[]))?;

@@ -11,7 +11,6 @@ use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
 use crate::scene::Scene;
 use crate::stream::{Seen, frames_to_see, looked_at, visible_contribution};
-use crate::work::Key;
 
 /// What the stage is called.
 pub(super) const NAME: &str = "visible";
@@ -74,7 +73,7 @@ impl Visible {
         let cameras = &scene.schedule.cameras[..];
         let look = |some: Range<usize>| visible_contribution(source, (cameras, &pictures[some]), stride, scene.limits);
         journal.stage(NAME, count, source, |_| {
-            let key = Key::of(&(&pictures, stride));
+            let key = scene.work.key(&(&pictures, stride));
             let found = scene.work.divided(NAME, key, pictures.len(), look, |parts| {
                 let mut sum = Contribution::new(count);
                 for part in parts {

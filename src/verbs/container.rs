@@ -31,7 +31,7 @@ use crate::model::Columns;
 use crate::scene::{InputOptions, Opened, first_box, kept_work, open_input, open_stream, room_to_pack};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
-use crate::work::{Key, Spilling};
+use crate::work::Spilling;
 
 /// What packing is called.
 const PACK: &str = "pack";
@@ -99,7 +99,7 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
     Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?;
     let (work, digest) = kept_work(input, &*opened.input)?;
     let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
-    let packing = storing.packing(|| work.known("extent", Key::of(&()), extent))?;
+    let packing = storing.packing(|| work.known("extent", work.key(&()), extent))?;
     let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
     let progress = |frames: usize| Progress::new(PACK, "Gaussian frames", (source.info().count * frames) as u64);
     let staged = if work.keeps() {

@@ -152,7 +152,7 @@ impl SideBySide {
     /// A source or a photograph that cannot be read; those of the work folder.
     pub fn evaluate(&self) -> Result<Evaluation> {
         let work = &self.scene.work;
-        let key = if work.keeps() { self.key()? } else { Key::of(&()) };
+        let key = self.key()?;
         let compute = |some| Ok(self.scores(some, |_, _, _| ())?.0);
         let scores = work.divided(NAME, key, self.pictures.len(), compute, |parts| {
             let mut all = Vec::with_capacity(self.pictures.len());
@@ -223,6 +223,9 @@ impl SideBySide {
 
     /// What scores follow from, beside the original and its cameras.
     fn key(&self) -> Result<Key> {
+        if !self.scene.work.keeps() {
+            return Ok(Key::NONE);
+        }
         let compressed = self.scene.digest_of(&self.compressed_path, &*self.compressed)?;
         let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.pictures)).transpose()?;
         Ok(Key::of(&(compressed, photographs, &self.pictures, self.background, self.flip)))

@@ -19,7 +19,7 @@ use crate::scene::pictures::{self, PictureSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
 use crate::stream::{Batch, Progress, Subject, View, show};
-use crate::work::{Key, Spill, Spilling};
+use crate::work::{Spill, Spilling};
 
 /// What rendering is called.
 const NAME: &str = "render";
@@ -99,7 +99,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
     } else {
         let name = |picture: &Picture| format!("{}.{}", picture.name(), format.extension());
         let staged = if scene.work.keeps() {
-            let key = Key::of(&(&chosen, background, format.extension()));
+            let key = scene.work.key(&(&chosen, background, format.extension()));
             let make = |some: Range<usize>, to: &mut Spilling| job.spill(&chosen[some], to);
             let spills = scene.work.divided_spill(NAME, key, chosen.len(), &scene.scratch, make)?;
             scene.work.not_divided("writing")?;

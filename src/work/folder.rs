@@ -9,8 +9,8 @@ use bytesize::ByteSize;
 use serde::Serialize;
 
 use super::piece::{Name, Piece, names};
-use super::ranges;
 use crate::error::{Error, Result};
+use crate::model::ranges;
 
 /// A result that is in a work folder, in one piece or in parts.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -72,7 +72,7 @@ pub fn text(listed: &[Listed]) -> String {
             let mut state = if *parts == 1 { "whole".to_owned() } else { format!("{parts} parts") };
             for (what, which) in [("missing", missing), ("damaged", damaged)] {
                 if !which.is_empty() {
-                    _ = write!(state, ", {what}: {}", ranges(which));
+                    _ = write!(state, ", {what}: {}", ranges(which).join(", "));
                 }
             }
             let bytes = ByteSize(*bytes).display().si().to_string();

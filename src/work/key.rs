@@ -7,25 +7,28 @@ use xxhash_rust::xxh3::Xxh3;
 
 /// The digest of everything that a result follows from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Key(u128);
+pub struct Key(Option<u128>);
 
 impl Key {
+    /// Of whatever: nothing is looked up under it.
+    pub const NONE: Key = Key(None);
+
     /// Of `value`, by its bits.
     pub fn of(value: &impl Serialize) -> Key {
         let mut hash = Hash(Xxh3::new());
         // Nothing that is hashed here has a part that cannot be written down.
         postcard::to_io(value, &mut hash).expect("plain data");
-        Key(hash.0.digest128())
+        Key(Some(hash.0.digest128()))
     }
 
     /// Of what this stands for, and `value`.
     pub fn and(self, value: &impl Serialize) -> Key {
-        Key::of(&(self.0, Key::of(value).0))
+        self.0.map_or(Key::NONE, |before| Key::of(&(before, Key::of(value))))
     }
 
     /// In 32 digits.
     pub(super) fn text(self) -> String {
-        format!("{:032x}", self.0)
+        format!("{:032x}", self.0.unwrap_or_default())
     }
 }
 

@@ -24,6 +24,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::error::{Error, Result};
+use crate::model::ranges;
 pub use folder::{Listed, clean, list, text};
 pub use key::Key;
 use part::MOST_PARTS;
@@ -73,6 +74,11 @@ impl Work {
     /// Whether anything is kept.
     pub fn keeps(&self) -> bool {
         self.place.is_some()
+    }
+
+    /// The key of `value`; where nothing is kept it stands for nothing, and takes no time.
+    pub fn key(&self, value: &impl Serialize) -> Key {
+        if self.keeps() { Key::of(value) } else { Key::NONE }
     }
 
     /// Things a person should know, said once.
@@ -161,10 +167,7 @@ impl Work {
             _ => join(&mut Part::all(of).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
         };
         self.keep(stage, key, &whole)?;
-        match self.part {
-            Some(Part::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Part::WHOLE))),
-            _ => Ok(whole),
-        }
+        self.complete(stage, whole)
     }
 
     /// The same of content that stays on the disk, written by `write`; in `scratch`, where nothing is kept. Gives the
@@ -198,9 +201,14 @@ impl Work {
         let of = self.divide(stage, key, &find, &make)?;
         let spill = |part: Part| Ok((part.of_units(units), find(part)?.map_or_else(|| make(part), Ok)?));
         let spills = Part::all(of).map(spill).collect::<Result<_>>()?;
+        self.complete(stage, spills)
+    }
+
+    /// All of `stage`, with which a run of its only part ends.
+    fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
             Some(Part::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Part::WHOLE))),
-            _ => Ok(spills),
+            _ => Ok(whole),
         }
     }
 
@@ -275,16 +283,7 @@ impl Work {
 
 /// Which of `of` parts are not `there`.
 fn missing(there: &BTreeSet<usize>, of: usize) -> String {
-    ranges(&(1..=of).filter(|index| !there.contains(index)).collect::<Vec<_>>())
-}
-
-/// Increasing numbers as a list with ranges, such as `3, 10-20`.
-fn ranges(numbers: &[usize]) -> String {
-    let texts = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match (run[0], run[run.len() - 1]) {
-        (first, last) if first == last => first.to_string(),
-        (first, last) => format!("{first}-{last}"),
-    });
-    texts.collect::<Vec<_>>().join(", ")
+    ranges(&(1..=of).filter(|index| !there.contains(index)).collect::<Vec<_>>()).join(", ")
 }
 
 #[cfg(test)]

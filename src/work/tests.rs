@@ -232,3 +232,15 @@ fn parts_are_named_by_two_numbers() {
         assert!(bad.parse::<Part>().is_err(), "{bad}");
     }
 }
+
+#[test]
+fn where_nothing_is_kept_no_key_is_made() {
+    struct Untouched;
+    impl Serialize for Untouched {
+        fn serialize<S: serde::Serializer>(&self, _: S) -> std::result::Result<S::Ok, S::Error> {
+            unreachable!("it would be hashed for nothing")
+        }
+    }
+    assert_eq!(Work::none().key(&Untouched), Key::NONE);
+    assert_eq!(Key::NONE.and(&Untouched), Key::NONE);
+}

@@ -115,11 +115,8 @@ impl Refine {
 
     /// What it does follows from this, and what it is done to.
     pub(super) fn key(&self) -> Key {
-        Key::of(&(self.columns.bits(), self.sh_degree, self.loss, self.steps, self.cut_steps)).and(&(
-            self.pictures,
-            self.cuts,
-            self.contrast_floor,
-        ))
+        let of_steps = (self.steps, self.cut_steps, self.pictures, self.cuts);
+        Key::of(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, of_steps))
     }
 
     fn manner(&self) -> Manner {
@@ -218,7 +215,7 @@ impl Refine {
             journal.leave_out("refinement", "nothing went that what stays could stand for");
             return Ok(reduction);
         }
-        let key = self.key().and(&(&reduction, wanted, steps, &scored.protected));
+        let key = scene.work.key(&(self.key(), &reduction, wanted, steps, &scored.protected));
         let run = |journal: &mut Journal| {
             journal.stage(NAME, count, scene.source(), |journal| {
                 let targets = Targets::new(scene, self.pictures)?;
@@ -356,8 +353,8 @@ impl<'a> Walk<'a> {
         targets: &'a Targets,
         parts: Parted,
     ) -> Walk<'a> {
-        let key = refine.key().and(&(&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart));
-        let key = key.and(&scored.protected);
+        let along = (&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart);
+        let key = scene.work.key(&(refine.key(), along, &scored.protected));
         let (turns, apart) = (Turns::of(parts.stepped), parts.apart);
         let progress = Progress::new(stage, "steps", 0);
         Walk { refine, scene, scored, targets, turns, apart, stage, progress, key }

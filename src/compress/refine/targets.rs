@@ -10,7 +10,7 @@ use crate::render::{Image, render};
 use crate::scene::Scene;
 use crate::scene::between::{Dice, between};
 use crate::stream::{Batch, Subject, VIEWS_AT_ONCE, View, show, spread};
-use crate::work::{Key, Spill, Spilling};
+use crate::work::{Spill, Spilling};
 
 /// What they are called in a work folder.
 pub(in crate::compress) const NAME: &str = "targets";
@@ -67,7 +67,7 @@ impl Targets {
                 made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
             })
         };
-        let key = Key::of(&(&cameras, &pictures));
+        let key = scene.work.key(&(&cameras, &pictures));
         let values = scene.work.divided_spill(NAME, key, pictures.len(), &scene.scratch, make)?;
         Ok(Targets { cameras, pictures, values })
     }

@@ -124,7 +124,7 @@ impl Search {
         journal: &mut Journal,
     ) -> Result<(Reduction, GoalSummary)> {
         let all = ranked.order().len();
-        let key = self.key(scored, ranked, like)?;
+        let key = self.key(scene, scored, ranked, like)?;
         let found = journal.kept_stage(NAME, all, scene, key, |journal| {
             let photographs = self.photographs(scene)?;
             let targets = Targets::new(scene, self.pictures)?;
@@ -161,18 +161,18 @@ impl Search {
     }
 
     /// What the search follows from.
-    fn key(&self, scored: &Scored, ranked: &Ranking, like: &Reduction) -> Result<Key> {
+    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &Reduction) -> Result<Key> {
         let (asked, folder) = match &self.quality {
             Quality::Psnr(least) => (*least, None),
             Quality::Loss { most, photographs } => (*most, Some(photographs)),
         };
         let mut files = Vec::new();
-        if let Some(folder) = folder {
+        if let Some(folder) = folder.filter(|_| scene.work.keeps()) {
             stamps(folder, &mut files)?;
         }
         let (field, bands) = (self.field.as_ref().map(|of| of.margin), self.bands.as_ref().map(|of| of.margin));
-        let key = Key::of(&(asked, files, self.pictures, field, bands));
-        Ok(key.and(&self.refine.as_ref().map(Refine::key)).and(&(&scored.protected, ranked, like)))
+        let refine = self.refine.as_ref().map(Refine::key);
+        Ok(scene.work.key(&((asked, files, self.pictures, field, bands, refine), &scored.protected, ranked, like)))
     }
 
     /// Confirms, before any work, that there are photographs, where a loss is asked for.
