@@ -273,7 +273,7 @@ fn whole(criterion: &mut Criterion) {
         states: &states,
         rows: &rows,
         importance: Importance { ids: &rows, coverage: &seen, visibility: &seen },
-        mergeable: &vec![true; n],
+        classes: &vec![Some(0); n],
         extent: 1.0,
     };
     let alike = |asked: Asked<'_>| Ok::<_, Infallible>(vec![1.0; asked.pairs().len()]);

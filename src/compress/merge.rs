@@ -41,9 +41,9 @@ pub(super) const PAIRS: &str = "pairs";
 /// Fewest pairs that are measured in parts.
 const DIVIDED: usize = 20_000;
 
-/// Memory of a Gaussian that may survive: its id, its state with base colours only, and whether it may merge. Twice
-/// the ids while merging is tried on some of them.
-const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<bool>();
+/// Memory of a Gaussian that may survive: its id, its state with base colours only, whether that is finite, and its class.
+/// Twice the ids while merging is tried on some of them.
+const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
 /// Sets of survivors that are taken to be tried until merging leaves the target, to say how much is read: the bracket
 /// closes by the secant, mostly in fewer.
@@ -194,8 +194,8 @@ struct Trial<'a> {
     pool: Vec<u32>,
     /// Their states at the reference frame, of the harmonics the first band.
     states: Gaussians,
-    /// Whether each may merge.
-    mergeable: Vec<bool>,
+    /// With which others each may merge: those of its class; none: with nobody.
+    classes: Vec<Option<u8>>,
     /// C and Vis by id.
     importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
@@ -209,10 +209,12 @@ struct Trial<'a> {
 impl<'a> Trial<'a> {
     fn new(scene: &'a Scene, scored: &'a Scored, stage: &'a Merge, pool: Vec<u32>) -> Result<Self> {
         let source = scene.source();
-        let (states, mut mergeable) = states_of(source, &pool, scored.reference.frame)?;
+        let (states, finite) = states_of(source, &pool, scored.reference.frame)?;
+        let class = |(&id, is_finite): (&u32, bool)| is_finite.then(|| scene.input.class(id));
+        let mut classes: Vec<Option<u8>> = pool.iter().zip(finite).map(class).collect();
         for id in &scored.protected {
             if let Ok(row) = pool.binary_search(id) {
-                mergeable[row] = false;
+                classes[row] = None;
             }
         }
         let mut merge = stage.recipe.clone();
@@ -229,7 +231,7 @@ impl<'a> Trial<'a> {
         let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
         let importance = scored.importance()?;
         let work = &scene.work;
-        Ok(Trial { scored, merge, pool, states, mergeable, importance, meter, work, pairs_together, known })
+        Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -246,13 +248,13 @@ impl<'a> Trial<'a> {
 
     /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
-        let Trial { scored, merge, pool, states, mergeable, importance, meter, work, pairs_together, known } = self;
+        let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known } = self;
         let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
             rows: &places_of(survivors, pool),
             importance: Importance { ids: pool, coverage, visibility },
-            mergeable,
+            classes,
             extent: scored.reference.extent,
         };
         let most = *pairs_together;

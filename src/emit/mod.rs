@@ -10,5 +10,6 @@ pub mod frame_stream;
 pub mod image;
 pub mod index_map;
 pub mod kind;
+pub(crate) mod npz;
 pub mod ply;
 pub mod rows;

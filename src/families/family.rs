@@ -89,6 +89,12 @@ pub trait Family: Send + Sync {
         None
     }
 
+    /// To what a Gaussian belongs: those of different classes never merge.
+    fn class(&self, id: u32) -> u8 {
+        let _ = id;
+        0
+    }
+
     /// The raw parameters that all frames follow from, of a family that has such.
     fn canonical(&self) -> Option<&Gaussians> {
         None

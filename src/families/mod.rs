@@ -4,6 +4,7 @@
 
 pub mod archive;
 mod container;
+mod dynamic_3d_gaussians;
 mod family;
 mod four_d_gaussians;
 mod ply_sequence;
@@ -23,8 +24,14 @@ use crate::error::{Error, Result};
 use family::{Entry, Found};
 
 /// Every family that lies in files; the first that recognises a path opens it.
-const FAMILIES: [Entry; 5] =
-    [four_d_gaussians::ENTRY, ply_sequence::FOLDER, ply_sequence::FILE, container::ENTRY, archive::ENTRY];
+const FAMILIES: [Entry; 6] = [
+    four_d_gaussians::ENTRY,
+    dynamic_3d_gaussians::ENTRY,
+    ply_sequence::FOLDER,
+    ply_sequence::FILE,
+    container::ENTRY,
+    archive::ENTRY,
+];
 
 /// Opens a path by what is there. Frames of a family that is continuous in time are still to be chosen.
 ///

@@ -6,5 +6,6 @@ pub(crate) mod digest;
 pub mod frame_stream;
 pub mod image;
 mod map;
+pub(crate) mod npz;
 pub mod ply;
 pub mod ply_sequence;

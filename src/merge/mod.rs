@@ -61,8 +61,9 @@ pub struct Survivors<'a> {
     pub rows: &'a [u32],
     /// Ids of all rows, whose hashes break ties of size; C by id, the size that ranks leaders; and Vis by id.
     pub importance: Importance<'a>,
-    /// Whether each of the rows may merge. One whose state is not finite never does.
-    pub mergeable: &'a [bool],
+    /// With which others each of the rows may merge: those of its class; none: with nobody. One whose state is not finite
+    /// never does.
+    pub classes: &'a [Option<u8>],
     /// Scene extent, the unit of [`LengthUnit::Extent`](recipe::LengthUnit::Extent).
     pub extent: f64,
 }
@@ -217,7 +218,11 @@ impl<'a> Nodes<'a> {
 
     fn is_usable(&self, node: usize) -> bool {
         let (states, row) = self.state(node);
-        self.survivors.mergeable[self.groups.leaders()[node] as usize] && is_finite(states, row)
+        self.class(node).is_some() && is_finite(states, row)
+    }
+
+    fn class(&self, node: usize) -> Option<u8> {
+        self.survivors.classes[self.groups.leaders()[node] as usize]
     }
 
     fn position(&self, node: usize) -> [f32; 3] {
@@ -261,7 +266,9 @@ fn each_coincident<E>(
     for crowd in order.chunk_by(|a, b| a.0 == b.0).filter(|crowd| crowd.len() > 1) {
         let leader = crowd[0].2;
         let (bits, look) = (nodes.look_bits(leader as usize), nodes.look(leader as usize));
-        let alike = |node: u32| nodes.look_bits(node as usize) == bits && gates.pass(&look, &nodes.look(node as usize));
+        let class = nodes.class(leader as usize);
+        let is_like = |node: usize| nodes.class(node) == class && nodes.look_bits(node) == bits;
+        let alike = |node: u32| is_like(node as usize) && gates.pass(&look, &nodes.look(node as usize));
         pairs.extend(crowd[1..].iter().filter(|member| alike(member.2)).map(|member| (leader, member.2)));
     }
     drop(order);
@@ -292,11 +299,12 @@ fn each_candidate<E>(
     let of_chunk = |search: &mut Search<'_>, leaders: &[Point]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
         for &Point { at, index: i } in leaders {
-            let look = nodes.look(i as usize);
+            let (look, class) = (nodes.look(i as usize), nodes.class(i as usize));
+            let passes = |j: u32| nodes.class(j as usize) == class && gates.pass(&look, &nodes.look(j as usize));
             let (near, cut) = search.nearest(i, at, recipe.max_neighbors);
             truncated += usize::from(cut);
             let behind = near.filter(|&j| rank[i as usize] < rank[j as usize]);
-            pairs.extend(behind.filter(|&j| gates.pass(&look, &nodes.look(j as usize))).map(|j| (i, j)));
+            pairs.extend(behind.filter(|&j| passes(j)).map(|j| (i, j)));
         }
         (pairs, truncated)
     };

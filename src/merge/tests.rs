@@ -21,7 +21,7 @@ struct Scene {
     ids: Vec<u32>,
     coverage: Vec<f64>,
     visibility: Vec<f64>,
-    mergeable: Vec<bool>,
+    classes: Vec<Option<u8>>,
     extent: f64,
 }
 
@@ -43,7 +43,7 @@ impl Scene {
             ids: (0..n as u32).collect(),
             coverage: (0..n).map(|i| uniform(i, 30)).collect(),
             visibility: (0..n).map(|i| uniform(i, 31)).collect(),
-            mergeable: vec![true; n],
+            classes: vec![Some(0); n],
             extent: 1.0,
         }
     }
@@ -80,8 +80,8 @@ impl Scene {
         frames: &[Column],
         most_pairs: usize,
     ) -> (Merged, Vec<usize>) {
-        let Scene { states, mergeable, extent, .. } = self;
-        let survivors = Survivors { states, rows, importance: self.importance(), mergeable, extent: *extent };
+        let Scene { states, classes, extent, .. } = self;
+        let survivors = Survivors { states, rows, importance: self.importance(), classes, extent: *extent };
         let gate = MotionGate::new(recipe, recipe.length_unit.in_scene_units(*extent));
         let mut parts = Vec::new();
         let measure = |asked: Asked<'_>| {
@@ -244,7 +244,7 @@ fn one_giant_background_gaussian_swallows_nothing_and_stays_alone() {
 #[test]
 fn what_is_not_finite_or_not_mergeable_stays_alone() {
     let mut scene = Scene::strewn(400);
-    scene.mergeable[11] = false;
+    scene.classes[11] = None;
     scene.states.opacity_logit.set_row(12, [f32::NAN]);
     scene.states.sh.plane_mut(11)[13] = f32::INFINITY;
     let merged = scene.merge(&scene.recipe(), None);
@@ -331,7 +331,7 @@ fn rows_left_out_change_nothing_as_if_they_were_not_there() {
         ids: rows.clone(),
         coverage: scene.coverage.clone(),
         visibility: scene.visibility.clone(),
-        mergeable: vec![true; rows.len()],
+        classes: vec![Some(0); rows.len()],
         extent: scene.extent,
     };
     let got = scene.merge_rows(&rows, &recipe, None, std::slice::from_ref(&scene.states.position));

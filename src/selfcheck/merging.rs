@@ -90,7 +90,7 @@ pub(super) fn duplicates() -> Case {
         states.opacity_logit.plane_mut(0).fill((opacity / (1.0 - opacity)).ln() as f32);
         let rows: Vec<u32> = (0..9).collect();
         let importance = Importance { ids: &rows, coverage: &[1.0; 9], visibility: &[1.0; 9] };
-        let survivors = Survivors { states: &states, rows: &rows, importance, mergeable: &[true; 9], extent: 1.0 };
+        let survivors = Survivors { states: &states, rows: &rows, importance, classes: &[Some(0); 9], extent: 1.0 };
         let mut worst = Worst::default();
         for (rule, expected) in [
             (ProxyOpacity::Sum, 8.0 * opacity),

@@ -14,6 +14,7 @@ mod assemble;
 mod cameras_json;
 mod fields;
 mod llff;
+mod meta_json;
 mod transforms;
 mod virtual_rig;
 
@@ -40,8 +41,15 @@ const MAX_PICTURES: usize = 1 << 24;
 
 /// What a folder is searched for, first match wins. `transforms*.json` come before `cameras.json`
 /// because a 3DGS `cameras.json` beside them has lost the times.
-const NAMES: [&str; 5] =
-    ["transforms_train.json", "transforms_test.json", "transforms.json", "cameras.json", "poses_bounds.npy"];
+const NAMES: [&str; 7] = [
+    "transforms_train.json",
+    "transforms_test.json",
+    "transforms.json",
+    "train_meta.json",
+    "test_meta.json",
+    "cameras.json",
+    "poses_bounds.npy",
+];
 
 /// Where COLMAP puts a reconstruction inside a data set.
 const COLMAP: [&str; 5] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin"];
@@ -81,6 +89,7 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
         Some(Kind::Transforms) => transforms::load(&file, document, options),
         Some(Kind::PerPicture) => cameras_json::load_per_picture(&file, &document),
         Some(Kind::PerCamera) => cameras_json::load_per_camera(&file, &document),
+        Some(Kind::PerFrame) => meta_json::load(&file, &document, path != file),
         None => Err(Error::input(
             &file,
             "",
@@ -127,11 +136,16 @@ enum Kind {
     PerPicture,
     /// 3DGS: one entry per camera.
     PerCamera,
+    /// Dynamic3DGaussians: one list of cameras per frame.
+    PerFrame,
 }
 
 fn kind(document: &Value) -> Option<Kind> {
     if document.is_array() {
         return Some(Kind::PerCamera);
+    }
+    if meta_json::is_one(document) {
+        return Some(Kind::PerFrame);
     }
     let first = document.get("frames")?.get(0)?;
     if first.get("w2c").is_some() {

@@ -1,0 +1,282 @@
+//! numpy's `.npz` archives, of which arrays are read where they lie.
+//!
+//! In: a path. Out: the shape of every array, and values of those asked for. Memory: pages of the mapped file. An array
+//! that is compressed or not f32 is decoded once, into a scratch file that is mapped in its place.
+
+use std::fs::File;
+use std::io::{BufWriter, Cursor, Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use half::f16;
+use npyz::{DType, Endianness, NpyHeader, Order, TypeChar};
+use zip::ZipArchive;
+use zip::read::ZipFile;
+
+use super::map::FileMap;
+use crate::emit::atomic::ScratchFile;
+use crate::error::{Error, Result};
+
+/// Longest header of an array; numpy's are 128 bytes.
+const MAX_HEADER: usize = 4096;
+/// Most digits of a shape: their product stays below 2⁶³.
+const MAX_DIGITS: usize = 18;
+/// Most arrays of an archive.
+const MAX_ARRAYS: usize = 4096;
+
+/// An open archive.
+#[derive(Debug)]
+pub(crate) struct Npz {
+    path: PathBuf,
+    map: Arc<FileMap>,
+    entries: Vec<Entry>,
+}
+
+/// An array of an archive.
+#[derive(Debug, Clone)]
+pub(crate) struct Entry {
+    /// Without `.npy`.
+    pub(crate) name: String,
+    /// Length of every axis, the slowest first.
+    pub(crate) shape: Vec<usize>,
+    /// How its values are stored; none: not as floating-point numbers in C order.
+    pub(crate) float: Option<Float>,
+    /// Type of its values, as numpy spells it.
+    pub(crate) descr: String,
+    /// Whether its first axis is the fastest.
+    pub(crate) is_fortran: bool,
+    /// Whether it is compressed.
+    pub(crate) is_compressed: bool,
+    /// Place in the archive.
+    index: usize,
+    /// Bytes of its header, and where in the file its values begin if it is not compressed.
+    header: usize,
+    start: usize,
+}
+
+/// A type of floating-point numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Float {
+    /// 2, 4 or 8.
+    pub(crate) bytes: usize,
+    big_endian: bool,
+}
+
+impl Float {
+    /// Four bytes, the lowest first.
+    const F32: Float = Float { bytes: 4, big_endian: false };
+
+    fn of(header: &NpyHeader) -> Option<Float> {
+        let DType::Plain(plain) = header.dtype() else { return None };
+        let bytes = plain.num_bytes().filter(|bytes| [2, 4, 8].contains(bytes))?;
+        let is_float = plain.type_char() == TypeChar::Float && header.order() == Order::C;
+        is_float.then_some(Float { bytes, big_endian: plain.endianness() == Endianness::Big })
+    }
+
+    /// The value in `stored`, of as many bytes as it takes.
+    pub(crate) fn decode(self, stored: &[u8]) -> f32 {
+        let mut bytes = [0; 8];
+        bytes[..self.bytes].copy_from_slice(stored);
+        if self.big_endian {
+            bytes[..self.bytes].reverse();
+        }
+        let [a, b, c, d, ..] = bytes;
+        match self.bytes {
+            2 => f16::from_le_bytes([a, b]).to_f32(),
+            4 => f32::from_le_bytes([a, b, c, d]),
+            _ => f64::from_le_bytes(bytes) as f32,
+        }
+    }
+
+    /// Stores `value`.
+    pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
+        match self.bytes {
+            2 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
+            4 => stored.copy_from_slice(&value.to_le_bytes()),
+            _ => stored.copy_from_slice(&f64::from(value).to_le_bytes()),
+        }
+        if self.big_endian {
+            stored.reverse();
+        }
+    }
+}
+
+impl Entry {
+    /// Number of values.
+    pub(crate) fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+}
+
+impl Npz {
+    /// Opens the archive at `path` and reads the headers of its arrays.
+    ///
+    /// # Errors
+    /// A file that is no archive, or is cut short; an array with a header that says nothing, or whose values are not all
+    /// there.
+    pub(crate) fn open(path: &Path) -> Result<Npz> {
+        let map = FileMap::open(path)?;
+        let wrong = |place: String, found: String| {
+            Error::input(path, place, "arrays as numpy.savez writes them", found)
+                .hint("if the file was copied, copy it again: one that is cut short has lost its list of arrays")
+        };
+        let mut archive = ZipArchive::new(Cursor::new(&map[..]))
+            .map_err(|error| wrong("list of arrays".into(), error.to_string()))?;
+        if archive.len() > MAX_ARRAYS {
+            return Err(wrong("list of arrays".into(), format!("{} arrays", archive.len())));
+        }
+        let mut entries: Vec<Entry> = Vec::new();
+        for index in 0..archive.len() {
+            let mut file =
+                archive.by_index(index).map_err(|error| wrong(format!("array {index}"), error.to_string()))?;
+            let Some(name) = npyz::npz::array_name_from_file_name(file.name()).map(str::to_owned) else { continue };
+            if entries.iter().any(|entry| entry.name == name) {
+                return Err(wrong(name, "two arrays of this name".into()));
+            }
+            let entry = Entry::read(&mut file, index, name.clone()).map_err(|found| wrong(name.clone(), found))?;
+            let bytes = entry.float.map(|float| entry.len() * float.bytes);
+            if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
+                || !entry.is_compressed && entry.start as u64 + (file.size() - entry.header as u64) > map.len() as u64
+            {
+                return Err(wrong(name, format!("{:?} values in {} bytes", entry.shape, file.size())));
+            }
+            entries.push(entry);
+        }
+        drop(archive);
+        Ok(Npz { path: path.to_owned(), map: Arc::new(map), entries })
+    }
+
+    /// Where it is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Its arrays, in the file's order.
+    pub(crate) fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The array called `name`.
+    pub(crate) fn entry(&self, name: &str) -> Option<&Entry> {
+        self.entries.iter().find(|entry| entry.name == name)
+    }
+
+    /// The values of the array called `name`, decoded into a file in `scratch` where they cannot be read where they lie.
+    ///
+    /// # Errors
+    /// An array that is not there or holds no floating-point numbers in C order; one that does not decode; a scratch file
+    /// that cannot be written.
+    pub(crate) fn floats(&self, name: &str, scratch: &Path) -> Result<Floats> {
+        let Some(entry) = self.entry(name) else {
+            let names: Vec<&str> = self.entries.iter().map(|entry| entry.name.as_str()).collect();
+            return Err(Error::input(&self.path, name, "an array of this name", names.join(", ")));
+        };
+        let Some(float) = entry.float else {
+            let found = format!("{} in another order or type", entry.descr);
+            return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found));
+        };
+        if !entry.is_compressed && float == Float::F32 {
+            return Ok(Floats { map: Arc::clone(&self.map), start: entry.start, len: entry.len(), _scratch: None });
+        }
+        let decoded = ScratchFile::new(scratch)?;
+        let mut out = BufWriter::new(File::create(decoded.path()).map_err(Error::io("create", decoded.path()))?);
+        let mut piece = vec![0; entry.len().min(1 << 16) * float.bytes];
+        let mut left = entry.len() * float.bytes;
+        self.read(entry, |values| {
+            while left > 0 {
+                let piece = &mut piece[..left.min(1 << 16)];
+                values.read_exact(piece).map_err(|error| self.damaged(entry, &error))?;
+                for stored in piece.chunks_exact(float.bytes) {
+                    let value = float.decode(stored).to_le_bytes();
+                    out.write_all(&value).map_err(Error::io("write", decoded.path()))?;
+                }
+                left -= piece.len();
+            }
+            out.flush().map_err(Error::io("write", decoded.path()))
+        })?;
+        let map = Arc::new(FileMap::open(decoded.path())?);
+        Ok(Floats { map, start: 0, len: entry.len(), _scratch: Some(Arc::new(decoded)) })
+    }
+
+    /// Has `take` read the stored values of `entry` from first to last.
+    ///
+    /// # Errors
+    /// Those of `take`; a file cut short since it was opened.
+    pub(crate) fn read(&self, entry: &Entry, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
+        self.map.check()?;
+        let broken = |error: zip::result::ZipError| self.damaged(entry, &error);
+        let mut archive = ZipArchive::new(Cursor::new(&self.map[..])).map_err(broken)?;
+        let mut file = archive.by_index(entry.index).map_err(broken)?;
+        let mut header = vec![0; entry.header];
+        file.read_exact(&mut header).map_err(|error| self.damaged(entry, &error))?;
+        take(&mut file)
+    }
+
+    /// That the values of `entry` are not as they were written.
+    pub(crate) fn damaged(&self, entry: &Entry, error: &dyn std::fmt::Display) -> Error {
+        Error::input(&self.path, &entry.name, "the values as they were written", error.to_string())
+    }
+}
+
+impl Entry {
+    fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<Entry, String> {
+        let is_compressed = file.compression() != zip::CompressionMethod::Stored;
+        let start = file.data_start();
+        let mut text = Vec::new();
+        file.take(MAX_HEADER as u64).read_to_end(&mut text).map_err(|error| error.to_string())?;
+        if !shape_is_small(&text) {
+            return Err("a header without a shape that can be read".into());
+        }
+        let mut rest = &text[..];
+        let header = NpyHeader::from_reader(&mut rest).map_err(|error| error.to_string())?;
+        let before = text.len() - rest.len();
+        Ok(Entry {
+            name,
+            shape: header.shape().iter().map(|&length| length as usize).collect(),
+            float: Float::of(&header),
+            descr: header.dtype().descr(),
+            is_fortran: header.order() == Order::Fortran,
+            is_compressed,
+            index,
+            header: before,
+            start: start as usize + before,
+        })
+    }
+}
+
+/// Whether the shape in a header is written in so few digits that the product of its sides fits 64 bits, whatever they
+/// are: the reader multiplies them before they can be looked at.
+fn shape_is_small(header: &[u8]) -> bool {
+    const KEY: &[u8] = b"'shape'";
+    let Some(shape) = header.windows(KEY.len()).position(|at| at == KEY).map(|at| &header[at..]) else { return false };
+    let Some(open) = shape.iter().position(|&byte| byte == b'(') else { return false };
+    let Some(close) = shape.iter().position(|&byte| byte == b')') else { return false };
+    open < close && shape[open..close].iter().filter(|byte| byte.is_ascii_digit()).count() <= MAX_DIGITS
+}
+
+/// Values of an array, f32, in its order.
+#[derive(Debug, Clone)]
+pub(crate) struct Floats {
+    map: Arc<FileMap>,
+    start: usize,
+    len: usize,
+    /// Where they were decoded to.
+    _scratch: Option<Arc<ScratchFile>>,
+}
+
+impl Floats {
+    /// Confirms that they are still there; call before a block of them is read.
+    pub(crate) fn check(&self) -> Result<()> {
+        self.map.check()
+    }
+
+    /// The values from `first` on.
+    ///
+    /// # Panics
+    /// If there are not `W`.
+    pub(crate) fn row<const W: usize>(&self, first: usize) -> [f32; W] {
+        assert!(first + W <= self.len, "values {first} to {} of {}", first + W, self.len);
+        let (stored, _) = self.map[self.start + 4 * first..][..4 * W].as_chunks::<4>();
+        std::array::from_fn(|c| f32::from_le_bytes(stored[c]))
+    }
+}
