@@ -99,6 +99,35 @@ fn an_evaluation_in_parts_is_that_of_one_run() {
 }
 
 #[test]
+fn a_report_in_parts_is_that_of_one_run_and_shares_the_parts_of_evaluate() {
+    let workplace = workplace(300);
+    workplace.done("--quiet compress scene.gseq --cameras cameras.json --no-refine -o small.gseq --target-ratio 0.6");
+    let models = "scene.gseq small.gseq --cameras cameras.json";
+    let rest = "--max-frames 9 --split all --flip";
+    joins_to_the_same(&workplace, &format!("report {models} {rest} -o page"), "page", &[1, 2, 7]);
+
+    _ = fs::remove_dir_all(workplace.path("work"));
+    run_parts(&workplace, &format!("evaluate {models} {rest}"), 3);
+    let part =
+        |index: usize| workplace.done(&format!("--quiet report {models} {rest} -o page --work work --part {index}/3"));
+    let said = part(2);
+    assert!(said.contains("scan: part 2/3 is done"), "the comparison is there: {said}");
+    // Until the pictures are looked at again; of these two parts are made, and the run that joins names and makes the third.
+    let mut others = 0;
+    while !part(1).contains("failure: part 1/3") {
+        [2, 3].map(part);
+        others += 1;
+        assert!(others < 9);
+    }
+    part(2);
+    let joined = workplace.run(&format!("--quiet report {models} {rest} -o page --work work"));
+    let missing = "failure: missing of 3 parts, and computed here: 3";
+    assert!(joined.code == 0 && joined.stderr.contains(missing), "{}", joined.stderr);
+    workplace.done(&format!("--quiet report {models} {rest} -o other"));
+    assert!(files(&workplace.path("page")) == files(&workplace.path("other")));
+}
+
+#[test]
 fn a_container_packed_in_parts_is_that_of_one_run() {
     let workplace = workplace(1500);
     for how in ["", "--raw", "--max-error position=0.1%,sh=1e-2"] {

@@ -417,6 +417,8 @@ pub(super) struct Report {
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
     #[command(flatten)]
+    pub(super) kept: Kept,
+    #[command(flatten)]
     pub(super) earlier: Earlier,
 }
 

@@ -133,12 +133,15 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Report(args) => {
             let page = args.output.join(report::PAGE);
+            let mut evaluate = evaluate_options(args.models);
+            evaluate.original.work = work_of(args.kept);
             let found = report::report(&ReportOptions {
-                evaluate: evaluate_options(args.models),
+                evaluate,
                 sweep: args.sweep,
                 output: args.output,
                 overwrite: args.earlier.replace(),
             })?;
+            notes(&found.work_notes);
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.display()))
         }

@@ -8,7 +8,7 @@
 //! The failure cases are those of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models",
 //! section 4.5. Memory: per thread one more picture, and the original's state without its colours.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::traits::{Kind, Traits};
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
@@ -28,7 +28,7 @@ pub const LOST: f64 = 0.01;
 pub const CROP: u32 = 64;
 
 /// Error sums of one picture, in f64 over pixels.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observed {
     /// By [`Kind::ALL`].
     kinds: [Sums; 3],
@@ -37,7 +37,7 @@ pub struct Observed {
     pixels: f64,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct Sums {
     /// Σ w.
     weight: f64,

@@ -33,6 +33,9 @@ pub struct Report {
     pub trade_off: Option<TradeOff>,
     /// Things a person should know.
     pub notes: Vec<String>,
+    /// The same of the work folder, which are no part of the result.
+    #[serde(skip)]
+    pub work_notes: Vec<String>,
 }
 
 /// Part of both models' pictures where a failure mode is worst.

@@ -31,12 +31,12 @@ use crate::compress::score::{SCORED, Scored, UserOverrides};
 use crate::compress::summary::TermSummary;
 use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
 use crate::error::{Error, Result};
-use crate::model::Rows;
-use crate::model::{Schedule, Split};
+use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
-use crate::verbs::evaluate::{self, EvaluateOptions, SideBySide};
+use crate::verbs::evaluate::{self, EvaluateOptions, SideBySide, Taken};
 use crate::verbs::trade_off::TradeOff;
+use crate::work::Key;
 pub use findings::Report;
 
 use failure::{FailureMode, Members, judge, observe};
@@ -88,13 +88,25 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         }));
         needs
     })?;
+    let in_parts = side.scene.work.keeps();
+    let compared = if in_parts { Some(side.compare()?) } else { None };
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
+    if in_parts {
+        // What comes now follows from this too; the comparison is that of `evaluate`.
+        side.scene.work.follow_from(Key::of(&(&side.scene.schedule, &recipe)));
+    }
     let scored = measure.run(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
-    let traits = traits(side.scene.source(), &scored, recipe.scan.alpha_min)?;
+    let find_traits = || traits(side.scene.source(), &scored, recipe.scan.alpha_min);
+    let traits = side.scene.work.known("traits", side.scene.work.key(&()), find_traits)?;
     let rows = scored.rows()?;
     let members = members(&rows, &traits, run.fates.as_deref());
-    let (evaluation, seen) = side.observe(|state, camera, taken| observe(state, &traits, camera, taken))?;
+    let look = |state: &Gaussians, camera: &Camera, taken: &Taken| observe(state, &traits, camera, taken);
+    let (evaluation, seen) = match compared {
+        None => side.observe(look)?,
+        Some(compared) => (compared, side.observe_in_parts("failure", look)?),
+    };
+    side.scene.work.not_divided("the page")?;
     let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
         Kind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
@@ -102,6 +114,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
 
     notes.extend(evaluation.notes.iter().cloned());
+    let work_notes = evaluation.work_notes.iter().cloned().chain(side.scene.work.take_notes()).collect();
     let histograms = match &run.fates {
         Some(fates) => Some(histograms(&rows, &scored.scores(&recipe.score)?, frames, fates)),
         None => None,
@@ -118,6 +131,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         run: run.summary.as_ref().map(|(_, whole)| whole.clone()),
         trade_off,
         notes,
+        work_notes,
     };
     write(options, &report, &page::page(&report, &run, &shown, &close), &run)?;
     Ok(report)

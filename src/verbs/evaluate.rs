@@ -10,6 +10,8 @@ use std::path::{Path, PathBuf};
 
 use hashbrown::{HashMap, HashSet};
 use rayon::prelude::*;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 
 use super::evaluation::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
 use crate::TOOL;
@@ -151,21 +153,21 @@ impl SideBySide {
     /// # Errors
     /// A source or a photograph that cannot be read; those of the work folder.
     pub fn evaluate(&self) -> Result<Evaluation> {
-        let work = &self.scene.work;
-        let key = self.key()?;
-        let compute = |some| Ok(self.scores(some, |_, _, _| ())?.0);
-        let scores = work.divided(NAME, key, self.pictures.len(), compute, |parts| {
-            let mut all = Vec::with_capacity(self.pictures.len());
-            for part in parts {
-                all.extend(part?);
-            }
-            Ok(all)
-        })?;
-        work.not_divided("averaging")?;
-        self.evaluation(scores)
+        let evaluation = self.compare()?;
+        self.scene.work.not_divided("averaging")?;
+        Ok(evaluation)
     }
 
-    /// [`SideBySide::evaluate`], undivided, of which `observe` sees every picture too, with the original's state, from any
+    /// [`SideBySide::evaluate`] as the beginning of a longer run, which uses the same parts.
+    ///
+    /// # Errors
+    /// Those of [`SideBySide::evaluate`].
+    pub fn compare(&self) -> Result<Evaluation> {
+        let compute = |some| Ok(self.scores(some, |_, _, _| ())?.0);
+        self.evaluation(self.divided(NAME, compute)?)
+    }
+
+    /// [`SideBySide::compare`], undivided, of which `observe` sees every picture too, with the original's state, from any
     /// thread. Gives what it made of them in the order of [`Evaluation::pictures`].
     ///
     /// # Errors
@@ -176,6 +178,49 @@ impl SideBySide {
     ) -> Result<(Evaluation, Vec<O>)> {
         let (scores, observed) = self.scores(0..self.pictures.len(), observe)?;
         Ok((self.evaluation(scores)?, observed))
+    }
+
+    /// What `observe` makes of every picture, as [`SideBySide::observe`] has it, without scores: the stage `name`, in
+    /// parts if the scene's work folder has some.
+    ///
+    /// # Errors
+    /// A source or a photograph that cannot be read; those of the work folder.
+    pub fn observe_in_parts<O: Send + Serialize + DeserializeOwned>(
+        &self,
+        name: &'static str,
+        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+    ) -> Result<Vec<O>> {
+        self.divided(name, |some| {
+            let progress = Progress::new(name, "pictures", some.len() as u64);
+            let mut all = Vec::with_capacity(some.len());
+            self.show(&self.pictures[some], |views| {
+                let see = |view: &View<'_, 2>| {
+                    let seen = observe(view.states[0], view.camera, &self.take(view)?);
+                    progress.advance(1);
+                    Ok(seen)
+                };
+                all.extend(views.par_iter().map(see).collect::<Result<Vec<O>>>()?);
+                Ok(())
+            })?;
+            Ok(all)
+        })
+    }
+
+    /// What `compute` finds of every picture, in order, as the stage `name`.
+    fn divided<T: Serialize + DeserializeOwned>(
+        &self,
+        name: &str,
+        compute: impl Fn(Range<usize>) -> Result<Vec<T>>,
+    ) -> Result<Vec<T>> {
+        let work = &self.scene.work;
+        let key = self.key()?;
+        work.divided(name, key, self.pictures.len(), compute, |parts| {
+            let mut all = Vec::with_capacity(self.pictures.len());
+            for part in parts {
+                all.extend(part?);
+            }
+            Ok(all)
+        })
     }
 
     /// What the scores of all pictures say.
