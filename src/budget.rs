@@ -434,7 +434,7 @@ impl Plan {
         let least = self.peak().div_ceil(1 << 20);
         let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
         Error::usage(format!(
-            "--memory {}{origin}: expected at least {least}MiB, which the stage {largest:?} takes for {} Gaussians{}\n  \
+            "--memory {}{origin}: expected at least {least}MiB, which the stage \"{largest}\" takes for {} Gaussians{}\n  \
              give it that, or fewer --threads; --explain shows what takes how much",
             size(self.budget),
             self.work.gaussians,

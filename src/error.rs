@@ -4,6 +4,8 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+pub use gseq::quoted;
+
 /// Result of anything that can fail here.
 pub type Result<T> = std::result::Result<T, Error>;
 
@@ -14,7 +16,7 @@ pub enum Error {
     #[error("{0}")]
     Input(Box<InputError>),
     /// The operating system refused: check the path, the permissions, the space left.
-    #[error("cannot {action} {path}: {source}", path = path.display())]
+    #[error("cannot {action} {path}: {source}{advice}", path = path.display(), advice = advice(source))]
     Io {
         /// What was being done, as a verb: "open", "create", "rename".
         action: &'static str,
@@ -63,6 +65,15 @@ impl fmt::Display for InputError {
             write!(f, "\n  {}", self.hint)?;
         }
         Ok(())
+    }
+}
+
+fn advice(source: &io::Error) -> &'static str {
+    match source.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            "\n  make room there, or name another place: the output with -o, scratch files with --scratch-dir"
+        }
+        _ => "",
     }
 }
 

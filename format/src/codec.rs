@@ -19,6 +19,8 @@
 //! less than raw; XOR with the frame before 1.65–1.87, order 3 1.86–2.02, order 2 without the zigzag 1.69–1.86.
 //! Transposing to [component][gaussian][frame] gained 1%.
 
+use std::fmt;
+
 use xxhash_rust::xxh3::xxh3_64;
 use zstd::bulk::Decompressor;
 
@@ -60,6 +62,16 @@ pub enum Encoding {
     },
 }
 
+impl fmt::Display for Encoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Encoding::Raw => write!(f, "as it is"),
+            Encoding::Filtered { order } => write!(f, "predicted, order {order}"),
+            Encoding::Bounded { order } => write!(f, "within a bound, order {order}"),
+        }
+    }
+}
+
 /// What a tile's stored values are like (of a constant tile: its one frame).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stats {
@@ -69,6 +81,13 @@ pub struct Stats {
     pub max: f32,
     /// Number of NaN and infinite values.
     pub non_finite: u32,
+}
+
+impl fmt::Display for Stats {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Stats { min, max, non_finite } = self;
+        write!(f, "values from {min} to {max}, {non_finite} of them not finite")
+    }
 }
 
 /// A tile ready to be written.

@@ -47,6 +47,29 @@ impl fmt::Display for Advice<'_> {
     }
 }
 
+/// `text` in quotation marks as a message shows it: what cannot be printed by its code, as in `<U+FEFF>`; at most 120
+/// characters.
+pub fn quoted(text: &str) -> String {
+    const LONGEST: usize = 120;
+    let unprinted = |c: char| {
+        c.is_control()
+            || matches!(c, '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{feff}')
+    };
+    let mut out = String::from("\"");
+    for (place, c) in text.chars().enumerate() {
+        match c {
+            _ if place == LONGEST => {
+                out.push('…');
+                break;
+            }
+            c if unprinted(c) => out += &format!("<U+{:04X}>", c as u32),
+            c => out.push(c),
+        }
+    }
+    out.push('"');
+    out
+}
+
 impl Error {
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.to_owned();

@@ -45,8 +45,8 @@ impl Index {
                 Ok(tile)
             }
             other => {
-                let expected = format!("the index entry of {id:?}, frames {} to {}", range.start, range.end);
-                Err(Fault::new(place, expected, format!("{other:?}")))
+                let expected = format!("the index entry of {id}, frames {} to {}", range.start, range.end);
+                Err(Fault::new(place, expected, other))
             }
         }
     }
@@ -114,7 +114,7 @@ impl Index {
             let (tile, next) = (&tiles[pair[0]], &tiles[pair[1]]);
             let apart = next.offset - RECORD >= tile.offset + u64::from(tile.stored_bytes);
             if !apart && !next.may_share(tile) {
-                let expected = format!("{:?} stored apart from {:?}", next.id, tile.id);
+                let expected = format!("{} stored apart from {}", next.id, tile.id);
                 return Err(Fault::new(
                     self.place(pair[1] as u64) + 24,
                     expected,

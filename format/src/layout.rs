@@ -2,12 +2,13 @@
 //! file header that says so (SPEC.md, "Header").
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 use std::ops::Range;
 
 use xxhash_rust::xxh3::xxh3_64;
 
 use crate::bounded::BOUNDS;
-use crate::error::{Error, Fault, Result};
+use crate::error::{Error, Fault, Result, quoted};
 
 /// First bytes of every container. A high bit, a line ending and a control byte, so that transfers
 /// which rewrite text are noticed at once.
@@ -66,6 +67,13 @@ pub struct TileId {
     pub gaussian_block: u32,
     /// Frames from `frame_block · Layout::frame_block`.
     pub frame_block: u32,
+}
+
+impl fmt::Display for TileId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let TileId { column, gaussian_block, frame_block } = self;
+        write!(f, "the tile of column {column}, Gaussian block {gaussian_block}, frame block {frame_block}")
+    }
 }
 
 impl Layout {
@@ -141,20 +149,23 @@ impl Layout {
         let mut names = BTreeSet::new();
         for ColumnSpec { name, width, max_error } in &self.columns {
             if !is_column_name(name) {
-                return Err(format!("column names of 1 to {MAX_NAME_BYTES} bytes [a-z][a-z0-9_]*, not {name:?}"));
+                return Err(format!(
+                    "column names of 1 to {MAX_NAME_BYTES} bytes [a-z][a-z0-9_]*, not {}",
+                    quoted(name)
+                ));
             }
             if !names.insert(name) {
-                return Err(format!("distinct column names, not two called {name:?}"));
+                return Err(format!("distinct column names, not two called {}", quoted(name)));
             }
             let frame_values = u64::from(self.gaussian_block) * u64::from(self.frame_block);
             let most = MAX_TILE_BYTES / 4 / frame_values.max(1);
             within(
-                &format!("width of column {name:?} (whole tiles hold {MAX_TILE_BYTES} bytes at most)"),
+                &format!("width of column {name} (whole tiles hold {MAX_TILE_BYTES} bytes at most)"),
                 (*width).into(),
                 1..=most,
             )?;
             if *max_error != 0.0 && !BOUNDS.contains(max_error) {
-                return Err(format!("a bound of column {name:?} that is 0 or a normal f32 above, not {max_error}"));
+                return Err(format!("a bound of column {name} that is 0 or a normal f32 above, not {max_error}"));
             }
         }
         let blocks = self.gaussians.div_ceil(self.gaussian_block.into());
@@ -271,7 +282,7 @@ impl Layout {
                 return Err(Fault::new(
                     start as u64,
                     "attributes in strictly increasing order of their keys",
-                    format!("{key:?}"),
+                    quoted(&key),
                 ));
             }
             attributes.insert(key, value);

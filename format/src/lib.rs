@@ -50,7 +50,7 @@ mod waiting;
 mod writer;
 
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
-pub use error::{Error, Result};
+pub use error::{Error, Result, quoted};
 pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
 pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TilesRead, Touched};
 pub use recover::{RecoverReport, recover};

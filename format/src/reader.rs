@@ -190,7 +190,7 @@ impl Reader {
         file.read_at(footer_offset, &mut record)?;
         let footer = match Record::from_bytes(&record, footer_offset).map_err(fault)? {
             Record::Footer(footer) => footer,
-            other => return Err(fault(Fault::new(footer_offset, "the footer", format!("{other:?}")))),
+            other => return Err(fault(Fault::new(footer_offset, "the footer", other))),
         };
         let start = footer_offset + RECORD;
         check_footer(&footer, &layout, &header, footer_offset, trailer_offset - start).map_err(fault)?;
@@ -541,7 +541,7 @@ impl Reader {
     fn record(&self, at: TileId) -> Result<(usize, TileRecord)> {
         let index = self.layout.index_of(at).filter(|&index| index < self.index.tiles).ok_or_else(|| {
             let frames = self.frames();
-            Error::usage(format!("{}: there is no {at:?} in {frames} frames", self.file.path().display()))
+            Error::usage(format!("{}: there is nothing such as {at} in {frames} frames", self.file.path().display()))
         })?;
         Ok((index as usize, self.index.record(&self.file, &self.layout, index)?))
     }
@@ -650,9 +650,9 @@ fn unfilter(
     let values = tile.values(layout);
     let max_error = layout.columns[tile.id.column as usize].max_error;
     let stored = Stored { bytes: stored, encoding: tile.encoding, frames: values / plane, plane, max_error };
-    frames.load(stored, zstd).map_err(|found| {
-        Fault::new(tile.offset, format!("{} bytes of {:?}", 4 * values, tile.id), found).at(file.path())
-    })
+    frames
+        .load(stored, zstd)
+        .map_err(|found| Fault::new(tile.offset, format!("{} bytes of {}", 4 * values, tile.id), found).at(file.path()))
 }
 
 /// Where a frame of a raw tile lies.
@@ -680,7 +680,7 @@ fn check_payload(tile: &TileRecord, computed: u64) -> std::result::Result<(), Fa
     if computed == tile.checksum {
         return Ok(());
     }
-    let expected = format!("{:?} with checksum {:016x}", tile.id, tile.checksum);
+    let expected = format!("{} with checksum {:016x}", tile.id, tile.checksum);
     Err(Fault::new(tile.offset, expected, format!("{computed:016x}")))
 }
 

@@ -1,6 +1,8 @@
 //! The three kinds of record and the trailer (SPEC.md, "Records"). A record is a header of 64 bytes
 //! with its own checksum and, after it, a payload with another.
 
+use std::fmt;
+
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use crate::codec::{Encoding, Stats};
@@ -56,6 +58,16 @@ pub(crate) enum Record {
     Tile(TileRecord),
     Times(TimesRecord),
     Footer(FooterRecord),
+}
+
+impl fmt::Display for Record {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Record::Tile(tile) => write!(f, "a record of {}, {} frames", tile.id, tile.frames),
+            Record::Times(times) => write!(f, "a record of time stamps, frame block {}", times.frame_block),
+            Record::Footer(_) => write!(f, "a footer"),
+        }
+    }
 }
 
 impl FooterRecord {
@@ -122,11 +134,11 @@ impl Record {
                     (0, 0) => Encoding::Raw,
                     (1, order @ 0..=2) => Encoding::Filtered { order },
                     (2, order @ 1..=2) => Encoding::Bounded { order },
-                    other => {
+                    (encoding, order) => {
                         return Err(Fault::new(
                             offset + 16,
                             "encoding 0 order 0, encoding 1 order 0 to 2, or encoding 2 order 1 or 2",
-                            format!("{other:?}"),
+                            format!("encoding {encoding} order {order}"),
                         ));
                     }
                 };
@@ -175,11 +187,7 @@ impl TileRecord {
     /// legal size, and its payload lies within `payloads`.
     pub(crate) fn check(&self, layout: &Layout, payloads: std::ops::Range<u64>, place: u64) -> Result<(), Fault> {
         if layout.index_of(self.id).is_none() {
-            return Err(Fault::new(
-                place + 4,
-                "a column and a Gaussian block of this container",
-                format!("{:?}", self.id),
-            ));
+            return Err(Fault::new(place + 4, "a column and a Gaussian block of this container", self.id));
         }
         if !(1..=layout.frame_block).contains(&self.frames) {
             return Err(Fault::new(place + 20, format!("1 to {} frames", layout.frame_block), self.frames));
@@ -193,11 +201,11 @@ impl TileRecord {
         let exact = layout.columns[self.id.column as usize].max_error == 0.0;
         if exact && matches!(self.encoding, Encoding::Bounded { .. }) {
             let expected = "an encoding that keeps every bit, as the column has no bound";
-            return Err(Fault::new(place + 16, expected, format!("{:?}", self.encoding)));
+            return Err(Fault::new(place + 16, expected, self.encoding));
         }
         if !legal {
             let expected = format!("{raw} stored bytes, or fewer if compressed");
-            return Err(Fault::new(place + 40, expected, format!("{stored} ({:?})", self.encoding)));
+            return Err(Fault::new(place + 40, expected, format!("{stored}, {}", self.encoding)));
         }
         let inside =
             self.offset >= payloads.start && self.offset.checked_add(stored).is_some_and(|end| end <= payloads.end);

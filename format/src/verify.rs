@@ -48,11 +48,7 @@ impl Reader {
                         self.file.read_at(self.index.place(index), &mut indexed)?;
                     }
                     let Some(index) = index.filter(|_| indexed == bytes) else {
-                        return Err(fault(Fault::new(
-                            position,
-                            "the tile the index describes, once",
-                            format!("{tile:?}"),
-                        )));
+                        return Err(fault(Fault::new(position, "the tile the index describes, once", tile.id)));
                     };
                     met[index as usize] = true;
                     report.tiles += 1;
@@ -125,7 +121,7 @@ pub(crate) fn check_stats(tile: &TileRecord, position: u64, values: &[f32]) -> s
     // As bits: a forged NaN must not compare as equal to nothing, nor −0 to the +0 it has to be.
     let bits = |stats: Stats| (stats.min.to_bits(), stats.max.to_bits(), stats.non_finite);
     if bits(found) != bits(tile.stats) {
-        return Err(Fault::new(position + 44, format!("{found:?}, as the values are"), format!("{:?}", tile.stats)));
+        return Err(Fault::new(position + 44, format!("{found}, as the values are"), tile.stats));
     }
     Ok(())
 }

@@ -130,16 +130,14 @@ impl Writer {
         let shape = |frames, width, len| format!("{frames} frames × {width} components × {len} Gaussians");
         if (tile.width, tile.len) != (width, len) || (tile.frames != frames && !tile.constant) {
             return Err(Error::usage(format!(
-                "{at:?} holds {}, not {}",
+                "{at} holds {}, not {}",
                 shape(frames, width, len),
                 shape(tile.frames, tile.width, tile.len)
             )));
         }
         if tile.max_error > max_error {
             let found = tile.max_error;
-            return Err(Error::usage(format!(
-                "{at:?} may be off by {max_error}, the bound of its column, not {found}"
-            )));
+            return Err(Error::usage(format!("{at} may be off by {max_error}, the bound of its column, not {found}")));
         }
         let mut record = TileRecord {
             id: at,
@@ -174,7 +172,7 @@ impl Writer {
         let (index, frames) = self.free_slot(at)?;
         let slot = index as usize % self.constants.len();
         let Some(earlier) = self.constants[slot] else {
-            return Err(Error::usage(format!("{at:?} has no constant tile before it to repeat")));
+            return Err(Error::usage(format!("{at} has no constant tile before it to repeat")));
         };
         let record = TileRecord { id: at, frames, ..earlier };
         let start = self.position;
@@ -187,10 +185,10 @@ impl Writer {
     /// Place in the index of a tile that is still to be written, and the frames it covers.
     fn free_slot(&mut self, at: TileId) -> Result<(u64, u32)> {
         let Some(index) = self.layout.index_of(at).filter(|&index| index < self.tiles) else {
-            return Err(Error::usage(format!("there is no {at:?} after {} frames", self.times.len())));
+            return Err(Error::usage(format!("there is nothing such as {at} after {} frames", self.times.len())));
         };
         if self.is_entered(index)? {
-            return Err(Error::usage(format!("{at:?} was written already")));
+            return Err(Error::usage(format!("{at} was written already")));
         }
         let frames = self.layout.frame_range(at.frame_block, self.times.len() as u64);
         Ok((index, (frames.end - frames.start) as u32))
@@ -240,7 +238,7 @@ impl Writer {
                 first += 1;
             }
             return Err(Error::usage(format!(
-                "{} of {} tiles are missing, the first is {:?}",
+                "{} of {} tiles are missing, the first is {}",
                 self.tiles - self.written,
                 self.tiles,
                 self.layout.tile_at(first)

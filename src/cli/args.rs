@@ -7,6 +7,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use super::recipe_flags::RecipeFlags;
 use crate::emit::atomic::Replace;
 use crate::emit::bounds::MaxError;
+use crate::error::quoted;
 use crate::verbs::method::Method;
 use crate::verbs::precision::Turned;
 use crate::work::Part;
@@ -647,7 +648,7 @@ pub(super) struct Completions {
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {
-    let expected = || format!("expected WIDTHxHEIGHT such as 800x800, found {text:?}");
+    let expected = || format!("expected WIDTHxHEIGHT such as 800x800, found {}", quoted(text));
     let (width, height) = text.split_once('x').ok_or_else(expected)?;
     match (width.parse(), height.parse()) {
         (Ok(width @ 1..=65_535), Ok(height @ 1..=65_535)) => Ok((width, height)),
@@ -658,7 +659,7 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
 fn parse_bytes(text: &str) -> Result<u64, String> {
     match text.parse::<bytesize::ByteSize>() {
         Ok(bytes) if bytes.as_u64() > 0 => Ok(bytes.as_u64()),
-        _ => Err(format!("expected a size such as 512MiB or 4GB, found {text:?}")),
+        _ => Err(format!("expected a size such as 512MiB or 4GB, found {}", quoted(text))),
     }
 }
 
@@ -666,25 +667,24 @@ fn parse_decibels(text: &str) -> Result<f64, String> {
     let number = text.trim().trim_end_matches(['b', 'B']).trim_end_matches(['d', 'D']).trim_end();
     match number.parse::<f64>() {
         Ok(decibels) if decibels > 0.0 && decibels <= 100.0 => Ok(decibels),
-        _ => Err(format!("expected decibels above 0 and at most 100, such as 0.5 or 35dB, found {text:?}")),
+        _ => Err(format!("expected decibels above 0 and at most 100, such as 0.5 or 35dB, found {}", quoted(text))),
     }
 }
 
+/// Numbers with commas or blanks between.
+pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> Result<Vec<T>, String> {
+    let parts = text.split([',', ' ']).filter(|part| !part.is_empty());
+    parts.map(|part| part.parse().map_err(|_| format!("{} is no number", quoted(part)))).collect()
+}
+
 fn parse_colour(text: &str) -> Result<[f32; 3], String> {
-    let channels: Vec<f32> = text
-        .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
-        .collect::<Result<_, _>>()?;
+    let channels: Vec<f32> = numbers(text)?;
     channels.try_into().map_err(|c: Vec<f32>| format!("expected three numbers, found {}", c.len()))
 }
 
 fn parse_box(text: &str) -> Result<[f64; 6], String> {
-    let numbers: Vec<f64> = text
-        .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
-        .collect::<Result<_, _>>()?;
     let corners: [f64; 6] =
-        numbers.try_into().map_err(|n: Vec<f64>| format!("expected six numbers, found {}", n.len()))?;
+        numbers(text)?.try_into().map_err(|n: Vec<f64>| format!("expected six numbers, found {}", n.len()))?;
     // A NaN is in no order.
     let in_order = |axis: usize| corners[axis].partial_cmp(&corners[axis + 3]).is_some_and(|order| order.is_le());
     match (0..3).find(|&axis| !in_order(axis)) {

@@ -4,6 +4,7 @@
 mod args;
 mod recipe_flags;
 mod signals;
+mod words;
 
 use std::io::{self, IsTerminal, Write};
 use std::path::Path;
@@ -14,7 +15,7 @@ use gseq::Compression;
 
 use crate::budget::{self, Budget, Tell};
 use crate::compress::{Only, Request, Run, Target, compress, divided_stages};
-use crate::emit::atomic::Replace;
+use crate::emit::atomic::{Replace, as_named};
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -40,7 +41,7 @@ use args::{
 
 /// Runs the program on the arguments of this process.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::try_parse_from(words::regular(std::env::args_os(), &Cli::command())) {
         Ok(cli) => cli,
         Err(error) => {
             // `--help` and `--version` arrive here too, with exit code 0.
@@ -67,6 +68,7 @@ pub fn main() -> ExitCode {
             ExitCode::SUCCESS
         }
         Err(error) => {
+            let error = as_named(error);
             tell(&format!("splatsieve: {error}"));
             ExitCode::from(code_of(&error))
         }

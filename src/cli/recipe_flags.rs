@@ -1,12 +1,13 @@
 //! One flag per hyper-parameter, made from the list in `recipe`, so that none can be forgotten.
 
-use std::fs;
 use std::path::PathBuf;
 
+use super::args::numbers;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use crate::compress::Record;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
+use crate::ingest::text::read_text;
 use crate::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
 const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a documented file)";
@@ -26,7 +27,7 @@ impl RecipeFlags {
     /// What the recipe file, if there is one, says of the run it was written beside.
     pub(super) fn record(&self) -> Result<Record> {
         let Some(path) = &self.file else { return Ok(Record::default()) };
-        let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
+        let text = read_text(path)?;
         Record::read(&text).map_err(|message| Error::usage(format!("{}: {message}", path.display())))
     }
 
@@ -36,7 +37,7 @@ impl RecipeFlags {
         let mut recipe = match &self.file {
             None => Recipe::preset(fallback)?,
             Some(path) => {
-                let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
+                let text = read_text(path)?;
                 Recipe::from_toml(&text, fallback)
                     .map_err(|message| Error::usage(format!("{}: {message}", path.display())))?
             }
@@ -46,7 +47,12 @@ impl RecipeFlags {
         }
         for (section, key, value) in &self.set {
             recipe = recipe.with(section, key, value).map_err(|message| {
-                Error::usage(format!("--{}: {value:?} does not fit: {}", key.replace('_', "-"), message.trim_end()))
+                Error::usage(format!(
+                    "--{}: {} does not fit: {}",
+                    key.replace('_', "-"),
+                    quoted(value),
+                    message.trim_end()
+                ))
             })?;
         }
         if !self.passes.is_empty() {
@@ -134,10 +140,7 @@ impl FromArgMatches for RecipeFlags {
 }
 
 fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
-    let numbers: Vec<f64> = text
-        .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
-        .collect::<std::result::Result<_, _>>()?;
+    let numbers: Vec<f64> = numbers(text)?;
     match numbers[..] {
         [epsilon, d0, rho, tau_m] => Ok(MergePass { epsilon, d0, rho, tau_m }),
         _ => Err(format!("expected four numbers EPSILON,D0,RHO,TAU_M, found {}", numbers.len())),

@@ -1,42 +1,38 @@
 //! What the user knows better than the scores: Gaussians to keep or to drop.
 
-use std::fs;
 use std::path::Path;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
+use crate::ingest::text::read_text;
 
-/// Ids from a file with one id (or range) per line, or from a list such as `3,10-20`; increasing,
-/// without repetition. Every id is below `count`.
+/// Ids and ranges from a file, where `#` begins a comment, or from a list such as `3,10-20`, with commas, blanks or lines
+/// between; increasing, without repetition. Every id is below `count`.
 pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
-    let is_list = spec.chars().all(|c| c.is_ascii_digit() || matches!(c, ',' | '-' | ' '));
-    let (text, origin) = if is_list {
-        (spec.replace(',', "\n"), "id list".to_owned())
-    } else {
-        (fs::read_to_string(spec).map_err(Error::io("read", Path::new(spec)))?, spec.to_owned())
-    };
+    let is_list = spec.chars().all(|c| c.is_ascii_digit() || matches!(c, ',' | '-') || c.is_ascii_whitespace());
+    let (text, origin) =
+        if is_list { (spec.to_owned(), "id list".to_owned()) } else { (read_text(Path::new(spec))?, spec.to_owned()) };
     let mut ids = Vec::new();
     for (number, line) in text.lines().enumerate() {
-        let line = line.split('#').next().unwrap_or("").trim();
-        if line.is_empty() {
-            continue;
-        }
-        let bounds = match line.split_once('-') {
-            None => line.parse().map(|id: u32| (id, id)),
-            Some((from, to)) => from.trim().parse().and_then(|from| Ok((from, to.trim().parse()?))),
+        let wrong = |expected: String, found: &str| {
+            Error::usage(format!("{origin}, line {}: expected {expected}, found {}", number + 1, quoted(found)))
         };
-        let (from, to) = bounds.map_err(|_| {
-            Error::usage(format!(
-                "{origin}, line {}: expected an id or a range such as 10-20, found {line:?}",
-                number + 1
-            ))
-        })?;
-        if from > to || to as usize >= count {
-            return Err(Error::usage(format!(
-                "{origin}, line {}: expected ids below {count}, the number of Gaussians, found {line:?}",
-                number + 1
-            )));
+        let line = line.split('#').next().unwrap_or("");
+        // Blanks around its hyphen belong to a range.
+        let line = line.split('-').map(str::trim).collect::<Vec<_>>().join("-");
+        for word in line.split([',', ' ', '\t']).filter(|word| !word.is_empty()) {
+            let bounds = match word.split_once('-') {
+                None => word.parse().map(|id: u32| (id, id)),
+                Some((from, to)) => from.parse().and_then(|from| Ok((from, to.parse()?))),
+            };
+            let (from, to) = bounds.map_err(|_| wrong("an id or a range such as 10-20".into(), word))?;
+            if from > to {
+                return Err(wrong(format!("a range that runs forwards, such as {to}-{from}"), word));
+            }
+            if to as usize >= count {
+                return Err(wrong(format!("ids below {count}, the number of Gaussians"), word));
+            }
+            ids.extend(from..=to);
         }
-        ids.extend(from..=to);
     }
     ids.sort_unstable();
     ids.dedup();
@@ -45,6 +41,8 @@ pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]
@@ -54,6 +52,19 @@ mod tests {
         let from_file = parse_ids(file.path().to_str().unwrap(), 20).unwrap();
         assert_eq!(from_file, [3, 10, 11, 12]);
         assert_eq!(parse_ids("3,10-12,12", 20).unwrap(), from_file);
+        for apart in ["3 10-12", "3, 10 - 12", "12 11\n10\t3,"] {
+            assert_eq!(parse_ids(apart, 20).unwrap(), from_file, "{apart:?}");
+        }
+        fs::write(file.path(), b"\xef\xbb\xbf3, 10-12 # a few\n").unwrap();
+        assert_eq!(parse_ids(file.path().to_str().unwrap(), 20).unwrap(), from_file);
+    }
+
+    #[test]
+    fn a_range_that_runs_backwards_is_named_as_one() {
+        let message = parse_ids("3,10-5", 20).unwrap_err().to_string();
+        assert!(message.contains("runs forwards, such as 5-10") && message.contains("\"10-5\""), "{message}");
+        // Also beyond the last: what is wrong first is said first.
+        assert!(parse_ids("100-5", 20).unwrap_err().to_string().contains("5-100"));
     }
 
     #[test]

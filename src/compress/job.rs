@@ -137,6 +137,9 @@ impl Job {
             Spared::Bands { .. } => Refine::of(recipe, part, looks && prunes).map(Refine::without_bands),
             Spared::Refining { .. } => None,
         };
+        if request.kind.is_none() {
+            OutputKind::check_name(&request.output)?;
+        }
         let kind = OutputKind::of(&request.output, request.kind, outlook.own_output);
         let is_archive = kind == OutputKind::Archive;
         if request.archive_psnr.is_some() && !is_archive {

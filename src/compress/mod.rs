@@ -33,7 +33,7 @@ pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
 use crate::budget::{Workload, seconds};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::families::Size;
 use crate::model::ALL_HARMONICS;
 use crate::recipe::{Precision, Recipe, WhichBands};
@@ -176,6 +176,9 @@ fn reduce(
             (reduction, summary, None)
         }
     };
+    if reduction.len() == 0 {
+        return Err(nothing_left(scene, &scored));
+    }
     job.write_down(request, &work, &scene.limits, &mut journal);
 
     // What the search was given was more.
@@ -236,6 +239,19 @@ fn reduce(
     scene.work.not_divided("writing")?;
     let written = |journal, size| summarise(journal, Some(size));
     Ok((job.emit.run(scene, &reduction, (&map, encoded.as_ref()), &recipe, journal, written)?, map))
+}
+
+/// That no Gaussian is left: nothing renders such a result.
+fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
+    let all = scored.count();
+    let dropped = scored.selection.counts.forced_drop;
+    let found = match (all, dropped) {
+        (0, _) => "none in the input".to_owned(),
+        (_, 0) => format!("none of {all}"),
+        _ => format!("none of {all}, {dropped} of which --drop-ids drops"),
+    };
+    let error = Error::input(&scene.path, "", "at least one Gaussian that stays", found);
+    if all == 0 { error } else { error.hint("nothing was written: drop fewer, or ask for a size with --target-ratio") }
 }
 
 /// Has places follow those of an archive, whose Gaussian `i` was at `order[i]`.

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use crate::error::{Error, Result};
 pub use named::MARKER;
 use named::{Owner, entries, files_below, is_our_file, name_files, parts, present};
-use workspace::{SCRATCH, Workspace};
+use workspace::{SCRATCH, Workspace, named_in};
 pub use workspace::{Withdrawn, withdraw_all};
 
 /// What an output is.
@@ -46,7 +46,7 @@ pub enum Replace {
 ///
 /// Refused are: a target without a name or in a folder that does not exist; a target that is an input,
 /// holds one or lies inside one, overwriting or not, whatever links lead there; an existing target that `replace` does
-/// not let go; a file in place of a folder or the reverse, and what is neither.
+/// not let go, but for an empty folder in place of a folder; a file in place of a folder or the reverse, and what is neither.
 ///
 /// # Errors
 /// Each of these, as a matter of usage; a system that will not say what is there.
@@ -82,6 +82,9 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
         }
     }
     let Ok(found) = fs::symlink_metadata(target) else { return Ok(()) };
+    if kind == Kind::Folder && is_empty_folder(target) {
+        return Ok(());
+    }
     if replace == Replace::Never {
         return Err(exists(target));
     }
@@ -269,18 +272,24 @@ fn exists(target: &Path) -> Error {
     ))
 }
 
+/// Whether there is a folder, no link to one, with nothing in it.
+fn is_empty_folder(target: &Path) -> bool {
+    fs::symlink_metadata(target).is_ok_and(|found| found.is_dir())
+        && entries(target).is_ok_and(|entries| entries.is_empty())
+}
+
 /// Confirms that what is at `target` may be replaced.
 fn may_go(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
     let shown = target.display();
     match (kind, replace) {
         (_, Replace::Any) => Ok(()),
+        (Kind::Folder, _) if is_empty_folder(target) => Ok(()),
         (_, Replace::Never) => Err(exists(target)),
         (Kind::File, Replace::Ours) if is_our_file(target) => Ok(()),
         (Kind::File, Replace::Ours) => Err(Error::usage(format!(
             "{shown} exists already, and nothing says that splatsieve wrote it: it is no container, and no summary beside \
              it lists it\n  --force replaces it all the same; or give another output"
         ))),
-        (Kind::Folder, Replace::Ours) if entries(target)?.is_empty() => Ok(()),
         (Kind::Folder, Replace::Ours) => match Owner::of(&target.join(MARKER)) {
             Owner::Listed(_) => Ok(()),
             Owner::Unlisted => Err(Error::usage(format!(
@@ -292,6 +301,21 @@ fn may_go(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
                  --force replaces it with all that is in it; or give another output"
             ))),
         },
+    }
+}
+
+/// The same failure of the system, of the file that a person asked for where it is one that it grows in meanwhile.
+pub fn as_named(error: Error) -> Error {
+    let (action, path, source) = match error {
+        Error::Io { action, path, source } | Error::Container(gseq::Error::Io { action, path, source }) => {
+            (action, path, source)
+        }
+        error => return error,
+    };
+    match named_in(&path) {
+        Some((path, true)) => Error::Io { action: "write a scratch file in", path, source },
+        Some((path, false)) => Error::Io { action, path, source },
+        None => Error::Io { action, path, source },
     }
 }
 

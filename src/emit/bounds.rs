@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 use crate::model::Columns;
 
 /// Bound of each column in its unit, in the order of [`Columns::all`]; 0 keeps every bit.
@@ -46,17 +46,21 @@ impl FromStr for MaxError {
 
     fn from_str(text: &str) -> std::result::Result<MaxError, String> {
         let names: Vec<&str> = Columns::all().iter().map(Columns::name).collect();
-        let (name, number) = text.split_once('=').ok_or_else(|| format!("expected COLUMN=BOUND, found {text:?}"))?;
+        let (name, number) =
+            text.split_once('=').ok_or_else(|| format!("expected COLUMN=BOUND, found {}", quoted(text)))?;
         let column = Columns::all().iter().find(|column| column.name() == name);
-        let column = column.ok_or_else(|| format!("expected a column of {}, found {name:?}", names.join(", ")))?;
+        let column =
+            column.ok_or_else(|| format!("expected a column of {}, found {}", names.join(", "), quoted(name)))?;
         let (number, of_extent) = number.strip_suffix('%').map_or((number, false), |percent| (percent, true));
         if of_extent && column != Columns::POSITION {
             return Err(format!(
-                "expected a bound in the unit of {name} (only of positions a percentage), found {text:?}"
+                "expected a bound in the unit of {name} (only of positions a percentage), found {}",
+                quoted(text)
             ));
         }
         let bound = number.parse::<f64>().ok().filter(|bound| (1e-30..=1e30).contains(bound));
-        let bound = bound.ok_or_else(|| format!("expected a bound above 0, from 1e-30 to 1e30, found {number:?}"))?;
+        let bound =
+            bound.ok_or_else(|| format!("expected a bound above 0, from 1e-30 to 1e30, found {}", quoted(number)))?;
         Ok(MaxError { column, bound: if of_extent { bound / 100.0 } else { bound }, of_extent })
     }
 }

@@ -13,3 +13,4 @@ pub mod kind;
 pub(crate) mod npz;
 pub mod ply;
 pub mod rows;
+pub(crate) mod zip_output;

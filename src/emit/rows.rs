@@ -13,6 +13,7 @@ use npyz::npz::NpzWriter;
 use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime};
 
+use super::zip_output::ZipOutput;
 use crate::error::{Error, Result};
 use crate::model::{self, Rows, Statistic};
 
@@ -107,7 +108,7 @@ impl RowTable<'_> {
     }
 
     fn npz_into(&self, out: impl Write + io::Seek) -> io::Result<()> {
-        let mut archive = NpzWriter::new(out);
+        let mut archive = NpzWriter::new(ZipOutput::new(out));
         // 8 bytes a value and a header: beyond 4 GiB an entry needs the 64-bit form.
         let large = self.rows.len() as u64 * 8 + 4096 > u64::from(u32::MAX);
         let options = FileOptions::default()
@@ -121,7 +122,7 @@ impl RowTable<'_> {
                 Values::Bool(values) => add(&mut archive, name, options, values)?,
             }
         }
-        archive.zip_writer().finish()?.flush()
+        archive.zip_writer().finish()?.close()
     }
 
     fn csv_into(&self, out: impl Write) -> io::Result<()> {

@@ -9,3 +9,4 @@ mod map;
 pub(crate) mod npz;
 pub mod ply;
 pub mod ply_sequence;
+pub mod text;

@@ -15,7 +15,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use super::digest::hash_file;
 use super::ply::{Ply, Property, check_ids};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
@@ -207,7 +207,7 @@ fn check_agrees(ply: &Ply, properties: &[Property], count: usize, first: &Path) 
     if ply.properties() != properties {
         let differing = (0..).find(|&i| ply.properties().get(i) != properties.get(i)).unwrap_or(0);
         let name = |list: &[Property]| match list.get(differing) {
-            Some(property) => format!("{:?} {:?}", property.scalar, property.name),
+            Some(property) => format!("{} {}", property.scalar.name(), quoted(&property.name)),
             None => "no property".to_owned(),
         };
         let expected = format!("{} in place {differing} of {}, as in {first}", name(properties), properties.len());

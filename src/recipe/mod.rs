@@ -10,7 +10,7 @@ use std::num::NonZeroU32;
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 use crate::model::{Columns, HIGHEST_DEGREE};
 
 pub use effort::Effort;
@@ -242,7 +242,7 @@ impl TryFrom<String> for WhichBands {
             "needed" => Ok(WhichBands::Needed),
             degree => match degree.parse() {
                 Ok(degree) if degree <= HIGHEST_DEGREE => Ok(WhichBands::UpTo(degree)),
-                _ => Err(format!("{text:?}: expected all, needed, or a degree from 0 to {HIGHEST_DEGREE}")),
+                _ => Err(format!("{}: expected all, needed, or a degree from 0 to {HIGHEST_DEGREE}", quoted(degree))),
             },
         }
     }
@@ -289,10 +289,10 @@ impl TryFrom<String> for Groups {
 
     fn try_from(text: String) -> std::result::Result<Groups, String> {
         let mut columns = Columns::empty();
-        for name in text.split(',').map(str::trim).filter(|&name| text != "none" && !name.is_empty()) {
+        for name in text.split([',', ' ']).filter(|&name| text != "none" && !name.is_empty()) {
             let group = GROUPS.iter().find(|group| group.0 == name).ok_or_else(|| {
                 let names = GROUPS.map(|group| group.0).join(",");
-                format!("{name:?}: expected some of {names}, or none")
+                format!("{}: expected some of {names}, or none", quoted(name))
             })?;
             columns |= group.1;
         }
@@ -516,9 +516,11 @@ impl Recipe {
 pub fn preset_text(name: &str) -> Result<&'static str> {
     match PRESETS.iter().find(|(known, _)| *known == name) {
         Some((_, text)) => Ok(text),
-        None => {
-            Err(Error::usage(format!("no preset is called {name:?}; there are: {}", PRESETS.map(|p| p.0).join(", "))))
-        }
+        None => Err(Error::usage(format!(
+            "no preset is called {}; there are: {}",
+            quoted(name),
+            PRESETS.map(|p| p.0).join(", ")
+        ))),
     }
 }
 

@@ -30,6 +30,7 @@ use crate::compress::measure::{Measure, Stages};
 use crate::compress::score::{SCORED, Scored, UserOverrides};
 use crate::compress::summary::TermSummary;
 use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
+use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
 use crate::recipe::{NonFinite, Recipe};
@@ -69,6 +70,7 @@ pub struct ReportOptions {
 pub fn report(options: &ReportOptions) -> Result<Report> {
     let mut inputs = options.evaluate.inputs();
     inputs.extend(options.sweep.as_deref());
+    check_folder_name(&options.output, "report")?;
     check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
     let trade_off = options.sweep.as_deref().map(read_sweep).transpose()?;
     let mut side = SideBySide::open(&options.evaluate)?;

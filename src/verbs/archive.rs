@@ -7,6 +7,7 @@ use std::path::Path;
 use crate::TOOL;
 use crate::archive::{MAGIC, Parts};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::families::archive::{is_folder, read_archive, unpack};
 use crate::model::Columns;
@@ -52,6 +53,7 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace) -> Result<
         staged.commit()?;
         return Ok(unpacked);
     }
+    check_folder_name(output, "unpack")?;
     check_target(output, Kind::Folder, &[path], overwrite)?;
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;

@@ -19,7 +19,7 @@ use crate::emit::container::{
     BOUNDED_FRAME_BLOCK, FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, join_container, spill_blocks, write_container,
 };
 use crate::emit::frame_stream::StreamWriter;
-use crate::emit::kind::OutputKind;
+use crate::emit::kind::{OutputKind, check_container_name, check_folder_name};
 use crate::error::{Error, Result};
 use crate::families::stream::pack_stream;
 use crate::families::trajectories::write_sequence;
@@ -76,6 +76,7 @@ impl Storing {
 /// # Errors
 /// What is wrong with the input; a bound of the extent of a stream, which is known at its end alone.
 pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
+    check_container_name(output, "pack")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     if input.is_stream() {
         let packing = storing.packing(|| {
@@ -156,6 +157,7 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
 
 /// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
 pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<Opened> {
+    check_folder_name(output, "unpack")?;
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
     let opened = open_input(input)?;
     let source = opened.input.source();
@@ -179,9 +181,15 @@ pub fn verify(path: &Path) -> Result<VerifyReport> {
 
 /// Saves the complete frames of a container that was cut short.
 pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
+    check_container_name(output, "recover")?;
     check_target(output, Kind::File, &[input], overwrite)?;
     let staged = StagedFile::new(output, overwrite)?;
     let report = gseq::recover(input, staged.path())?;
+    if report.frames == 0 {
+        let found = format!("{} time stamps and {} intact tiles", report.frames_seen, report.tiles_seen);
+        return Err(Error::input(input, "", "at least one complete frame to save", found)
+            .hint("nothing was written: a frame is saved if every tile of its block, and all before it, are intact"));
+    }
     staged.commit()?;
     Ok(report)
 }

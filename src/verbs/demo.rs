@@ -10,6 +10,7 @@ use crate::compress::{Request, compress_scene, keep_to_budget};
 use crate::demo::{self, Body};
 use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::emit::kind::OutputKind;
+use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::families::trajectories::write_sequence;
 use crate::ingest::container::Container;
@@ -37,6 +38,7 @@ pub fn run(
     memory: Budget,
 ) -> Result<DemoReport> {
     if let Some(output) = output {
+        check_folder_name(output, "demo")?;
         check_target(output, Kind::Folder, &[], overwrite)?;
         let staged = StagedFolder::new(output, overwrite)?;
         let report = run_in(staged.path(), gaussians, frames, recipe, memory)?;

@@ -11,6 +11,7 @@ use crate::budget::{Need, Workload};
 use crate::compress::summary::{CameraSummary, InputSummary};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::image::{ImageFormat, image_bytes, write_image};
+use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture};
@@ -73,7 +74,10 @@ pub struct Rendered {
 pub fn render(options: &RenderOptions) -> Result<Rendered> {
     let output = options.output.as_path();
     let (kind, format) = match options.wanted {
-        Wanted::All(format) => (Kind::Folder, format),
+        Wanted::All(format) => {
+            check_folder_name(output, "--all")?;
+            (Kind::Folder, format)
+        }
         Wanted::One { .. } => (Kind::File, format_of(output)?),
     };
     let mut inputs = vec![options.input.path.as_path()];

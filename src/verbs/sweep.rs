@@ -15,6 +15,7 @@ use super::whole_run::{WholeRun, result_name, trained};
 use crate::TOOL;
 use crate::compress::Target;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::report::trade_off::{PAGE, page};
 use crate::scene::{InputOptions, open_scene};
@@ -61,6 +62,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
     }
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
+    check_folder_name(&options.output, "sweep")?;
     check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut fractions = options.fractions.clone();

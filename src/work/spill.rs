@@ -86,12 +86,18 @@ impl Spilling {
         Ok(Spilling { writer, at: target.to_owned(), staged: Some(staged) })
     }
 
+    /// What fails with a write: a scratch file has no name to call it by.
+    fn action(&self) -> &'static str {
+        if self.staged.is_some() { "write values to" } else { "write a scratch file in" }
+    }
+
     /// Writes `bytes` behind what is there.
     ///
     /// # Errors
     /// A failed write.
     pub fn write(&mut self, bytes: &[u8]) -> Result<()> {
-        self.writer.write_all(bytes).map_err(Error::io("write values to", &self.at))
+        let failed = Error::io(self.action(), &self.at);
+        self.writer.write_all(bytes).map_err(failed)
     }
 
     /// Writes the length of `bytes`, then these, behind what is there.
@@ -107,7 +113,7 @@ impl Spilling {
     pub(super) fn write_value(&mut self, value: &impl Serialize) -> Result<()> {
         let Err(error) = postcard::to_io(value, &mut self.writer) else { return Ok(()) };
         let failed = self.writer.failed.take().unwrap_or_else(|| io::Error::other(error));
-        Err(Error::io("write values to", &self.at)(failed))
+        Err(Error::io(self.action(), &self.at)(failed))
     }
 
     /// Ends writing: only then can be read, and only then it has its name, if it gets one.
@@ -115,9 +121,10 @@ impl Spilling {
     /// # Errors
     /// A failed write.
     pub fn finish(self) -> Result<Spill> {
+        let action = self.action();
         let Spilling { writer, at, staged } = self;
         let start = writer.start();
-        let file = writer.finish().map_err(Error::io("write values to", &at))?;
+        let file = writer.finish().map_err(Error::io(action, &at))?;
         staged.map_or(Ok(()), StagedFile::commit)?;
         Ok(Spill { file, start, at })
     }

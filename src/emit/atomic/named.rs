@@ -8,7 +8,7 @@ use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 
 /// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
 /// result's own; [`super::StagedFolder::commit`] and [`super::commit_files`] enter them.
@@ -62,8 +62,9 @@ pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
     // As text, for the other entries keep their order.
     let Some(entries) = text.trim_end().strip_suffix('}').filter(|_| found.is_object()) else {
         return Err(Error::usage(format!(
-            "{}: expected a JSON object to list files in, found {text:?}",
-            path.display()
+            "{}: expected a JSON object to list files in, found {}",
+            path.display(),
+            quoted(&text)
         )));
     };
     let entries = entries.trim_end();
@@ -173,7 +174,7 @@ fn is_folder(path: &Path) -> bool {
 /// The folder and the name of a target.
 pub(super) fn parts(target: &Path) -> Result<(PathBuf, &OsStr)> {
     let Some(name) = target.file_name() else {
-        return Err(Error::usage(format!("{:?} is no name for an output", target.display().to_string())));
+        return Err(Error::usage(format!("{} is no name for an output", quoted(&target.to_string_lossy()))));
     };
     let parent = target.parent().filter(|parent| !parent.as_os_str().is_empty());
     Ok((parent.unwrap_or(Path::new(".")).to_owned(), name))

@@ -112,6 +112,36 @@ impl Drop for Workspace {
     }
 }
 
+/// What a person calls the file at `path`, if it is one that grows in such a folder: the target, or a file in it; of a
+/// scratch file, which has no name that says anything, the folder that it is in.
+pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
+    // Of `.name.random` the name.
+    let name_of = |part: &OsStr, ending: &str| -> Option<String> {
+        let name = part.to_str()?.strip_prefix('.')?.strip_suffix(ending)?;
+        Some(name.rsplit_once('.')?.0.to_owned())
+    };
+    let mut parts = path.components();
+    let mut before = PathBuf::new();
+    let name = loop {
+        let part = parts.next()?;
+        match name_of(part.as_os_str(), ENDING) {
+            Some(name) => break name,
+            None => before.push(part),
+        }
+    };
+    if name == SCRATCH {
+        return Some((before, true));
+    }
+    before.push(name);
+    // Containers grow under a hidden name of their own.
+    before.extend(
+        parts
+            .skip(1)
+            .map(|part| name_of(part.as_os_str(), ".tmp").map_or_else(|| part.as_os_str().to_owned(), Into::into)),
+    );
+    Some((before, false))
+}
+
 /// Gives files their names, all or none where a signal comes.
 pub(super) fn rename_files(files: &[(&Workspace, &Path)]) -> Result<()> {
     let held = live();

@@ -4,7 +4,7 @@ use std::fmt;
 use std::ops::Range;
 use std::path::Path;
 
-use crate::error::Error;
+use crate::error::{Error, quoted};
 
 /// Nesting beyond this is refused: each level is a stack frame.
 const MAX_DEPTH: usize = 32;
@@ -32,7 +32,7 @@ impl fmt::Display for Literal {
             Literal::Bool(false) => write!(f, "False"),
             Literal::Int(value) => write!(f, "{value}"),
             Literal::Float(value) => write!(f, "{value}"),
-            Literal::Str(value) => write!(f, "the string {value:?}"),
+            Literal::Str(value) => write!(f, "the string {}", quoted(value)),
             Literal::Sequence(items) => write!(f, "a list of {}", items.len()),
             Literal::Dict(entries) => write!(f, "a dictionary of {}", entries.len()),
             Literal::Opaque(text) => write!(f, "`{}`", text.chars().take(40).collect::<String>()),

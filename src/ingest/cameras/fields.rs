@@ -30,8 +30,8 @@ impl<'a> Fields<'a> {
     pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
         let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), describe);
         let place = match self.frame {
-            Some(frame) => format!("frame {frame}, key {key:?}"),
-            None => format!("key {key:?}"),
+            Some(frame) => format!("frame {frame}, key \"{key}\""),
+            None => format!("key \"{key}\""),
         };
         Error::input(self.path, place, expected, found)
     }

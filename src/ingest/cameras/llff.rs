@@ -13,8 +13,9 @@ use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
 use super::assemble::{Listing, Picture, assemble, check, from_camera_to_world};
-use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, read_limited};
+use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
+use crate::ingest::text::read_limited;
 use crate::model::{Camera, Rig, Split};
 
 /// Values per camera.

@@ -21,19 +21,16 @@ mod virtual_rig;
 #[cfg(test)]
 mod tests;
 
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
 use crate::error::{Error, Result};
+use crate::ingest::text::read_json;
 use crate::model::Rig;
 
 pub use virtual_rig::virtual_rig;
 
-/// Largest camera file that is read. 10⁵ pictures take some 60 MB of JSON.
-const MAX_FILE_BYTES: u64 = 256 << 20;
 /// Largest picture side in pixels: beyond it the width times the height of one picture nears 2³².
 const MAX_SIDE_PX: u32 = 1 << 15;
 /// Most pictures of a rig.
@@ -168,22 +165,4 @@ fn check_options(options: &CameraOptions) -> Result<()> {
         return Err(Error::usage("frames 0: there must be at least one"));
     }
     Ok(())
-}
-
-/// The bytes of a file no larger than the limit.
-fn read_limited(path: &Path) -> Result<Vec<u8>> {
-    let file = File::open(path).map_err(Error::io("open", path))?;
-    let mut bytes = Vec::new();
-    file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
-    if bytes.len() as u64 > MAX_FILE_BYTES {
-        return Err(Error::input(path, "", format!("a camera file of at most {MAX_FILE_BYTES} bytes"), "a larger one"));
-    }
-    Ok(bytes)
-}
-
-fn read_json(path: &Path) -> Result<Value> {
-    serde_json::from_slice(&read_limited(path)?).map_err(|error| {
-        Error::input(path, format!("line {}, column {}", error.line(), error.column()), "JSON", error.to_string())
-            .hint("NaN and Infinity are not JSON numbers: if a pose holds them, take the picture out of the file")
-    })
 }

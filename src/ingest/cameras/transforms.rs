@@ -14,10 +14,11 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use serde_json::Value;
 
+use super::CameraOptions;
 use super::assemble::{Listing, Picture, assemble, from_camera_to_world, view_in_name};
 use super::fields::Fields;
-use super::{CameraOptions, read_json};
 use crate::error::Result;
+use crate::ingest::text::read_json;
 use crate::model::{Rig, Split};
 
 /// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).

@@ -51,7 +51,7 @@ impl Container {
         for column in Columns::all().iter() {
             let place = layout.column(column.name()).ok_or_else(|| {
                 let names: Vec<&str> = layout.columns.iter().map(|c| c.name.as_str()).collect();
-                Error::input(path, "columns", format!("a column {:?}", column.name()), format!("{names:?}"))
+                Error::input(path, "columns", format!("a column {}", column.name()), names.join(", "))
             })?;
             let width = layout.columns[place as usize].width as usize;
             let legal = match column {
@@ -61,7 +61,7 @@ impl Container {
                 _ => width == 3,
             };
             if !legal {
-                let place = format!("column {:?}", column.name());
+                let place = format!("column {}", column.name());
                 return Err(Error::input(
                     path,
                     place,

@@ -1,5 +1,6 @@
 //! The fixed parts of a frame stream, bytes in, values out (format/STREAM.md).
 
+use crate::error::quoted;
 use crate::model::{Columns, sh_coefficients};
 
 const VERSION: u32 = 1;
@@ -63,7 +64,7 @@ impl StreamHeader {
             Err(Illegal { offset, expected: expected.to_owned(), found, hint })
         };
         if bytes[..8] != Self::MAGIC {
-            return illegal(0, "a frame stream (format/STREAM.md)", format!("{:?}", shown(&bytes[..8])), FOREIGN);
+            return illegal(0, "a frame stream (format/STREAM.md)", quoted(&shown(&bytes[..8])), FOREIGN);
         }
         let version = u32_at(bytes, 8);
         if version != VERSION {
@@ -147,7 +148,7 @@ impl Mark {
                 }
                 Ok(Mark::Frame { index, time, bytes: length })
             }
-            _ => illegal(0, format!("frame {frames} or the end mark"), format!("{:?}", shown(&bytes[..4])), FOREIGN),
+            _ => illegal(0, format!("frame {frames} or the end mark"), quoted(&shown(&bytes[..4])), FOREIGN),
         }
     }
 }

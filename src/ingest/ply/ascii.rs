@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use super::header::{Element, Header, Property, Scalar};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 
 /// The body as little-endian rows. One row per line; blank lines are skipped; what follows the last
 /// row is ignored.
@@ -61,9 +61,9 @@ fn place(element: &Element) -> String {
 }
 
 fn unreadable(path: &Path, line: usize, property: &Property, word: &[u8]) -> Error {
-    let expected = format!("a number of type {:?} for property {:?}", property.scalar, property.name);
+    let expected = format!("a number of type {} for property {}", property.scalar.name(), quoted(&property.name));
     let word = String::from_utf8_lossy(&word[..word.len().min(60)]);
-    Error::input(path, format!("line {line}"), expected, format!("{word:?}"))
+    Error::input(path, format!("line {line}"), expected, quoted(&word))
 }
 
 /// Appends the number `word` stands for; `None` when it stands for none of that type.

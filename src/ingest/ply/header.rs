@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, quoted};
 
 /// How the body stores numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,6 +45,20 @@ impl Scalar {
             "double" | "float64" => Scalar::F64,
             _ => return None,
         })
+    }
+
+    /// The old spelling.
+    pub fn name(self) -> &'static str {
+        match self {
+            Scalar::I8 => "char",
+            Scalar::U8 => "uchar",
+            Scalar::I16 => "short",
+            Scalar::U16 => "ushort",
+            Scalar::I32 => "int",
+            Scalar::U32 => "uint",
+            Scalar::F32 => "float",
+            Scalar::F64 => "double",
+        }
     }
 
     /// Bytes of one value in a binary body.
@@ -132,7 +146,7 @@ impl Header {
                         "binary_big_endian" => Encoding::BigEndian,
                         _ => {
                             let expected = "ascii, binary_little_endian or binary_big_endian";
-                            return Err(Error::input(path, place(), expected, format!("{name:?}")));
+                            return Err(Error::input(path, place(), expected, quoted(name)));
                         }
                     });
                 }
@@ -142,34 +156,28 @@ impl Header {
                             path,
                             place(),
                             "elements of different names",
-                            format!("{name:?} twice"),
+                            format!("{} twice", quoted(name)),
                         ));
                     }
-                    let count =
-                        count.parse().map_err(|_| Error::input(path, place(), "a row count", format!("{count:?}")))?;
+                    let count = count.parse().map_err(|_| Error::input(path, place(), "a row count", quoted(count)))?;
                     elements.push(Element { name: name.to_owned(), count, properties: Vec::new(), stride: 0 });
                 }
                 ["property", "list", .., name] => {
                     let element = elements.last().map_or("no element", |element| &element.name);
-                    let found = format!("list property {name:?} in element {element:?}");
+                    let found = format!("list property {} in element {}", quoted(name), quoted(element));
                     return Err(Error::input(path, place(), "properties of one number", found)
                         .hint("lists do not occur in Gaussian models; export the points alone"));
                 }
                 ["property", kind, name] => {
                     let Some(scalar) = Scalar::parse(kind) else {
-                        return Err(Error::input(
-                            path,
-                            place(),
-                            "a number type of PLY, such as float",
-                            format!("{kind:?}"),
-                        ));
+                        return Err(Error::input(path, place(), "a number type of PLY, such as float", quoted(kind)));
                     };
                     let Some(element) = elements.last_mut() else {
                         return Err(Error::input(path, place(), "an element before its properties", found(raw)));
                     };
                     if element.properties.iter().any(|property| property.name == name) {
-                        let expected = format!("each property of element {:?} once", element.name);
-                        return Err(Error::input(path, place(), expected, format!("{name:?} twice")));
+                        let expected = format!("each property of element {} once", quoted(&element.name));
+                        return Err(Error::input(path, place(), expected, format!("{} twice", quoted(name))));
                     }
                     element.properties.push(Property { name: name.to_owned(), scalar, offset: element.stride });
                     element.stride += scalar.bytes();
@@ -238,7 +246,7 @@ fn found(line: &[u8]) -> String {
     let line = line.trim_ascii();
     match line.len() {
         0 => "nothing".to_owned(),
-        1..=60 => format!("{:?}", String::from_utf8_lossy(line)),
-        _ => format!("{:?}…", String::from_utf8_lossy(&line[..60])),
+        1..=60 => quoted(&String::from_utf8_lossy(line)),
+        _ => format!("{}…", quoted(&String::from_utf8_lossy(&line[..60]))),
     }
 }

@@ -95,5 +95,5 @@ fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     } else {
         "a Gaussian model has x y z f_dc_0..2 opacity scale_0..2 rot_0..3"
     };
-    Error::input(path, "element vertex", format!("property {name:?}"), format!("only {}", names.join(" "))).hint(hint)
+    Error::input(path, "element vertex", format!("property {name}"), format!("only {}", names.join(" "))).hint(hint)
 }

@@ -26,6 +26,7 @@ use crate::compress::measure::{Measure, Outlook, Stages};
 use crate::compress::score::UserOverrides;
 use crate::compress::{Job, Request, Target};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
+use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::model::{Rows, Schedule, Split};
 use crate::recipe::Recipe;
@@ -166,6 +167,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     }
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
+    check_folder_name(&options.output, "precision")?;
     check_target(&options.output, Kind::Folder, &inputs, options.overwrite)?;
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
 

@@ -14,6 +14,7 @@ use half::slice::HalfFloatSliceExt;
 use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
+use crate::emit::zip_output::ZipOutput;
 use crate::error::{Error, Result};
 
 /// Where the values of a tensor begin in the file is a multiple of so many bytes, as PyTorch has it.
@@ -95,7 +96,7 @@ impl Stored {
 /// A failed write.
 pub(crate) fn write_state_dict(path: &Path, tensors: &[Stored]) -> Result<()> {
     let write = || {
-        let mut archive = ZipWriter::new(BufWriter::new(File::create(path)?));
+        let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path)?)));
         // The pickle first, and all in one folder: by its name readers know the others.
         add(&mut archive, "data.pkl", &pickle(tensors))?;
         add(&mut archive, "byteorder", if cfg!(target_endian = "big") { b"big" } else { b"little" })?;
@@ -103,12 +104,12 @@ pub(crate) fn write_state_dict(path: &Path, tensors: &[Stored]) -> Result<()> {
             add(&mut archive, &format!("data/{key}"), tensor.values.bytes())?;
         }
         add(&mut archive, "version", b"3\n")?;
-        archive.finish()?.flush()
+        archive.finish()?.close()
     };
     write().map_err(Error::io("write", path))
 }
 
-fn add(archive: &mut ZipWriter<BufWriter<File>>, name: &str, bytes: &[u8]) -> io::Result<()> {
+fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &[u8]) -> io::Result<()> {
     let options = FileOptions::default()
         .compression_method(CompressionMethod::Stored)
         .last_modified_time(DateTime::default())
