@@ -7,7 +7,7 @@
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
 //! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`], [`archive`] | pure mathematics: slices in, values out |
-//! | L3 | [`ingest`], [`stream`], [`emit`], [`work`], [`families`], [`demo`] | files, threads, terminals |
+//! | L3 | [`ingest`], [`stream`], [`emit`], [`work`], [`families`], [`demo`], [`player`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`], [`selfcheck`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
 //!
@@ -34,6 +34,7 @@ pub mod method {}
 pub mod limits;
 pub mod metrics;
 pub mod model;
+pub mod player;
 pub mod recipe;
 pub mod reduction;
 pub mod refine;

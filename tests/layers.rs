@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 const LAYERS: [&[&str]; 5] = [
     &["error", "machine", "model", "limits", "recipe", "reduction", "source"],
     &["deform", "stats", "score", "select", "merge", "render", "refine", "metrics", "archive"],
-    &["ingest", "stream", "emit", "work", "families", "demo"],
+    &["ingest", "stream", "emit", "work", "families", "demo", "player"],
     &["budget", "scene", "compress", "verbs", "report", "selfcheck"],
     &["cli"],
 ];

@@ -26,6 +26,7 @@ Examples:
   splatsieve sweep model --cameras data -o curves        every method at every size, curves as a page
   splatsieve precision model --cameras data -o page      error against run time, knob by knob
   splatsieve report model small --cameras data -o page   what it cost, as a page to look at
+  splatsieve view model small --cameras data -o scene.html    both in motion, in any browser, offline
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
   exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
   splatsieve unpack a.gseq --stream | splatsieve compress - -o b.gseq
@@ -64,6 +65,8 @@ pub(super) enum Verb {
     Precision(Precision),
     /// Write a page that shows what compression cost: pictures, curves, failure modes
     Report(Report),
+    /// Write a page that plays a scene in any browser: one model, or the original and the compressed one side by side
+    View(View),
     /// Pack any input into a .gseq container
     Pack(Pack),
     /// Say what an input holds
@@ -93,6 +96,7 @@ impl Verb {
             Verb::Compress(args) => args.input.memory.explain,
             Verb::Score(Score { input, .. })
             | Verb::Render(Render { input, .. })
+            | Verb::View(View { input, .. })
             | Verb::Pack(Pack { input, .. })
             | Verb::Info(Info { input, .. })
             | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
@@ -245,6 +249,10 @@ pub(super) struct Compress {
     /// List the stages that --part divides, in order, with the units that parts are made of, and do nothing else
     #[arg(long, conflicts_with = "part")]
     pub(super) list_stages: bool,
+    /// Write a page too that plays the result beside the original in any browser, as `view` does [default: the output's name
+    /// with .html behind]
+    #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, conflicts_with_all = ["dry_run", "part"])]
+    pub(super) view: Option<Option<PathBuf>>,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print the summary as JSON
@@ -512,6 +520,55 @@ pub(super) struct Precision {
     pub(super) json: bool,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
+}
+
+const VIEW_EXAMPLES: &str = "\
+Examples:
+  splatsieve view model --cameras data -o scene.html              a model in motion
+  splatsieve view model small --cameras data -o scene.html        before and after, under a wipe or side by side
+  splatsieve view model small --cameras data -o scene.html --max-frames 30 --original-degree 0
+  splatsieve view scan.ply -o scan.html                           a static scene, looked at from all around
+  splatsieve view long.gseq --max-frames 600 -o scene             a folder: open scene/index.html";
+
+/// `view`
+#[derive(Debug, Args)]
+#[command(before_help = VIEW_EXAMPLES)]
+pub(super) struct View {
+    #[command(flatten)]
+    pub(super) input: Input,
+    /// The model after compression, of any kind, to show beside it
+    pub(super) compressed: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) cameras: CameraFile,
+    /// Show at most this many frames, evenly from first to last
+    #[arg(long, value_name = "N", default_value_t = DEFAULT_FRAMES, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) max_frames: u32,
+    /// Show at most this many of the original beside a compressed model [default: --max-frames]
+    #[arg(long, value_name = "N", requires = "compressed", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) original_frames: Option<u32>,
+    /// Show the original beside a compressed model with harmonics of this degree at most [default: its own]
+    #[arg(long, value_name = "DEGREE", requires = "compressed", value_parser = clap::value_parser!(u8).range(0..=3))]
+    pub(super) original_degree: Option<u8>,
+    #[command(flatten)]
+    pub(super) background: Background,
+    /// Write a folder instead of one page where its frames take more than this
+    #[arg(long, value_name = "SIZE", default_value = DEFAULT_PAGE, value_parser = parse_bytes)]
+    pub(super) page_limit: u64,
+    /// NAME.html, one page with everything in it, or a folder, whose index.html is the page; both open without a server
+    #[arg(short, long, value_name = "PATH")]
+    pub(super) output: PathBuf,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
+}
+
+/// Frames that a page shows at most.
+pub(super) const DEFAULT_FRAMES: u32 = 60;
+/// Bytes of frames that one page holds.
+const DEFAULT_PAGE: &str = "64MB";
+
+/// The limit of a page that nobody chose.
+pub(super) fn default_page_limit() -> u64 {
+    parse_bytes(DEFAULT_PAGE).expect("a size")
 }
 
 /// `pack`

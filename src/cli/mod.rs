@@ -7,7 +7,7 @@ mod signals;
 mod words;
 
 use std::io::{self, IsTerminal, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
@@ -32,11 +32,12 @@ use crate::verbs::method::Method;
 use crate::verbs::precision::{PrecisionOptions, Turned};
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::SweepOptions;
-use crate::verbs::{archive, container, demo, evaluate, precision, render, score, sweep};
+use crate::verbs::view::ViewOptions;
+use crate::verbs::{archive, container, demo, evaluate, precision, render, score, sweep, view};
 use crate::work;
 use args::{
     CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, SideBySide, SplitArg,
-    Sweep, Verb,
+    Sweep, Verb, View,
 };
 
 /// Runs the program on the arguments of this process.
@@ -89,12 +90,19 @@ fn run(cli: Cli) -> Result<()> {
     match cli.verb {
         Verb::Compress(args) => {
             let (json, list_stages) = (args.json, args.list_stages);
+            let view_output = args.view.clone();
             let request = compress_options(*args, cli.quiet)?;
             if list_stages {
                 return print(&divided_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
             }
+            let page = view_output.map(|output| view_of_result(&request, output)).transpose()?;
             let summary = compress(&request)?;
-            print(&if json { summary.json() } else { summary.text() })
+            print(&if json { summary.json() } else { summary.text() })?;
+            match page {
+                // The summary is what stdout is for.
+                Some(page) => Ok(tell(&viewed(&page)?)),
+                None => Ok(()),
+            }
         }
         Verb::Score(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
@@ -147,6 +155,7 @@ fn run(cli: Cli) -> Result<()> {
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.display()))
         }
+        Verb::View(args) => print(&(viewed(&view_options(args))? + "\n")),
         Verb::Pack(args) => {
             let storing = match (args.raw, args.max_error) {
                 (true, _) => Storing::Exact(Compression::Raw),
@@ -350,6 +359,59 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
         csv: None,
         overwrite: Replace::Never,
     }
+}
+
+fn view_options(args: View) -> ViewOptions {
+    let mut original = input_options(args.input, None, Some(&args.output));
+    original.use_cameras(args.cameras);
+    ViewOptions {
+        original,
+        compressed: args.compressed,
+        max_frames: args.max_frames as usize,
+        original_frames: args.original_frames.map(|frames| frames as usize),
+        original_degree: args.original_degree.map(usize::from),
+        background: args.background.background,
+        page_limit: args.page_limit,
+        output: args.output,
+        overwrite: args.earlier.replace(),
+    }
+}
+
+/// The page of what `request` writes beside what it reads; that it may be written is known before the run.
+fn view_of_result(request: &Request, output: Option<PathBuf>) -> Result<ViewOptions> {
+    if request.input.is_stream() {
+        return Err(Error::usage(
+            "--view: a stream is read once, and gone when its result is there; view the result alone",
+        ));
+    }
+    let beside = || {
+        let mut name = request.output.clone().into_os_string();
+        name.push(".html");
+        PathBuf::from(name)
+    };
+    let mut original = request.input.clone();
+    (original.work, original.memory.tell) = (None, Tell::Nothing);
+    let options = ViewOptions {
+        original,
+        compressed: Some(request.output.clone()),
+        max_frames: args::DEFAULT_FRAMES as usize,
+        original_frames: None,
+        original_degree: None,
+        background: None,
+        page_limit: args::default_page_limit(),
+        output: output.unwrap_or_else(beside),
+        overwrite: request.overwrite,
+    };
+    view::check(&options)?;
+    Ok(options)
+}
+
+/// Writes a page and says where it is.
+fn viewed(options: &ViewOptions) -> Result<String> {
+    let found = view::view(options)?;
+    notes(&found.notes);
+    let files = if found.files == 1 { String::new() } else { format!(" in {} files", found.files) };
+    Ok(format!("{}: {} frames, {} bytes{files}", found.page.display(), found.frames, found.bytes))
 }
 
 fn sweep_options(args: Sweep) -> SweepOptions {

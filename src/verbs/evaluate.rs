@@ -385,7 +385,7 @@ fn last_before(pictures: &[Picture], start: usize, these: &[Picture]) -> Vec<Pic
 const TIME_TOLERANCE: f64 = 1e-6;
 
 /// Opens the compressed model at the frames of the original.
-fn open_compressed(path: &Path, original: &Scene) -> Result<Box<dyn Family>> {
+pub(super) fn open_compressed(path: &Path, original: &Scene) -> Result<Box<dyn Family>> {
     let times = &original.source().info().times;
     let input = families::open(path, &OpenOptions::default())?;
     let input = match input.timing() {

@@ -14,4 +14,5 @@ pub mod render;
 pub mod score;
 pub mod sweep;
 pub mod trade_off;
+pub mod view;
 mod whole_run;

@@ -1,0 +1,287 @@
+//! The page: a program for the browser, what it is told of the scene, and the chunks of its models.
+//!
+//! In: chunks as they come. Out: one HTML file, or a folder whose page loads them as scripts, for a page from a disk may not
+//! read files. Memory: one chunk. Every name is in JSON that no `<` leaves, and the program shows names as text.
+
+use std::fs::{self, File};
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use glam::DVec3;
+use hashbrown::HashMap;
+use serde::Serialize;
+
+use super::track::Track;
+use crate::TOOL;
+use crate::emit::atomic::ScratchFolder;
+use crate::error::{Error, Result};
+use crate::model::{Rig, Split};
+
+/// The page of a folder.
+pub const INDEX: &str = "index.html";
+/// Cameras that the page offers at most, evenly among all.
+const CAMERAS: usize = 400;
+
+const PAGE: &str = include_str!("page/page.html");
+/// What stands for what in the page.
+const PARTS: [(&str, &str); 3] = [
+    ("/*page.css*/", include_str!("page/page.css")),
+    ("/*sorter.js*/", include_str!("page/sorter.js")),
+    ("/*player.js*/", concat!(include_str!("page/painter.js"), include_str!("page/player.js"))),
+];
+const SHADERS: [(&str, &str); 5] = [
+    ("cover", include_str!("page/cover.vert")),
+    ("project", include_str!("page/project.frag")),
+    ("quad", include_str!("page/quad.vert")),
+    ("splat", include_str!("page/splat.frag")),
+    ("compose", include_str!("page/compose.frag")),
+];
+
+/// One model as the page is told of it.
+#[derive(Debug, Serialize)]
+pub struct Shown {
+    /// What it is: `original` or `compressed`.
+    pub role: &'static str,
+    /// Name of its file or folder.
+    pub name: String,
+    /// Bytes of it on the disk.
+    pub bytes: u64,
+    /// Frames that it has.
+    pub frames: usize,
+    /// Degree of harmonics that it has.
+    pub degree: usize,
+    /// What is shown.
+    pub track: Track,
+}
+
+/// What the page is told.
+#[derive(Debug, Serialize)]
+pub struct Stage {
+    /// What made the page.
+    pub tool: &'static str,
+    /// One, or the original and the compressed one.
+    pub models: Vec<Shown>,
+    /// Where cameras stood.
+    pub cameras: Vec<Look>,
+    /// Behind the scene, red, green, blue in [0, 1].
+    pub background: [f32; 3],
+    /// Middle of the scene.
+    pub middle: [f64; 3],
+    /// Longest side of the scene without its floaters.
+    pub extent: f64,
+    /// Upwards in the cameras' pictures.
+    pub up: [f64; 3],
+    /// Files of the chunks to load, in order; none where they are in the page.
+    pub files: Vec<String>,
+}
+
+/// A camera, as the page is told.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Look {
+    view: u32,
+    split: Split,
+    /// When its only picture was taken.
+    time: Option<f64>,
+    size: [u32; 2],
+    focal: [f64; 2],
+    principal: [f64; 2],
+    near: f64,
+    /// Rows of the rotation from world to camera.
+    rotation: [[f64; 3]; 3],
+    eye: [f64; 3],
+}
+
+/// The cameras of a rig, one for each place and size.
+pub fn looks(rig: &Rig) -> Vec<Look> {
+    let mut places: HashMap<(u32, u32), usize> = HashMap::new();
+    let mut found: Vec<(Look, usize)> = Vec::new();
+    for shot in &rig.shots {
+        let place = *places.entry((shot.view, shot.camera)).or_insert(found.len());
+        if let Some((look, shots)) = found.get_mut(place) {
+            *shots += 1;
+            look.time = None;
+            continue;
+        }
+        let camera = &rig.cameras[shot.camera as usize];
+        let look = Look {
+            view: shot.view,
+            split: shot.split,
+            time: shot.time,
+            size: [camera.width, camera.height],
+            focal: [camera.fx, camera.fy],
+            principal: [camera.cx, camera.cy],
+            near: camera.near,
+            rotation: [0, 1, 2].map(|row| camera.rotation.row(row).to_array()),
+            eye: camera.center().to_array(),
+        };
+        found.push((look, 1));
+    }
+    let step = found.len().div_ceil(CAMERAS).max(1);
+    found.into_iter().step_by(step).map(|(look, _)| look).collect()
+}
+
+/// Upwards in the pictures of a rig, on average; z where they say nothing.
+pub fn upwards(rig: &Rig) -> DVec3 {
+    let sum: DVec3 = rig.cameras.iter().map(|camera| -camera.rotation.row(1)).sum();
+    let is_known = sum.is_finite() && sum.length() > 1e-3 * rig.cameras.len() as f64;
+    if is_known { sum.normalize() } else { DVec3::Z }
+}
+
+/// Chunks as scripts, on their way into a page.
+pub struct Chunks {
+    folder: ScratchFolder,
+    /// When it is wanted, in parts of the time shown; model; chunk; bytes.
+    made: Vec<(f64, usize, usize, u64)>,
+}
+
+impl Chunks {
+    /// None yet; they wait in a folder in `scratch`.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub fn new(scratch: &Path) -> Result<Chunks> {
+        Ok(Chunks { folder: ScratchFolder::new(scratch)?, made: Vec::new() })
+    }
+
+    /// Takes chunk `chunk` of model `model`, wanted after the part `since` of the time that is shown.
+    ///
+    /// # Errors
+    /// A disk that is full.
+    pub fn add(&mut self, model: usize, chunk: usize, since: f64, bytes: &[u8]) -> Result<()> {
+        let path = self.path(model, chunk);
+        let script = format!("splatsieve.chunk({model},{chunk},\"{}\");\n", STANDARD.encode(bytes));
+        fs::write(&path, &script).map_err(Error::io("write", &path))?;
+        self.made.push((since, model, chunk, script.len() as u64));
+        Ok(())
+    }
+
+    /// Bytes of all of them.
+    pub fn bytes(&self) -> u64 {
+        self.made.iter().map(|made| made.3).sum()
+    }
+
+    fn path(&self, model: usize, chunk: usize) -> PathBuf {
+        self.folder.path().join(name(model, chunk))
+    }
+
+    /// In the order in which they are wanted: of both models what is shown first.
+    fn ordered(&self) -> Vec<(usize, usize)> {
+        let mut made = self.made.clone();
+        made.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.2, a.1).cmp(&(b.2, b.1))));
+        made.into_iter().map(|(_, model, chunk, _)| (model, chunk)).collect()
+    }
+
+    /// Writes one page with everything in it; gives its bytes.
+    ///
+    /// # Errors
+    /// A disk that is full.
+    pub fn write_page(&self, stage: &Stage, path: &Path) -> Result<u64> {
+        let failed = || Error::io("write", path);
+        let mut to = BufWriter::new(File::create(path).map_err(failed())?);
+        to.write_all(head(stage).as_bytes()).map_err(failed())?;
+        for (model, chunk) in self.ordered() {
+            let from = self.path(model, chunk);
+            let script = fs::read(&from).map_err(Error::io("read", &from))?;
+            to.write_all(b"<script>").and_then(|()| to.write_all(&script)).map_err(failed())?;
+            to.write_all(b"</script>\n").map_err(failed())?;
+        }
+        to.write_all(b"</body>\n</html>\n").and_then(|()| to.flush()).map_err(failed())?;
+        Ok(fs::metadata(path).map_err(failed())?.len())
+    }
+
+    /// Writes the page and the chunks beside it into a folder; gives the names of all files, and their bytes.
+    ///
+    /// # Errors
+    /// A disk that is full.
+    pub fn write_folder(&self, stage: &mut Stage, folder: &Path) -> Result<(Vec<String>, u64)> {
+        stage.files = self.ordered().into_iter().map(|(model, chunk)| name(model, chunk)).collect();
+        for file in &stage.files {
+            let (from, to) = (self.folder.path().join(file), folder.join(file));
+            fs::copy(&from, &to).map_err(Error::io("write", &to))?;
+        }
+        let page = head(stage) + "</body>\n</html>\n";
+        let path = folder.join(INDEX);
+        fs::write(&path, &page).map_err(Error::io("write", &path))?;
+        let names = stage.files.iter().cloned().chain([INDEX.to_owned()]).collect();
+        Ok((names, self.bytes() + page.len() as u64))
+    }
+}
+
+fn name(model: usize, chunk: usize) -> String {
+    format!("frames_{model}_{chunk:05}.js")
+}
+
+/// The page up to its chunks.
+fn head(stage: &Stage) -> String {
+    let shaders: serde_json::Map<String, serde_json::Value> =
+        SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
+    let json = serde_json::to_value(stage).expect("plain data");
+    let mut page = PARTS.iter().fold(PAGE.to_owned(), |page, (mark, text)| page.replace(mark, text));
+    // Last, for names may look like anything.
+    page = page.replace("/*tool*/", TOOL).replace("/*shaders*/", &inline(&shaders.into()));
+    page + "<script>splatsieve.begin(" + &inline(&json) + ");</script>\n"
+}
+
+/// JSON that may stand in a script.
+fn inline(json: &serde_json::Value) -> String {
+    json.to_string().replace('<', "\\u003c")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::player::lattice::Steps;
+
+    fn stage(name: &str) -> Stage {
+        let track = Track {
+            count: 0,
+            sh_degree: 0,
+            times: vec![0.0],
+            steps: Steps::of_extent(1.0),
+            varying: Vec::new(),
+            groups: vec![1],
+            unseen: 0,
+        };
+        Stage {
+            tool: TOOL,
+            models: vec![Shown { role: "original", name: name.to_owned(), bytes: 0, frames: 1, degree: 0, track }],
+            cameras: Vec::new(),
+            background: [0.0; 3],
+            middle: [0.0; 3],
+            extent: 1.0,
+            up: [0.0, 0.0, 1.0],
+            files: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn every_part_has_its_place_and_no_name_leaves_its_own() {
+        let page = head(&stage("</script><script>alert(1)//*page.css*/"));
+        assert!(!page.contains("<script>alert") && page.contains("\\u003c/script>\\u003cscript>alert(1)//*page.css*/"));
+        for (mark, _) in PARTS.iter().chain(&[("/*shaders*/", ""), ("/*tool*/", "")]) {
+            assert_eq!(PAGE.matches(mark).count(), 1, "{mark}");
+        }
+        assert!(!page.contains("http://") && !page.contains("https://"), "the page names an address");
+    }
+
+    #[test]
+    fn chunks_come_in_the_order_of_time_whoever_made_them_first() {
+        let scratch = tempfile::tempdir().unwrap();
+        let mut chunks = Chunks::new(scratch.path()).unwrap();
+        for (model, chunk, since) in [(0, 0, 0.0), (0, 1, 0.0), (0, 2, 0.5), (1, 0, 0.0), (1, 1, 0.0), (1, 2, 0.4)] {
+            chunks.add(model, chunk, since, &[7; 10]).unwrap();
+        }
+        assert_eq!(chunks.ordered(), [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (0, 2)]);
+        let page = scratch.path().join("page.html");
+        let bytes = chunks.write_page(&stage("a"), &page).unwrap();
+        let text = fs::read_to_string(&page).unwrap();
+        assert_eq!((bytes, text.matches("splatsieve.chunk(").count()), (text.len() as u64, 6));
+        let folder = scratch.path().join("folder");
+        fs::create_dir(&folder).unwrap();
+        let (names, bytes) = chunks.write_folder(&mut stage("a"), &folder).unwrap();
+        let on_disk: u64 = names.iter().map(|name| fs::metadata(folder.join(name)).unwrap().len()).sum();
+        assert_eq!((names.len(), bytes), (7, on_disk));
+    }
+}

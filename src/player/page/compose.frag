@@ -1,0 +1,18 @@
+#version 300 es
+// The finished pictures on the canvas: one, two under a wipe, or what differs between them.
+precision highp float;
+
+uniform highp sampler2D left;
+uniform highp sampler2D right;
+uniform vec2 corner;      // of this picture on the canvas
+uniform float cut;        // column from which the right one is shown
+uniform float gain;       // above 0: their difference, times this
+out vec4 paint;
+
+void main() {
+    vec2 at = gl_FragCoord.xy - corner;
+    vec3 a = texelFetch(left, ivec2(at), 0).rgb;
+    vec3 b = texelFetch(right, ivec2(at), 0).rgb;
+    vec3 colour = gain > 0.0 ? gain * abs(clamp(a, 0.0, 1.0) - clamp(b, 0.0, 1.0)) : at.x < cut ? a : b;
+    paint = vec4(clamp(colour, 0.0, 1.0), 1.0);
+}

@@ -1,0 +1,314 @@
+//! A sequence as the page unpacks it: a first state, then groups of frames as differences in time.
+//!
+//! In: a source of frames. Out: chunks of bytes, in order, each a zlib stream (RFC 1950) that needs the first chunk and
+//! itself. Memory: one state, and the lattice points of a group's frames, at most [`GROUP_VALUES`] or those of one frame.
+//!
+//! A chunk holds, for each of its components, a byte and then planes of bytes. Chunk 0 has every component at the first
+//! frame; the others have the components of the columns that vary, at some frames that follow one another. The byte: bits
+//! 0 to 2, how many planes there are; bit 3, whether differences are those of differences; bit 4, whether a value
+//! takes more than 16 bits. Planes hold byte 0, 1, … of every difference d as 2d or −2d − 1, Gaussian by Gaussian,
+//! those of one Gaussian frame by frame. The first difference of a Gaussian in a group is to the first frame of all, in chunk 0
+//! to 0; the next to the frame before; from then on, with bit 3, to the frame before and as much further as that was
+//! from the one before it. No planes: no differences.
+
+use std::io::Write;
+
+use flate2::Compression;
+use flate2::write::ZlibEncoder;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::lattice::{Steps, components, width, write_points};
+use crate::error::{Error, Result};
+use crate::model::{Columns, Gaussians};
+use crate::source::{FrameSource, Wanted};
+use crate::stream::{Progress, States};
+
+/// Lattice points of a group's frames that lie ready together.
+pub const GROUP_VALUES: usize = 1 << 23;
+/// Frames of a group at most: what a jump in time has to unpack.
+const GROUP_FRAMES: usize = 20;
+/// Differences are those of differences.
+const SECOND_ORDER: u8 = 8;
+/// A value takes more than 16 bits.
+const WIDE: u8 = 16;
+
+/// What the page is told of a sequence before its chunks.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Track {
+    /// N.
+    pub count: usize,
+    /// Degree of the harmonics that are shown.
+    pub sh_degree: usize,
+    /// Time stamps of the frames that are shown.
+    pub times: Vec<f64>,
+    /// Lattices of the values.
+    pub steps: Steps,
+    /// The first of the components that change with time, and how many: runs, in order.
+    pub varying: Vec<[usize; 2]>,
+    /// First frame of each group, then the number of frames.
+    pub groups: Vec<usize>,
+    /// Gaussians that have no place on the lattices at some frame, and are not shown there.
+    #[serde(skip)]
+    pub unseen: usize,
+}
+
+impl Track {
+    /// How `frames` of `source` are divided, with harmonics of at most `sh_degree`.
+    pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: Steps) -> Track {
+        let info = source.info();
+        let sh_degree = sh_degree.min(info.sh_degree);
+        let of_frame = info.varying.width(sh_degree).max(1) * info.count.max(1);
+        let together = (GROUP_VALUES / of_frame).clamp(1, GROUP_FRAMES);
+        // All alike in length, for each costs about the same to begin.
+        let groups = (frames.len().saturating_sub(1)).div_ceil(together);
+        let varying = if groups == 0 { Columns::empty() } else { changing(info.varying) };
+        Track {
+            count: info.count,
+            sh_degree,
+            times: frames.iter().map(|&frame| info.times[frame]).collect(),
+            steps,
+            varying: varying.iter().map(|column| components(column, sh_degree)).map(|c| [c.start, c.len()]).collect(),
+            groups: (0..=groups).map(|k| if groups == 0 { 1 } else { 1 + k * (frames.len() - 1) / groups }).collect(),
+            unseen: 0,
+        }
+    }
+
+    /// Number of chunks.
+    pub fn chunks(&self) -> usize {
+        self.groups.len()
+    }
+}
+
+/// Columns to follow where `varying` change: a Gaussian that is not finite for a while is not seen meanwhile.
+fn changing(varying: Columns) -> Columns {
+    if varying.is_empty() { varying } else { varying | Columns::OPACITY }
+}
+
+/// Hands the chunks of `track`, which was planned for `frames` of `source`, to `sink`, in order; of frames decoded together
+/// a reader keeps `held`.
+///
+/// # Errors
+/// A frame that cannot be read; those of `sink`.
+pub fn encode(
+    source: &dyn FrameSource,
+    frames: &[usize],
+    track: &mut Track,
+    held: usize,
+    mut sink: impl FnMut(usize, Vec<u8>) -> Result<()>,
+) -> Result<()> {
+    let Some(&first) = frames.first() else { return Ok(()) };
+    let progress = Progress::new("view", "frames", frames.len() as u64);
+    let mut states = States::open(source, &Wanted::of(frames.iter().copied()).holding(held))?;
+    let mut shown = Gaussians::default();
+    let (count, degree) = (track.count, track.sh_degree);
+    let mut points = vec![0; width(degree) * count];
+    let mut read = |frame: usize, which: Columns, points: &mut [i32], states: &mut States| -> Result<()> {
+        let state = states.at(frame)?;
+        let mut unseen = 0;
+        if degree < state.sh_degree() {
+            shown.clone_from(state);
+            shown.drop_bands(degree);
+            unseen += write_points(&shown, which, &track.steps, points);
+        } else {
+            unseen += write_points(state, which, &track.steps, points);
+        }
+        track.unseen = track.unseen.max(unseen);
+        progress.advance(1);
+        Ok(())
+    };
+    read(first, Columns::all(), &mut points, &mut states)?;
+    let zeros = vec![0; count];
+    let planes: Vec<&[i32]> = points.chunks_exact(count.max(1)).collect();
+    sink(0, pack(planes.iter().map(|plane| (&zeros[..], vec![*plane])).collect())?)?;
+
+    let base = points.clone();
+    let varying = changing(source.info().varying);
+    let moving: Vec<usize> = track.varying.iter().flat_map(|&[start, len]| start..start + len).collect();
+    for (chunk, group) in track.groups.windows(2).enumerate() {
+        let mut together = Vec::with_capacity(moving.len() * count * (group[1] - group[0]));
+        for &frame in &frames[group[0]..group[1]] {
+            read(frame, varying, &mut points, &mut states)?;
+            moving.iter().for_each(|&c| together.extend_from_slice(&points[c * count..][..count]));
+        }
+        let plane = |of: usize| &together[of * count..][..count];
+        let of_component = |(k, &c): (usize, &usize)| {
+            let frames = (0..group[1] - group[0]).map(|frame| plane(frame * moving.len() + k)).collect();
+            (&base[c * count..][..count], frames)
+        };
+        sink(chunk + 1, pack(moving.iter().enumerate().map(of_component).collect())?)?;
+    }
+    Ok(())
+}
+
+/// The bytes of components, each a plane to start from and one of every frame.
+fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
+    let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
+    let mut to = ZlibEncoder::new(Vec::new(), Compression::best());
+    // A few at a time on all threads: their bytes wait to be compressed in order.
+    for some in components.chunks(8) {
+        let bytes: Vec<Vec<u8>> = some.par_iter().map(|(start, frames)| component_bytes(start, frames)).collect();
+        bytes.iter().try_for_each(|bytes| to.write_all(bytes)).map_err(failed)?;
+    }
+    to.finish().map_err(failed)
+}
+
+fn component_bytes(start: &[i32], frames: &[&[i32]]) -> Vec<u8> {
+    let mut orders = [false, true].map(|is_second| differences(start, frames, is_second));
+    let cost = |values: &[u32]| values.iter().map(|&v| u64::from(32 - v.leading_zeros())).sum::<u64>();
+    let is_second = frames.len() > 1 && cost(&orders[1]) < cost(&orders[0]);
+    let values = std::mem::take(&mut orders[usize::from(is_second)]);
+    let largest = values.iter().copied().max().unwrap_or(0);
+    let planes = (32 - largest.leading_zeros()).div_ceil(8) as usize;
+    let is_wide = frames.iter().any(|frame| frame.iter().any(|&x| i16::try_from(x).is_err()));
+    let mut bytes = Vec::with_capacity(1 + planes * values.len());
+    bytes.push(planes as u8 | if is_second { SECOND_ORDER } else { 0 } | if is_wide { WIDE } else { 0 });
+    (0..planes).for_each(|plane| bytes.extend(values.iter().map(|value| (value >> (8 * plane)) as u8)));
+    bytes
+}
+
+/// Differences, Gaussian by Gaussian, with the sign in the lowest bit.
+fn differences(start: &[i32], frames: &[&[i32]], is_second: bool) -> Vec<u32> {
+    let mut values = Vec::with_capacity(start.len() * frames.len());
+    for (i, &first) in start.iter().enumerate() {
+        let (mut before, mut step) = (first, 0i32);
+        for (place, frame) in frames.iter().enumerate() {
+            let expected = if is_second { before.wrapping_add(step) } else { before };
+            let off = frame[i].wrapping_sub(expected);
+            values.push(((off << 1) ^ (off >> 31)) as u32);
+            // The way from the first frame of all says nothing of the next one.
+            step = if place == 0 { 0 } else { frame[i].wrapping_sub(before) };
+            before = frame[i];
+        }
+    }
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use flate2::read::ZlibDecoder;
+
+    use super::*;
+    use crate::demo;
+    use crate::stream::gather_all;
+
+    /// Every frame of the chunks, `[frames][width][N]`: the words of the header of this file, one value at a time.
+    fn unpacked(track: &Track, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
+        let (count, width) = (track.count, width(track.sh_degree));
+        let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {
+            let mut bytes = Vec::new();
+            ZlibDecoder::new(&chunks[k][..]).read_to_end(&mut bytes).unwrap();
+            let mut found = vec![base.to_vec(); frames];
+            let mut at = 0;
+            for &component in moving {
+                let flags = bytes[at];
+                let planes = usize::from(flags & 7);
+                for i in 0..count {
+                    let mut history = vec![base[component][i]];
+                    for frame in 0..frames {
+                        let byte = |plane: usize| {
+                            i64::from(bytes[at + 1 + plane * count * frames + i * frames + frame]) << (8 * plane)
+                        };
+                        let code: i64 = (0..planes).map(byte).sum();
+                        let off = if code % 2 == 0 { code / 2 } else { -(code + 1) / 2 };
+                        let drift = match flags & 8 != 0 && frame > 1 {
+                            true => history[frame] - history[frame - 1],
+                            false => 0,
+                        };
+                        history.push(history[frame] + drift + off);
+                        found[frame][component][i] = history[frame + 1];
+                        assert!(flags & 16 != 0 || i16::try_from(history[frame + 1]).is_ok(), "not told to be wide");
+                    }
+                }
+                at += 1 + planes * count * frames;
+            }
+            assert_eq!(at, bytes.len(), "chunk {k}");
+            found
+        };
+        let all: Vec<usize> = (0..width).collect();
+        let mut frames = chunk(0, &all, 1, &vec![vec![0; count]; width]);
+        let base = frames[0].clone();
+        let moving: Vec<usize> = track.varying.iter().flat_map(|&[start, len]| start..start + len).collect();
+        for (k, group) in track.groups.windows(2).enumerate() {
+            frames.extend(chunk(k + 1, &moving, group[1] - group[0], &base));
+        }
+        frames
+    }
+
+    fn encoded(source: &dyn FrameSource, frames: &[usize], degree: usize) -> (Track, Vec<Vec<u8>>) {
+        let mut track = Track::plan(source, frames, degree, Steps::of_extent(2.0));
+        let mut chunks = Vec::new();
+        let sink = |place: usize, bytes| {
+            assert_eq!(place, chunks.len());
+            chunks.push(bytes);
+            Ok(())
+        };
+        encode(source, frames, &mut track, 2, sink).unwrap();
+        assert_eq!(chunks.len(), track.chunks());
+        (track, chunks)
+    }
+
+    #[test]
+    fn what_is_unpacked_is_within_half_a_step_of_every_value() {
+        let scene = demo::Scene::new(700, 47);
+        let frames = [0, 1, 2, 5, 9, 12, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 46];
+        let (track, chunks) = encoded(&scene, &frames, 3);
+        assert!(track.chunks() > 2 && track.groups.last() == Some(&frames.len()), "{:?}", track.groups);
+        let found = unpacked(&track, &chunks);
+        assert_eq!(found.len(), frames.len());
+        let steps = track.steps;
+        for (&frame, found) in frames.iter().zip(&found) {
+            let state = gather_all(&scene, frame, Columns::all()).unwrap();
+            let near = |component: usize, i: usize, value: f64, step: f64| {
+                let off = (found[component][i] as f64 * step - value).abs();
+                assert!(off <= 0.5 * step * (1.0 + 1e-9), "frame {frame}, component {component}: {off} of {step}");
+            };
+            for i in 0..track.count {
+                for c in 0..3 {
+                    near(c, i, state.position.plane(c)[i].into(), steps.position);
+                    near(7 + c, i, state.log_scale.plane(c)[i].into(), steps.log_scale);
+                }
+                near(10, i, crate::model::opacity(state.opacity_logit.plane(0)[i]), steps.opacity);
+                for c in 0..state.sh.width() {
+                    near(11 + c, i, state.sh.plane(c)[i].into(), steps.sh);
+                }
+                let q: [f64; 4] = std::array::from_fn(|c| state.rotation.plane(c)[i].into());
+                let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let along: f64 = (0..4).map(|c| q[c] * found[3 + c][i] as f64).sum();
+                (0..4).for_each(|c| near(3 + c, i, along.signum() * q[c] / length, steps.rotation));
+            }
+        }
+    }
+
+    #[test]
+    fn one_frame_is_one_chunk_and_fewer_bands_are_fewer_components() {
+        let scene = demo::Scene::new(300, 5);
+        let (track, chunks) = encoded(&scene, &[3], 0);
+        assert_eq!((track.chunks(), track.sh_degree, track.varying.len()), (1, 0, 0));
+        let found = unpacked(&track, &chunks);
+        assert_eq!((found.len(), found[0].len()), (1, 14));
+        assert!(encoded(&scene, &[3], 3).1[0].len() >= chunks[0].len());
+    }
+
+    #[test]
+    fn the_bytes_do_not_depend_on_the_threads() {
+        let scene = demo::Scene::new(900, 12);
+        let frames: Vec<usize> = (0..12).collect();
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| encoded(&scene, &frames, 3))
+        };
+        assert!(with(1) == with(5));
+    }
+
+    #[test]
+    fn the_demo_takes_few_bytes_for_a_gaussian_and_frame() {
+        let scene = demo::Scene::new(2000, 48);
+        let frames: Vec<usize> = (0..48).collect();
+        let bytes: usize = encoded(&scene, &frames, 3).1.iter().map(Vec::len).sum();
+        let of_each = bytes as f64 / (2000.0 * 48.0);
+        assert!(of_each < 4.0, "{of_each} bytes for what takes 44 as f32");
+    }
+}
