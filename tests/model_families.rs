@@ -126,9 +126,7 @@ fn dynamic_3d_gaussians_go_through_every_verb() {
         println!("{ratio}: {pruned} dB pruned, {default} with merging, {refined} refined");
         assert!(default >= pruned && refined > pruned + 1.0, "{pruned} {default} {refined}");
     }
-    place.done(&format!(
-        "compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"
-    ));
+    place.done(&format!("compress {model} --cameras {model} -o merged.gseq --merge-only --preset strong --no-refine"));
     place.done(&format!("pack {model} -o packed.gseq"));
     place.done(&format!("score {model} --cameras {model} -o rows.csv"));
     place.done(&format!("render {model} --cameras {model} --frame 3 --view 1 -o picture.png"));

@@ -11,6 +11,7 @@ use std::path::Path;
 use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
+use super::zip_output::ZipOutput;
 use crate::error::{Error, Result};
 use crate::ingest::npz::{Entry, Npz};
 
@@ -42,7 +43,8 @@ pub(crate) fn write_like(
     path: &Path,
 ) -> Result<()> {
     let failed = |error| Error::io("write", path)(error);
-    let mut archive = ZipWriter::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?));
+    let mut archive =
+        ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?)));
     for entry in template.entries() {
         let axis = axis(entry);
         let mut shape = entry.shape.clone();
@@ -95,7 +97,7 @@ pub(crate) fn write_like(
             Ok(())
         })?;
     }
-    archive.finish().and_then(|mut out| Ok(out.flush()?)).map_err(|error| failed(error.into()))
+    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
 /// The header of an array, version 1.0 of numpy's format: a dictionary padded to a multiple of 64 bytes.
