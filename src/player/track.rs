@@ -28,6 +28,8 @@ use crate::stream::{Progress, States};
 pub const GROUP_VALUES: usize = 1 << 23;
 /// Frames of a group at most: what a jump in time has to unpack.
 const GROUP_FRAMES: usize = 20;
+/// Of deflate: differences are mostly noise, in which higher ones look long for little.
+const LEVEL: u32 = 6;
 /// Differences are those of differences.
 const SECOND_ORDER: u8 = 8;
 /// A value takes more than 16 bits.
@@ -144,7 +146,7 @@ pub fn encode(
 /// The bytes of components, each a plane to start from and one of every frame.
 fn pack(components: Vec<(&[i32], Vec<&[i32]>)>) -> Result<Vec<u8>> {
     let failed = |error| Error::io("compress", "the page's frames".as_ref())(error);
-    let mut to = ZlibEncoder::new(Vec::new(), Compression::best());
+    let mut to = ZlibEncoder::new(Vec::new(), Compression::new(LEVEL));
     // A few at a time on all threads: their bytes wait to be compressed in order.
     for some in components.chunks(8) {
         let bytes: Vec<Vec<u8>> = some.par_iter().map(|(start, frames)| component_bytes(start, frames)).collect();

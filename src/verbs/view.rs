@@ -83,6 +83,9 @@ fn is_page(output: &Path) -> bool {
 pub fn view(options: &ViewOptions) -> Result<Viewed> {
     check(options)?;
     let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
+    if scene.source().info().times.is_empty() {
+        return Err(Error::input(&options.original.path, "", "at least one frame to show", "none"));
+    }
     let compressed = options.compressed.as_deref().map(|path| open_compressed(path, &scene)).transpose()?;
     let background = background(options.background, &scene)?;
     let limits = {

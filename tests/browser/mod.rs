@@ -1,6 +1,8 @@
 //! A headless Chromium, driven through its debugging pipe: real mouse, real keys, and every request,
 //! console message and exception seen. See the Chrome DevTools Protocol.
 
+#![allow(dead_code, reason = "every test crate compiles this module and uses a part of it")]
+
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
@@ -42,19 +44,22 @@ pub(crate) struct Browser {
 impl Browser {
     /// Starts `program` with an empty page of 1100 × 900 pixels.
     pub(crate) fn start(program: &Path) -> Browser {
+        Browser::with(program, &["--disable-gpu"])
+    }
+
+    /// The same with WebGL, computed by the processor where there is no graphics card.
+    pub(crate) fn start_drawing(program: &Path) -> Browser {
+        Browser::with(program, &["--use-angle=swiftshader", "--enable-unsafe-swiftshader"])
+    }
+
+    fn with(program: &Path, graphics: &[&str]) -> Browser {
         let home = tempfile::tempdir().unwrap();
         let pipes = ["to", "from"].map(|name| home.path().join(name));
         assert!(Command::new("mkfifo").args(&pipes).status().unwrap().success());
         let mut shell = Command::new("sh");
         // The browser expects its pipe as descriptors 3 and 4.
         shell.arg("-c").arg("exec \"$@\" 3<\"$TO\" 4>\"$FROM\"").arg("sh").arg(program);
-        shell.args([
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--remote-debugging-pipe",
-            "--disable-dev-shm-usage",
-        ]);
+        shell.args(["--headless", "--no-sandbox", "--remote-debugging-pipe", "--disable-dev-shm-usage"]).args(graphics);
         shell.arg("--window-size=1100,900").arg(format!("--user-data-dir={}", home.path().display()));
         shell.env("TO", &pipes[0]).env("FROM", &pipes[1]).env("HOME", home.path());
         let process = shell.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();

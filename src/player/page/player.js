@@ -5,14 +5,14 @@ const el = (id) => document.getElementById(id);
 const FRAMES_PER_SECOND = 30; // at speed 1
 let stage, painter, models = [], span = [0, 0], camera, focus, home;
 let time = 0, playing = false, cut = 0.5, exact = false, isDirty = true, isBusy = false, coarse = 1, moved = 0;
-let drawn = [], waiting = [];
+let drawn = [], waiting = [], trouble = "";
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const plus = (a, b, s = 1) => a.map((x, k) => x + s * b[k]);
 const unit = (a) => a.map((x) => x / (Math.hypot(...a) || 1));
 const count = (n) => n.toLocaleString("en").replaceAll(",", "\u202f");
 const bytes = (n) => n < 1e6 ? `${(n / 1e3).toFixed(1)} kB` : `${(n / 1e6).toFixed(n < 1e7 ? 2 : 1)} MB`;
-const fail = (error) => { el("status").textContent = error.message ?? String(error); };
+const fail = (error) => { el("status").textContent = trouble = error.message ?? String(error); };
 
 class Model {
     constructor(shown, source) {
@@ -99,7 +99,7 @@ function load(place) {
 function arrivals() {
     const wanted = models.reduce((sum, model) => sum + model.track.groups.length, 0);
     const here = models.reduce((sum, model) => sum + model.arrived.size, 0);
-    el("status").textContent = here < wanted ? `loading, ${Math.floor(100 * here / wanted)}%` : "";
+    el("status").textContent = trouble || (here < wanted ? `loading, ${Math.floor(100 * here / wanted)}%` : "");
     isDirty = true;
     return here === wanted;
 }
