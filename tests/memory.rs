@@ -136,6 +136,7 @@ fn every_verb_that_touches_frames_keeps_to_a_budget() {
     for arguments in [
         format!("score packed.gseq {REQUEST} -o rows.npz"),
         "render packed.gseq --cameras cameras.json --frame 3 --view 0 -o x.png".to_owned(),
+        "render packed.gseq --cameras cameras.json --beside small.gseq --video film.gif".to_owned(),
         "evaluate packed.gseq small.gseq --cameras cameras.json --max-frames 2".to_owned(),
         "report packed.gseq small.gseq --cameras cameras.json --max-frames 2 -o page".to_owned(),
         "pack packed.gseq -o again.gseq".to_owned(),

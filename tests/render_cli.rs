@@ -1,5 +1,6 @@
 //! `render` and `evaluate` as a user runs them.
 
+mod film;
 mod models;
 
 use std::collections::BTreeMap;

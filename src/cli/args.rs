@@ -28,6 +28,7 @@ Examples:
   splatsieve report model small --cameras data -o page   what it cost, as a page to look at
   splatsieve view model small --cameras data -o scene.html    both in motion, in any browser, offline
   splatsieve render small --cameras data --frame 0 --view 1 -o x.png
+  splatsieve render small --cameras data --video x.mp4   a film: --path through the cameras, --beside another model
   exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
   splatsieve unpack a.gseq --stream | splatsieve compress - -o b.gseq
   splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq
@@ -335,7 +336,7 @@ pub(super) struct Score {
 
 /// `render`
 #[derive(Debug, Args)]
-#[command(group(clap::ArgGroup::new("wanted").args(["frame", "all"]).required(true)))]
+#[command(group(clap::ArgGroup::new("wanted").args(["frame", "all", "video"]).required(true)))]
 pub(super) struct Render {
     #[command(flatten)]
     pub(super) input: Input,
@@ -344,13 +345,27 @@ pub(super) struct Render {
     /// Frame of the one picture to render, from 0
     #[arg(long, value_name = "T", requires = "view")]
     pub(super) frame: Option<u32>,
-    /// View of the one picture to render
-    #[arg(long, value_name = "V", requires = "frame")]
+    /// View of the one picture to render, or that --video follows through time
+    #[arg(long, value_name = "V", conflicts_with = "all")]
     pub(super) view: Option<u32>,
     /// Render every picture of the split, into a folder of tNNN_vNN files
     #[arg(long)]
     pub(super) all: bool,
-    /// Which of the cameras' pictures [default: with --all test, or all if none is held out; else all]
+    /// Write a film, a picture for every frame: NAME.png or NAME.apng (animated PNG, every bit), NAME.gif, or with ffmpeg
+    /// NAME.mp4 or NAME.webm. From --view [default: the first], or along --path. --frames of a model that is continuous
+    /// in time need not be the cameras'
+    #[arg(long, value_name = "FILE")]
+    pub(super) video: Option<PathBuf>,
+    /// Move through the cameras of these views as time goes on, such as 0,2,5 [default: of all that --all would render]
+    #[arg(long, value_name = "VIEWS", num_args = 0..=1, value_delimiter = ',', conflicts_with = "view")]
+    pub(super) path: Option<Vec<u32>>,
+    /// Frames of --video a second [default: 25]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(super) fps: Option<u32>,
+    /// Show another model of the same frames to the right in --video
+    #[arg(long, value_name = "MODEL")]
+    pub(super) beside: Option<PathBuf>,
+    /// Which of the cameras' pictures [default: with --all and --path test, or all if none is held out; else all]
     #[arg(long, value_enum)]
     pub(super) split: Option<SplitArg>,
     /// Format of the files of --all [default: png]
@@ -359,8 +374,8 @@ pub(super) struct Render {
     #[command(flatten)]
     pub(super) background: Background,
     /// NAME.png (8 bits, clamped) or NAME.npy (float32 [H, W, 3], not clamped); with --all a folder
-    #[arg(short, long, value_name = "PATH")]
-    pub(super) output: PathBuf,
+    #[arg(short, long, value_name = "PATH", required_unless_present = "video", conflicts_with = "video")]
+    pub(super) output: Option<PathBuf>,
     #[command(flatten)]
     pub(super) kept: Kept,
     #[command(flatten)]

@@ -32,6 +32,7 @@ use crate::verbs::method::Method;
 use crate::verbs::precision::{PrecisionOptions, Turned};
 use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::SweepOptions;
+use crate::verbs::video::{VideoOptions, Way, places, video};
 use crate::verbs::view::ViewOptions;
 use crate::verbs::{archive, container, demo, evaluate, precision, render, score, sweep, view};
 use crate::work;
@@ -115,12 +116,15 @@ fn run(cli: Cli) -> Result<()> {
                 report.kept
             ))
         }
-        Verb::Render(args) => {
-            let output = args.output.clone();
-            let rendered = render::render(&render_options(args))?;
+        Verb::Render(mut args) => {
+            if let Some(output) = args.video.take() {
+                return film(args, output);
+            }
+            let options = render_options(args)?;
+            let rendered = render::render(&options)?;
             notes(&rendered.notes);
             let plural = if rendered.pictures == 1 { "" } else { "s" };
-            print(&format!("{}: {} picture{plural}\n", output.display(), rendered.pictures))
+            print(&format!("{}: {} picture{plural}\n", options.output.display(), rendered.pictures))
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
@@ -322,7 +326,13 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     })
 }
 
-fn render_options(args: Render) -> RenderOptions {
+fn render_options(args: Render) -> Result<RenderOptions> {
+    // The parser lets them pass beside what --video does not go with.
+    let of_films =
+        [("--path", args.path.is_some()), ("--fps", args.fps.is_some()), ("--beside", args.beside.is_some())];
+    if let Some((flag, _)) = of_films.into_iter().find(|(_, given)| *given) {
+        return Err(Error::usage(format!("{flag} is for --video FILE")));
+    }
     let format = match args.format {
         Some(ImageKind::Npy) => ImageFormat::Npy,
         Some(ImageKind::Png) | None => ImageFormat::Png,
@@ -331,17 +341,45 @@ fn render_options(args: Render) -> RenderOptions {
         Some((frame, view)) => (Wanted::One { frame: frame as usize, view }, PictureSet::All),
         None => (Wanted::All(format), PictureSet::HeldOut),
     };
-    let mut input = input_options(args.input, None, Some(&args.output));
+    let output = args.output.unwrap_or_default();
+    let mut input = input_options(args.input, None, Some(&output));
     input.use_cameras(args.cameras);
     input.work = work_of(args.kept);
-    RenderOptions {
+    Ok(RenderOptions {
         input,
         wanted,
         part: args.split.map_or(part, part_of),
         background: args.background.background,
-        output: args.output,
+        output,
         overwrite: args.earlier.replace(),
-    }
+    })
+}
+
+/// `render --video`.
+fn film(args: Render, output: PathBuf) -> Result<()> {
+    let (way, part) = match args.path {
+        Some(views) => (Way::Path(views), PictureSet::HeldOut),
+        None => (Way::View(args.view), PictureSet::All),
+    };
+    let mut input = input_options(args.input, None, Some(&output));
+    input.use_cameras(args.cameras);
+    input.work = work_of(args.kept);
+    let options = VideoOptions {
+        input,
+        beside: args.beside,
+        way,
+        part: args.split.map_or(part, part_of),
+        fps: args.fps.unwrap_or(25),
+        background: args.background.background,
+        output,
+        overwrite: args.earlier.replace(),
+    };
+    let filmed = video(&options)?;
+    notes(&filmed.notes);
+    let (path, (width, height), fps) = (options.output.display(), filmed.size, options.fps);
+    let places = options.beside.as_deref().map(|right| format!("  {}\n", places(&options.input.path, right)));
+    let places = places.unwrap_or_default();
+    print(&format!("{path}: {} frames of {width}x{height}, {fps} a second\n{places}", filmed.frames))
 }
 
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {

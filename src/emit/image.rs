@@ -1,12 +1,14 @@
 //! Pictures as files: what a screen shows, or the very values.
 //!
-//! In: an [`Image`]. Out: an 8-bit RGB `.png`, or a `.npy` of float32 `[height, width, 3]`, not clamped.
-//! Memory: for a PNG 3 bytes per pixel, for an array none of its own.
+//! In: an [`Image`]. Out: an 8-bit RGB `.png`, or a `.npy` of float32 `[height, width, 3]`, not clamped; for pages a JPEG.
+//! Memory: for a PNG or JPEG 3 bytes per pixel, for an array none of its own.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
+use image::ExtendedColorType;
+use image::codecs::jpeg::JpegEncoder;
 use npyz::{WriteOptions, WriterBuilder};
 
 use crate::error::{Error, Result};
@@ -69,10 +71,25 @@ fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
-    let bytes: Vec<u8> = image.data.iter().map(|&value| byte(value)).collect();
     let mut writer = encoder.write_header()?;
-    writer.write_image_data(&bytes)?;
+    writer.write_image_data(&rgb(image))?;
     Ok(writer.finish()?)
+}
+
+/// What a screen shows, 8 bits a channel.
+pub(super) fn rgb(image: &Image) -> Vec<u8> {
+    image.data.iter().map(|&value| byte(value)).collect()
+}
+
+/// A JPEG of `quality` from 1 to 100, for pages that hold many pictures.
+///
+/// # Errors
+/// A picture without pixels, or of more than 65535 each way.
+pub fn jpeg_bytes(image: &Image, quality: u8) -> io::Result<Vec<u8>> {
+    let mut out = Vec::new();
+    let mut encoder = JpegEncoder::new_with_quality(&mut out, quality);
+    encoder.encode(&rgb(image), image.width, image.height, ExtendedColorType::Rgb8).map_err(io::Error::other)?;
+    Ok(out)
 }
 
 /// The nearest of the 256 steps from 0 to 1, halves upward; NaN is 0.

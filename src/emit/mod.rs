@@ -6,6 +6,7 @@
 pub mod atomic;
 pub mod bounds;
 pub mod container;
+pub mod film;
 pub mod frame_stream;
 pub mod image;
 pub mod index_map;

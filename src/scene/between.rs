@@ -34,7 +34,8 @@ pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     found
 }
 
-fn on_the_way(from: &Camera, to: &Camera, way: f64, focus: DVec3) -> Camera {
+/// The camera at a part `way` of the way from one to another, see [`between`]; `focus`: where the optical axes meet.
+pub(super) fn on_the_way(from: &Camera, to: &Camera, way: f64, focus: DVec3) -> Camera {
     let [a, b] = [from, to].map(|camera| DQuat::from_mat3(&camera.rotation));
     let turned = DMat3::from_quat(a.slerp(b, way));
     let [start, end] = [from, to].map(|camera| camera.center() - focus);
@@ -53,7 +54,7 @@ fn on_the_way(from: &Camera, to: &Camera, way: f64, focus: DVec3) -> Camera {
 }
 
 /// The point nearest to all optical axes in the sense of least squares; of parallel ones the middle of the cameras.
-fn meeting_point(cameras: &[Camera]) -> DVec3 {
+pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
     let (mut matrix, mut right, mut middle) = (DMat3::ZERO, DVec3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let axis = camera.rotation.row(2);

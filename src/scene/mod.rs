@@ -3,6 +3,7 @@
 pub mod between;
 mod input;
 mod open;
+pub mod path;
 pub mod photographs;
 pub mod pictures;
 mod stream;

@@ -116,7 +116,7 @@ pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, 
 
 impl PictureSet {
     /// The split it comes to with these cameras; none: every picture.
-    fn split(self, rig: &Rig) -> Option<Split> {
+    pub fn split(self, rig: &Rig) -> Option<Split> {
         match self {
             PictureSet::HeldOut => Some(Split::Test).filter(|_| rig.shots.iter().any(|shot| shot.split == Split::Test)),
             PictureSet::Split(split) => Some(split),

@@ -300,6 +300,28 @@ impl SideBySide {
         Ok(found)
     }
 
+    /// That of the number `place` among [`Evaluation::pictures`].
+    pub fn picture(&self, place: usize) -> Picture {
+        self.pictures[place]
+    }
+
+    /// What `see` makes of both models' pictures, the original's first, of any `pictures` of the scene's cameras, in order.
+    ///
+    /// # Errors
+    /// A source that cannot be read; those of `see`.
+    pub fn both<O: Send>(&self, pictures: &[Picture], see: impl Fn([&Image; 2]) -> Result<O> + Sync) -> Result<Vec<O>> {
+        let mut found = Vec::with_capacity(pictures.len());
+        self.show(pictures, |views| {
+            let of = |&View { camera, states, .. }: &View<'_, 2>| {
+                let images = states.map(|state| render(state, camera, self.background));
+                see([&images[0], &images[1]])
+            };
+            found.extend(views.par_iter().map(of).collect::<Result<Vec<O>>>()?);
+            Ok(())
+        })?;
+        Ok(found)
+    }
+
     /// Gaussians of the compressed model.
     pub fn compressed_count(&self) -> usize {
         self.compressed.source().info().count

@@ -14,5 +14,6 @@ pub mod render;
 pub mod score;
 pub mod sweep;
 pub mod trade_off;
+pub mod video;
 pub mod view;
 mod whole_run;
