@@ -282,3 +282,18 @@ fn the_scale_script_compresses_every_size_and_says_what_it_took() {
     let kept: Vec<_> = fs::read_dir(workplace.path("here")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert_eq!(kept.len(), 2, "only cameras.json and scale.json stay, not {kept:?}");
 }
+
+/// A sweep's bar stands above those of its runs: none is longer than its terminal, or stays behind.
+#[test]
+#[ignore = "needs Python"]
+fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 2000 --frames 16 -o demo --no-refine");
+    let program = assert_cmd::cargo::cargo_bin("splatsieve");
+    let mut terminal = Command::new(python("pty"));
+    terminal.arg(script("terminal.py")).args(["--columns", "60,100,120"]).arg(program);
+    let sweep =
+        "sweep demo/scene.gseq --cameras demo/cameras.json -o curves --methods default --fractions 0.3 --overwrite";
+    let said = run(terminal.args(sweep.split(' ')), &workplace);
+    assert_eq!(String::from_utf8(said).unwrap().matches("all fit").count(), 3);
+}

@@ -82,7 +82,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
     let (compression, left) = (Compression::Zstd(LEVEL), reduction.sh_degree.min(*sh_degree));
     let mut writer = ContainerWriter::create(path, *count, left, FRAME_BLOCK, compression, BTreeMap::new())?;
-    let progress = Progress::new("emit", "Gaussian frames", (count * times.len()) as u64);
+    let progress = Progress::new("emit", "states", (count * times.len()) as u64);
     let parts = parts(&merged, most);
     for start in (0..times.len()).step_by(FRAME_BLOCK) {
         let of_block = start..times.len().min(start + FRAME_BLOCK);
@@ -134,7 +134,7 @@ fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
 pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, held: usize) -> Result<()> {
     let info = source.info();
     if kind == OutputKind::Gseq {
-        let progress = Progress::new("emit", "Gaussian frames", info.count as u64 * info.times.len() as u64);
+        let progress = Progress::new("emit", "states", info.count as u64 * info.times.len() as u64);
         return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
     }
     let progress = Progress::new("emit", "frames", info.times.len() as u64);

@@ -131,7 +131,7 @@ impl PairMeter<'_> {
         let info = self.source.info();
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
-        let progress = Progress::new("merge", "Gaussian frames", (ids.len() * frames) as u64);
+        let progress = Progress::new("merge", "states", (ids.len() * frames) as u64);
         let wanted = Wanted::of(0..frames).holding(self.frames_held);
         let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state();

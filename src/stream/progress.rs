@@ -1,17 +1,29 @@
-//! Progress on stderr. On a terminal a bar with rate and time left; elsewhere, for logs, a line when a stage
-//! ends and at most one a minute within it; nothing when quiet.
+//! Progress on stderr. On a terminal a bar with rate and time left, a line each for what goes on within another;
+//! elsewhere, for logs, a line when a stage ends and at most one a minute within it; nothing when quiet.
+//!
+//! A line that is longer than the terminal is wide would leave its end behind when it is drawn anew: so lines are put
+//! together here, of what there is room for.
 
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write as _};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use indicatif::{HumanCount, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
+use console::Term;
+use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 
 /// Seconds between two lines of one stage.
 const LINE_EVERY: u64 = 60;
 
+/// Columns of a terminal that does not say how many it has.
+const USUAL_COLUMNS: u16 = 80;
+/// Columns that a bar has at most, and at least: a shorter one shows nothing that the percentage does not.
+const BAR: [usize; 2] = [30, 8];
+
+/// All bars of this process: one that begins within another has a line below it.
+static BARS: LazyLock<MultiProgress> =
+    LazyLock::new(|| MultiProgress::with_draw_target(ProgressDrawTarget::stderr_with_hz(10)));
 /// A library says nothing unasked.
 static QUIET: AtomicBool = AtomicBool::new(true);
 static RUN: Mutex<Option<Run>> = Mutex::new(None);
@@ -116,7 +128,7 @@ impl Progress {
         Hush(QUIET.swap(true, Ordering::Relaxed))
     }
 
-    /// A bar named after what it does; `unit` is plural ("Gaussian frames").
+    /// A bar named after what it does; `unit` is plural ("states").
     pub fn new(what: &'static str, unit: &str, total: u64) -> Self {
         Self::begin(what, unit, Some(total))
     }
@@ -134,23 +146,20 @@ impl Progress {
         if !io::stderr().is_terminal() {
             return Progress(Shown::Lines(Log::new(name, unit, total)));
         }
-        let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(10));
-        let template = match total {
-            Some(_) => format!(
-                "{{prefix:>10}} [{{wide_bar}}] {{percent:>3}}% {{human_pos}}/{{human_len}} {unit}, {{rate}}, {{eta}} \
-                 left{{run}}"
-            ),
-            None => format!("{{prefix:>10}} {{spinner}} {{human_pos}} {unit}, {{rate}}"),
-        };
-        if let Ok(style) = ProgressStyle::with_template(&template) {
-            let rate = |state: &ProgressState, out: &mut dyn std::fmt::Write| _ = out.write_str(&rate(state.per_sec()));
-            let of_run = |state: &ProgressState, out: &mut dyn std::fmt::Write| {
-                let left = run().as_ref().map(|run| run.left(state.eta().as_secs_f64(), Instant::now()));
-                let _ = left.map(|left| write!(out, " (about {} in all)", duration(left)));
+        let bar = BARS.add(total.map_or_else(ProgressBar::no_length, ProgressBar::new));
+        if let Ok(style) = ProgressStyle::with_template("{line}") {
+            let unit = unit.to_owned();
+            // Of what goes on around a run nobody knows how it follows from the run.
+            let is_stage = name != what;
+            let line = move |state: &ProgressState, out: &mut dyn std::fmt::Write| {
+                let columns = Term::stderr().size_checked().map_or(USUAL_COLUMNS, |(_, columns)| columns);
+                // Writing to what is drawn cannot fail. The last column stays free: some terminals go on to the next line.
+                let _ = out.write_str(
+                    &Moment::of(state, (&name, is_stage), &unit).line(usize::from(columns).saturating_sub(1)),
+                );
             };
-            bar.set_style(style.with_key("rate", rate).with_key("run", of_run).progress_chars("=> "));
+            bar.set_style(style.with_key("line", line));
         }
-        bar.set_prefix(name);
         bar.enable_steady_tick(Duration::from_millis(200));
         Progress(Shown::Bar(bar))
     }
@@ -169,9 +178,74 @@ impl Drop for Progress {
     fn drop(&mut self) {
         match &self.0 {
             Shown::Nothing => (),
-            Shown::Bar(bar) => bar.finish_and_clear(),
+            Shown::Bar(bar) => {
+                bar.finish_and_clear();
+                BARS.remove(bar);
+            }
             Shown::Lines(log) => log.end(),
         }
+    }
+}
+
+/// What a bar shows.
+struct Moment<'a> {
+    name: &'a str,
+    unit: &'a str,
+    done: u64,
+    total: Option<u64>,
+    per_second: f64,
+    /// Seconds that this will take yet, and the whole run; none where nobody knows.
+    left: Option<f64>,
+    run: Option<f64>,
+}
+
+impl<'a> Moment<'a> {
+    fn of(state: &ProgressState, (name, is_stage): (&'a str, bool), unit: &'a str) -> Moment<'a> {
+        let (done, total) = (state.pos(), state.len());
+        // Of what has not begun to move nobody knows how fast it is.
+        let left = total.filter(|&total| done > 0 && total > done).map(|_| state.eta().as_secs_f64());
+        let run = run().as_ref().filter(|_| is_stage).map(|run| run.left(left.unwrap_or(0.0), Instant::now()));
+        Moment { name, unit, done, total, per_second: state.per_sec(), left, run }
+    }
+
+    /// All of it that has room in so many columns: its name always, then how much is done, how long it takes yet, how
+    /// much, how fast, how long the run takes, and a bar.
+    fn line(&self, columns: usize) -> String {
+        let Moment { name, unit, done, total, per_second, left, run } = self;
+        let soon = |seconds: &&f64| **seconds >= 1.0;
+        // What has no steps yet is being prepared.
+        let total = total.filter(|&total| total > 0);
+        let part = total.map(|total| (*done as f64 / total as f64).min(1.0));
+        let of = total.map_or(String::new(), |total| format!("/{}", HumanCount(total)));
+        let pieces = [
+            part.map(|part| format!("{:>3.0}%", (100.0 * part).floor())),
+            left.as_ref().filter(soon).map(|left| format!("{} left", duration(left.floor()))),
+            Some(format!("{}{of} {unit}", HumanCount(*done))).filter(|_| *done > 0 || total.is_some()),
+            Some(rate(*per_second, unit)).filter(|_| *done > 0),
+            run.as_ref().filter(soon).map(|run| format!("the run {}", duration(run.floor()))),
+        ];
+        let mut shown = [false; 5];
+        let mut width = name.chars().count().max(10);
+        for (piece, shown) in pieces.iter().zip(&mut shown) {
+            let more = piece.as_ref().map_or(0, |piece| piece.chars().count() + 2);
+            *shown = piece.is_some() && width + more <= columns;
+            width += if *shown { more } else { 0 };
+        }
+        let [percent, left, count, rate, run] = std::array::from_fn(|k| pieces[k].as_ref().filter(|_| shown[k]));
+        let mut line = format!("{name:>10}");
+        if let Some(part) = part {
+            let room = columns.saturating_sub(width + 3).min(BAR[0]);
+            if room >= BAR[1] {
+                let full = (part * room as f64) as usize;
+                line += &format!(" [{}{}]", "=".repeat(full), " ".repeat(room - full));
+            }
+        }
+        line.extend(percent.map(|percent| format!(" {percent}")));
+        let rest: Vec<&str> = [count, rate, left, run].into_iter().flatten().map(String::as_str).collect();
+        if !rest.is_empty() {
+            line += &format!(" {}", rest.join(", "));
+        }
+        line.chars().take(columns).collect()
     }
 }
 
@@ -219,7 +293,7 @@ impl Log {
         if let Some(total) = self.total.filter(|&total| total != done) {
             let _ = write!(line, " of {}", HumanCount(total));
         }
-        let _ = write!(line, " {}, {}, ", self.unit, rate(per_second));
+        let _ = write!(line, " {}, {}, ", self.unit, rate(per_second, &self.unit));
         let _ = match self.total.filter(|&total| total > done && !ended) {
             Some(total) => write!(line, "{} left", duration((total - done) as f64 / per_second)),
             None => write!(line, "{}", duration(elapsed.as_secs_f64())),
@@ -233,16 +307,19 @@ fn tell(line: &str) {
     let _ = writeln!(io::stderr(), "{line}");
 }
 
-/// A rate as a person reads it: two digits or three.
-fn rate(per_second: f64) -> String {
-    let (value, unit) = match per_second {
-        more if more >= 999.5e6 => (more / 1e9, " G"),
-        more if more >= 999.5e3 => (more / 1e6, " M"),
-        more if more >= 999.5 => (more / 1e3, " k"),
+/// A rate as a person reads it: two digits or three, or how long each takes.
+fn rate(per_second: f64, unit: &str) -> String {
+    if per_second > 0.0 && per_second < 0.5 {
+        return format!("{} each", duration(1.0 / per_second));
+    }
+    let (value, scale) = match per_second {
+        more if more >= 999.5e6 => (more / 1e9, "G "),
+        more if more >= 999.5e3 => (more / 1e6, "M "),
+        more if more >= 999.5 => (more / 1e3, "k "),
         few => (few, ""),
     };
     let digits = if value < 9.95 { 1 } else { 0 };
-    format!("{value:.digits$}{unit}/s")
+    format!("{value:.digits$} {scale}{unit}/s")
 }
 
 /// A time as a person reads it.
@@ -261,30 +338,59 @@ mod tests {
 
     #[test]
     fn a_line_says_what_is_done_how_fast_and_how_long_it_took_or_will_take() {
-        let log = Log::new("scan".to_owned(), "Gaussian frames", Some(1_252_980));
+        let log = Log::new("scan".to_owned(), "states", Some(1_252_980));
         log.advance(626_490);
         let minute = Duration::from_secs(60);
-        assert_eq!(log.line(minute, false), "scan  626,490 of 1,252,980 Gaussian frames, 10 k/s, 1 min 00 s left");
-        assert_eq!(log.line(minute, true), "scan  626,490 of 1,252,980 Gaussian frames, 10 k/s, 1 min 00 s");
+        assert_eq!(log.line(minute, false), "scan  626,490 of 1,252,980 states, 10 k states/s, 1 min 00 s left");
+        assert_eq!(log.line(minute, true), "scan  626,490 of 1,252,980 states, 10 k states/s, 1 min 00 s");
         log.advance(626_490);
-        assert_eq!(log.line(Duration::from_millis(404), true), "scan  1,252,980 Gaussian frames, 3.1 M/s, 0.4 s");
+        assert_eq!(log.line(Duration::from_millis(404), true), "scan  1,252,980 states, 3.1 M states/s, 0.4 s");
         let counter = Log::new("receive".to_owned(), "frames", None);
-        counter.advance(7);
-        assert_eq!(counter.line(Duration::from_secs(7200), false), "receive  7 frames, 0.0/s, 2 h 00 min");
+        counter.advance(72);
+        assert_eq!(counter.line(Duration::from_secs(7200), false), "receive  72 frames, 1 min 40 s each, 2 h 00 min");
     }
 
     #[test]
     fn rates_are_rounded_to_what_a_person_reads() {
         for (rate_of, text) in [
-            (0.5, "0.5/s"),
-            (12.4, "12/s"),
-            (999.6, "1.0 k/s"),
-            (45_600.0, "46 k/s"),
-            (3.14e6, "3.1 M/s"),
-            (2e9, "2.0 G/s"),
+            (0.01, "1 min 40 s each"),
+            (0.5, "0.5 pictures/s"),
+            (12.4, "12 pictures/s"),
+            (999.6, "1.0 k pictures/s"),
+            (45_600.0, "46 k pictures/s"),
+            (3.14e6, "3.1 M pictures/s"),
+            (2e9, "2.0 G pictures/s"),
         ] {
-            assert_eq!(rate(rate_of), text);
+            assert_eq!(rate(rate_of, "pictures"), text);
         }
+    }
+
+    #[test]
+    fn a_bar_is_never_longer_than_its_room_says_most_in_most_and_no_time_of_no_seconds() {
+        let moment = Moment {
+            name: "[3/9] rounds",
+            unit: "pictures",
+            done: 1234,
+            total: Some(5000),
+            per_second: 12.0,
+            left: Some(313.0),
+            run: Some(4000.0),
+        };
+        for columns in 0..200 {
+            let line = moment.line(columns);
+            assert!(line.chars().count() <= columns, "{columns}: {line}");
+        }
+        assert_eq!(
+            moment.line(119),
+            "[3/9] rounds [=====                   ]  24% 1,234/5,000 pictures, 12 pictures/s, 5 min 13 s left, \
+             the run 1 h 06 min"
+        );
+        assert_eq!(moment.line(79), "[3/9] rounds [==        ]  24% 1,234/5,000 pictures, 5 min 13 s left");
+        assert_eq!(moment.line(30), "[3/9] rounds  24%");
+        let nearly = Moment { left: Some(0.4), run: Some(0.2), ..moment };
+        assert!(!nearly.line(119).contains("left") && !nearly.line(119).contains("run"), "{}", nearly.line(119));
+        let counting = Moment { total: None, left: None, run: None, ..nearly };
+        assert_eq!(counting.line(119), "[3/9] rounds 1,234 pictures, 12 pictures/s");
     }
 
     #[test]

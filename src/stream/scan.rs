@@ -52,7 +52,7 @@ pub fn scan_blocks(
     let info = source.info();
     let frames = info.times.len();
     let gaussians = info.count.min(blocks.end * BLOCK) - info.count.min(blocks.start * BLOCK);
-    let progress = Progress::new("scan", "Gaussian frames", gaussians as u64 * frames as u64);
+    let progress = Progress::new("scan", "states", gaussians as u64 * frames as u64);
     let scan = BlockScans { source, schedule, plan, blocks, progress, alive: Mutex::new(vec![0; frames]) };
     let blocks = match source.ahead() {
         Some(ahead) if frames > 0 => stages::scan_in_stages(&scan, ahead)?,
