@@ -1,55 +1,65 @@
 #!/usr/bin/env python3
-"""Compares the time that --explain names with the time that runs take, stage by stage.
+"""Compares what a run says that it will take with what it takes.
 
     cargo build --release
     python3 scripts/estimate.py target/release/splatsieve INPUT[=CAMERAS] ...
 
-An INPUT is whatever `compress` reads. Prints seconds as named and as taken of every stage, and their ratio for the
-whole run. Standard library only.
+An INPUT is whatever `compress` reads. Prints a table: core-seconds and seconds, as said (least, likely, most) and as taken,
+memory as said and as taken, and how long a dry run takes; ends with 1 if anything lies outside of what was said. Standard library only.
 """
 
 import json
-import re
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
-CASES = [["--preset", "default"], ["--preset", "strong"], ["--preset", "paper"], ["--target-ratio", "0.1"]]
+CASES = [
+    ["--target-ratio", "0.6"],
+    ["--target-ratio", "0.3"],
+    ["--target-ratio", "0.1"],
+    ["--target-ratio", "0.1", "--effort", "fast"],
+    ["--target-ratio", "0.5", "--no-refine"],
+    ["--target-ratio", "0.1", "--no-refine"],
+    ["--target-ratio", "0.3", "--preset", "paper"],
+]
 
 
-def seconds(text):
-    parts = re.fullmatch(r"(?:(\d+) h )?(?:(\d+) min)? ?(?:([\d.]+) s)?", text.strip())
-    hours, minutes, rest = (float(part or 0) for part in parts.groups())
-    return 3600 * hours + 60 * minutes + rest
-
-
-def stages_named(line):
-    inside = line[line.index("(") + 1 : line.rindex(")")]
-    return {part.rsplit(" ", 1)[1]: seconds(part.rsplit(" ", 1)[0]) for part in inside.split(" + ")}
+def said(values, taken):
+    least, likely, most = (values[name] for name in ("least", "likely", "most"))
+    inside = least <= taken <= most
+    return f"{least:.1f} {likely:.1f} {most:.1f} | {taken:.1f}{'' if inside else ' OUTSIDE'}", inside
 
 
 def main():
     if len(sys.argv) < 3:
         print(__doc__)
         sys.exit(2)
-    binary = sys.argv[1]
+    binary, sound = sys.argv[1], True
+    print("| model, options | core-seconds said | taken | seconds said | taken | memory said, MiB | taken | dry run, s |")
+    print("|---|---|---|---|---|---|---|---|", flush=True)
     for argument in sys.argv[2:]:
         path, _, cameras = argument.partition("=")
         for case in CASES:
             with tempfile.TemporaryDirectory() as folder:
-                options = ["--cameras", cameras or path, "--explain", "--json", "-o", str(Path(folder) / "small")]
-                run = subprocess.run([binary, "compress", path, *options, *case], capture_output=True, text=True)
-            if run.returncode != 0:
-                sys.exit(run.stderr)
-            line = next(line for line in run.stderr.splitlines() if line.startswith("time: "))
-            named, taken = stages_named(line), {}
-            for stage in json.loads(run.stdout)["stages"]:
-                if stage["name"] in named:
-                    taken[stage["name"]] = taken.get(stage["name"], 0.0) + stage["seconds"]
-            whole = sum(named.values()) / sum(taken.values())
-            each = ", ".join(f"{name} {named[name]:.1f} {taken.get(name, 0.0):.1f}" for name in named)
-            print(f"{Path(path).name} {' '.join(case)}: named / taken {whole:.2f} ({each})", flush=True)
+                options = ["compress", path, "--cameras", cameras or path, "--json", "-o", str(Path(folder) / "small"), *case]
+                start = time.monotonic()
+                dry = subprocess.run([binary, *options, "--dry-run"], capture_output=True, text=True)
+                seconds = time.monotonic() - start
+                run = subprocess.run([binary, *options], capture_output=True, text=True)
+            for done in (dry, run):
+                if done.returncode != 0:
+                    sys.exit(done.stderr)
+            summary = json.loads(run.stdout)
+            forecast, stages = summary["forecast"], summary["stages"]
+            cores, inside = said(forecast["core_seconds"], sum(stage["processor_seconds"] for stage in stages))
+            wall, in_time = said(forecast["seconds"], sum(stage["seconds"] for stage in stages))
+            peak = max(stage["peak_memory_bytes"] for stage in stages)
+            sound &= inside and in_time and peak <= forecast["memory_bytes"]
+            memory = f"{forecast['memory_bytes'] / 2**20:.0f} | {peak / 2**20:.0f}"
+            print(f"| {Path(path).name} {' '.join(case)} | {cores} | {wall} | {memory} | {seconds:.1f} |", flush=True)
+    sys.exit(0 if sound else 1)
 
 
 if __name__ == "__main__":

@@ -89,6 +89,8 @@ pub struct Workload {
     pub shots: u64,
     /// Threads to work on.
     pub threads: u64,
+    /// How fast they are.
+    pub pace: Pace,
 }
 
 impl Workload {
@@ -106,6 +108,7 @@ impl Workload {
             pictures: 0,
             shots: 0,
             threads: rayon::current_num_threads() as u64,
+            pace: Pace::UNKNOWN,
         }
     }
 
@@ -231,14 +234,14 @@ impl Workload {
         shared * self.reads(frames, limits)
     }
 
-    /// Seconds that `pictures` pictures of `gaussians` Gaussians take, by what each and a pixel take.
-    pub fn picturing(&self, pictures: f64, gaussians: f64, (gaussian, pixel): (f64, f64)) -> f64 {
-        pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
+    /// Seconds that `pictures` pictures of `gaussians` Gaussians take to be made in some way.
+    pub fn picturing(&self, pictures: f64, gaussians: f64, Picturing { gaussian, pixel, pace }: Picturing) -> f64 {
+        pace(&self.pace) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
     /// Seconds that the states of `gaussians` Gaussians at `frames` frames take to read.
     pub fn reading(&self, gaussians: f64, frames: f64) -> f64 {
-        gaussians * frames * self.input.seconds_per_state
+        self.pace.states * gaussians * frames * self.input.seconds_per_state
     }
 
     /// N, as a part of which later stages are timed.
@@ -265,14 +268,43 @@ impl Workload {
     }
 }
 
-/// Seconds of one processor that a Gaussian and a pixel of a picture take to be looked at, to find what pictures lose
-/// without it, and to be rendered and compared: fitted to runs on three trained models (`scripts/estimate.py` shows how
-/// well they tell the time of a run).
-pub const LOOK: (f64, f64) = (3e-7, 1e-8);
-/// See [`LOOK`].
-pub const REMOVE: (f64, f64) = (6.5e-7, 3e-8);
-/// See [`LOOK`].
-pub const RENDER: (f64, f64) = (9e-7, 8e-8);
+/// What a scene takes on this machine, as times what the constants here name: by a calibration, else 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pace {
+    /// Reading states, and what is done with each of them.
+    pub states: f64,
+    /// See [`LOOK`].
+    pub look: f64,
+    /// See [`REMOVE`].
+    pub remove: f64,
+    /// See [`RENDER`].
+    pub render: f64,
+    /// Processors that this process got at a time while that was measured; none: nothing was measured.
+    pub processors: Option<f64>,
+}
+
+impl Pace {
+    /// Of a machine and a scene that nobody measured.
+    pub const UNKNOWN: Pace = Pace { states: 1.0, look: 1.0, remove: 1.0, render: 1.0, processors: None };
+}
+
+/// A way of making pictures.
+#[derive(Debug, Clone, Copy)]
+pub struct Picturing {
+    /// Seconds of one processor for each Gaussian.
+    gaussian: f64,
+    /// And for each pixel.
+    pixel: f64,
+    pace: fn(&Pace) -> f64,
+}
+
+/// Looking at a picture, fitted to runs on three trained models (`scripts/estimate.py` shows how well such times tell
+/// that of a run).
+pub const LOOK: Picturing = Picturing { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
+/// Finding what a picture loses without each of its Gaussians.
+pub const REMOVE: Picturing = Picturing { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };
+/// Rendering a picture and comparing it.
+pub const RENDER: Picturing = Picturing { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render };
 
 /// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
 pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
@@ -340,8 +372,7 @@ impl Plan {
         let fits = plan.excess() == 0;
         match budget.tell {
             Tell::Plan => eprint!("budget: {}\n{}", budget.named(), plan.text()),
-            Tell::Time if fits => eprintln!("{}memory: at most {}", plan.time(), size(plan.peak())),
-            _ => (),
+            Tell::Time | Tell::Nothing => (),
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
     }
@@ -404,11 +435,6 @@ impl Plan {
     pub fn reads(&self) -> f64 {
         let sum: f64 = self.needs.iter().map(|need| need.reads).sum();
         if self.limits.tiles_held { sum.min(1.0) } else { sum }
-    }
-
-    /// Stages and the seconds that each takes, about; none where nobody knows how many frames there will be.
-    pub fn stages(&self) -> Vec<(&'static str, f64)> {
-        seconds(&self.work, &self.needs)
     }
 
     /// Bytes resident at most.
@@ -494,19 +520,17 @@ impl Plan {
         let held = if limits.tiles_held { "every tile stays in memory once it is decoded; else " } else { "" };
         let named = named.join(" + ");
         let _ = writeln!(out, "full reads of the input: at most {:.2} ({held}{named})", self.reads());
-        out + &self.time()
+        out
     }
 
-    /// How long it will take, for a person.
-    fn time(&self) -> String {
-        let stages = self.stages();
-        let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
-        if self.work.frames == 0 {
-            return "time: nobody knows how many frames will arrive\n".to_owned();
+    /// How long it will take, by what was measured elsewhere; said where the plan is.
+    pub fn tell_time(&self, tell: Tell) {
+        if tell == Tell::Plan {
+            let stages = seconds(&self.work, &self.needs);
+            let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
+            let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds)));
+            eprintln!("time: about {} ({})", duration(whole), named.collect::<Vec<_>>().join(" + "));
         }
-        let named: Vec<String> =
-            stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds))).collect();
-        format!("time: about {} ({})\n", duration(whole), named.join(" + "))
     }
 }
 
@@ -557,6 +581,7 @@ pub fn reset_peak_memory() -> bool {
     fs::write("/proc/self/clear_refs", "5").is_ok()
 }
 
-fn size(bytes: u64) -> String {
+/// Bytes for a person.
+pub fn size(bytes: u64) -> String {
     ByteSize(bytes).display().iec().to_string()
 }

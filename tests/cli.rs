@@ -51,10 +51,11 @@ fn replace(bytes: &mut [u8], from: &[u8], to: &[u8]) {
 }
 
 #[test]
-fn help_opens_with_examples_on_stdout() {
+fn help_says_what_the_tool_is_and_then_examples_on_stdout() {
     let workplace = Workplace::new();
     let help = workplace.done("--help");
-    assert!(help.starts_with("Examples:\n  splatsieve demo"), "{help}");
+    assert!(help.starts_with("Shrinks trained dynamic Gaussian-splatting models"), "{help}");
+    assert!(help.contains("\n\nExamples:\n  splatsieve demo"), "{help}");
     for verb in
         ["compress", "score", "pack", "info", "verify", "unpack", "recover", "work", "demo", "recipe", "completions"]
     {
@@ -65,7 +66,42 @@ fn help_opens_with_examples_on_stdout() {
         let help = workplace.done(&format!("{verb} --help"));
         assert!(help.contains("--work <FOLDER>") && help.contains("--part <I/N>"), "{verb}: {help}");
     }
+    let [short, long] = ["-h", "--help"].map(|flag| workplace.done(&format!("compress {flag}")));
+    assert!(short.lines().count() < 90 && 2 * short.len() < long.len(), "{short}");
+    for group in ["\nCameras:\n", "\nHow small:\n", "\nMachine:\n", "\nRecipe:\n"] {
+        assert!(short.contains(group), "{group:?}: {short}");
+    }
     assert!(workplace.done("--version").starts_with("splatsieve "));
+}
+
+#[test]
+fn manual_pages_are_written_of_every_verb_with_its_options_and_examples() {
+    let workplace = Workplace::new();
+    let said = workplace.done("man pages");
+    let pages: Vec<_> = fs::read_dir(workplace.path("pages")).unwrap().map(|page| page.unwrap().path()).collect();
+    assert!(said.contains(&format!("{} pages", pages.len())), "{said}");
+    let page = |name: &str| fs::read_to_string(workplace.path(&format!("pages/{name}.1"))).unwrap();
+    let compress = page("splatsieve-compress");
+    for part in [".TH ", "target\\-ratio", "splatsieve compress model", "round\\-pictures"] {
+        assert!(compress.contains(part), "{part} is not in {compress}");
+    }
+    assert!(page("splatsieve").contains("splatsieve demo"));
+    assert!(pages.iter().any(|page| page.ends_with("splatsieve-man.1")));
+}
+
+#[test]
+fn the_end_of_a_run_says_what_stays_what_it_costs_and_where_it_lies_in_few_lines() {
+    let workplace = Workplace::new();
+    let options = "compress {tiny} --cameras {tiny} --target-ratio 0.5";
+    let most = workplace.done(&format!("{options} -o out"));
+    let starts: Vec<&str> = most.lines().map(|line| line.split(' ').next().unwrap_or_default()).collect();
+    assert_eq!(starts[..5], ["kept", "size", "cost", "took", "lies"], "{most}");
+    assert!(starts.len() <= 9 && most.contains("kept    150 of 300 Gaussians (50.0%)\n"), "{most}");
+    assert!(most.contains("\nlies in out\n"), "{most}");
+    assert!(["dB from the original's", "no difference in "].iter().any(|cost| most.contains(cost)), "{most}");
+    assert!(!most.contains("left out") && !most.contains(" -> "), "{most}");
+    let all = workplace.done(&format!("{options} -o again --verbose"));
+    assert!(all.contains("left out: ") && all.contains(" -> ") && all.contains("\nkept    150"), "{all}");
 }
 
 #[test]

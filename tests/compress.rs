@@ -179,9 +179,9 @@ fn box_keeps_who_is_inside_at_the_reference_frame() {
 #[test]
 fn dry_run_writes_nothing_and_tells_the_count() {
     let workplace = Workplace::new();
-    let planned = workplace.summary("{tiny} -o out --dry-run");
+    let planned = workplace.summary("{tiny} -o out --target-ratio 0.37 --dry-run");
     assert!(files(&workplace.path("")).is_empty());
-    let done = workplace.summary("{tiny} -o out");
+    let done = workplace.summary("{tiny} -o out --target-ratio 0.37");
     assert_eq!(planned["gaussians"], done["gaussians"]);
     assert!(planned["output_bytes"].is_null());
     // The model as a whole, without what lies beside it.

@@ -12,40 +12,25 @@ use crate::verbs::method::Method;
 use crate::verbs::precision::Turned;
 use crate::work::Part;
 
-const EXAMPLES: &str = "\
-Examples:
-  splatsieve demo                                        a built-in scene, no files needed
-  splatsieve compress model --cameras data -o small      a trained 4DGaussians model, drop-in result
-  splatsieve compress model --cameras data -o small --target-ratio 0.3
-  splatsieve compress model --cameras data -o small --min-psnr 35dB
-  splatsieve compress model --cameras data -o small.gsz  the smallest, to store and to send
-  splatsieve unpack small.gsz -o small                   the model folder in it
-  splatsieve compress frames/ -o small.gseq --preset paper
-  splatsieve score model --cameras data -o rows.npz      the statistics, nothing removed
-  splatsieve evaluate model small --cameras data         what it cost, on the held-out pictures
-  splatsieve sweep model --cameras data -o curves        every method at every size, curves as a page
-  splatsieve precision model --cameras data -o page      error against run time, knob by knob
-  splatsieve report model small --cameras data -o page   what it cost, as a page to look at
-  splatsieve view model small --cameras data -o scene.html    both in motion, in any browser, offline
-  splatsieve render small --cameras data --frame 0 --view 1 -o x.png
-  splatsieve render small --cameras data --video x.mp4   a film: --path through the cameras, --beside another model
-  exporter | splatsieve compress - --cameras data -o small.gseq      frames as they come, see format/STREAM.md
-  splatsieve unpack a.gseq --stream | splatsieve compress - -o b.gseq
-  splatsieve pack frames/ -o scene.gseq && splatsieve info scene.gseq
-  splatsieve selfcheck                                   are the numbers right on this machine?";
+/// Headings of groups of options.
+const CAMERAS: &str = "Cameras";
+const HOW_SMALL: &str = "How small";
+const WHAT_STAYS: &str = "What stays";
+const MACHINE: &str = "Machine";
+const IN_PARTS: &str = "Work that is kept and shared";
 
-/// Shrinks trained dynamic Gaussian-splatting models, without retraining.
+/// Shrinks trained dynamic (4D) Gaussian-splatting models after training: no retraining, the same renderers open the result
 #[derive(Debug, Parser)]
-#[command(name = "splatsieve", version, about, before_help = EXAMPLES, max_term_width = 110)]
+#[command(name = "splatsieve", version, about, max_term_width = 110)]
 pub(super) struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub(super) verb: Verb,
-    /// Threads to work on; the result does not depend on it. Default: all.
-    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    /// Threads to work on; the result does not depend on it [default: all]
+    #[arg(long, global = true, help_heading = MACHINE, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub(super) threads: Option<u16>,
     /// Show no progress: no bars on a terminal, no lines in a log
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = MACHINE)]
     pub(super) quiet: bool,
 }
 
@@ -62,7 +47,7 @@ pub(super) enum Verb {
     Evaluate(Evaluate),
     /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
     Sweep(Sweep),
-    /// Work-precision diagrams: what every knob of a run costs in time and memory, and what error it leaves
+    /// Work-precision diagrams: what every knob of a run costs, and what error it leaves
     Precision(Precision),
     /// Write a page that shows what compression cost: pictures, curves, failure modes
     Report(Report),
@@ -74,7 +59,7 @@ pub(super) enum Verb {
     Info(Info),
     /// Check every byte of a .gseq container
     Verify(Verify),
-    /// Write the model that an archive holds; of other inputs the frames, as a folder of PLY files or as a frame stream
+    /// Write the model in an archive; of other inputs the frames, as PLY files or a stream
     Unpack(Unpack),
     /// Save the complete frames of a .gseq container that was cut short
     Recover(Recover),
@@ -82,12 +67,14 @@ pub(super) enum Verb {
     Work(Work),
     /// Generate a small dynamic scene, compress it, say what happened
     Demo(Demo),
-    /// Check the numbers of this program on this machine against closed forms and slow, plain sums; takes no files
+    /// Check the numbers of this program on this machine; takes no files
     Selfcheck(Selfcheck),
     /// Print a recipe file with every parameter documented
     Recipe(RecipeVerb),
     /// Print a completion script for a shell
     Completions(Completions),
+    /// Write manual pages of the program and of every verb
+    Man(Man),
 }
 
 impl Verb {
@@ -110,7 +97,8 @@ impl Verb {
             | Verb::Work(_)
             | Verb::Selfcheck(_)
             | Verb::Recipe(_)
-            | Verb::Completions(_) => false,
+            | Verb::Completions(_)
+            | Verb::Man(_) => false,
         }
     }
 }
@@ -122,11 +110,11 @@ pub(super) struct Input {
     /// input
     pub(super) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
-    #[arg(long, value_name = "K")]
+    #[arg(long, value_name = "K", hide_short_help = true)]
     pub(super) iteration: Option<u32>,
     /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
     /// --memory [default: that of the output, else the system's]
-    #[arg(long, value_name = "FOLDER")]
+    #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
     pub(super) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(super) memory: Memory,
@@ -135,12 +123,12 @@ pub(super) struct Input {
 /// Where results of stages stay, so that a run goes on where another was cut short, and several runs share the work.
 #[derive(Debug, Args)]
 pub(super) struct Kept {
-    /// Keep what stages find in this folder, and take from it what is there: a run that was cut short goes on
-    #[arg(long, value_name = "FOLDER")]
+    /// Keep what stages find in this folder: a run that was cut short goes on from there
+    #[arg(long, help_heading = IN_PARTS, value_name = "FOLDER")]
     pub(super) work: Option<PathBuf>,
     /// Compute part I of N of the next stage that can be divided, in the work folder, and nothing else; a run without
     /// this joins them and does the rest
-    #[arg(long, value_name = "I/N", requires = "work")]
+    #[arg(long, help_heading = IN_PARTS, value_name = "I/N", requires = "work", hide_short_help = true)]
     pub(super) part: Option<Part>,
 }
 
@@ -168,13 +156,15 @@ impl Earlier {
 /// How much memory to take.
 #[derive(Debug, Args)]
 pub(super) struct Memory {
-    /// Most memory to take, such as 512MiB or 4GB; the result does not depend on it, but that nothing is refined where
-    /// that takes more, which the summary says [default: a quarter of the machine's]
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
+    /// Most memory to take, such as 512MiB or 4GB [default: a quarter of the machine's]
+    ///
+    /// The result does not depend on it, but that nothing is refined where that takes more, which the summary says.
+    #[arg(long, help_heading = MACHINE, value_name = "SIZE", value_parser = parse_bytes)]
     pub(super) memory: Option<u64>,
-    /// Print, before any work, what takes how much memory and how often the frames are read; at the end, what was
-    /// taken
-    #[arg(long)]
+    /// Say, before any work, what will take how much memory and time
+    ///
+    /// And how often the frames are read; at the end, what was taken.
+    #[arg(long, help_heading = MACHINE)]
     pub(super) explain: bool,
 }
 
@@ -183,13 +173,13 @@ pub(super) struct Memory {
 pub(super) struct CameraFile {
     /// transforms*.json, cameras.json, poses_bounds.npy, or a folder with one [default: beside the model's
     /// data if cfg_args names it, else a virtual rig]
-    #[arg(long, value_name = "PATH")]
+    #[arg(long, help_heading = CAMERAS, value_name = "PATH")]
     pub(super) cameras: Option<PathBuf>,
     /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = CAMERAS, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) frames: Option<u32>,
     /// Picture size where the cameras name none
-    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
     pub(super) size: Option<(u32, u32)>,
 }
 
@@ -199,7 +189,7 @@ pub(super) struct Cameras {
     #[command(flatten)]
     pub(super) file: CameraFile,
     /// Which of the cameras' pictures to score with [default: train]
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, help_heading = CAMERAS)]
     pub(super) split: Option<SplitArg>,
 }
 
@@ -218,8 +208,6 @@ pub(super) enum SplitArg {
 #[derive(Debug, Args)]
 pub(super) struct Compress {
     #[command(flatten)]
-    pub(super) input: Input,
-    #[command(flatten)]
     pub(super) cameras: Cameras,
     /// Where to write: a folder, NAME.gsz, NAME.gseq or NAME.ply
     #[arg(short, long, value_name = "PATH")]
@@ -230,35 +218,42 @@ pub(super) struct Compress {
     /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
     /// grids: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50dB
     /// where that is closer]
-    #[arg(long, value_name = "DB", value_parser = parse_decibels)]
+    #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]
     pub(super) size: OutputSize,
     /// Prune, do not merge
-    #[arg(long, conflicts_with = "merge_only")]
+    #[arg(long, help_heading = WHAT_STAYS, hide_short_help = true, conflicts_with = "merge_only")]
     pub(super) prune_only: bool,
     /// Merge, do not prune
-    #[arg(long)]
+    #[arg(long, help_heading = WHAT_STAYS, hide_short_help = true)]
     pub(super) merge_only: bool,
     #[command(flatten)]
     pub(super) overrides: Overrides,
-    /// Say what would happen; write nothing
+    /// Say what would be done, what it would take and what would be written, in seconds; write nothing
     #[arg(long)]
     pub(super) dry_run: bool,
     #[command(flatten)]
     pub(super) kept: Kept,
     /// List the stages that --part divides, in order, with the units that parts are made of, and do nothing else
-    #[arg(long, conflicts_with = "part")]
+    #[arg(long, conflicts_with = "part", help_heading = IN_PARTS, hide_short_help = true)]
     pub(super) list_stages: bool,
     /// Write a page too that plays the result beside the original in any browser, as `view` does [default: the output's name
     /// with .html behind]
-    #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, conflicts_with_all = ["dry_run", "part"])]
+    #[arg(long, value_name = "PATH", num_args = 0..=1, require_equals = true, hide_short_help = true)]
+    #[arg(conflicts_with_all = ["dry_run", "part"])]
     pub(super) view: Option<Option<PathBuf>>,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print the summary as JSON
     #[arg(long)]
     pub(super) json: bool,
+    /// Say everything at the end: stages with their times, what was left out and why, all notes
+    #[arg(short, long, conflicts_with = "json")]
+    pub(super) verbose: bool,
+    // Groups of options come in the order of these fields: those of the machine last but the recipe's.
+    #[command(flatten)]
+    pub(super) input: Input,
     #[command(flatten)]
     pub(super) recipe: RecipeFlags,
 }
@@ -268,23 +263,27 @@ pub(super) struct Compress {
 #[command(group(clap::ArgGroup::new("size_of_output")))]
 pub(super) struct OutputSize {
     /// Exactly this many Gaussians in the output
-    #[arg(long, value_name = "N", group = "size_of_output")]
+    #[arg(long, help_heading = HOW_SMALL, value_name = "N", group = "size_of_output")]
     pub(super) target_count: Option<u64>,
     /// Exactly this fraction of the Gaussians in the output
-    #[arg(long, value_name = "R", group = "size_of_output")]
+    #[arg(long, help_heading = HOW_SMALL, value_name = "R", group = "size_of_output")]
     pub(super) target_ratio: Option<f64>,
-    /// The smallest output whose pictures stay this close to the original's own: mean PSNR, such as 35 or 35dB
-    #[arg(long, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
+    /// The smallest output whose pictures stay this close to the original's: mean PSNR, such as 35dB
+    #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels)]
     pub(super) min_psnr: Option<f64>,
-    /// The smallest output that loses at most this much PSNR against the photographs of --ground-truth, such as 0.5dB
-    #[arg(long, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
+    /// The smallest output that loses at most this much PSNR against --ground-truth, such as 0.5dB
+    #[arg(long, help_heading = HOW_SMALL, value_name = "DB", group = "size_of_output", value_parser = parse_decibels, requires = "ground_truth")]
     pub(super) max_loss: Option<f64>,
-    /// The best output that is at most this large with everything written beside it, such as 5MB; an archive without
-    #[arg(long, value_name = "SIZE", group = "size_of_output", value_parser = parse_bytes)]
+    /// The best output that is at most this large, such as 5MB
+    ///
+    /// With everything written beside it; an archive without.
+    #[arg(long, help_heading = HOW_SMALL, value_name = "SIZE", group = "size_of_output", value_parser = parse_bytes)]
     pub(super) target_size: Option<u64>,
-    /// Folder of photographs of the held-out cameras for --max-loss: tNNN_vNN.png, or named as the cameras name them. A
-    /// quarter of them is not searched on and gives the figure that is reported
-    #[arg(long, value_name = "FOLDER", requires = "max_loss")]
+    /// Folder of photographs of the held-out cameras for --max-loss
+    ///
+    /// tNNN_vNN.png, or named as the cameras name them. A quarter of them is not searched on and gives the figure that is
+    /// reported.
+    #[arg(long, help_heading = HOW_SMALL, value_name = "FOLDER", requires = "max_loss")]
     pub(super) ground_truth: Option<PathBuf>,
 }
 
@@ -292,13 +291,13 @@ pub(super) struct OutputSize {
 #[derive(Debug, Args)]
 pub(super) struct Overrides {
     /// Keep every Gaussian inside this box (at the reference frame), unmerged
-    #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", value_parser = parse_box, allow_hyphen_values = true)]
+    #[arg(long, help_heading = WHAT_STAYS, value_name = "X0,Y0,Z0,X1,Y1,Z1", hide_short_help = true, value_parser = parse_box, allow_hyphen_values = true)]
     pub(super) keep_box: Option<[f64; 6]>,
     /// Keep these Gaussians, unmerged: a file with one id per line, or a list such as 3,10-20
-    #[arg(long, value_name = "FILE|IDS")]
+    #[arg(long, help_heading = WHAT_STAYS, value_name = "FILE|IDS", hide_short_help = true)]
     pub(super) keep_ids: Option<String>,
     /// Drop these Gaussians: a file with one id per line, or a list such as 3,10-20
-    #[arg(long, value_name = "FILE|IDS")]
+    #[arg(long, help_heading = WHAT_STAYS, value_name = "FILE|IDS", hide_short_help = true)]
     pub(super) drop_ids: Option<String>,
 }
 
@@ -537,17 +536,8 @@ pub(super) struct Precision {
     pub(super) recipe: RecipeFlags,
 }
 
-const VIEW_EXAMPLES: &str = "\
-Examples:
-  splatsieve view model --cameras data -o scene.html              a model in motion
-  splatsieve view model small --cameras data -o scene.html        before and after, under a wipe or side by side
-  splatsieve view model small --cameras data -o scene.html --max-frames 30 --original-degree 0
-  splatsieve view scan.ply -o scan.html                           a static scene, looked at from all around
-  splatsieve view long.gseq --max-frames 600 -o scene             a folder: open scene/index.html";
-
 /// `view`
 #[derive(Debug, Args)]
-#[command(before_help = VIEW_EXAMPLES)]
 pub(super) struct View {
     #[command(flatten)]
     pub(super) input: Input,
@@ -717,6 +707,13 @@ pub(super) struct Completions {
     /// Shell to complete for
     #[arg(value_enum)]
     pub(super) shell: clap_complete::Shell,
+}
+
+/// `man`
+#[derive(Debug, Args)]
+pub(super) struct Man {
+    /// Folder to write them into, which is made
+    pub(super) folder: PathBuf,
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {

@@ -2,6 +2,7 @@
 //! else on stderr.
 
 mod args;
+mod help;
 mod recipe_flags;
 mod signals;
 mod words;
@@ -10,11 +11,12 @@ use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser};
+use clap::FromArgMatches;
 use gseq::Compression;
 
 use crate::budget::{self, Budget, Tell};
-use crate::compress::{Only, Request, Run, Target, compress, divided_stages};
+use crate::compress::summary::Detail;
+use crate::compress::{Only, Request, Run, Target, compress, divided_stages, foresee};
 use crate::emit::atomic::{Replace, as_named};
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
@@ -43,7 +45,9 @@ use args::{
 
 /// Runs the program on the arguments of this process.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse_from(words::regular(std::env::args_os(), &Cli::command())) {
+    let command = help::command();
+    let words = words::regular(std::env::args_os(), &command);
+    let cli = match command.try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found)) {
         Ok(cli) => cli,
         Err(error) => {
             // `--help` and `--version` arrive here too, with exit code 0.
@@ -90,20 +94,25 @@ fn run(cli: Cli) -> Result<()> {
     }
     match cli.verb {
         Verb::Compress(args) => {
-            let (json, list_stages) = (args.json, args.list_stages);
+            let (json, list_stages, dry_run) = (args.json, args.list_stages, args.dry_run);
+            let detail = if args.verbose { Detail::All } else { Detail::Most };
             let view_output = args.view.clone();
             let request = compress_options(*args, cli.quiet)?;
             if list_stages {
                 return print(&divided_stages(&request)?.iter().map(|stage| format!("{stage}\n")).collect::<String>());
             }
+            if dry_run {
+                let foreseen = foresee(&request)?;
+                return print(&if json { foreseen.json() } else { foreseen.text() });
+            }
             let page = view_output.map(|output| view_of_result(&request, output)).transpose()?;
             let summary = compress(&request)?;
-            print(&if json { summary.json() } else { summary.text() })?;
-            match page {
+            print(&if json { summary.json() } else { summary.text(detail) })?;
+            if let Some(page) = page {
                 // The summary is what stdout is for.
-                Some(page) => Ok(tell(&viewed(&page)?)),
-                None => Ok(()),
+                tell(&viewed(&page)?);
             }
+            Ok(())
         }
         Verb::Score(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
@@ -260,8 +269,12 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Recipe(args) => print(preset_text(&args.preset)?),
         Verb::Completions(args) => {
             let mut script = Vec::new();
-            clap_complete::generate(args.shell, &mut Cli::command(), "splatsieve", &mut script);
+            clap_complete::generate(args.shell, &mut help::command(), "splatsieve", &mut script);
             write_stdout(&script)
+        }
+        Verb::Man(args) => {
+            let pages = help::write_pages(&args.folder)?;
+            print(&format!("{}: {pages} pages\n", args.folder.display()))
         }
     }
 }
@@ -321,7 +334,6 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
         keep_ids: args.overrides.keep_ids.or(run.keep_ids),
         drop_ids: args.overrides.drop_ids.or(run.drop_ids),
         keep_box: args.overrides.keep_box.or(run.keep_box),
-        dry_run: args.dry_run,
         overwrite: args.earlier.replace(),
     })
 }

@@ -10,7 +10,8 @@ use crate::error::{Error, Result, quoted};
 use crate::ingest::text::read_text;
 use crate::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
-const HEADING: &str = "Recipe (every parameter; `splatsieve recipe` prints a documented file)";
+const RECIPE: &str = "Recipe";
+const HEADING: &str = "Recipe, every parameter (`splatsieve recipe` prints a documented file)";
 
 /// The recipe as the command line gives it: a preset or a file, and single parameters over it.
 #[derive(Debug, Clone, Default)]
@@ -66,20 +67,25 @@ impl RecipeFlags {
 impl Args for RecipeFlags {
     fn augment_args(command: Command) -> Command {
         let mut command = command
-            .arg(Arg::new("preset").long("preset").value_parser(PRESETS.map(|(name, _)| name)).help(
-                "Where the parameters start from: `default`, the best known; `paper`, the paper to the letter; `gentle`; `strong`",
-            ))
+            .arg(
+                Arg::new("preset")
+                    .long("preset")
+                    .value_parser(PRESETS.map(|(name, _)| name))
+                    .help_heading(RECIPE)
+                    .help("Where the parameters start from: `default`, the best known; `paper`, to the letter"),
+            )
             .arg(
                 Arg::new("recipe")
                     .long("recipe")
                     .value_name("FILE")
                     .value_parser(clap::value_parser!(PathBuf))
-                    .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run, options and all"),
+                    .help_heading(RECIPE)
+                    .help("TOML file with any of the parameters; the recipe.toml beside a result repeats its run"),
             );
         command = command.arg(
-            Arg::new("effort").long("effort").value_parser(Effort::ALL.map(Effort::name)).help(
-                "How much time to take for how small an error: `fast`, a third of the steps of refinement and a coarser look and rounds; `default`; `best`, three times the steps",
-            ),
+            Arg::new("effort").long("effort").value_parser(Effort::ALL.map(Effort::name)).help_heading(RECIPE).help(
+                "How much time to take for how small an error",
+            ).long_help("How much time to take for how small an error: `fast`, a third of the steps of refinement and a coarser look and rounds; `default`; `best`, three times the steps"),
         );
         for parameter in parameters() {
             let mut arg = Arg::new(parameter.key.clone())
@@ -95,9 +101,12 @@ impl Args for RecipeFlags {
             command = command.arg(arg);
         }
         command = command.arg(
-            Arg::new("no_refine").long("no-refine").action(clap::ArgAction::SetTrue).conflicts_with("refine").help(
-                "Leave what stays as it was stored, as --refine none does; what looks and moves alike merges instead",
-            ),
+            Arg::new("no_refine")
+                .long("no-refine")
+                .action(clap::ArgAction::SetTrue)
+                .conflicts_with("refine")
+                .help_heading(RECIPE)
+                .help("Leave what stays as it was stored; what looks and moves alike merges instead"),
         );
         command.arg(
             Arg::new("merge_pass")

@@ -13,7 +13,8 @@ use glam::DVec3;
 
 use super::journal::{Clock, Journal};
 use super::measure::{Measure, Measured, Outlook, Stages};
-use crate::budget::{Budget, Plan, Tell, Workload};
+use super::pace::measured;
+use crate::budget::{Budget, Plan, Tell, Workload, size};
 use crate::error::Result;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
@@ -37,15 +38,39 @@ pub fn open_to_measure<S: Stages>(
 ) -> Result<(Scene, S, Option<Measured>)> {
     let start = Clock::start();
     if options.is_stream() {
-        let found = receive_measured(options, plan)?;
+        let found = receive_measured(options, plan, journal)?;
         journal.opened("receive", start, found.0.source().info().count, Reads::default());
         return Ok(found);
     }
     let mut scene = open_scene(options)?;
     let stages = plan(Outlook::of(&scene), &scene.workload())?;
-    scene.keep_to(options.memory, |work, limits| stages.needs(work, limits))?;
+    let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
+    scene.follow(&plan);
+    foretell(&mut scene, &plan, &stages, 0, options.memory.tell, journal)?;
     journal.opened("read", start, scene.source().info().count, scene.source().reads());
     Ok((scene, stages, None))
+}
+
+/// How many of the first stages are done by what was measured on arrival.
+pub(super) fn measured_already(arrived: &Option<Measured>) -> usize {
+    usize::from(arrived.is_some()) + arrived.iter().filter(|measured| measured.seen.is_some()).count()
+}
+
+/// Says what is to come, if anybody asked.
+fn foretell(
+    scene: &mut Scene,
+    plan: &Plan,
+    stages: &impl Stages,
+    done: usize,
+    tell: Tell,
+    journal: &mut Journal,
+) -> Result<()> {
+    if tell != Tell::Nothing {
+        let forecast = measured(scene, plan, stages, done)?;
+        eprint!("{}", forecast.text(tell));
+        journal.forecast = Some(forecast);
+    }
+    Ok(())
 }
 
 /// Packs a stream into a scratch container and measures it meanwhile, if there is memory for that beside the frames
@@ -53,6 +78,7 @@ pub fn open_to_measure<S: Stages>(
 fn receive_measured<S: Stages>(
     options: &InputOptions,
     plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
+    journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
     let loaded = load_cameras(options, options.cameras.as_deref())?;
     let has_cameras = loaded.is_some();
@@ -76,6 +102,9 @@ fn receive_measured<S: Stages>(
     };
     let measures = fit(Tell::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
+    if options.memory.tell == Tell::Time {
+        eprintln!("memory: at most {}; nobody knows how many frames will arrive", size(memory.peak()));
+    }
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
@@ -117,7 +146,8 @@ fn receive_measured<S: Stages>(
     let mut scene = scene_of(opened, options)?;
     // Now that the frames are counted.
     let counted = Budget { tell: Tell::Nothing, ..options.memory };
-    scene.keep_to(counted, |work, limits| stages.needs(work, limits))?;
+    let later = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits))?;
+    scene.follow(&later);
     if measures && measuring.is_none() && room.arrived() > 0 {
         let note = format!(
             "statistics were taken from the packed frames, not as they arrived: there is memory for {to_measure} that way"
@@ -135,6 +165,8 @@ fn receive_measured<S: Stages>(
             }
         }
     }
+    let done = measured_already(&arrived);
+    foretell(&mut scene, &later, &stages, done, options.memory.tell, journal)?;
     Ok((scene, stages, arrived))
 }
 

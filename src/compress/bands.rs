@@ -69,10 +69,11 @@ impl Bands {
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
-        let renders = 3.0 * pictures as f64;
         Need {
             stage: NAME,
-            seconds: work.reading(work.count(), 2.0 * pictures as f64) + work.picturing(renders, work.count(), RENDER),
+            seconds: work.reading(work.count(), 2.0 * pictures as f64)
+                + work.picturing(pictures as f64, work.count(), RENDER)
+                + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: 2.0 * work.scattered_reads(pictures, limits),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 36 * work.pixels)],

@@ -57,8 +57,8 @@ impl Choose {
         let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
         let frames = (PICTURES as u64).min(work.pictures);
         // The original, and two of about half as many Gaussians.
-        let made = work.picturing(frames as f64, 2.0 * work.count(), (RENDER.0, 0.0))
-            + work.picturing(3.0 * frames as f64, 0.0, RENDER);
+        let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
+            + work.picturing(2.0 * frames as f64, 0.0, RENDER);
         Need {
             stage: NAME,
             seconds: work.reading(work.count(), frames as f64) + made,

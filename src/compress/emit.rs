@@ -48,6 +48,13 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
     result.with_file_name(file)
 }
 
+/// Paths of what goes with a result of `kind` named `output`.
+pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
+    [RECIPE, INDEX_MAP, MARKER]
+        .into_iter()
+        .map(move |name| beside(output, kind.is_folder(), name).display().to_string())
+}
+
 /// The writing of a run.
 #[derive(Debug, Clone)]
 pub struct Emit {

@@ -53,7 +53,8 @@ impl Field {
         Need {
             stage: NAME,
             seconds: work.reading(work.count(), 4.0 * pictures as f64)
-                + work.picturing(4.0 * pictures as f64, work.count(), RENDER),
+                + work.picturing(2.0 * pictures as f64, work.count(), RENDER)
+                + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: work.reads(pictures, limits),
             per_gaussian: [scored(limits), per_gaussian].concat(),
             fixed: vec![

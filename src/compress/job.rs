@@ -306,6 +306,18 @@ impl Stages for Job {
         needs.push(self.emit.need(work, limits, self.left));
         needs
     }
+
+    /// What is close enough already is not refined.
+    fn easiest(&self, work: &Workload, limits: &Limits, hardly_seen: f64) -> Vec<Need> {
+        match self.left >= 1.0 - hardly_seen {
+            true => Job { refine: None, ..self.clone() }.needs(work, limits),
+            false => self.needs(work, limits),
+        }
+    }
+
+    fn searches(&self) -> bool {
+        self.search.is_some() || self.degree.is_some()
+    }
 }
 
 #[cfg(test)]

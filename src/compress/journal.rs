@@ -7,6 +7,7 @@ use cpu_time::ProcessTime;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::forecast::Forecast;
 use super::summary::{BandsSummary, FieldSummary, LeftOut, Saved, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::error::{Error, Result};
@@ -60,6 +61,8 @@ pub struct Journal {
     pub field: Option<FieldSummary>,
     /// What was found about the bands of spherical harmonics.
     pub bands: Option<BandsSummary>,
+    /// What the run was expected to take, where that was said.
+    pub forecast: Option<Forecast>,
 }
 
 impl Journal {

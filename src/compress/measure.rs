@@ -41,6 +41,16 @@ pub trait Stages {
 
     /// What all its stages need.
     fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need>;
+
+    /// What they need at best, where pictures hardly differ without a part `hardly_seen` of the Gaussians.
+    fn easiest(&self, work: &Workload, limits: &Limits, _hardly_seen: f64) -> Vec<Need> {
+        self.needs(work, limits)
+    }
+
+    /// Whether it is only found on the way how much there is to do.
+    fn searches(&self) -> bool {
+        false
+    }
 }
 
 /// The stages that measure and score.

@@ -8,11 +8,14 @@ mod choose;
 mod degree;
 pub mod emit;
 mod field;
+pub mod forecast;
+pub mod foresee;
 mod ids;
 mod job;
 pub mod journal;
 pub mod measure;
 mod merge;
+mod pace;
 mod prune;
 mod record;
 mod refine;
@@ -27,6 +30,7 @@ pub mod summary;
 pub mod visible;
 
 pub use arrival::open_to_measure;
+pub use foresee::foresee;
 pub use job::Job;
 pub use record::{Record, Run};
 pub use request::{Goal, Only, Quality, Request, Target};
@@ -42,6 +46,7 @@ use crate::scene::{InputOptions, Scene};
 use crate::select::Ranking;
 use crate::stream::begin_run;
 use archive::{Asked, LEFT_BY_SEARCH};
+use arrival::measured_already;
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
@@ -116,8 +121,7 @@ fn reduce(
     let work = scene.workload();
     let stages = seconds(&work, &job.needs(&work, &scene.limits));
     // What was measured on arrival is not done again.
-    let measured = usize::from(arrived.is_some()) + arrived.iter().filter(|measured| measured.seen.is_some()).count();
-    let _numbered = begin_run(stages[measured..].to_vec());
+    let _numbered = begin_run(stages[measured_already(&arrived)..].to_vec());
     let input = InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?;
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;
@@ -186,7 +190,7 @@ fn reduce(
         goal.asked = *least;
     }
     journal.notes.extend(scene.work.take_notes());
-    let archived = match job.archive.as_ref().filter(|_| !request.dry_run) {
+    let archived = match &job.archive {
         Some(archive) => {
             let asked = match (&goal, &request.goal) {
                 (Some(goal), _) => Asked::Loss(goal.searched - goal.asked),
@@ -210,14 +214,15 @@ fn reduce(
     if let Some(encoded) = &encoded {
         follow(&mut map, &encoded.order);
     }
-    let summarise = |journal: Journal, output: Option<Size>| Summary {
+    let summarise = |journal: Journal, output: Size| Summary {
         schema: summary::SCHEMA,
         files: Vec::new(),
         tool: TOOL.to_owned(),
         cameras: CameraSummary::of(scene),
+        output: request.output.display().to_string(),
         gaussians: reduction.len(),
-        output_bytes: output.map(|size| size.whole()),
-        output_size: output,
+        output_bytes: Some(output.whole()),
+        output_size: Some(output),
         selection: scored.selection.counts,
         terms: scored.term_summaries(),
         flags: scored.flags.clone(),
@@ -229,16 +234,12 @@ fn reduce(
         left_out: journal.left_out,
         notes: journal.notes,
         planned_reads: scene.planned_reads,
+        forecast: journal.forecast,
         stages: journal.stages,
         input,
     };
-    if request.dry_run {
-        journal.notes.push("dry run: nothing was written".to_owned());
-        return Ok((summarise(journal, None), map));
-    }
     scene.work.not_divided("writing")?;
-    let written = |journal, size| summarise(journal, Some(size));
-    Ok((job.emit.run(scene, &reduction, (&map, encoded.as_ref()), &recipe, journal, written)?, map))
+    Ok((job.emit.run(scene, &reduction, (&map, encoded.as_ref()), &recipe, journal, summarise)?, map))
 }
 
 /// That no Gaussian is left: nothing renders such a result.

@@ -93,8 +93,6 @@ pub struct Request {
     pub drop_ids: Option<String>,
     /// Box whose Gaussians are kept.
     pub keep_box: Option<[f64; 6]>,
-    /// Write nothing.
-    pub dry_run: bool,
     /// Replace an earlier output.
     pub overwrite: Replace,
 }
@@ -115,7 +113,6 @@ impl Request {
             keep_ids: None,
             drop_ids: None,
             keep_box: None,
-            dry_run: false,
             overwrite: Replace::Never,
         }
     }

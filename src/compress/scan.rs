@@ -36,7 +36,10 @@ impl Scan {
         Need {
             stage: NAME,
             reads: 1.0,
-            seconds: work.count() * work.frames as f64 * (ACCUMULATING + work.views as f64 * PROJECTING)
+            seconds: work.pace.states
+                * work.count()
+                * work.frames as f64
+                * (ACCUMULATING + work.views as f64 * PROJECTING)
                 + work.reading(work.count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
             fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving(), ("frames", frames)],

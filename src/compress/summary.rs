@@ -11,9 +11,9 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::{Deserialize, Deserializer, Serialize};
 
+use super::forecast::Forecast;
 use crate::archive::Parts;
 use crate::error::Result;
-use crate::families::size::of;
 use crate::families::{Family, Size};
 use crate::merge::PassCounts;
 use crate::metrics::PSNR_CAP_DB;
@@ -330,6 +330,23 @@ impl BandsSummary {
     }
 }
 
+/// How much of a summary a person is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Detail {
+    /// What was kept, what it costs and where it lies.
+    Most,
+    /// And every stage, what was left out and why, and all notes.
+    All,
+}
+
+/// Notes that are shown unless all are asked for.
+const NOTES: usize = 2;
+
+/// So many pictures, for a person.
+fn pictures(count: usize) -> String {
+    format!("{count} picture{}", if count == 1 { "" } else { "s" })
+}
+
 /// Version of the schema: grows when a field changes its meaning or goes.
 pub const SCHEMA: u32 = 3;
 
@@ -344,9 +361,12 @@ pub struct Summary {
     pub input: InputSummary,
     /// From where it was looked at.
     pub cameras: CameraSummary,
+    /// Path of the output as given.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub output: String,
     /// Gaussians in the output.
     pub gaussians: usize,
-    /// Bytes of everything that a renderer opens of the output; none for a dry run.
+    /// Bytes of everything that a renderer opens of the output.
     pub output_bytes: Option<u64>,
     /// The same by part.
     #[serde(default)]
@@ -355,6 +375,9 @@ pub struct Summary {
     pub selection: Counts,
     /// Full reads of the input that the plan named at most; none where nothing was planned.
     pub planned_reads: Option<f64>,
+    /// What the run was expected to take before it began, where that was said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub forecast: Option<Forecast>,
     /// Everything in order.
     pub stages: Vec<Stage>,
     /// Percentiles of every term.
@@ -397,12 +420,23 @@ impl Summary {
         text
     }
 
-    /// A few lines for a person.
-    pub fn text(&self) -> String {
+    /// What was done, for a person: what was kept, what that costs and where it lies; before it, if all is asked for,
+    /// how it came about.
+    pub fn text(&self, detail: Detail) -> String {
         let mut out = String::new();
-        let input = &self.input;
         // Writing to a String cannot fail.
-        let _ = writeln!(
+        let _ = match detail {
+            Detail::All => self.write_course(&mut out),
+            Detail::Most => Ok(()),
+        };
+        let _ = self.write_result(&mut out, detail);
+        out
+    }
+
+    /// Input, cameras, stages and what was left out.
+    fn write_course(&self, out: &mut String) -> std::fmt::Result {
+        let input = &self.input;
+        writeln!(
             out,
             "{}: {}, {} Gaussians x {} frames, SH degree {}",
             input.path,
@@ -410,12 +444,12 @@ impl Summary {
             input.gaussians,
             input.frames.unwrap_or(0),
             input.sh_degree
-        );
-        let _ = writeln!(
+        )?;
+        writeln!(
             out,
             "cameras: {} ({} cameras, {} pictures)",
             self.cameras.origin, self.cameras.cameras, self.cameras.pairs
-        );
+        )?;
         for stage in &self.stages {
             let scratch = match stage.scratch_bytes {
                 0 => String::new(),
@@ -423,44 +457,93 @@ impl Summary {
             };
             let processors = stage.processor_seconds.map_or(String::new(), |s| format!(" ({s:.1} of processors)"));
             let memory = stage.peak_memory_bytes.map_or(String::new(), |b| format!(", peak {} MiB", b >> 20));
-            let _ = writeln!(
+            writeln!(
                 out,
                 "  {:<7} {:>9} -> {:>9}  {:8.2} s{processors}, {:.2} reads{scratch}{memory}",
                 stage.name, stage.gaussians_in, stage.gaussians_out, stage.seconds, stage.full_reads
-            );
+            )?;
         }
         if let Some(planned) = self.planned_reads {
-            let _ = writeln!(out, "full reads of the input: {:.2}, planned at most {planned:.2}", self.full_reads());
+            writeln!(out, "full reads of the input: {:.2}, planned at most {planned:.2}", self.full_reads())?;
         }
         if let Some(field) = self.field.as_ref().filter(|field| field.half) {
-            let _ = writeln!(out, "field: in half precision: {}", field.why());
+            writeln!(out, "field: in half precision: {}", field.why())?;
         }
         if let Some(bands) = self.bands.as_ref().filter(|bands| bands.sh_degree < input.sh_degree) {
-            let _ = writeln!(out, "bands: SH degree {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why());
+            writeln!(out, "bands: SH degree {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why())?;
+        }
+        if let Some(sizes) = self.output_size.as_ref().zip(input.size.as_ref()) {
+            writeln!(out, "bytes: {}", sizes.0.parts_of(sizes.1))?;
         }
         for left in &self.left_out {
-            let _ = writeln!(out, "  left out: {} ({})", left.what, left.reason());
+            writeln!(out, "  left out: {} ({})", left.what, left.reason())?;
         }
-        for note in &self.notes {
-            let _ = writeln!(out, "  note: {note}");
-        }
-        let percent = 100.0 * self.gaussians as f64 / input.gaussians.max(1) as f64;
-        let _ = write!(out, "{} of {} Gaussians ({percent:.1}%)", self.gaussians, input.gaussians);
+        Ok(())
+    }
+
+    /// Counts, bytes, decibels, notes, and where it lies.
+    fn write_result(&self, out: &mut String, detail: Detail) -> std::fmt::Result {
+        let input = &self.input;
+        let part = |of: usize, all: usize| 100.0 * of as f64 / all.max(1) as f64;
+        let (kept, all) = (self.gaussians, input.gaussians);
+        writeln!(out, "kept    {kept} of {all} Gaussians ({:.1}%)", part(kept, all))?;
         if let Some(bytes) = self.output_bytes {
-            let _ = write!(out, "; bytes: {}", of(bytes, input.bytes));
+            let [after, before] = [bytes, input.bytes].map(|bytes| ByteSize(bytes).display().si().to_string());
+            let percent = 100.0 * bytes as f64 / input.bytes.max(1) as f64;
+            writeln!(out, "size    {after} of {before} ({percent:.1}%)")?;
         }
-        if let (Some(after), Some(before)) = (&self.output_size, &input.size) {
-            let _ = write!(out, ": {}", after.parts_of(before));
-        }
-        out.push('\n');
+        writeln!(out, "cost    {}", self.cost())?;
         if let Some(archive) = &self.archive {
-            let _ = write!(out, "archive: its pictures are {:.2} dB from those of the result before", archive.psnr);
+            write!(out, "        its archive's pictures are {:.2} dB from those of the result before", archive.psnr)?;
             // Of a result that is the original, nothing can be lost that is not counted already.
-            if archive.level < PSNR_CAP_DB {
-                let _ = write!(out, ", and lose {:.2} dB against the original's", archive.loss);
+            match archive.level < PSNR_CAP_DB {
+                true => writeln!(out, ", and lose {:.2} dB against the original's", archive.loss)?,
+                false => writeln!(out)?,
             }
-            out.push('\n');
         }
-        out
+        let (seconds, peak) = self.taken();
+        let memory = peak.map_or(String::new(), |bytes| format!(", at most {} MiB of memory", bytes >> 20));
+        writeln!(out, "took    {}{memory}", duration(seconds))?;
+        if !self.output.is_empty() {
+            writeln!(out, "lies in {}", self.output)?;
+        }
+        let shown = match detail {
+            Detail::All => self.notes.len(),
+            Detail::Most => self.notes.len().min(NOTES),
+        };
+        for note in &self.notes[..shown] {
+            writeln!(out, "note    {note}")?;
+        }
+        let more = self.notes.len() - shown;
+        if more > 0 {
+            writeln!(out, "        {more} more notes with --verbose, all in the summary")?;
+        }
+        Ok(())
+    }
+
+    /// Wall-clock seconds of all stages, and the largest memory.
+    fn taken(&self) -> (f64, Option<u64>) {
+        let seconds = self.stages.iter().filter(|stage| !stage.kept).map(|stage| stage.seconds).sum();
+        (seconds, self.stages.iter().filter_map(|stage| stage.peak_memory_bytes).max())
+    }
+
+    /// How close pictures of the result come to the original's, where that was found on the way.
+    fn cost(&self) -> String {
+        let to = |psnr: f64, by: &str| match psnr {
+            same if same >= PSNR_CAP_DB => format!("no difference in {by}"),
+            _ => format!("pictures {psnr:.1} dB from the original's ({by})"),
+        };
+        let bands = self.bands.as_ref().map(|bands| (bands.result, bands.pictures));
+        let field = self.field.as_ref().and_then(|field| Some((field.result?, field.pictures)));
+        match (&self.goal, bands.or(field)) {
+            (Some(goal), _) if goal.name == "max_loss" => {
+                format!("{:.2} dB against photographs held back, {} asked for", goal.held, goal.asked)
+            }
+            (Some(goal), _) => {
+                to(goal.held, &format!("{} held back; {} dB asked for", pictures(goal.held_pictures.len()), goal.asked))
+            }
+            (None, Some((psnr, count))) if psnr.is_finite() => to(psnr, &pictures(count)),
+            _ => "not measured; `splatsieve evaluate` compares pictures".to_owned(),
+        }
     }
 }

@@ -11,7 +11,7 @@ mod work;
 
 use std::path::PathBuf;
 
-use crate::budget::{Budget, Need, Plan, Workload};
+use crate::budget::{Budget, Need, Pace, Plan, Workload};
 use crate::error::Result;
 use crate::families::Family;
 use crate::limits::Limits;
@@ -44,6 +44,8 @@ pub struct Scene {
     pub limits: Limits,
     /// Full reads of the input at most, of the plan that the limits are from.
     pub planned_reads: Option<f64>,
+    /// How fast it is looked at here.
+    pub pace: Pace,
     /// Folder for scratch files while the run lasts.
     pub scratch: PathBuf,
     /// Where what stages find is kept, if anywhere.
@@ -71,6 +73,7 @@ impl Scene {
             background,
             limits: Limits::NONE,
             planned_reads: None,
+            pace: Pace::UNKNOWN,
             scratch: std::env::temp_dir(),
             work: Work::none(),
             digest: None,
@@ -85,7 +88,8 @@ impl Scene {
 
     /// What the need for memory depends on.
     pub fn workload(&self) -> Workload {
-        Workload::new(self.source().info(), self.input.residence()).seen(&self.rig, &self.schedule)
+        let work = Workload::new(self.source().info(), self.input.residence()).seen(&self.rig, &self.schedule);
+        Workload { pace: self.pace, ..work }
     }
 
     /// Plans what is to be done, stages that need what `needs` says, and takes the limits of that plan.
@@ -93,7 +97,9 @@ impl Scene {
     /// # Errors
     /// A budget that cannot work.
     pub fn keep_to(&mut self, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
-        self.follow(&Plan::fit(self.workload(), budget, needs)?);
+        let plan = Plan::fit(self.workload(), budget, needs)?;
+        plan.tell_time(budget.tell);
+        self.follow(&plan);
         Ok(())
     }
 

@@ -97,12 +97,12 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
     }
     let opened = open_input(input)?;
     let source = opened.input.source();
-    Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?;
+    Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?.tell_time(input.memory.tell);
     let (work, digest) = kept_work(input, &*opened.input)?;
     let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
     let packing = storing.packing(|| work.known("extent", work.key(&()), extent))?;
     let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
-    let progress = |frames: usize| Progress::new(PACK, "Gaussian frames", (source.info().count * frames) as u64);
+    let progress = |frames: usize| Progress::new(PACK, "states", (source.info().count * frames) as u64);
     let staged = if work.keeps() {
         let encode = |blocks: Range<usize>, to: &mut Spilling| {
             let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
@@ -136,7 +136,9 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let source = opened.input.source();
     let info = source.info();
     let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
-    let held = Plan::fit(workload(&*opened.input), input.memory, unpacking)?.limits.frames_held;
+    let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
+    plan.tell_time(input.memory.tell);
+    let held = plan.limits.frames_held;
     let wanted = Wanted::every().holding(held);
     let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
     let mut state = frames.state();
@@ -161,7 +163,9 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     check_target(output, Kind::Folder, &[&input.path], overwrite)?;
     let opened = open_input(input)?;
     let source = opened.input.source();
-    let held = Plan::fit(workload(&*opened.input), input.memory, unpacking)?.limits.frames_held;
+    let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
+    plan.tell_time(input.memory.tell);
+    let held = plan.limits.frames_held;
     let staged = StagedFolder::new(output, overwrite)?;
     write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
     let marker = serde_json::json!({

@@ -144,7 +144,9 @@ impl SideBySide {
         let of_scene = self.scene.workload();
         let gaussians = of_scene.gaussians.max(self.compressed_count() as u64);
         let pictures = of_scene.pictures.max(self.pictures.len() as u64);
-        self.scene.limits = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, needs)?.limits;
+        let plan = Plan::fit(Workload { gaussians, pictures, ..of_scene }, budget, needs)?;
+        plan.tell_time(budget.tell);
+        self.scene.limits = plan.limits;
         Ok(())
     }
 

@@ -218,7 +218,7 @@ fn not_finite_gaussians_are_refused_dropped_or_kept_as_asked() {
         let others: Vec<u32> = (0..100).filter(|&i| i != 7).collect();
         workplace.ply("others.ply", &odd_cloud.pick(&others));
         let [found, expected] = ["odd.ply --non-finite keep", "others.ply"].map(|request| {
-            workplace.summary(&format!("{request} --coverage projected --cameras cameras.json --dry-run -o x.ply"))
+            workplace.summary(&format!("{request} --coverage projected --cameras cameras.json --overwrite -o x.ply"))
         });
         assert_eq!(found["terms"], expected["terms"], "{what}");
     }

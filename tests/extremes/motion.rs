@@ -197,8 +197,7 @@ fn far_from_the_origin_noise_is_snapped_and_counted_and_motion_is_that_of_the_fl
             (0..2 * RESTING).for_each(|i| state.position.set_row(i, [x(i, t) as f32, 0.0, 0.0]));
         };
         let rows = sequence().rows("--preset default", fill);
-        let summary =
-            sequence().summary("--preset default --coverage projected --prune-only --no-refine --dry-run", fill);
+        let summary = sequence().summary("--preset default --coverage projected --prune-only --no-refine", fill);
         assert!(rows.values().flatten().all(|value| value.is_finite()), "offset {offset:e}");
         for i in 0..2 * RESTING {
             let at = |t: usize| f64::from(x(i, t) as f32);

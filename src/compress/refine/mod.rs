@@ -40,6 +40,9 @@ use targets::{Parted, Targets};
 /// What the stage is called.
 const NAME: &str = "refine";
 
+/// Time of a step, as times that of rendering its picture.
+const STEP: f64 = 3.0;
+
 /// Steps between two looks at the pictures kept apart: a third of all, within these.
 const JUDGE_EVERY: [usize; 2] = [100, 500];
 /// Time after which it is kept where a way is: so many times what keeping took, ...
@@ -173,7 +176,7 @@ impl Refine {
             // States and twice as long again for how they change.
             let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / moving::FOUND_EVERY as f64 } else { 0.0 };
             work.reading(of, frames as f64 * found)
-                + work.picturing(renders + 2.5 * steps as f64, of, RENDER)
+                + work.picturing(renders + STEP * steps as f64, of, RENDER)
                 + work.picturing(ranked, of, REMOVE)
         };
         Need {

@@ -1,0 +1,182 @@
+//! Help: what the tool and each verb is, examples, then options in groups; and the same as manual pages.
+
+use std::path::Path;
+
+use clap::{Command, CommandFactory};
+
+use super::args::Cli;
+use crate::error::{Error, Result};
+
+/// What it is comes first, then how it is used.
+const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
+
+const EXAMPLES: &str = "\
+Examples:
+  splatsieve demo                                    a scene of its own, no files
+  splatsieve compress model --cameras data -o small  a 4DGaussians model, drop-in
+  splatsieve evaluate model small --cameras data     what it cost, on held-out pictures
+  splatsieve report model small -o page              the same, as a page to look at
+  splatsieve view model small -o scene.html          both in motion, in a browser
+  splatsieve compress model -o small.gsz             the smallest, to store, to send
+  splatsieve unpack small.gsz -o small               the model folder in it
+`splatsieve VERB -h` has a verb's examples and usual options, `--help` all of them.";
+
+/// Examples of every verb; two spaces stand before what is said about one.
+const OF_VERBS: &[(&str, &[&str])] = &[
+    (
+        "compress",
+        &[
+            "splatsieve compress model --cameras data -o small     drop-in result",
+            "splatsieve compress model -o small --target-ratio 0.3  exactly 30% of them",
+            "splatsieve compress model -o small --min-psnr 35dB    fewest as close",
+            "splatsieve compress model -o small --target-size 5MB  best no larger",
+            "splatsieve compress model -o small.gsz                smallest, to send",
+            "splatsieve compress model -o small --dry-run          what it would take",
+            "splatsieve compress frames -o small.gseq --preset paper",
+            "exporter | splatsieve compress - -o small.gseq        frames as they come",
+        ],
+    ),
+    (
+        "score",
+        &[
+            "splatsieve score model --cameras data -o rows.npz  statistics, nothing removed",
+            "splatsieve score model -o rows.csv --preset paper",
+        ],
+    ),
+    (
+        "render",
+        &[
+            "splatsieve render model --frame 0 --view 1 -o x.png  one picture",
+            "splatsieve render model --all -o pictures            all held-out ones",
+            "splatsieve render model --video x.mp4                a film of the first view",
+            "splatsieve render model --video x.gif --path 0,3,5 --beside small",
+        ],
+    ),
+    (
+        "evaluate",
+        &[
+            "splatsieve evaluate model small --cameras data       on held-out pictures",
+            "splatsieve evaluate model small --flip --csv scores.csv",
+        ],
+    ),
+    (
+        "sweep",
+        &[
+            "splatsieve sweep model --cameras data -o curves      every method and size",
+            "splatsieve sweep model -o curves --methods default,paper --fractions 0.5,0.2",
+        ],
+    ),
+    (
+        "precision",
+        &[
+            "splatsieve precision model --cameras data -o page    error against run time",
+            "splatsieve precision model -o page --knobs look,rounds",
+        ],
+    ),
+    ("report", &["splatsieve report model small --cameras data -o page  then open page/report.html"]),
+    (
+        "view",
+        &[
+            "splatsieve view model small --cameras data -o scene.html  both in motion",
+            "splatsieve view scan.ply -o scan.html                a static scene",
+            "splatsieve view long.gseq --max-frames 600 -o scene  open scene/index.html",
+        ],
+    ),
+    (
+        "pack",
+        &[
+            "splatsieve pack frames -o scene.gseq                 every bit kept",
+            "splatsieve pack frames -o scene.gseq --max-error position=0.01%",
+        ],
+    ),
+    ("info", &["splatsieve info scene.gseq", "splatsieve info model --json"]),
+    ("verify", &["splatsieve verify scene.gseq"]),
+    (
+        "unpack",
+        &[
+            "splatsieve unpack small.gsz -o small                 the model in an archive",
+            "splatsieve unpack scene.gseq -o frames               a PLY per frame",
+            "splatsieve unpack scene.gseq --stream | splatsieve compress - -o small.gseq",
+        ],
+    ),
+    ("recover", &["splatsieve recover cut.gseq -o saved.gseq"]),
+    ("work", &["splatsieve work folder                               what is in it", "splatsieve work folder --clean"]),
+    ("demo", &["splatsieve demo", "splatsieve demo -o folder --gaussians 20000          keep what it makes"]),
+    ("selfcheck", &["splatsieve selfcheck                                 are the numbers right here?"]),
+    ("recipe", &["splatsieve recipe > recipe.toml                      every parameter"]),
+    ("completions", &["splatsieve completions bash > splatsieve.bash"]),
+    ("man", &["splatsieve man share/man/man1                        then: man splatsieve-compress"]),
+];
+
+/// The command line with its examples.
+pub(super) fn command() -> Command {
+    let command = Cli::command().help_template(TEMPLATE).before_help(EXAMPLES);
+    OF_VERBS.iter().fold(command, |command, (verb, examples)| {
+        let examples = format!("Examples:\n  {}", examples.join("\n  "));
+        command.mut_subcommand(verb, |verb| verb.help_template(TEMPLATE).before_help(examples))
+    })
+}
+
+/// Writes a manual page of the program and one of each verb into `folder`; gives their number.
+///
+/// # Errors
+/// A folder that cannot be made or written to.
+pub(super) fn write_pages(folder: &Path) -> Result<usize> {
+    std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    let mut command = command().disable_help_subcommand(true);
+    command.build();
+    let of_verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
+    let pages = std::iter::once(&command).chain(of_verbs);
+    let mut count = 0;
+    for page in pages {
+        let name = page.get_display_name().unwrap_or(page.get_name()).to_owned();
+        let path = folder.join(format!("{name}.1"));
+        let mut text = Vec::new();
+        // Manual pages have examples at their end, and one line each.
+        let examples = page.get_before_help().map(ToString::to_string).unwrap_or_default();
+        let page = page.clone().name(name).before_help("");
+        clap_mangen::Man::new(page).render(&mut text).map_err(Error::io("write", &path))?;
+        let lines = examples.lines().skip(1).map(|line| format!("{}\n", line.trim().replace('-', "\\-")));
+        text.extend(format!(".SH EXAMPLES\n.nf\n{}.fi\n", lines.collect::<String>()).bytes());
+        std::fs::write(&path, text).map_err(Error::io("write", &path))?;
+        count += 1;
+    }
+    Ok(count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_verb_has_examples_and_every_example_is_understood() {
+        for verb in command().get_subcommands() {
+            let help = verb.clone().render_help().to_string();
+            let examples: Vec<&str> = help.lines().filter(|line| line.starts_with("  splatsieve ")).collect();
+            assert!(!examples.is_empty(), "{}: give it an example in OF_VERBS", verb.get_name());
+            for example in examples {
+                // What follows two spaces is said about it.
+                let line = example.trim().split("  ").next().unwrap_or_default();
+                for one in line.split(" | ").filter_map(|one| one.split(" > ").next()) {
+                    let parsed = command().try_get_matches_from(one.split_whitespace());
+                    assert!(parsed.is_ok(), "{one}: {}", parsed.unwrap_err());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn help_says_first_what_a_thing_is_then_how_it_is_used_and_its_examples_fit_80_columns() {
+        for mut verb in command().get_subcommands().cloned().chain([command()]) {
+            let about = verb.get_about().map(ToString::to_string).unwrap_or_default();
+            let help = verb.render_help().to_string();
+            let first = about.split_whitespace().next().unwrap_or_default();
+            assert!(!first.is_empty() && help.starts_with(first), "{help}");
+            let [examples, usage] = ["Examples:\n", "Usage: "].map(|part| help.find(part));
+            assert!(examples.is_some() && examples < usage, "{help}");
+            let mut examples = help[..usage.unwrap_or_default()].lines().filter(|line| line.starts_with("  "));
+            let long = examples.find(|line| line.len() > 80);
+            assert_eq!(long, None);
+        }
+    }
+}
