@@ -16,8 +16,8 @@ use serde_json::json;
 use splatsieve::render::render;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
-/// Least PSNR of the page's pictures against the rasteriser's; 35 dB is what was promised.
-const LEAST_DB: f64 = 42.0;
+/// Least PSNR of the page's pictures against the rasteriser's; 35 dB were promised, 52 to 61 seen.
+const LEAST_DB: f64 = 50.0;
 
 fn opened(path: &Path, cameras: &Path) -> Scene {
     let options = InputOptions { path: path.to_owned(), cameras: Some(cameras.to_owned()), ..InputOptions::default() };

@@ -190,6 +190,7 @@ fn evenly(frames: usize, count: usize) -> Vec<usize> {
 /// What it takes to turn frames into chunks.
 fn need(work: &Workload, limits: &Limits) -> Need {
     let points = 4 * width(work.sh_degree) as u64;
+    let of_all = points / 4 * work.gaussians * work.frames.max(1);
     Need {
         stage: NAME,
         reads: 1.0,
@@ -201,7 +202,7 @@ fn need(work: &Workload, limits: &Limits) -> Need {
             ("points", 3 * points),
         ],
         // The group, and eight of its components as differences and as bytes, and what comes of all.
-        fixed: vec![work.arriving(), ("group", 10 * GROUP_VALUES as u64)],
+        fixed: vec![work.arriving(), ("group", 10 * of_all.min(GROUP_VALUES as u64))],
     }
 }
 
