@@ -297,3 +297,12 @@ fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
     let said = run(terminal.args(sweep.split(' ')), &workplace);
     assert_eq!(String::from_utf8(said).unwrap().matches("all fit").count(), 3);
 }
+
+/// The script's own tests: compress, streams, containers and refusals, through the module that is installed.
+#[test]
+#[ignore = "needs maturin, numpy and zstandard"]
+fn what_the_python_package_promises_holds_of_the_installed_wheel() {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/tests/installed.py");
+    let output = Command::new(python("maturin, numpy, zstandard")).arg(script).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}

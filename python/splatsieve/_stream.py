@@ -1,0 +1,140 @@
+"""Writes frame streams (format/STREAM.md), to anything or to the program itself.
+
+Columns are arrays [N, ...], in stored encoding: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural
+logs; opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Those that hold for every frame are given once, the others with
+every frame. Needs numpy.
+"""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+from collections.abc import Mapping
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from ._program import Error, Log, Option, Running, flags, parsed
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+COLUMNS = ["position", "rotation", "log_scale", "opacity_logit", "sh"]
+
+
+class StreamWriter:
+    """Writes a stream to `out`, a binary file.
+
+    with StreamWriter(sys.stdout.buffer, count, sh_degree, {"sh": features, ...}) as stream:
+        for time, position, rotation in frames:
+            stream.frame(time, {"position": position, "rotation": rotation})
+    """
+
+    def __init__(
+        self, out: IO[bytes], count: int, sh_degree: int, constant: Mapping[str, ArrayLike] | None = None
+    ) -> None:
+        self.out, self.frames = out, 0
+        constant = dict(constant or {})
+        self.varying = [name for name in COLUMNS if name not in constant]
+        bits = sum(1 << COLUMNS.index(name) for name in self.varying)
+        out.write(struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", 1, sh_degree, count, bits, 0))
+        out.writelines(planes(constant[name]) for name in COLUMNS if name in constant)
+
+    def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
+        """Writes the columns that vary as they are at `time`, which is later than the frame's before."""
+        payload = b"".join(planes(columns[name]) for name in self.varying)
+        self.out.write(struct.pack("<4sIdQ", b"FRAM", self.frames, time, len(payload)) + payload)
+        self.frames += 1
+
+    def end(self) -> None:
+        """Writes the end mark, without which the reader knows that an exporter has failed."""
+        self.out.write(struct.pack("<4sI16x", b"DONE", self.frames))
+
+    def __enter__(self) -> StreamWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, failure: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.end()
+        self.out.flush()
+
+
+def planes(column: ArrayLike) -> bytes:
+    return np.ascontiguousarray(np.moveaxis(np.asarray(column), 0, -1), "<f4").tobytes()
+
+
+class Stream:
+    """What `splatsieve.stream` gives: the program, with a frame stream going in."""
+
+    # What `compress` wrote into its summary; None before the block has ended, and of other verbs.
+    summary: dict[str, Any] | None = None
+
+    def __init__(
+        self,
+        output: str,
+        count: int,
+        sh_degree: int,
+        constant: Mapping[str, ArrayLike] | None = None,
+        *,
+        verb: str = "compress",
+        log: Log | None = None,
+        options: Mapping[str, Option] | None = None,
+    ) -> None:
+        options = {"output": output, **(options or {})} | ({"json": True} if verb == "compress" else {})
+        words = [verb, *flags(options), "--", "-"]
+        self.words, self.log = words, log
+        self.shape = (count, sh_degree, {name: np.asarray(column) for name, column in (constant or {}).items()})
+        self.reads = verb == "compress"
+
+    def __enter__(self) -> Stream:
+        self.running = Running(self.words, self.log, stdin=subprocess.PIPE)
+        assert self.running.process.stdin is not None
+        self.pipe = self.running.process.stdin
+        try:
+            self.writer = StreamWriter(self.pipe, *self.shape)
+        except BrokenPipeError:
+            self.refused()
+        return self
+
+    def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
+        """Hands over the columns that vary as they are at `time`, which is later than the frame's before."""
+        try:
+            self.writer.frame(time, columns)
+        except BrokenPipeError:
+            self.refused()
+
+    def refused(self) -> None:
+        """The program reads no more: says why."""
+        self.close()
+        self.running.finish()
+        raise Error("splatsieve ended before the stream did", 0)
+
+    def close(self) -> None:
+        try:
+            self.pipe.close()
+        except BrokenPipeError:
+            pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, failure: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            # Without the end mark: it ends with an error of its own, which says less than what was raised.
+            self.close()
+            if not issubclass(kind, Exception):
+                self.running.process.terminate()
+            try:
+                self.running.finish()
+            except Error:
+                pass
+            return
+        try:
+            self.writer.end()
+            self.pipe.close()
+        except BrokenPipeError:
+            self.refused()
+        printed = self.running.finish()
+        self.summary = parsed(printed) if self.reads else None

@@ -1,0 +1,160 @@
+#!/usr/bin/env python3
+"""Builds the wheel, installs it into an environment of its own, and tries what the README promises there.
+
+    python3 python/tests/installed.py [WHEEL]
+
+Needs maturin, numpy and zstandard; a WHEEL given is not built. Nothing is downloaded: numpy and zstandard are those of
+the Python that runs this.
+"""
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import unittest
+import venv
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def wheel(folder):
+    command = [sys.executable, "-m", "maturin", "build", "--release", "--out", folder]
+    subprocess.run(command, cwd=PACKAGE, check=True)
+    (built,) = Path(folder).glob("*.whl")
+    return built
+
+
+def main():
+    """Runs this file again with the Python of an environment that has the wheel."""
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(sys.argv[1]) if len(sys.argv) > 1 else wheel(folder)
+        environment = Path(folder) / "environment"
+        venv.create(environment, with_pip=True)
+        python = environment / ("Scripts" if os.name == "nt" else "bin") / "python"
+        subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", built], check=True)
+        ask = "import sysconfig; print(sysconfig.get_path('purelib'))"
+        own = subprocess.run([python, "-c", ask], check=True, capture_output=True, text=True).stdout.strip()
+        (Path(own) / "of_the_tester.pth").write_text(sysconfig.get_path("purelib"))
+        sys.exit(subprocess.run([python, __file__], env=os.environ | {"SPLATSIEVE_INSTALLED": own}, cwd=folder).returncode)
+
+
+class Installed(unittest.TestCase):
+    """The module and the program of the wheel, in an empty folder."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.folder = tempfile.TemporaryDirectory()
+        cls.at = Path(cls.folder.name)
+        splatsieve.run("demo", output=cls.at / "demo")
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.folder.cleanup()
+
+    def test_module_and_program_are_the_installed_ones(self):
+        own = Path(os.environ["SPLATSIEVE_INSTALLED"])
+        self.assertEqual(Path(splatsieve.__file__).parent, own / "splatsieve")
+        self.assertTrue((own / "splatsieve" / "py.typed").is_file())
+        self.assertEqual(Path(splatsieve.program()).parent, Path(sysconfig.get_path("scripts")))
+
+    def test_compress_gives_the_summary_that_lies_beside_the_result(self):
+        lines = []
+        summary = splatsieve.compress(
+            self.at / "demo" / "scene.gseq", self.at / "half.gseq", target_ratio=0.5, refine_steps=2, log=lines.append
+        )
+        written = json.loads((self.at / "half.gseq.summary.json").read_text())
+        self.assertIn("half.gseq", written.pop("files"))
+        self.assertEqual(summary, written)
+        self.assertTrue(any("scan" in line for line in lines), lines)
+        before, after = (splatsieve.info(self.at / name)["gaussians"] for name in ("demo/scene.gseq", "half.gseq"))
+        self.assertEqual(after, -(-before // 2))
+
+    def test_a_dry_run_writes_nothing(self):
+        splatsieve.run("compress", self.at / "demo" / "scene.gseq", output=self.at / "no.gseq", dry_run=True)
+        self.assertFalse((self.at / "no.gseq").exists())
+
+    def test_a_refusal_raises_with_the_message_of_the_program(self):
+        with self.assertRaisesRegex(splatsieve.Error, "no_such_model") as refused:
+            splatsieve.compress(self.at / "no_such_model", self.at / "x.gseq")
+        self.assertEqual(refused.exception.code, 1)
+        self.assertNotIn("splatsieve:", str(refused.exception))
+        with self.assertRaisesRegex(splatsieve.Error, "--no-such-option") as misused:
+            splatsieve.compress("a", "b", no_such_option=1)
+        self.assertEqual(misused.exception.code, 2)
+
+    def columns(self, count):
+        dice = np.random.default_rng(3)
+        return {
+            "position": dice.normal(size=(count, 3)).astype("<f4"),
+            "rotation": np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+            "log_scale": np.full((count, 3), -3, "<f4"),
+            "opacity_logit": np.full(count, 2, "<f4"),
+            "sh": dice.normal(size=(count, 1, 3)).astype("<f4"),
+        }
+
+    def test_frames_streamed_into_a_container_are_read_back_to_the_bit(self):
+        columns = self.columns(300)
+        position = columns.pop("position")
+        with splatsieve.stream(self.at / "s.gseq", 300, 0, columns, verb="pack") as out:
+            for frame in range(5):
+                out.frame(frame / 4, {"position": position + np.float32(frame)})
+        scene = splatsieve.read_gseq(str(self.at / "s.gseq"))
+        self.assertEqual(scene.times.tolist(), [0, 0.25, 0.5, 0.75, 1])
+        for frame in range(5):
+            self.assertTrue(np.array_equal(scene.column("position", frame), position + np.float32(frame)))
+        self.assertTrue(np.array_equal(scene.column("sh", 3), columns["sh"].reshape(300, 3)))
+
+    def test_a_stream_is_compressed_and_its_summary_given(self):
+        columns = self.columns(200)
+        with splatsieve.stream(self.at / "c.gseq", 200, 0, columns, target_count=50, no_refine=True) as out:
+            out.frame(0.0, {})
+            out.frame(1.0, {})
+        self.assertEqual(splatsieve.info(self.at / "c.gseq")["gaussians"], 50)
+        self.assertEqual(out.summary["gaussians"], 50)
+
+    def test_an_exporter_that_fails_leaves_no_file_and_its_own_error(self):
+        with self.assertRaisesRegex(ZeroDivisionError, "exporter"):
+            with splatsieve.stream(self.at / "f.gseq", 200, 0, self.columns(200), verb="pack") as out:
+                out.frame(0.0, {})
+                raise ZeroDivisionError("exporter")
+        self.assertFalse((self.at / "f.gseq").exists())
+
+    def test_what_the_program_refuses_of_a_stream_is_raised(self):
+        with self.assertRaisesRegex(splatsieve.Error, "frame 1.*above 1"):
+            with splatsieve.stream(self.at / "t.gseq", 200, 0, self.columns(200), verb="pack") as out:
+                out.frame(1.0, {})
+                for _ in range(1000):
+                    out.frame(0.5, {})
+
+    def test_options_without_values_are_those_of_the_program(self):
+        def help(*words):
+            return subprocess.run([splatsieve.program(), *words, "--help"], check=True, capture_output=True, text=True).stdout
+
+        verbs = re.findall(r"^  (\w+) ", help().partition("Commands:")[2].partition("Options:")[0], re.M)
+        self.assertIn("compress", verbs)
+        options = "".join(help(verb) for verb in verbs if verb != "help")
+        # What follows a name is its value, or after two blanks what it is for.
+        found = set(re.findall(r"^ {2,6}(?:-\w, )?--([\w-]+)(?:$| {2,}\S)", options, re.M))
+        self.assertEqual({name.replace("-", "_") for name in found} - {"help", "version"}, set(_program.SWITCHES))
+
+    def test_options_become_words_of_the_command_line(self):
+        words = _program.flags({"as_": "ply", "overwrite": False, "dry_run": True, "choose_by_views": False, "cameras": None})
+        self.assertEqual(words, ["--as=ply", "--dry-run", "--choose-by-views=false"])
+        words = _program.flags({"keep_box": (-1, 0, 1.5), "max_error": {"position": 1e-3}, "merge_pass": [(1, 2), (3, 4)]})
+        self.assertEqual(words, ["--keep-box=-1,0,1.5", "--max-error=position=0.001", "--merge-pass=1,2", "--merge-pass=3,4"])
+
+
+if __name__ == "__main__":
+    if "SPLATSIEVE_INSTALLED" not in os.environ:
+        main()
+    import json
+
+    import numpy as np
+
+    import splatsieve
+    from splatsieve import _program
+
+    unittest.main()
