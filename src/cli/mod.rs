@@ -108,8 +108,8 @@ fn run(cli: Cli) -> Result<()> {
             let page = view_output.map(|output| view_of_result(&request, output)).transpose()?;
             let summary = compress(&request)?;
             print(&if json { summary.json() } else { summary.text(detail) })?;
+            // The summary is what stdout is for.
             if let Some(page) = page {
-                // The summary is what stdout is for.
                 tell(&viewed(&page)?);
             }
             Ok(())

@@ -71,7 +71,7 @@ impl Track {
             times: frames.iter().map(|&frame| info.times[frame]).collect(),
             steps,
             varying: varying.iter().map(|column| components(column, sh_degree)).map(|c| [c.start, c.len()]).collect(),
-            groups: (0..=groups).map(|k| if groups == 0 { 1 } else { 1 + k * (frames.len() - 1) / groups }).collect(),
+            groups: (0..=groups).map(|k| 1 + k * frames.len().saturating_sub(1) / groups.max(1)).collect(),
             unseen: 0,
         }
     }
@@ -267,7 +267,7 @@ mod tests {
                 let off = (found[component][i] as f64 * step - value).abs();
                 assert!(off <= 0.5 * step * (1.0 + 1e-9), "frame {frame}, component {component}: {off} of {step}");
             };
-            for i in 0..track.count {
+            (0..track.count).for_each(|i| {
                 for c in 0..3 {
                     near(c, i, state.position.plane(c)[i].into(), steps.position);
                     near(7 + c, i, state.log_scale.plane(c)[i].into(), steps.log_scale);
@@ -280,7 +280,7 @@ mod tests {
                 let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
                 let along: f64 = (0..4).map(|c| q[c] * found[3 + c][i] as f64).sum();
                 (0..4).for_each(|c| near(3 + c, i, along.signum() * q[c] / length, steps.rotation));
-            }
+            });
         }
     }
 
