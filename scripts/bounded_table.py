@@ -12,6 +12,7 @@ ones; zstd level 19 both). COMMAND, for .4dgs, gets the folder of those frames a
 folder of PLY files that it decodes to. Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import json
 import math

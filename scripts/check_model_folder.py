@@ -18,6 +18,7 @@ is said. Checked, in the terms of the original loader (`GaussianModel.load_ply`,
 Exits 1 at the first thing that does not hold; prints the bytes of the folder by part at the end.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import array
 import ast
 import collections

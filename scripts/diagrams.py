@@ -9,6 +9,7 @@ Each is the first whose caption begins so. README's two are made from deform2:
 Needs nothing but Python.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import html
 import re
 import sys

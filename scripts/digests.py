@@ -12,6 +12,7 @@ times, and recipe.toml are left out. Bytes of models depend on the processor's i
 tables of one machine. --only WORD runs the cases whose names hold it. Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import hashlib
 import shutil

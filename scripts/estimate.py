@@ -8,6 +8,7 @@ An INPUT is whatever `compress` reads. Prints a table: core-seconds and seconds,
 memory as said and as taken, and how long a dry run takes; ends with 1 if anything lies outside of what was said. Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import json
 import subprocess
 import sys

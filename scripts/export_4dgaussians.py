@@ -11,6 +11,7 @@ whatever `gaussians._deformation` gives. Frames are the distinct times of the ca
 spaced ones (i/N). `--device cpu` works where the fork's classes do.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import json
 import os
 import sys

@@ -11,12 +11,13 @@ An .npz, or a folder of .npy files (mapped, not loaded), with these arrays; T fr
     rotation       [T, N, 4] or [N, 4]: wxyz, any length
     log_scale      [T, N, 3] or [N, 3]: natural logs; or scale, the scales themselves
     opacity_logit  [T, N, 1] or [T, N] or [N, 1] or [N]: logits; or opacity in [0, 1]
-    sh             [T, N, (d+1)^2, 3] or [N, (d+1)^2, 3]; or rgb [T, N, 3] or [N, 3] in [0, 1]
+    sh             [T, N, (d+1)^2, 3] or [N, (d+1)^2, 3], the last two as one or not; or rgb [T, N, 3] or [N, 3] in [0, 1]
 
 An array without T holds for every frame. Where T = N and shapes are ambiguous, an array of opacity needs its last axis
 of 1. Needs numpy.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import sys
 from pathlib import Path
 
@@ -58,6 +59,9 @@ def main():
             sys.exit(f"{sys.argv[1]}: expected an array {name}" + (f" or {other}" if other else ""))
         columns[name] = arrays[name if name in arrays else other]
         convert[name] = (lambda array: array) if name in arrays else function
+    if "sh" in arrays and columns["sh"].shape[-1] != 3:
+        # One row of 3(d+1)^2 for a Gaussian, as containers and read_gseq.py have them.
+        columns["sh"] = columns["sh"].reshape(*columns["sh"].shape[:-1], -1, 3)
     times = np.asarray(arrays.get("times", np.arange(1)), np.float64)
     count = columns["position"].shape[-2]
     # One axis more than a single state has, counting from the values of one Gaussian.

@@ -11,6 +11,7 @@ give the same bytes.
 Memory: 0.8 kB per Gaussian, whatever the number of frames. Needs numpy.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import sys
 

@@ -12,6 +12,7 @@ Effectiveness of Deep Features as a Perceptual Metric", 2018.
 """
 
 # This folder is on the path of its own scripts, and this script bears the name of the package it needs.
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import sys
 
 if sys.path and not getattr(sys.flags, "safe_path", False):

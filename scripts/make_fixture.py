@@ -12,6 +12,7 @@ Written, beside the files of a model folder and its cameras:
   statistics_f64.npz  life, V, D and kappa over all frames, by the definitions of tests/trained_models.rs
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import json
 import math
 import platform

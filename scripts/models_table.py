@@ -9,6 +9,7 @@ Every figure comes from what the program prints; quality is that of 15 frames of
 memory are those of this machine. Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import json
 import subprocess
 import sys

@@ -13,6 +13,7 @@ Every tile is found through the footer's index; one frame block of one column is
 verified (that is `splatsieve verify`). Needs numpy and zstandard.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import sys
 from pathlib import Path
 

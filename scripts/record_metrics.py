@@ -7,6 +7,7 @@ per picture one PSNR and SSIM, computed in float64 by 2-D convolution with PyTor
 computed by its authors' package (flip-evaluator), and the versions that made them.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import importlib.metadata
 import json
 import pathlib

@@ -18,6 +18,7 @@ and best come to: 30% kept unrefined, then refined at every ratio; wall and proc
 Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import json
 import math
 import sys

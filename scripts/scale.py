@@ -14,6 +14,7 @@ generate_stream.py makes the sequences, `pack` stores each in FOLDER, and it is 
 mapped pages count), those of its stages the program's own. Needs numpy.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import hashlib
 import json

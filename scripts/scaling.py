@@ -11,6 +11,7 @@ stage, the longest chain, and the estimate; `--check` makes it exit 1 where the 
 same stage in one part though each works 5 s or more (`--parts` has to begin with 1). Needs nothing but Python.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import json
 import math

@@ -7,6 +7,7 @@ MODEL is a 4DGaussians model folder with its cameras inside; the picture is one 
 Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import json
 import struct

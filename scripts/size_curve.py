@@ -12,6 +12,7 @@ archive (.gsz, preset default); of what pruning alone leaves (--no-refine --prun
 what COMMAND, a splat-transform of PlayCanvas, makes of as many (.sog and .spz, decimated by itself). Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import lzma
 import shlex

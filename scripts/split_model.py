@@ -13,6 +13,7 @@ to a fifth in a gibibyte, and says how close the held-out pictures of both stay.
 behind it and prints what that took and how close 15 frames of the held-out views stay. Needs nothing but Python.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import json
 import math

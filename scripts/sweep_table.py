@@ -10,6 +10,7 @@ tables stands where `default` is more than 0.05 dB below another method, and whe
 `projected`: it is expected to say "nowhere" twice. Standard library only.
 """
 
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import array
 import json
 import math
