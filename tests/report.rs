@@ -108,11 +108,25 @@ fn the_page_is_well_formed_holds_all_it_needs_and_is_light() {
         assert!(!page.contains(outside), "the page holds {outside:?}");
     }
     assert!(page.contains("default-src 'none'"));
-    for part in ["Error by run time", "Error by memory", "S_static", "Time per stage", "left out", "Thin structures"] {
+    for part in [
+        "Error by run time",
+        "Error by memory",
+        "S_static",
+        "powers of ten",
+        "Time per stage",
+        "left out",
+        "Thin structures",
+    ] {
         assert!(page.contains(part), "{part} is missing");
     }
     assert!(!page.contains("<i>odd") && !page.contains("<b>points"), "text of a file became elements");
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
+    // Three images of each of five frames; their figures are those of evaluate.
+    let films = data(&at, "r")["films"].as_array().unwrap().clone();
+    assert_eq!(page.matches("data:image/jpeg;base64,").count(), films.len() * 5 * 3);
+    assert_eq!(films[0]["frames"], json!([0, 1, 2, 3, 4]));
+    let shown = &data(&at, "r")["shown"][0];
+    assert_eq!(films[0]["psnr"][shown["frame"].as_u64().unwrap() as usize], shown["psnr"]);
     // Any letters may stand in a picture's base64.
     let written = |part: &str| part.split_once('"').map_or(part, |(_, after)| after).to_owned();
     let words: String = page.split("data:image/png;base64,").map(written).collect();

@@ -95,6 +95,61 @@ fn the_page_asks_for_nothing_and_its_slider_and_choices_work() {
     assert_eq!(page.complaints(), Vec::<String>::new());
 }
 
+#[test]
+#[ignore = "needs a browser"]
+fn the_films_play_and_go_by_key_and_the_page_fits_a_phone() {
+    let program = browser::installed();
+    let at = Workplace::new();
+    at.done("demo -o d --gaussians 1500 --frames 5");
+    at.done("report d/scene.gseq d/compressed.gseq --cameras d/cameras.json --flip -o report");
+    let mut page = Browser::start(&program);
+    page.open(&at.path("report/report.html"));
+    let now = "[...document.querySelectorAll('.film.active .pile')]\
+               .map(pile => [...pile.children].findIndex(image => getComputedStyle(image).visibility === 'visible'))";
+    assert_eq!(page.value(now), json!([0, 0, 0]), "original, compressed, difference");
+    let distinct = "[...document.querySelector('.pile').children].map(i => i.src).filter((s, k, all) => all.indexOf(s) === k).length";
+    assert_eq!(page.value(distinct), json!(5), "every frame of five is another picture");
+    page.value("document.querySelector('#reel input').focus()");
+    page.key("ArrowRight", 39);
+    page.key("ArrowRight", 39);
+    assert_eq!(page.value(now), json!([2, 2, 2]));
+    assert_eq!(
+        page.value("document.querySelector('#reel input').getAttribute('aria-valuetext').split(':')[0]"),
+        json!("frame 2")
+    );
+    page.key(" ", 32);
+    assert_eq!(page.value("document.querySelector('#reel button').textContent"), json!("Pause"));
+    let moved = format!(
+        "new Promise(done => {{ const look = () => {now}[0] === 2 ? setTimeout(look, 20) : done(true); look(); }})"
+    );
+    assert_eq!(page.value(&moved), json!(true), "it does not play");
+    page.key(" ", 32);
+    assert_eq!(page.value("document.querySelector('#reel button').textContent"), json!("Play"));
+    assert_eq!(page.value("document.querySelectorAll('[data-play]').length"), json!(2));
+    page.value("document.querySelectorAll('[data-play]')[1].click()");
+    assert_eq!(
+        page.value("[...document.querySelectorAll('.film')].map(f => f.offsetHeight > 0)"),
+        json!([false, true])
+    );
+    assert!(page.value("document.body.textContent").as_str().unwrap().contains("FLIP over frames"));
+
+    for (width, scale) in [(375, 2), (1400, 1)] {
+        let device = json!({ "width": width, "height": 800, "deviceScaleFactor": scale, "mobile": width < 1000 });
+        page.ask("Emulation.setDeviceMetricsOverride", device);
+        let wide = page
+            .value("Math.max(...[...document.querySelectorAll('main *')].map(e => e.getBoundingClientRect().right))");
+        assert!(wide.as_f64() <= Some(f64::from(width)), "something reaches to {wide} of {width} pixels");
+        assert_eq!(page.value(UNREADABLE), json!([]), "{width}");
+    }
+    let smallest = "Math.min(...[...document.querySelectorAll('svg text')].map(t => t.getBoundingClientRect().height))";
+    page.ask(
+        "Emulation.setDeviceMetricsOverride",
+        json!({ "width": 375, "height": 800, "deviceScaleFactor": 2, "mobile": true }),
+    );
+    assert!(page.value(smallest).as_f64() > Some(9.0), "letters of {} pixels", page.value(smallest));
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
 /// Pairs of words of one chart that lie on one another, and words that reach beyond their chart.
 const UNREADABLE: &str = "[...document.querySelectorAll('svg')].flatMap(svg => {
     const outer = svg.getBoundingClientRect();

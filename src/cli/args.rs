@@ -436,6 +436,9 @@ pub(super) struct Report {
     /// The sweep.json that `sweep` wrote, for its curves
     #[arg(long, value_name = "FILE")]
     pub(super) sweep: Option<PathBuf>,
+    /// The precision.json that `precision` wrote, for its diagrams
+    #[arg(long, value_name = "FILE")]
+    pub(super) precision: Option<PathBuf>,
     /// Folder to write report.html into, and all it shows as JSON and CSV
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,

@@ -161,6 +161,7 @@ fn run(cli: Cli) -> Result<()> {
             let found = report::report(&ReportOptions {
                 evaluate,
                 sweep: args.sweep,
+                precision: args.precision,
                 output: args.output,
                 overwrite: args.earlier.replace(),
             })?;

@@ -15,12 +15,12 @@ pub const STYLE: &str = include_str!("chart.css");
 /// Size of a chart in its own units, which are about a pixel.
 const WIDTH: f64 = 480.0;
 const HEIGHT: f64 = 270.0;
-const LEFT: f64 = 70.0;
+const LEFT: f64 = 80.0;
 const RIGHT: f64 = 14.0;
-const BOTTOM: f64 = 44.0;
-/// Height of a line of the legend, and about how wide one of its letters is.
+const BOTTOM: f64 = 46.0;
+/// Height of a line of the legend, and about how wide one of its letters is on a narrow page, where they are largest.
 const LINE: f64 = 18.0;
-const LETTER: f64 = 6.6;
+const LETTER: f64 = 8.2;
 /// Colours, shapes and dashes that [`STYLE`] and this file know.
 const LOOKS: usize = 9;
 
@@ -343,7 +343,7 @@ impl Drawing {
             top: 10.0,
             labels: Vec::new(),
         };
-        let (mut x, mut y) = (LEFT, 14.0);
+        let (mut x, mut y) = (LEFT, 17.0);
         for Entry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
             // The mark, with a piece of the line through it.
             let sample = if *joined { 26.0 } else { 12.0 };
@@ -423,7 +423,7 @@ impl Drawing {
         let middle = 0.5 * (bottom + self.top);
         let _ = write!(
             self.text,
-            "<text class=\"middle\" transform=\"translate(13 {middle:.1}) rotate(-90)\">{}</text>",
+            "<text class=\"middle\" transform=\"translate(17 {middle:.1}) rotate(-90)\">{}</text>",
             escape(y_label)
         );
         self.x_axis(x, x_label, [self.top, bottom]);
@@ -437,7 +437,7 @@ impl Drawing {
                 self.text,
                 "<path class=\"grid\" d=\"M{at:.1} {top:.1}V{bottom:.1}\"/>\
                  <text class=\"middle\" x=\"{at:.1}\" y=\"{:.1}\">{}</text>",
-                bottom + 16.0,
+                bottom + 21.0,
                 figure(tick)
             );
         }
@@ -447,7 +447,7 @@ impl Drawing {
             x.from,
             x.to,
             0.5 * (x.from + x.to),
-            bottom + 34.0,
+            bottom + 39.0,
             escape(label)
         );
     }

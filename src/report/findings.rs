@@ -3,9 +3,11 @@
 use serde::Serialize;
 
 use super::failure::FailureMode;
+use super::film::Film;
 use super::histogram::Histogram;
 use super::shown::Choice;
 use crate::verbs::evaluation::{Evaluation, PictureScores};
+use crate::verbs::precision::found::Precision;
 use crate::verbs::trade_off::TradeOff;
 
 /// Everything the page shows, as data.
@@ -21,6 +23,8 @@ pub struct Report {
     pub pictures: Vec<PictureScores>,
     /// Pictures that the page shows.
     pub shown: Vec<Choice>,
+    /// Films that it shows.
+    pub films: Vec<Film>,
     /// The failure modes, by [`super::traits::Kind::ALL`].
     pub failure_modes: Vec<FailureMode>,
     /// The scores of what was kept, merged and dropped; none where that is not known.
@@ -31,6 +35,9 @@ pub struct Report {
     pub missing: Vec<String>,
     /// A sweep over the original.
     pub trade_off: Option<TradeOff>,
+    /// Work-precision diagrams of the original.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub precision: Option<Precision>,
     /// Things a person should know.
     pub notes: Vec<String>,
     /// The same of the work folder, which are no part of the result.

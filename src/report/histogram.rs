@@ -1,7 +1,8 @@
 //! How the scores of what was kept, merged and dropped are spread.
 //!
 //! In: one value per Gaussian, and its fate. Out: counts per bin and fate. Bins are equal in ratio
-//! over the positive values, for scores span many powers of ten; what is 0 is counted apart.
+//! over the positive values, for scores span many powers of ten; those of parts of the frames are of equal width
+//! over all of their range. What is 0 is counted apart.
 
 use std::borrow::Cow;
 
@@ -46,6 +47,8 @@ pub struct Histogram {
     pub name: &'static str,
     /// What it measures, with the unit.
     pub meaning: &'static str,
+    /// Whether bins are equal in ratio; else they are of equal width from 0 to 1.
+    pub log: bool,
     /// One more than there are bins, increasing; empty if no value is positive.
     pub edges: Vec<f64>,
     /// Counts per bin; of a bin its lower edge is in it, of the last both; the first also holds what is
@@ -65,22 +68,31 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
     ];
     let part = |&count: &u32| f64::from(count) / frames.max(1) as f64;
     let statistic = |of: Statistic| {
-        let values = match of.values() {
-            Values::F64(values, _) => Cow::Borrowed(&values(rows)[..]),
-            Values::U32(values, _) => values(rows).iter().map(part).collect(),
+        let (values, most) = match of.values() {
+            Values::F64(values, _) => (Cow::Borrowed(&values(rows)[..]), None),
+            Values::U32(values, _) => (values(rows).iter().map(part).collect(), Some(frames)),
         };
-        (of.name(), of.meaning(), values)
+        (of.name(), of.meaning(), values, most)
     };
-    let scores = scores.map(|(name, meaning, values)| (name, meaning, Cow::Borrowed(&values[..])));
+    let scores = scores.map(|(name, meaning, values)| (name, meaning, Cow::Borrowed(&values[..]), None));
     let all = scores.into_iter().chain([C, W, D, Kappa, V, Life, Vis].map(statistic));
     // Without visible coverage there is no W.
-    all.filter(|(_, _, values)| values.len() == fates.len() && !fates.is_empty())
-        .map(|(name, meaning, values)| Histogram::of(name, meaning, &values, fates))
+    all.filter(|(_, _, values, _)| values.len() == fates.len() && !fates.is_empty())
+        .map(|(name, meaning, values, parts)| match parts {
+            Some(frames) => Histogram::within(name, meaning, even(frames), &values, fates),
+            None => Histogram::of(name, meaning, &values, fates),
+        })
         .collect()
 }
 
+/// Edges from 0 to 1 for parts of `frames` frames: no bin is narrower than a frame.
+fn even(frames: usize) -> Vec<f64> {
+    let bins = frames.clamp(1, BINS);
+    (0..=bins).map(|k| k as f64 / bins as f64).collect()
+}
+
 impl Histogram {
-    /// Of `values`, one per fate.
+    /// Of `values`, one per fate, by powers of ten.
     fn of(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let (mut low, high) = values
@@ -102,10 +114,18 @@ impl Histogram {
             1 => vec![low / 1.1, high * 1.1],
             _ => (0..=bins).map(|k| if k == bins { high } else { low * (step * k as f64).exp() }).collect(),
         };
+        Histogram { log: true, ..Histogram::within(name, meaning, edges, values, fates) }
+    }
+
+    /// Of `values`, one per fate, between `edges`.
+    fn within(name: &'static str, meaning: &'static str, edges: Vec<f64>, values: &[f64], fates: &[Fate]) -> Histogram {
+        let positive = |v: &f64| *v > 0.0 && v.is_finite();
+        let bins = edges.len().saturating_sub(1);
         let empty = || vec![0; bins];
         let mut found = Histogram {
             name,
             meaning,
+            log: false,
             edges,
             bins: ByFate { kept: empty(), merged: empty(), dropped: empty() },
             zero: ByFate::default(),
@@ -176,10 +196,20 @@ mod tests {
     }
 
     #[test]
+    fn parts_of_the_frames_are_drawn_over_all_of_their_range() {
+        // 4 of 10 frames, 7 of 10, and twice all of them.
+        let found = Histogram::within("life", "", even(10), &[0.4, 0.7, 1.0, 1.0, 0.0], &[Fate::Kept; 5]);
+        assert_eq!((found.edges[0], found.edges[10], found.log), (0.0, 1.0, false));
+        assert_eq!(found.bins.kept, [0, 0, 0, 0, 1, 0, 0, 1, 0, 2]);
+        assert_eq!(found.zero.kept, 1);
+        assert_eq!((even(1000).len(), even(1).len(), even(0).len()), (BINS + 1, 2, 2));
+    }
+
+    #[test]
     fn csv_is_these_bytes() {
         let bins = ByFate { kept: vec![1, 0], merged: vec![2, 3], dropped: vec![0, 4] };
         let zero = ByFate { kept: 5, merged: 0, dropped: 6 };
-        let of = Histogram { name: "C", meaning: "", edges: vec![1e-7, 0.5, 2.0], bins, zero };
+        let of = Histogram { name: "C", meaning: "", log: true, edges: vec![1e-7, 0.5, 2.0], bins, zero };
         assert_eq!(
             csv(&[of]),
             "score,from,to,kept,merged,dropped\nC,0,0,5,0,6\nC,0.0000001,0.5,1,2,0\nC,0.5,2,0,3,4\n"

@@ -10,6 +10,7 @@
 pub mod chart;
 mod document;
 pub mod failure;
+pub mod film;
 mod findings;
 pub mod histogram;
 mod html;
@@ -25,6 +26,8 @@ mod verdict;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
+
 use crate::compress::journal::Journal;
 use crate::compress::measure::{Measure, Stages};
 use crate::compress::score::{SCORED, Scored, UserOverrides};
@@ -36,7 +39,6 @@ use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
 use crate::verbs::evaluate::{self, EvaluateOptions, SideBySide, Taken};
-use crate::verbs::trade_off::TradeOff;
 use crate::work::Key;
 pub use findings::Report;
 
@@ -57,6 +59,8 @@ pub struct ReportOptions {
     pub evaluate: EvaluateOptions,
     /// What `sweep` wrote.
     pub sweep: Option<PathBuf>,
+    /// What `precision` wrote.
+    pub precision: Option<PathBuf>,
     /// Folder to write.
     pub output: PathBuf,
     /// Replace an earlier report.
@@ -70,9 +74,11 @@ pub struct ReportOptions {
 pub fn report(options: &ReportOptions) -> Result<Report> {
     let mut inputs = options.evaluate.inputs();
     inputs.extend(options.sweep.as_deref());
+    inputs.extend(options.precision.as_deref());
     check_folder_name(&options.output, "report")?;
     check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
-    let trade_off = options.sweep.as_deref().map(read_sweep).transpose()?;
+    let trade_off = options.sweep.as_deref().map(|path| read_found(path, "sweep")).transpose()?;
+    let precision = options.precision.as_deref().map(|path| read_found(path, "precision")).transpose()?;
     let mut side = SideBySide::open(&options.evaluate)?;
     let info = side.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
@@ -86,6 +92,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         needs.push(traits::need(work));
         needs.extend(evaluate::needs(work, limits).into_iter().map(|mut need| {
             need.per_gaussian.push(("rows", SCORED + 8));
+            need.fixed.push(("films", film::bytes(work)));
             need
         }));
         needs
@@ -114,6 +121,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         Kind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
     let choices = choices(&evaluation);
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
+    let films = film::films(&side, &shown)?;
 
     notes.extend(evaluation.notes.iter().cloned());
     let work_notes = evaluation.work_notes.iter().cloned().chain(side.scene.work.take_notes()).collect();
@@ -127,11 +135,13 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         pictures: evaluation.pictures.clone(),
         evaluation,
         shown: choices,
+        films,
         failure_modes,
         histograms,
         missing: run.missing.clone(),
         run: run.summary.as_ref().map(|(_, whole)| whole.clone()),
         trade_off,
+        precision,
         notes,
         work_notes,
     };
@@ -139,11 +149,13 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     Ok(report)
 }
 
-fn read_sweep(path: &Path) -> Result<TradeOff> {
+/// Reads the data that `verb` wrote.
+fn read_found<T: DeserializeOwned>(path: &Path, verb: &str) -> Result<T> {
     let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
     serde_json::from_str(&text).map_err(|error| {
-        Error::input(path, format!("line {}", error.line()), "what `splatsieve sweep` wrote", error.to_string())
-            .hint("splatsieve sweep ORIGINAL --cameras F writes a sweep.json")
+        let expected = format!("what `splatsieve {verb}` wrote");
+        Error::input(path, format!("line {}", error.line()), expected, error.to_string())
+            .hint(format!("splatsieve {verb} ORIGINAL --cameras F -o FOLDER writes a {verb}.json"))
     })
 }
 
@@ -272,6 +284,7 @@ fn write(options: &ReportOptions, report: &Report, page: &str, run: &Run) -> Res
     files.extend(report.trade_off.as_ref().map(|of| ("trade_off.csv", of.csv())));
     let turned = report.trade_off.as_ref().filter(|of| !of.knobs.is_empty());
     files.extend(turned.map(|of| ("knobs.csv", of.knobs_csv())));
+    files.extend(report.precision.as_ref().map(|of| ("precision.csv", of.csv())));
     for (name, text) in files {
         let path = staged.path().join(name);
         fs::write(&path, text).map_err(Error::io("write", &path))?;

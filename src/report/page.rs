@@ -3,18 +3,21 @@
 use super::chart::{Axis, Bars, Plot, Series, Stack};
 use super::document::{document, figure_of, links, list};
 use super::failure::{APART_DB, FailureMode, LOST, VISIBLE_DB, Verdict};
+use super::film::{Film, KINDS, QUALITY};
 use super::findings::{Close, Report};
 use super::histogram::Histogram;
 use super::html::{bytes, count, escape, figure, file_name, percent};
 use super::run::Run;
 use super::shown::Shown;
-use super::trade_off;
+use super::{precision, trade_off};
 use crate::compress::summary::{Stage, Summary};
 use crate::families::Size;
 use crate::verbs::evaluation::{Both, Comparison, FrameMeans, Means, ViewMeans};
 
 /// What moves the slider.
 const SCRIPT: &str = include_str!("page.js");
+/// What plays the films.
+const PLAY: &str = include_str!("film.js");
 
 /// Puts the page together.
 pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close]) -> String {
@@ -23,16 +26,19 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
     let sections = [
         ("", header(report)),
         ("Compare", compare(shown)),
+        ("See it move", films(&report.films)),
         ("Where it is lost", by_frame_and_view(report)),
         ("Known failure modes", failure_modes(&report.failure_modes, close)),
         ("Run", stages(run)),
         ("Scores of what was kept and dropped", score_histograms(report)),
         ("Notes and what was left out", left_out(report, run)),
-        ("Trade-off", sweep(report)),
+        ("Trade-off", sweep(report, run)),
+        ("Error against run time", report.precision.as_ref().map_or(String::new(), precision::section)),
         ("Data", data(report, run)),
     ];
     for (heading, body) in sections {
         match heading {
+            _ if body.is_empty() => (),
             "" => out += &format!("<header>\n{body}</header>\n"),
             _ => {
                 let id = heading.split(' ').next().unwrap_or(heading).to_lowercase();
@@ -40,7 +46,7 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
             }
         }
     }
-    out += &format!("<script>\n{SCRIPT}</script>\n");
+    out += &format!("<script>\n{SCRIPT}</script>\n<script>\n{PLAY}</script>\n");
     document(&title, &out)
 }
 
@@ -64,8 +70,9 @@ fn header(report: &Report) -> String {
         count(counts.compressed),
         from(count(counts.original), counts.compressed as f64, counts.original as f64),
     );
+    let whole = if size_parts(&found.size).is_empty() { "size" } else { "size of the whole model" };
     out += &card(
-        "size",
+        whole,
         bytes(sizes.compressed),
         from(bytes(sizes.original), sizes.compressed as f64, sizes.original as f64),
     );
@@ -77,6 +84,10 @@ fn header(report: &Report) -> String {
     out += &card("SSIM to the original", format!("{:.4}", mean.ssim), format!("worst frame {:.4}", worst(|m| m.ssim)));
     if let Some(temporal) = mean.temporal {
         out += &card("temporal error", figure(temporal), "of frame-to-frame differences".to_owned());
+    }
+    if let Some(flip) = mean.flip {
+        let worst = found.loss.per_frame.iter().filter_map(|of| of.means.flip).fold(0.0, f64::max);
+        out += &card("FLIP to the original", format!("{flip:.4}"), format!("worst frame {worst:.4}"));
     }
     if let Some(truth) = &found.ground_truth {
         let (after, before) = (truth.compressed.overall, truth.original.overall);
@@ -136,12 +147,10 @@ fn compare(shown: &[Shown]) -> String {
             };
             out += &format!("<img data-kind=\"{name}\"{side} alt=\"{name}\" draggable=\"false\" src=\"{uri}\">\n");
         }
-        let shrunk = match picture.shrunk {
-            1 => String::new(),
-            by => format!("; shown at 1/{by} of its size"),
-        };
+        let shrunk = at_size(picture.shrunk);
+        let flip = picture.choice.flip.map_or(String::new(), |flip| format!(", FLIP {}", figure(flip)));
         out += &format!(
-            "<p class=\"caption\" hidden>frame {}, view {}: PSNR {}, SSIM {:.4}; the difference is {} times as bright as it \
+            "<p class=\"caption\" hidden>frame {}, view {}: PSNR {}, SSIM {:.4}{flip}; the difference is {} times as bright as it \
              is{shrunk}</p>\n</div>\n",
             picture.choice.frame,
             picture.choice.view,
@@ -153,6 +162,68 @@ fn compare(shown: &[Shown]) -> String {
     out += "<span class=\"tag tag-left\"></span><span class=\"tag tag-right\"></span><i id=\"handle\"></i>\n</div>\n\
             <input id=\"cut\" type=\"range\" min=\"0\" max=\"100\" step=\"0.5\" value=\"50\" \
             aria-label=\"how much of the left picture is seen\">\n<p class=\"note\" id=\"caption\"></p>\n";
+    out
+}
+
+/// Of pictures of which that many pixels each way became one.
+fn at_size(shrunk: u32) -> String {
+    match shrunk {
+        1 => String::new(),
+        by => format!("; shown at 1/{by} of its size"),
+    }
+}
+
+/// Films with what plays them. Without a script their first frames are seen.
+fn films(films: &[Film]) -> String {
+    let Some(first) = films.first() else { return String::new() };
+    let mut out = String::new();
+    if films.len() > 1 {
+        out += "<div class=\"bar\" role=\"group\" aria-label=\"film\">\n";
+        for (number, film) in films.iter().enumerate() {
+            out += &format!(
+                "<button type=\"button\" data-play=\"{number}\" aria-pressed=\"{}\">from the {}<small>view {}, its camera at \
+                 frame {}</small></button>\n",
+                number == 0,
+                escape(&film.why[0]),
+                film.view,
+                film.camera_of_frame
+            );
+        }
+        out += "</div>\n";
+    }
+    out += &format!(
+        "<div id=\"reel\" class=\"bar\" hidden><button type=\"button\">Play</button><input type=\"range\" min=\"0\" max=\"{}\" \
+         step=\"1\" value=\"0\" aria-label=\"frame\"><output></output></div>\n",
+        first.frames.len() - 1
+    );
+    for (number, film) in films.iter().enumerate() {
+        let join = |values: Vec<String>| values.join(" ");
+        let active = if number == 0 { " active" } else { "" };
+        out += &format!(
+            "<div class=\"film{active}\" data-film=\"{number}\" data-frames=\"{}\" data-psnr=\"{}\" style=\"--ratio: {} / {}\">\n",
+            join(film.frames.iter().map(usize::to_string).collect()),
+            join(film.psnr.iter().map(|psnr| format!("{psnr:.2}")).collect()),
+            film.size.0,
+            film.size.1
+        );
+        for (k, kind) in KINDS.iter().enumerate() {
+            out += &format!("<figure><figcaption>{kind}</figcaption><div class=\"pile\">");
+            for (place, (images, frame)) in film.images.iter().zip(&film.frames).enumerate() {
+                let now = if place == 0 { " class=\"now\"" } else { "" };
+                out += &format!("<img{now} alt=\"{kind}, frame {frame}\" draggable=\"false\" src=\"{}\">", images[k]);
+            }
+            out += "</div></figure>\n";
+        }
+        out += &format!(
+            "<p class=\"note\">View {}, by its camera at frame {}: {} frames, evenly from first to last; the difference is {} times as bright as it is{}; JPEG of quality {QUALITY}, the \
+             figures are those of the pictures themselves.</p>\n</div>\n",
+            film.view,
+            film.camera_of_frame,
+            film.frames.len(),
+            film.factor,
+            at_size(film.shrunk)
+        );
+    }
     out
 }
 
@@ -193,6 +264,9 @@ fn by_frame_and_view(report: &Report) -> String {
     if found.loss.overall.temporal.is_some() {
         out +=
             &figure_of("Temporal error over frames", &frames(&|m| m.temporal, "error", "Temporal error over frames"));
+    }
+    if found.loss.overall.flip.is_some() {
+        out += &figure_of("FLIP over frames", &frames(&|m| m.flip, "FLIP", "FLIP over frames"));
     }
     out + "</div>\n"
 }
@@ -275,7 +349,7 @@ fn stages(run: &Run) -> String {
         );
     };
     let mut out = String::from(
-        "<table class=\"wide\">\n<tr><th>stage</th><th>Gaussians in</th><th>out</th><th>time</th><th>peak memory so far</th></tr>\n",
+        "<table class=\"wide figures\">\n<tr><th>stage</th><th>Gaussians in</th><th>out</th><th>time</th><th>peak memory so far</th></tr>\n",
     );
     for stage in &summary.stages {
         let memory = stage.peak_memory_bytes.map_or("–".to_owned(), |of| format!("{:.0} MiB", of as f64 / 1048576.0));
@@ -290,7 +364,10 @@ fn stages(run: &Run) -> String {
     let total: f64 = summary.stages.iter().map(|stage| stage.seconds).sum();
     out += &format!("<tr><th>together</th><td></td><td></td><th>{total:.2} s</th><td></td></tr>\n</table>\n");
     out += "<div class=\"charts\">\n";
-    out += &figure_of("Time per stage", &stage_bars(summary, "seconds", |stage| Some(stage.seconds)));
+    out += &figure_of(
+        "Time per stage",
+        &stage_bars(summary, "seconds", |stage| Some((1e3 * stage.seconds).round() / 1e3)),
+    );
     let mib = |stage: &Stage| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
     out += &figure_of("Largest memory up to the end of each stage", &stage_bars(summary, "MiB", mib));
     out + "</div>\n"
@@ -300,7 +377,9 @@ fn stages(run: &Run) -> String {
 fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
     let parts = size.original.named().into_iter().zip(size.compressed.named());
     let parts: Vec<_> = parts.map(|((name, before), (_, after))| (name, before, after)).collect();
-    let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > 0).collect();
+    // A hundredth of the whole is not worth a card.
+    let least = size.compressed.whole() / 100;
+    let both: Vec<_> = parts.into_iter().filter(|&(_, before, after)| before > 0 && after > least).collect();
     if both.len() > 1 { both } else { Vec::new() }
 }
 
@@ -315,7 +394,12 @@ fn score_histograms(report: &Report) -> String {
             "Which Gaussians went is not known: there is no index map beside the compressed model that fits.",
         );
     };
-    let mut out = String::from("<div class=\"charts\">\n");
+    let mut out = String::from(
+        "<p class=\"note\">How many Gaussians of the original have which value: those that were kept at the bottom of each bar, \
+         then those dropped, then those merged into others. Values go by powers of ten, but shares of the frames from none to \
+         all; 0 has no place among powers of ten, and who has it is counted in the legend. Where kept and dropped ones lie \
+         apart, the value says who goes; where they lie on one another, something else decided.</p>\n<div class=\"charts\">\n",
+    );
     for of in histograms {
         out += &figure_of(&format!("{}: {}", of.name, of.meaning), &histogram(of));
     }
@@ -329,7 +413,10 @@ fn histogram(of: &Histogram) -> String {
     };
     Stack {
         title: format!("{} of kept, dropped and merged Gaussians", of.name),
-        x: Axis { label: of.name.to_owned(), log: true, from_zero: false },
+        x: match of.log {
+            true => Axis { label: of.name.to_owned(), log: true, from_zero: false },
+            false => Axis { label: format!("{}, part of the frames", of.name), ..Axis::default() },
+        },
         edges: of.edges.clone(),
         groups: vec![
             with("kept", of.zero.kept, &of.bins.kept),
@@ -371,16 +458,19 @@ fn left_out(report: &Report, run: &Run) -> String {
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
-fn sweep(report: &Report) -> String {
+fn sweep(report: &Report, run: &Run) -> String {
+    let searched = run.summary.as_ref().and_then(|(summary, _)| summary.goal.as_ref());
+    let searched = searched.map_or(String::new(), trade_off::search);
     let Some(found) = &report.trade_off else {
-        return absent(&format!(
-            "Curves of quality against size, time and memory come from a sweep: \
+        return searched
+            + &absent(&format!(
+                "Curves of quality against size, time and memory come from a sweep: \
              <code>splatsieve sweep {} --cameras F</code> writes <code>sweep.json</code>, which <code>report</code> \
              takes as <code>--sweep FILE</code>.",
-            escape(&report.evaluation.path.original)
-        ));
+                escape(&report.evaluation.path.original)
+            ));
     };
-    trade_off::section(found)
+    searched + &trade_off::section(found)
 }
 
 fn data(report: &Report, run: &Run) -> String {
@@ -389,6 +479,7 @@ fn data(report: &Report, run: &Run) -> String {
     names.extend(run.summary.as_ref().map(|_| "stages.csv"));
     names.extend(report.trade_off.as_ref().map(|_| "trade_off.csv"));
     names.extend(report.trade_off.as_ref().filter(|of| !of.knobs.is_empty()).map(|_| "knobs.csv"));
+    names.extend(report.precision.as_ref().map(|_| "precision.csv"));
     format!(
         "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
         links(&names),

@@ -26,10 +26,39 @@ const WORK: [Work; 3] = [
 pub fn page(found: &Precision) -> String {
     let title = format!("{} – error against run time", file_name(&found.path));
     let mut body = format!(
-        "<header>\n<h1>Error against run time: {}</h1>\n</header>\n<p class=\"note\">{} Gaussians × {} frames; {} pictures \
-         of {} frames looked at, judged by {}: {}. Every setting keeps {} Gaussians. {} threads; medians of up to {} \
-         runs, fewer where they took {} s.</p>\n",
+        "<header>\n<h1>Error against run time: {}</h1>\n</header>\n{}",
         escape(file_name(&found.path)),
+        conditions(found)
+    );
+    for knob in &found.knobs {
+        body += &format!(
+            "<section>\n<h2>{} <small>({} error)</small></h2>\n{}</section>\n",
+            escape(&knob.name),
+            knob.source.name(),
+            turned(knob)
+        );
+    }
+    body += &format!(
+        "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
+        links(&["precision.json", "precision.csv"]),
+        escape(&found.tool)
+    );
+    document(&title, &body)
+}
+
+/// All of it as a part of another page.
+pub(super) fn section(found: &Precision) -> String {
+    let knob = |knob: &Knob| {
+        format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), turned(knob))
+    };
+    conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
+}
+
+/// What all of it was measured on, and the notes.
+fn conditions(found: &Precision) -> String {
+    let said = format!(
+        "<p class=\"note\">{} Gaussians × {} frames; {} pictures of {} frames looked at, judged by {}: {}. Every setting \
+         keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
         count(found.gaussians),
         count(found.frames),
         count(found.pictures),
@@ -41,25 +70,12 @@ pub fn page(found: &Precision) -> String {
         found.runs,
         found.enough,
     );
-    body += &list(&found.notes);
-    for knob in &found.knobs {
-        body += &section(knob);
-    }
-    body += &format!(
-        "<p>Everything on this page, as data beside it: {}.</p>\n<p class=\"note\">Made by {}.</p>\n",
-        links(&["precision.json", "precision.csv"]),
-        escape(&found.tool)
-    );
-    document(&title, &body)
+    said + &list(&found.notes)
 }
 
-fn section(knob: &Knob) -> String {
-    let mut out = format!(
-        "<section>\n<h2>{} <small>({} error)</small></h2>\n<p>{}</p>\n<div class=\"charts\">\n",
-        escape(&knob.name),
-        knob.source.name(),
-        escape(&knob.about)
-    );
+/// What turning a knob showed.
+fn turned(knob: &Knob) -> String {
+    let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
     for (caption, svg) in charts(knob) {
         out += &figure_of(&caption, &svg);
     }
@@ -67,7 +83,7 @@ fn section(knob: &Knob) -> String {
     for curve in &knob.curves {
         out += &table(curve);
     }
-    out + "</section>\n"
+    out
 }
 
 /// Charts of a knob: its errors against the time of all processors, and the first one of them against the wall and memory
@@ -207,7 +223,7 @@ mod tests {
     fn what_is_exact_has_a_table_and_no_diagram() {
         let knob = knob(vec![mark(1.0, &[("bytes", 0.0)])]);
         assert!(charts(&knob).is_empty());
-        let section = section(&knob);
+        let section = turned(&knob);
         assert!(section.contains("<td>0</td>") && !section.contains("<b>"), "{section}");
     }
 }

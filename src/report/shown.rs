@@ -40,6 +40,9 @@ pub struct Choice {
     pub psnr: f64,
     /// SSIM of the same.
     pub ssim: f64,
+    /// FLIP of the same, where it was computed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flip: Option<f64>,
 }
 
 /// The pictures worth looking at, the worst first; one that is several of them comes once.
@@ -68,8 +71,8 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
             continue;
         }
         let of = &pictures[place];
-        let Score { psnr, ssim, .. } = of.loss;
-        chosen.push(Choice { why: vec![why.to_owned()], place, frame: of.frame, view: of.view, psnr, ssim });
+        let Score { psnr, ssim, flip, .. } = of.loss;
+        chosen.push(Choice { why: vec![why.to_owned()], place, frame: of.frame, view: of.view, psnr, ssim, flip });
     }
     chosen
 }
@@ -94,10 +97,10 @@ pub struct Shown {
 /// # Errors
 /// A picture without pixels, which PNG does not know.
 pub fn show(choice: &Choice, taken: &Taken) -> Result<Shown> {
-    let shrunk = shrinkage(&taken.original);
+    let shrunk = shrinkage(&taken.original, MAX_PIXELS);
     let difference = difference(&taken.compressed, &taken.original);
     let factor = brightening(&difference);
-    let bright = Image { data: difference.data.iter().map(|v| v * factor as f32).collect(), ..difference };
+    let bright = brighter(&difference, factor);
     let mut images = Vec::new();
     for (name, image) in [
         ("original", Some(&taken.original)),
@@ -124,10 +127,15 @@ pub fn data_uri(image: &Image) -> Result<String> {
 }
 
 /// |a − b| of what a screen shows, per channel.
-fn difference(a: &Image, b: &Image) -> Image {
+pub(super) fn difference(a: &Image, b: &Image) -> Image {
     let shown = |v: f32| v.clamp(0.0, 1.0);
     let data = a.data.iter().zip(&b.data).map(|(&a, &b)| (shown(a) - shown(b)).abs()).collect();
     Image { width: a.width, height: a.height, data }
+}
+
+/// All of it `factor` times as bright.
+pub(super) fn brighter(image: &Image, factor: u32) -> Image {
+    Image { data: image.data.iter().map(|v| v * factor as f32).collect(), ..*image }
 }
 
 /// The largest power of two, up to [`MAX_FACTOR`], that clips no more than it may.
@@ -145,14 +153,14 @@ fn brightening(difference: &Image) -> u32 {
     factor
 }
 
-/// Pixels each way that become one, so that what is left is few enough.
-fn shrinkage(image: &Image) -> u32 {
+/// Pixels each way that become one, so that at most `most` are left.
+pub(super) fn shrinkage(image: &Image, most: u64) -> u32 {
     let pixels = |by: u32| u64::from(image.width.div_ceil(by)) * u64::from(image.height.div_ceil(by));
-    (1..).find(|&by| pixels(by) <= MAX_PIXELS).unwrap_or(1)
+    (1..).find(|&by| pixels(by) <= most).unwrap_or(1)
 }
 
 /// Means over squares of `by` pixels, those at the far borders perhaps smaller.
-fn shrink(image: &Image, by: u32) -> Image {
+pub(super) fn shrink(image: &Image, by: u32) -> Image {
     if by == 1 {
         return image.clone();
     }
@@ -185,13 +193,13 @@ mod tests {
     #[test]
     fn shrinking_keeps_the_mean_and_fits() {
         let large = image(1352, 1014, |i| (i % 256) as f32 / 255.0);
-        let by = shrinkage(&large);
+        let by = shrinkage(&large, MAX_PIXELS);
         let small = shrink(&large, by);
         assert_eq!((by, small.width, small.height), (3, 451, 338));
         assert!(u64::from(small.width * small.height) <= MAX_PIXELS);
         let mean = |image: &Image| image.data.iter().map(|&v| f64::from(v)).sum::<f64>() / image.data.len() as f64;
         assert!((mean(&small) - mean(&large)).abs() < 1e-3);
-        assert_eq!(shrinkage(&image(320, 256, |_| 0.0)), 1);
+        assert_eq!(shrinkage(&image(320, 256, |_| 0.0), MAX_PIXELS), 1);
     }
 
     #[test]

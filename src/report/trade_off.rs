@@ -5,6 +5,7 @@
 use super::chart::{Axis, Plot, Series};
 use super::document::{document, figure_of, links, list};
 use super::html::{bytes, count, escape, figure, file_name};
+use crate::compress::summary::GoalSummary;
 use crate::verbs::method::Method;
 use crate::verbs::trade_off::{Knob, Point, TradeOff};
 
@@ -50,6 +51,26 @@ pub(super) fn section(found: &TradeOff) -> String {
         out += &figure_of(&caption, &svg);
     }
     out + "</div>\n" + &list(&found.notes)
+}
+
+/// The sizes that a run tried to find the one that was asked for by its quality, and what each has.
+pub(super) fn search(goal: &GoalSummary) -> String {
+    let mut tried: Vec<(f64, f64)> = goal.tried.iter().map(|&(size, quality)| (size as f64, quality)).collect();
+    tried.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let ends = [tried.first(), tried.last()].into_iter().flatten().map(|end| (end.0, goal.asked)).collect();
+    let what = if goal.name == "max_loss" { "PSNR lost against photographs, dB" } else { "PSNR, dB" };
+    let series = vec![
+        Series { name: "tried".to_owned(), points: tried, joined: true, ..Series::default() },
+        Series {
+            name: format!("asked for: {} dB", figure(goal.asked)),
+            points: ends,
+            joined: true,
+            ..Series::default()
+        },
+    ];
+    let title = format!("Sizes that the run tried for --{}", goal.name.replace('_', "-"));
+    let plot = Plot { title: title.clone(), x: log("Gaussians"), y: linear(what), series };
+    format!("<div class=\"charts\">\n{}</div>\n", figure_of(&title, &plot.svg()))
 }
 
 /// Every curve of a sweep, a series per method in the order of its points, and every knob.
