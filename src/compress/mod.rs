@@ -180,7 +180,7 @@ fn reduce(
             (reduction, summary, None)
         }
     };
-    if reduction.len() == 0 {
+    if reduction.is_empty() {
         return Err(nothing_left(scene, &scored));
     }
     job.write_down(request, &work, &scene.limits, &mut journal);
