@@ -1,0 +1,542 @@
+#!/usr/bin/env python3
+"""Makes the saved corpus beside it: whole files of a few Gaussians, and what is left of them after what happens to files.
+
+    python3 tests/corpus/make.py target/release/splatsieve
+
+Needs zstandard. PROGRAM packs the container, the stream and the archive; everything else is written
+here, by the formats' descriptions, so that no code under test makes what it is tested with.
+"""
+
+import io
+import json
+import math
+import pickle
+import random
+import struct
+import subprocess
+import sys
+import tempfile
+import types
+import zipfile
+from collections import OrderedDict
+from pathlib import Path
+
+import zstandard
+
+HERE = Path(__file__).resolve().parent
+COUNT, WIDTH, CHANNELS, SIZE = 6, 4, 2, 2
+DICE = random.Random(15)
+# What text files come with from other programs.
+BOM, LATIN = b"\xef\xbb\xbf", "é".encode("latin-1")
+
+
+def normal(count, spread=1.0, middle=0.0):
+    return [DICE.gauss(middle, spread) for _ in range(count)]
+
+
+def floats(values):
+    return struct.pack(f"<{len(values)}f", *values)
+
+
+def write(target, name, data):
+    folder = HERE / target
+    folder.mkdir(exist_ok=True)
+    data = data.encode() if isinstance(data, str) else data
+    assert len(data) < 20_000, (target, name, len(data))
+    (folder / name).write_bytes(data)
+
+
+def damaged(target, whole, places=()):
+    """What a copy that breaks off or a bad disk leaves; `places` are bytes that mean something."""
+    write(target, "whole", whole)
+    write(target, "empty", b"")
+    for part in (1, 8, len(whole) // 3, len(whole) - 1):
+        write(target, f"cut_{part}", whole[:part])
+    write(target, "more", whole + b"\0" * 7)
+    write(target, "as_text", whole.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"))
+    write(target, "zeros", whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2))
+    for at in places:
+        for name, value in (("ff", 0xFF), ("turned", whole[at] ^ 0x10)):
+            write(target, f"byte_{at}_{name}", whole[:at] + bytes([value]) + whole[at + 1 :])
+
+
+def texts(target, whole, replaced):
+    """A text file, `replaced` by name: what is looked for, and what stands there instead."""
+    damaged(target, whole.encode())
+    write(target, "bom", BOM + whole.encode())
+    write(target, "latin_1", whole.encode() + LATIN)
+    write(target, "utf_16", whole.encode("utf-16"))
+    for name, (before, after) in replaced.items():
+        assert before in whole, (target, name)
+        write(target, name, whole.replace(before, after, 1))
+
+
+# --- PLY ---------------------------------------------------------------------------------------------------------------
+
+NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(9))]
+NAMES += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+def header(form="binary_little_endian", count=COUNT, names=NAMES):
+    lines = ["ply", f"format {form} 1.0", f"element vertex {count}", *(f"property float {name}" for name in names)]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def row():
+    return [*normal(3, 0.5), 0, 0, 0, *normal(12, 0.3), DICE.uniform(-2, 4), *normal(3, 0.5, -3), *normal(4)]
+
+
+def make_ply():
+    rows = [row() for _ in range(COUNT)]
+    body = b"".join(map(floats, rows))
+    whole = header() + body
+    damaged("ply", whole, [0, 4, len(header()) - 2, len(header()) + 3])
+    text = "\n".join(" ".join(f"{value:.6g}" for value in values) for values in rows)
+    write("ply", "ascii", header("ascii") + text.encode() + b"\n")
+    write("ply", "ascii_short", header("ascii") + text.encode()[:-40])
+    write("ply", "ascii_words", header("ascii") + text.replace("0", "zero").encode())
+    big = b"".join(struct.pack(f">{len(values)}f", *values) for values in rows)
+    write("ply", "big_endian", header("binary_big_endian") + big)
+    for name, before, after in (
+        ("none", b"vertex 6", b"vertex 0"),
+        ("negative", b"vertex 6", b"vertex -6"),
+        ("many", b"vertex 6", b"vertex 4294967296"),
+        ("more_than_fit", b"vertex 6", b"vertex 18446744073709551615"),
+        ("no_opacity", b"property float opacity", b"property float opaque"),
+        ("doubles", b"property float", b"property double"),
+        ("twice", b"property float y", b"property float x"),
+        ("a_list", b"property float nx", b"property list uchar int nx"),
+        ("no_rest", b"f_rest_8", b"f_rest_9"),
+        ("no_format", b"format binary_little_endian 1.0\n", b""),
+        ("version", b" 1.0", b" 2.0"),
+        ("no_end", b"end_header", b"end"),
+        ("before", b"element vertex", b"element camera 4294967295\nproperty double x\nelement vertex"),
+        ("long_line", b"ply\n", b"ply\ncomment " + b"x" * 9000 + b"\n"),
+        ("bytes", b"x\n", b"\xff\xfe\n"),
+    ):
+        write("ply", name, whole.replace(before, after, 1))
+    for name, value in (("nan", math.nan), ("infinite", math.inf), ("largest", 3.4e38)):
+        write("ply", name, header() + floats([value] * len(NAMES) * COUNT))
+    return whole
+
+
+# --- state dicts -------------------------------------------------------------------------------------------------------
+
+
+class Storage:
+    """Stands for a tensor's storage; the pickle refers to it by what `persistent_id` gives."""
+
+    def __init__(self, key, values):
+        self.key, self.values = key, values
+
+
+def named(module, name):
+    """Something that a pickle calls `module.name`, without that module's being there."""
+    made = type(name, (), {})
+    made.__module__, made.__qualname__ = module, name
+    for part in (module[: at] for at, letter in enumerate(module + ".") if letter == "."):
+        sys.modules.setdefault(part, types.ModuleType(part))
+    setattr(sys.modules[module], name, made)
+    return made
+
+
+FLOATS, REBUILD = named("torch", "FloatStorage"), named("torch._utils", "_rebuild_tensor_v2")
+
+
+class Tensor:
+    def __init__(self, storage, shape, offset=0, strides=None):
+        self.storage, self.shape, self.offset = storage, shape, offset
+        self.strides = strides or tuple(math.prod(shape[k + 1 :]) for k in range(len(shape)))
+
+    def __reduce__(self):
+        return Rebuilt(), (self.storage, self.offset, self.shape, self.strides, False, OrderedDict())
+
+
+class Rebuilt:
+    """Callable, so that `__reduce__` takes it, and pickled as the name of what PyTorch calls."""
+
+    def __call__(self, *_):
+        raise NotImplementedError
+
+    def __reduce__(self):
+        return "REBUILD"
+
+
+class Pickler(pickle._Pickler):
+    dispatch = dict(pickle._Pickler.dispatch)
+
+    def save(self, thing, **options):
+        if isinstance(thing, Rebuilt):
+            thing = REBUILD
+        return super().save(thing, **options)
+
+    def persistent_id(self, thing):
+        if isinstance(thing, Storage):
+            return ("storage", FLOATS, thing.key, "cpu", len(thing.values))
+        return None
+
+
+def pickled(state):
+    out = io.BytesIO()
+    Pickler(out, protocol=2).dump(state)
+    return out.getvalue()
+
+
+def zipped(entries, method=zipfile.ZIP_STORED):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        for name, data in entries.items():
+            archive.writestr(zipfile.ZipInfo(f"archive/{name}", (1980, 1, 1, 0, 0, 0)), data, method)
+    return out.getvalue()
+
+
+def checkpoint(tensors, change=lambda data: data, method=zipfile.ZIP_STORED):
+    """A file as torch.save writes it; `tensors` by name: shape and values."""
+    state, data = OrderedDict(), {}
+    for name, (shape, values) in tensors.items():
+        storage = Storage(str(len(data)), values)
+        state[name] = Tensor(storage, shape)
+        data[f"data/{storage.key}"] = floats(values)
+    entries = {"data.pkl": change(pickled(state)), "byteorder": b"little", **data, "version": b"3\n"}
+    return zipped(entries, method)
+
+
+def field():
+    """Planes of one level, and heads that move and fade."""
+    tensors = {"deformation_net.grid.aabb": ((2, 3), [1.6] * 3 + [-1.6] * 3)}
+    for plane in range(6):
+        shape = (1, CHANNELS, SIZE, SIZE)
+        tensors[f"deformation_net.grid.grids.0.{plane}"] = (shape, normal(math.prod(shape), 0.3, 1.0))
+    layers = {"feature_out.0": (CHANNELS, WIDTH)}
+    for head, outputs in {"pos_deform": 3, "opacity_deform": 1}.items():
+        layers[f"{head}.1"], layers[f"{head}.3"] = (WIDTH, WIDTH), (WIDTH, outputs)
+    for name, (fan_in, fan_out) in layers.items():
+        tensors[f"deformation_net.{name}.weight"] = ((fan_out, fan_in), normal(fan_in * fan_out, 0.3))
+        tensors[f"deformation_net.{name}.bias"] = ((fan_out,), normal(fan_out, 0.1))
+    return tensors
+
+
+def make_pickle():
+    tensors = field()
+    whole = checkpoint(tensors)
+    start = whole.index(b"\x80\x02")
+    damaged("pickle", whole, [0, 8, 26, start + 2, start + 60, len(whole) - 6, len(whole) - 12])
+    write("pickle", "deflated", checkpoint(tensors, method=zipfile.ZIP_DEFLATED))
+    first = next(iter(tensors))
+    for name, change in {
+        "missing": {first: None},
+        "another_shape": {first: ((3, 2), tensors[first][1])},
+        "no_values": {first: ((0, 3), [])},
+        "more_than_stored": {first: ((2000, 3000), tensors[first][1])},
+        "product_overflows": {first: ((1 << 31, 1 << 31, 1 << 31), tensors[first][1])},
+        "negative": {first: ((-2, 3), tensors[first][1])},
+        "not_finite": {first: ((2, 3), [math.nan] * 6)},
+        "flat_box": {first: ((2, 3), [0.0] * 6)},
+    }.items():
+        state = {key: value for key, value in (tensors | change).items() if value}
+        write("pickle", name, checkpoint(state))
+    for name, data in {
+        "nothing": pickled(OrderedDict()),
+        "a_number": pickled(3),
+        "a_list": pickled([1, 2]),
+        "runs_a_command": b"cposix\nsystem\n(S'true'\ntR.",
+        "empty": b"",
+        "deep": b"\x80\x02" + b"(" * 4000 + b".",
+        "nested": b"\x80\x02" + b"]" * 3000 + b"a" * 2999 + b".",
+        "itself": b"\x80\x02}q\x00(h\x00h\x00u.",
+        "long_text": b"\x80\x02X\xff\xff\xff\x7fabc.",
+        "long_memo": b"\x80\x02Nr\xff\xff\xff\xff.",
+        "long_integer": b"\x80\x02\x8b\xff\xff\xff\x7f.",
+        "frame": b"\x80\x04\x95\xff\xff\xff\xff\xff\xff\xff\x7fN.",
+        "stack_empty": b"\x80\x02R.",
+        "mark_missing": b"\x80\x02t.",
+    }.items():
+        write("pickle", f"pickle_{name}", checkpoint(tensors, lambda _, data=data: data))
+    write("pickle", "no_pickle", zipped({"data/0": floats([1.0])}))
+    write("pickle", "legacy", pickle.dumps(0x1950A86A20F9469CFC6C, 2) + pickle.dumps(1001, 2) + pickled(OrderedDict()))
+    return whole
+
+
+# --- configuration, recipes, cameras -----------------------------------------------------------------------------------
+
+
+def make_cfg_args():
+    planes = {
+        "grid_dimensions": 2,
+        "input_coordinate_dim": 4,
+        "output_coordinate_dim": CHANNELS,
+        "resolution": [SIZE] * 4,
+    }
+    whole = (
+        "Namespace(sh_degree=1, source_path='data', model_path='output', white_background=False, eval=True, "
+        f"net_width={WIDTH}, defor_depth=1, bounds=1.6, kplanes_config={planes}, multires=[1], no_dx=False, "
+        "no_grid=False, no_ds=True, no_dr=True, no_do=False, no_dshs=True, empty_voxel=False, grid_pe=0, "
+        "static_mlp=False, apply_rotation=False)"
+    )
+    texts("cfg_args", whole, {
+        "another_name": ("Namespace", "Namespaces"),
+        "no_end": ("False)", "False"),
+        "text_for_a_number": ("net_width=4", "net_width='4'"),
+        "negative": ("net_width=4", "net_width=-4"),
+        "huge": ("net_width=4", "net_width=9223372036854775807"),
+        "more_than_64_bits": ("net_width=4", "net_width=99999999999999999999999"),
+        "depth": ("defor_depth=1", "defor_depth=1000000000"),
+        "no_levels": ("multires=[1]", "multires=[]"),
+        "many_levels": ("multires=[1]", f"multires={[1] * 2000}"),
+        "levels_multiply": ("multires=[1]", "multires=[4294967296, 4294967296]"),
+        "no_channels": ("'output_coordinate_dim': 2", "'output_coordinate_dim': 0"),
+        "encoded": ("grid_pe=0", "grid_pe=2000000000"),
+        "not_finite": ("bounds=1.6", "bounds=nan"),
+        "exponent": ("bounds=1.6", "bounds=1e999999999"),
+        "twice": ("eval=True", "sh_degree=3"),
+        "escapes": ("'data'", r"'\x4\u00\U0011ffff\N{x}\777'"),
+        "open_text": ("'data'", "'data"),
+        "deep": ("[1]", "[" * 5000 + "]" * 5000),
+        "calls": ("'data'", "PosixPath(" * 40 + "'x'" + ")" * 40),
+        "degree": ("sh_degree=1", "sh_degree=-1"),
+        "static": ("static_mlp=False", "static_mlp=True"),
+        "a_voxel": ("empty_voxel=False", "empty_voxel=True"),
+    })
+    return whole
+
+
+def make_recipe(program):
+    whole = subprocess.run([program, "recipe", "--preset", "default"], check=True, capture_output=True, text=True).stdout
+    lines = [line for line in whole.splitlines() if line and not line.startswith("#")]
+    whole = "\n".join(lines) + "\n"
+    first = next(line for line in lines if line.startswith("alpha_min"))
+    texts("recipe", whole, {
+        "unknown": (first, first + "\nunknown = 1"),
+        "twice": (first, first + "\n" + first),
+        "removed": (first, first + "\n[refit]\nrefit_ridge = 1"),
+        "text": (first, "alpha_min = 'small'"),
+        "negative": (first, "alpha_min = -1"),
+        "not_a_number": (first, "alpha_min = nan"),
+        "infinite": (first, "alpha_min = inf"),
+        "too_large": (first, "alpha_min = 1e400"),
+        "a_date": (first, "alpha_min = 1979-05-27T07:32:00Z"),
+        "a_table": (first, "alpha_min = { a = 1 }"),
+        "deep": (first, "alpha_min = " + "[" * 3000 + "]" * 3000),
+        "dotted": (first, ".".join("a" * 2000) + " = 1"),
+        "preset": (lines[0], "preset = 'no such'\n" + lines[0]),
+        "of_another": (lines[0], "preset = 'paper'\n" + lines[0]),
+        "escape": (first, 'alpha_min = "\\uD800"'),
+    })
+
+
+def camera(view, split="train"):
+    angle = math.tau * view / 3
+    c, s = math.cos(angle), math.sin(angle)
+    pose = [[c, 0.0, -s, 0.0], [0.0, 1.0, 0.0, 0.0], [s, 0.0, c, 4.0], [0.0, 0.0, 0.0, 1.0]]
+    own = {"v": view, "time": 0.5, "split": split, "image": f"{split}/{view}.png", "width": 32, "height": 24}
+    return own | {"fx": 40.0, "fy": 40.0, "cx": 16.0, "cy": 12.0, "w2c": pose}
+
+
+def make_cameras():
+    document = {"background": [1, 1, 1], "frames": [camera(0), camera(1), camera(2, "test")]}
+    whole = json.dumps(document)
+    texts("cameras", whole, {
+        "no_frames": (whole, '{"frames": []}'),
+        "frames_of_numbers": (whole, '{"frames": [1, 2]}'),
+        "null": (whole, "null"),
+        "nan": ('"fx": 40.0', '"fx": NaN'),
+        "huge_number": ('"fx": 40.0', '"fx": 1e999'),
+        "zero_focal": ('"fx": 40.0', '"fx": 0'),
+        "text_focal": ('"fx": 40.0', '"fx": "40"'),
+        "no_focal": ('"fx"', '"gx"'),
+        "huge_side": ('"width": 32', '"width": 4294967295'),
+        "negative_side": ('"width": 32', '"width": -32'),
+        "part_side": ('"width": 32', '"width": 32.5'),
+        "no_rotation": ("[[1.0", "[[2.0"),
+        "zero_rotation": ("[0.0, 1.0, 0.0, 0.0]", "[0.0, 0.0, 0.0, 0.0]"),
+        "three_rows": (", [0.0, 0.0, 0.0, 1.0]]", "]"),
+        "long_row": ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.0, 1.0, 2.0]"),
+        "split": ('"train"', '"val"'),
+        "view": ('"v": 0', '"v": 1'),
+        "huge_view": ('"v": 0', '"v": 4294967296'),
+        "background": ("[1, 1, 1]", "[1, 1, 2]"),
+        "deep": ("[1, 1, 1]", "[" * 4000 + "]" * 4000),
+        "twice": ('"frames"', '"frames": [], "frames"'),
+        "surrogate": ("train/0.png", "\\ud800"),
+    })
+    nerf = {"camera_angle_x": 0.7, "w": 64, "h": 64}
+    frames = [{"file_path": f"./r_{view}", "time": 0.0, "transform_matrix": camera(view)["w2c"]} for view in range(3)]
+    whole = json.dumps(nerf | {"frames": frames})
+    write("cameras", "transforms", whole)
+    write("cameras", "transforms_angle", whole.replace("0.7", "3.2"))
+    write("cameras", "transforms_no_angle", whole.replace('"camera_angle_x": 0.7, ', ""))
+    write("cameras", "transforms_no_size", whole.replace('"w": 64, "h": 64, ', ""))
+    write("cameras", "transforms_distorted", whole.replace('"w"', '"k1": 0.5, "w"'))
+    static = [
+        {"id": 0, "img_name": "a", "width": 32, "height": 24, "position": [0, 0, 4], "fx": 40, "fy": 40,
+         "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+    ]
+    write("cameras", "of_3dgs", json.dumps(static))
+    write("cameras", "of_3dgs_twice", json.dumps(static * 2))
+    write("cameras", "of_3dgs_empty", "[]")
+
+    def poses(shape, values, kind="<f8"):
+        text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
+        text += " " * (-(len(text) + 11) % 64) + "\n"
+        return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + values
+
+    pose = [0.0, 1.0, 0.0, 0.0, 24.0, 1.0, 0.0, 0.0, 0.0, 32.0, 0.0, 0.0, -1.0, 4.0, 40.0, 0.1, 10.0]
+    values = struct.pack("<17d", *pose)
+    write("cameras", "poses", poses((1, 17), values))
+    write("cameras", "poses_cut", poses((1, 17), values[:-3]))
+    write("cameras", "poses_many", poses((1 << 60, 17), values))
+    write("cameras", "poses_overflow", poses((1 << 63, 1 << 63), values))
+    write("cameras", "poses_none", poses((0, 17), b""))
+    write("cameras", "poses_wide", poses((1, 18), values + values[:8]))
+    write("cameras", "poses_objects", poses((1, 17), values, "|O"))
+    write("cameras", "poses_halves", poses((1, 17), values[:34], "<f2"))
+    write("cameras", "poses_nan", poses((1, 17), struct.pack("<17d", *[math.nan] * 17)))
+
+
+# --- frames ------------------------------------------------------------------------------------------------------------
+
+
+TRACKS = 24
+
+
+def stream(frames):
+    """Frames whose positions move smoothly, so that tiles of them are filtered (format/STREAM.md)."""
+    out = struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", 1, 0, TRACKS, 1, 0)
+    # Rotations and colours that are alike, so that some constant tiles are packed and some are not.
+    out += floats([1.0] * TRACKS + [0.0] * 3 * TRACKS + normal(3 * TRACKS, 0.5, -3) + normal(TRACKS) + [0.5] * 3 * TRACKS)
+    rest, phase = normal(3 * TRACKS), normal(3 * TRACKS)
+    for frame in range(frames):
+        payload = floats([at + 0.1 * math.sin(frame / 4 + turn) for at, turn in zip(rest, phase)])
+        out += struct.pack("<4sIdQ", b"FRAM", frame, frame / 11, len(payload)) + payload
+    return out + struct.pack("<4sI16x", b"DONE", frames)
+
+
+def make_frames(program, ply):
+    frames = stream(3)
+    damaged("stream", frames, [0, 8, 12, 16, 23, 24, 28, frames.index(b"FRAM"), frames.index(b"FRAM") + 5])
+    for name, at, value in (
+        ("version", 8, struct.pack("<I", 2)),
+        ("degree", 12, struct.pack("<I", 4)),
+        ("many", 16, struct.pack("<Q", 0xFFFFFFFF)),
+        ("more_than_fit", 16, struct.pack("<Q", 1 << 63)),
+        ("none", 16, struct.pack("<Q", 0)),
+        ("columns", 24, struct.pack("<I", 0xFFFFFFFF)),
+        ("all_vary", 24, struct.pack("<I", 31)),
+        ("none_varies", 24, struct.pack("<I", 0)),
+    ):
+        write("stream", name, frames[:at] + value + frames[at + len(value) :])
+    mark = frames.index(b"FRAM")
+    for name, at, value in (
+        ("frame_number", mark + 4, struct.pack("<I", 7)),
+        ("time_nan", mark + 8, struct.pack("<d", math.nan)),
+        ("time_infinite", mark + 8, struct.pack("<d", math.inf)),
+        ("time_back", mark + 8, struct.pack("<d", 9.0)),
+        ("length", mark + 16, struct.pack("<Q", 1 << 62)),
+    ):
+        write("stream", name, frames[:at] + value + frames[at + len(value) :])
+    write("stream", "no_end", frames[:-24])
+    write("stream", "two", frames + frames)
+    write("stream", "no_frames", frames[:mark] + struct.pack("<4sI16x", b"DONE", 0))
+
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+
+        def run(*arguments):
+            subprocess.run([program, "--quiet", *arguments], check=True, cwd=folder, input=stream(8))
+
+        run("pack", "-", "-o", "a.gseq")
+        run("pack", "-", "-o", "b.gseq", "--max-error", "position=0.001,log_scale=0.01")
+        whole = (folder / "a.gseq").read_bytes()
+        bounded = (folder / "b.gseq").read_bytes()
+        (folder / "a.ply").write_bytes(ply)
+        model = folder / "model"
+        iteration = model / "point_cloud" / "iteration_7"
+        iteration.mkdir(parents=True)
+        (model / "cfg_args").write_bytes((HERE / "cfg_args" / "whole").read_bytes())
+        (iteration / "point_cloud.ply").write_bytes(ply)
+        (iteration / "deformation.pth").write_bytes((HERE / "pickle" / "whole").read_bytes())
+        keep = ["--target-count", str(COUNT - 1), "--no-refine", "--prune-only"]
+        run("compress", "a.ply", "-o", "ply.gsz", *keep)
+        run("compress", "model", "--frames", "3", "-o", "model.gsz", *keep)
+        archives = [(folder / name).read_bytes() for name in ("model.gsz", "ply.gsz")]
+
+    footer = struct.unpack_from("<Q", whole, len(whole) - 32)[0]
+    places = [8, 12, 16, 24, 28, 32, 40, 44, footer + 8, footer + 16, footer + 64, len(whole) - 32]
+    tile = whole.index(b"TILE")
+    places += [tile + at for at in (4, 8, 12, 16, 18, 20, 24, 40)]
+    damaged("container", whole, places)
+    write("container", "bounded", bounded)
+    write("container", "bounded_cut", bounded[: len(bounded) * 2 // 3])
+    write("container", "no_footer", whole[:footer])
+    for name, at, value in (
+        ("many", 16, struct.pack("<Q", 1 << 32)),
+        ("more_than_fit", 16, struct.pack("<Q", 1 << 63)),
+        ("block_of_none", 24, struct.pack("<I", 0)),
+        ("long_block", 28, struct.pack("<I", 1 << 24)),
+        ("many_columns", 32, struct.pack("<I", 0xFFFFFFFF)),
+        ("many_attributes", 36, struct.pack("<I", 0xFFFFFFFF)),
+    ):
+        write("container", name, whole[:at] + value + whole[at + len(value) :])
+    whole, other = archives
+    damaged("archive", whole, [8, 12, 18, 20, 36, 44, 60, 68, 84, 92, 116, 120, len(whole) - 20])
+    write("archive", "of_a_ply", other)
+    write("archive", "of_a_ply_cut", other[:-9])
+    for name, at in (("table", 20), ("cloud", 44), ("field", 68), ("blobs", 92)):
+        write("archive", f"long_{name}", whole[:at] + struct.pack("<Q", 1 << 40) + whole[at + 8 :])
+    make_sections(whole)
+
+
+def make_sections(archive):
+    """An archive's sections as they are before they are packed, and tables that lie."""
+    heads = [struct.unpack_from("<QQ", archive, 12 + 24 * k) for k in range(4)]
+    at, stored = 116, []
+    for length, _ in heads:
+        stored.append(archive[at : at + length])
+        at += length
+    plain = zstandard.ZstdDecompressor()
+    table, blobs = (plain.decompress(stored[k], max_output_size=heads[k][1]) for k in (0, 3))
+
+    def sections(table, cloud=stored[1], field=stored[2], blobs=blobs):
+        return struct.pack("<3I", len(table), len(cloud), len(field)) + table + cloud + field + blobs
+
+    write("archive_sections", "whole", sections(table))
+    write("archive_sections", "no_cloud", sections(table, cloud=b""))
+    write("archive_sections", "no_field", sections(table, field=b""))
+    write("archive_sections", "no_blobs", sections(table, blobs=b""))
+    write("archive_sections", "long_blobs", sections(table, blobs=blobs + b"x" * 100))
+    write("archive_sections", "table_no_json", sections(b"table"))
+    write("archive_sections", "table_nested", sections(b"[" * 5000))
+    document = json.loads(table)
+
+    def places(node, path=()):
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            if isinstance(value, (dict, list)):
+                yield from places(value, (*path, key))
+            elif isinstance(value, (int, float)):
+                yield (*path, key)
+
+    numbers = list(places(document))
+    for k, path in enumerate(DICE.sample(numbers, 8)):
+        for name, value in (("huge", 2**62), ("negative", -1), ("none", 0)):
+            changed = json.loads(table)
+            node = changed
+            for key in path[:-1]:
+                node = node[key]
+            node[path[-1]] = value
+            write("archive_sections", f"number_{k}_{name}", sections(json.dumps(changed, separators=(",", ":")).encode()))
+
+
+def main():
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    program = Path(sys.argv[1]).resolve()
+    ply = make_ply()
+    write("cfg_args", "whole", make_cfg_args())
+    make_pickle()
+    make_recipe(program)
+    make_cameras()
+    make_frames(program, ply)
+
+
+if __name__ == "__main__":
+    main()
