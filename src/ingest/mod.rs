@@ -6,6 +6,7 @@ pub(crate) mod digest;
 pub mod frame_stream;
 pub mod image;
 mod map;
+pub(crate) mod npy;
 pub(crate) mod npz;
 pub mod ply;
 pub mod ply_sequence;

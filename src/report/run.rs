@@ -4,7 +4,7 @@
 //! the reason, for the page to give. Memory: 8 bytes per Gaussian.
 
 use std::fs::{self, File};
-use std::io::BufReader;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use serde::Deserialize;
@@ -13,6 +13,7 @@ use serde_json::Value;
 use crate::compress::emit::{INDEX_MAP, RECIPE, beside};
 use crate::compress::summary::Summary;
 use crate::emit::atomic::MARKER;
+use crate::ingest::npy::header_is_sound;
 use crate::recipe::Recipe;
 
 /// What became of a Gaussian of the original.
@@ -78,7 +79,12 @@ fn read_recipe(path: &Path) -> Result<Recipe, String> {
 
 fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fate>, String> {
     let file = File::open(path).map_err(|e| e.to_string())?;
-    let array = npyz::NpyFile::new(BufReader::new(file)).map_err(|e| e.to_string())?;
+    let bytes = file.metadata().map_err(|e| e.to_string())?.len();
+    let mut file = BufReader::new(file);
+    if !header_is_sound(file.fill_buf().map_err(|e| e.to_string())?, bytes) {
+        return Err("expected a NumPy array, found a header that no array of numbers has".to_owned());
+    }
+    let array = npyz::NpyFile::new(file).map_err(|e| e.to_string())?;
     // Before anything is allocated by a length that the file claims.
     if array.shape() != [original as u64] {
         return Err(format!("expected an array of the original's {original} Gaussians, found {:?}", array.shape()));

@@ -15,6 +15,7 @@ use npyz::{NpyFile, Order, TypeChar};
 use super::assemble::{Listing, Picture, assemble, check, from_camera_to_world};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
+use crate::ingest::npy::header_is_sound;
 use crate::ingest::text::read_limited;
 use crate::model::{Camera, Rig, Split};
 
@@ -81,6 +82,9 @@ fn read_rows(file: &Path, bytes: &[u8]) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
     if !shape_is_small(bytes) {
         return Err(unreadable("no readable shape".into()));
+    }
+    if !header_is_sound(bytes, bytes.len() as u64) {
+        return Err(unreadable("a header that no array of numbers has".into()));
     }
     let array = NpyFile::new(bytes).map_err(|error| unreadable(error.to_string()))?;
     let dtype = array.dtype();
