@@ -2,11 +2,16 @@
 
 /// Longest header. Those of arrays of numbers have 118 bytes, or 54 more for every axis.
 const LONGEST: u64 = 4096;
+/// Bytes of a file that hold its header, if that is not too long.
+pub(crate) const HEAD: u64 = LONGEST + 12;
+/// Most digits of a shape: the product of its lengths stays below 2⁶³.
+const MOST_DIGITS: usize = 18;
 /// Deepest brackets: a shape within the dictionary, and one more.
 const DEEPEST: usize = 3;
 
-/// Whether a file of `bytes`, which begins with `head` (4108 of them or all), has a header that a reader can be given: it makes
-/// room for the length that is announced, up to 4 GiB, before it looks, and its time doubles with every open bracket.
+/// Whether a file of `bytes`, which begins with `head` ([`HEAD`] of them or all), has a header that a reader can be given: it
+/// makes room for the length that is announced, up to 4 GiB, before it looks, its time doubles with every open bracket, and
+/// it multiplies the lengths of a shape whatever they are.
 pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
     let start = if head.get(6) == Some(&1) { 10 } else { 12 };
     let Some(digits) = head.get(8..start) else { return false };
@@ -16,14 +21,23 @@ pub(crate) fn header_is_sound(head: &[u8], bytes: u64) -> bool {
     }
     let Some(text) = head.get(start..start + length as usize) else { return false };
     let mut depth = 0usize;
-    text.iter().all(|byte| {
-        match byte {
-            b'{' | b'[' | b'(' => depth += 1,
-            b'}' | b']' | b')' => depth = depth.saturating_sub(1),
-            _ => {}
-        }
-        depth <= DEEPEST
-    })
+    digits_of_shape(text) <= MOST_DIGITS
+        && text.iter().all(|byte| {
+            match byte {
+                b'{' | b'[' | b'(' => depth += 1,
+                b'}' | b']' | b')' => depth = depth.saturating_sub(1),
+                _ => {}
+            }
+            depth <= DEEPEST
+        })
+}
+
+/// Digits of the first tuple of lengths; a header without one has none.
+fn digits_of_shape(text: &[u8]) -> usize {
+    const KEY: &[u8] = b"'shape'";
+    let Some(at) = text.windows(KEY.len()).position(|some| some == KEY) else { return 0 };
+    let shape = text[at..].split(|&byte| byte == b')').next().unwrap_or_default();
+    shape.iter().filter(|byte| byte.is_ascii_digit()).count()
 }
 
 #[cfg(test)]
@@ -51,6 +65,16 @@ mod tests {
         }
         assert!(!header_is_sound(&file(2, u32::MAX, text), 1 << 40));
         assert!(!header_is_sound(b"\x93NUMPY\x02\0\0\0", 10) && !header_is_sound(b"", 0));
+    }
+
+    #[test]
+    fn lengths_whose_product_overflows_are_not_sound() {
+        let sound = |shape: &str| {
+            let text = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
+            header_is_sound(&file(1, text.len() as u32, &text), 1000)
+        };
+        assert!(sound("(300, 1000000, 4)") && sound("()"));
+        assert!(!sound("(9999999999, 9999999999)") && !sound("(1000000000, 1000000, 1000000)"));
     }
 
     #[test]

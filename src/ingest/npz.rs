@@ -14,13 +14,10 @@ use zip::ZipArchive;
 use zip::read::ZipFile;
 
 use super::map::FileMap;
+use super::npy::{HEAD, header_is_sound};
 use crate::emit::atomic::ScratchFile;
 use crate::error::{Error, Result};
 
-/// Longest header of an array; numpy's are 128 bytes.
-const MAX_HEADER: usize = 4096;
-/// Most digits of a shape: their product stays below 2⁶³.
-const MAX_DIGITS: usize = 18;
 /// Most arrays of an archive.
 const MAX_ARRAYS: usize = 4096;
 
@@ -223,9 +220,9 @@ impl Entry {
         let is_compressed = file.compression() != zip::CompressionMethod::Stored;
         let start = file.data_start();
         let mut text = Vec::new();
-        file.take(MAX_HEADER as u64).read_to_end(&mut text).map_err(|error| error.to_string())?;
-        if !shape_is_small(&text) {
-            return Err("a header without a shape that can be read".into());
+        file.by_ref().take(HEAD).read_to_end(&mut text).map_err(|error| error.to_string())?;
+        if !header_is_sound(&text, file.size()) {
+            return Err("a header that no array of numbers has".into());
         }
         let mut rest = &text[..];
         let header = NpyHeader::from_reader(&mut rest).map_err(|error| error.to_string())?;
@@ -242,16 +239,6 @@ impl Entry {
             start: start as usize + before,
         })
     }
-}
-
-/// Whether the shape in a header is written in so few digits that the product of its sides fits 64 bits, whatever they
-/// are: the reader multiplies them before they can be looked at.
-fn shape_is_small(header: &[u8]) -> bool {
-    const KEY: &[u8] = b"'shape'";
-    let Some(shape) = header.windows(KEY.len()).position(|at| at == KEY).map(|at| &header[at..]) else { return false };
-    let Some(open) = shape.iter().position(|&byte| byte == b'(') else { return false };
-    let Some(close) = shape.iter().position(|&byte| byte == b')') else { return false };
-    open < close && shape[open..close].iter().filter(|byte| byte.is_ascii_digit()).count() <= MAX_DIGITS
 }
 
 /// Values of an array, f32, in its order.

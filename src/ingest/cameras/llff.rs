@@ -80,9 +80,6 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
 /// The rows of the array in `bytes`, checked to be `[V, 17]` floats that are all there.
 fn read_rows(file: &Path, bytes: &[u8]) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
-    if !shape_is_small(bytes) {
-        return Err(unreadable("no readable shape".into()));
-    }
     if !header_is_sound(bytes, bytes.len() as u64) {
         return Err(unreadable("a header that no array of numbers has".into()));
     }
@@ -119,15 +116,4 @@ fn read_rows(file: &Path, bytes: &[u8]) -> Result<Vec<[f64; WIDTH]>> {
         _ => return Err(Error::input(file, "header", "dtype float64 or float32", dtype.descr())),
     };
     Ok(values.as_chunks().0.to_vec())
-}
-
-/// Whether the header's shape is written in few enough digits that the product of its sides fits 64
-/// bits, whatever they are: the reader multiplies them before they can be looked at.
-fn shape_is_small(bytes: &[u8]) -> bool {
-    const LONGEST: usize = 18;
-    const HEADER: usize = 256;
-    let header = &bytes[..bytes.len().min(HEADER)];
-    let at = |wanted: u8, from: usize| header[from..].iter().position(|&b| b == wanted).map(|found| from + found);
-    let Some(open) = at(b'(', 0) else { return false };
-    at(b')', open).is_some_and(|close| close - open <= LONGEST)
 }
