@@ -101,6 +101,20 @@ class Painter {
         return picture;
     }
 
+    /// Resolves when everything asked for so far is drawn: a slow machine would else be asked for more and more.
+    finished() {
+        const gl = this.gl, sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+        gl.flush();
+        return new Promise((resolve) => {
+            const look = () => {
+                if (gl.clientWaitSync(sync, 0, 0) === gl.TIMEOUT_EXPIRED) return setTimeout(look, 3);
+                gl.deleteSync(sync);
+                resolve();
+            };
+            setTimeout(look);
+        });
+    }
+
     /// Puts two pictures on the canvas from column `x` on, the right one from column `cut` of theirs; with `gain` what differs.
     put(left, right, x, cut, gain) {
         const gl = this.gl, { program, at } = this.compose;

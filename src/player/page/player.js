@@ -211,6 +211,7 @@ async function refresh() {
         await Promise.all(seen().map((place) => models[place].show(at, from)));
         current = from;
         draw();
+        await painter.finished();
         rate();
         if (!isDirty && !playing && arrivals()) {
             isDirty = false;
@@ -224,13 +225,12 @@ async function refresh() {
 /// Pictures per second; where they are few, those that move are drawn coarser.
 function rate() {
     const now = performance.now();
-    drawn.push(now);
-    drawn = drawn.filter((t) => now - t < 2000);
-    const gaps = drawn.slice(1).map((t, k) => t - drawn[k]).filter((gap) => gap < 500);
-    const mean = gaps.reduce((sum, gap) => sum + gap, 0) / gaps.length;
-    el("rate").textContent = gaps.length > 2 ? `${(1000 / mean).toFixed(mean > 100 ? 1 : 0)} fps` : "";
-    if (gaps.length > 4 && mean > 90 && coarse > 0.3 && !exact) {
-        coarse /= 1.4;
+    // Who looks at something still waits for nothing.
+    drawn = now - moved < 1000 ? [...drawn.filter((t) => now - t < 8000).slice(-8), now] : [];
+    const gaps = drawn.length - 1, mean = (now - drawn[0]) / gaps;
+    if (gaps > 1) el("rate").textContent = `${(1000 / mean).toFixed(mean > 100 ? 1 : 0)} fps`;
+    if (gaps > 1 && mean > 90 && coarse > 0.25 && !exact) {
+        coarse = Math.max(0.25, coarse * Math.sqrt(60 / mean));
         drawn = [];
     }
 }
@@ -251,7 +251,6 @@ function tick(now) {
     }
     if (coarse < 1 && now - moved > 400) {
         coarse = 1;
-        drawn = [];
         isDirty = true;
     }
     if (isDirty && !isBusy) refresh().catch(fail);
@@ -281,6 +280,7 @@ function step(by) {
 }
 function play(on) {
     playing = on && span[1] > span[0];
+    drawn = [];
     el("play").textContent = playing ? "❚❚" : "▶";
     el("play").setAttribute("aria-label", playing ? "Pause" : "Play");
     isDirty = true;
