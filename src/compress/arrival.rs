@@ -46,8 +46,10 @@ pub fn open_to_measure<S: Stages>(
     let stages = plan(Outlook::of(&scene), &scene.workload())?;
     let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
     scene.follow(&plan);
-    foretell(&mut scene, &plan, &stages, 0, options.memory.tell, journal)?;
-    journal.opened("read", start, scene.source().info().count, scene.source().reads());
+    // What measuring beforehand reads is no part of the plan.
+    let reads = scene.source().reads();
+    foretell(&mut scene, &plan, &stages, 0, options, journal)?;
+    journal.opened("read", start, scene.source().info().count, reads);
     Ok((scene, stages, None))
 }
 
@@ -62,10 +64,13 @@ fn foretell(
     plan: &Plan,
     stages: &impl Stages,
     done: usize,
-    tell: Tell,
+    options: &InputOptions,
     journal: &mut Journal,
 ) -> Result<()> {
-    if tell != Tell::Nothing {
+    let tell = options.memory.tell;
+    // Of a part nobody knows how much of the run it is.
+    let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
+    if tell != Tell::Nothing && !is_part {
         let forecast = measured(scene, plan, stages, done)?;
         eprint!("{}", forecast.text(tell));
         journal.forecast = Some(forecast);
@@ -166,7 +171,7 @@ fn receive_measured<S: Stages>(
         }
     }
     let done = measured_already(&arrived);
-    foretell(&mut scene, &later, &stages, done, options.memory.tell, journal)?;
+    foretell(&mut scene, &later, &stages, done, options, journal)?;
     Ok((scene, stages, arrived))
 }
 

@@ -13,7 +13,7 @@ use super::pace::measured;
 use super::request::{Goal, Quality, Request};
 use super::summary::{CameraSummary, LeftOut};
 use crate::TOOL;
-use crate::budget::{Plan, Tell, Workload};
+use crate::budget::{Budget, Plan, Tell, Workload};
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::scene::{InputOptions, open_scene};
@@ -75,7 +75,7 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     job.emit.check(&[&request.input.path])?;
     scene.input.check_output(job.emit.kind, &request.output)?;
     let needs = |work: &Workload, limits: &_| job.needs(work, limits);
-    let plan = Plan::fit(scene.workload(), crate::budget::Budget { tell: Tell::Nothing, ..input.memory }, needs)?;
+    let plan = Plan::fit(scene.workload(), Budget { tell: Tell::Nothing, ..input.memory }, needs)?;
     scene.follow(&plan);
     let forecast = measured(&mut scene, &plan, &job, 0)?;
     let mut journal = Journal::default();

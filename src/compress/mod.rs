@@ -36,7 +36,7 @@ pub use record::{Record, Run};
 pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
-use crate::budget::{Workload, seconds};
+use crate::budget::{Budget, Tell, Workload, seconds};
 use crate::error::{Error, Result};
 use crate::families::Size;
 use crate::model::ALL_HARMONICS;
@@ -85,7 +85,8 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<
 /// Those of opening the input; nothing else is read.
 pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
     let plan = |outlook, work: &Workload| Job::within(request, outlook, work);
-    let input = InputOptions { work: None, ..request.input.clone() };
+    let memory = Budget { tell: Tell::Nothing, ..request.input.memory };
+    let input = InputOptions { work: None, memory, ..request.input.clone() };
     let (scene, job, _) = open_to_measure(&input, plan, &mut Journal::default())?;
     Ok(job.divided(&scene))
 }
