@@ -153,6 +153,16 @@ impl Workload {
         work.seen_by(rig, views, pairs)
     }
 
+    /// Gaussians of a block: there may be fewer in all.
+    pub fn at_most(&self, block: u64) -> u64 {
+        block.min(self.gaussians)
+    }
+
+    /// Frames of a block: there may be fewer in all, if their number is known.
+    fn frames_at_most(&self, block: u64) -> u64 {
+        if self.frames == 0 { block } else { block.min(self.frames) }
+    }
+
     /// Bytes of one Gaussian's columns `of`.
     pub fn state(&self, of: Columns) -> u64 {
         state_bytes(self.sh_degree, of)
@@ -170,13 +180,15 @@ impl Workload {
 
     /// One block of each thread on its way from a reader, and what decoding it takes.
     pub fn arriving(&self) -> Part {
-        let block = BLOCK as u64 * (self.state(Columns::all()) + self.input.reader);
+        let block = self.at_most(BLOCK as u64) * (self.state(Columns::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
     /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
     fn decoding(&self) -> u64 {
         let Residence { frame_block, gaussian_block, .. } = self.input;
+        let gaussian_block = self.at_most(gaussian_block);
+        let frame_block = self.frames_at_most(frame_block);
         let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
         let largest = Columns::all().iter().map(|column| self.state(column) * frames(column)).max().unwrap_or(0);
         if frame_block == 0 { 0 } else { self.threads * 3 * gaussian_block * largest }
@@ -209,8 +221,9 @@ impl Workload {
 
     /// Buffers of a container of `frames` frames per tile in the making.
     pub fn writing_together(&self, frames: usize) -> Vec<Part> {
-        let varying = frames as u64 * self.state(self.varying);
-        let block = GAUSSIAN_BLOCK as u64 * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
+        let varying = self.frames_at_most(frames as u64) * self.state(self.varying);
+        let block =
+            self.at_most(GAUSSIAN_BLOCK as u64) * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }
 

@@ -42,7 +42,11 @@ impl Scan {
                 * (ACCUMULATING + work.views as f64 * PROJECTING)
                 + work.reading(work.count(), work.frames as f64),
             per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
-            fixed: vec![("blocks", work.threads * BLOCK as u64 * block), work.arriving(), ("frames", frames)],
+            fixed: vec![
+                ("blocks", work.threads * work.at_most(BLOCK as u64) * block),
+                work.arriving(),
+                ("frames", frames),
+            ],
         }
     }
 
