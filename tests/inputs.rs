@@ -216,3 +216,205 @@ fn a_full_disk_is_blamed_on_what_was_being_written() {
         assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), "0", "{run} left something");
     }
 }
+
+#[test]
+fn a_folder_inside_a_model_names_the_folder_above() {
+    let workplace = Workplace::new();
+    for inside in ["point_cloud", "point_cloud/iteration_7"] {
+        let run = workplace.run_words(["info", tiny().join(inside).to_str().unwrap()]);
+        assert_eq!(run.code, 1, "{}", run.stderr);
+        let parts = ["give the folder above", "tiny_model"];
+        assert!(parts.iter().all(|part| run.stderr.contains(part)), "{}", run.stderr);
+    }
+}
+
+#[test]
+fn as_many_frames_as_the_cameras_have_times_are_these_times() {
+    let workplace = Workplace::new();
+    let with = workplace.done("evaluate {tiny} {tiny} --cameras {tiny} --frames 10 --json");
+    assert_eq!(with, workplace.done("evaluate {tiny} {tiny} --cameras {tiny} --json"));
+}
+
+#[test]
+fn ground_truth_is_compared_where_it_exists_and_the_number_is_said() {
+    let workplace = Workplace::new();
+    workplace.done("render {tiny} --cameras {tiny} --all -o photos --quiet");
+    let line = "evaluate {tiny} {tiny} --cameras {tiny} --ground-truth photos";
+    let json =
+        |line: &str| -> serde_json::Value { serde_json::from_str(&workplace.done(&format!("{line} --json"))).unwrap() };
+    let whole = json(line);
+    let of = whole["ground_truth"]["of"].as_u64().unwrap();
+    assert_eq!(whole["ground_truth"]["pairs"], of);
+    let mut photos: Vec<_> = fs::read_dir(workplace.path("photos"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|end| end == "png"))
+        .collect();
+    photos.sort();
+    for photo in photos.iter().step_by(2) {
+        fs::remove_file(photo).unwrap();
+    }
+    let some = json(line);
+    let left = photos.len() as u64 / 2;
+    assert_eq!((&some["ground_truth"]["pairs"], &some["ground_truth"]["of"]), (&left.into(), &of.into()));
+    assert_eq!(some["psnr"], whole["psnr"], "the models are compared on all pictures");
+    let text = workplace.done(&format!("{line} --csv scores.csv"));
+    assert!(text.contains(&format!("{left} of {of} pictures have a photograph in photos")), "{text}");
+    let csv = fs::read_to_string(workplace.path("scores.csv")).unwrap();
+    let commas: Vec<usize> = csv.lines().map(|line| line.matches(',').count()).collect();
+    assert!(commas.windows(2).all(|pair| pair[0] == pair[1]), "{csv}");
+    fs::remove_dir_all(workplace.path("photos")).unwrap();
+    fs::create_dir(workplace.path("photos")).unwrap();
+    workplace.refused(1, line, &["photos", "no such file, nor one of another picture"]);
+}
+
+#[test]
+fn photographs_of_a_rig_lie_in_a_folder_per_camera() {
+    let workplace = Workplace::new();
+    workplace.done("render {tiny} --cameras {tiny} --split all --all -o photos --quiet");
+    // As DyNeRF has them: numbers of cameras with a gap, frame by frame.
+    for (place, camera) in ["cam00", "cam01", "cam03", "cam04", "cam07", "cam10"].iter().enumerate() {
+        let images = workplace.path("rig").join(camera).join("images");
+        fs::create_dir_all(&images).unwrap();
+        for frame in 0..10 {
+            let from = workplace.path("photos").join(format!("t{frame:03}_v{place:02}.png"));
+            if from.is_file() {
+                fs::copy(from, images.join(format!("{frame:04}.png"))).unwrap();
+            }
+        }
+    }
+    let line = |folder: &str| {
+        format!("evaluate {{tiny}} {{tiny}} --cameras {{tiny}} --split all --json --ground-truth {folder}")
+    };
+    let json = |folder: &str| -> serde_json::Value { serde_json::from_str(&workplace.done(&line(folder))).unwrap() };
+    let (named, of_rig) = (json("photos"), json("rig"));
+    assert_eq!(named["ground_truth"]["psnr"], of_rig["ground_truth"]["psnr"]);
+    assert_eq!(named["ground_truth"]["pairs"], of_rig["ground_truth"]["pairs"]);
+}
+
+#[test]
+fn a_gap_among_frames_is_named_and_refused_unless_allowed() {
+    let workplace = Workplace::new();
+    workplace.done("unpack {tiny} -o frames");
+    fs::remove_file(workplace.path("frames/summary.json")).ok();
+    workplace.done("info frames");
+    fs::rename(workplace.path("frames/frame_00004.ply"), workplace.path("four.ply")).unwrap();
+    let refused = |parts: &[&str]| {
+        workplace.refused(1, "info frames", parts);
+        workplace.refused(1, "compress frames -o out", parts);
+        workplace.done("info frames --allow-gaps");
+    };
+    refused(&["frame_00004.ply", "frame_00003.ply, then frame_00005.ply", "--allow-gaps"]);
+    fs::create_dir(workplace.path("frames/frame_00004.ply")).unwrap();
+    refused(&["frame_00004.ply", "a folder", "--allow-gaps"]);
+    fs::remove_dir(workplace.path("frames/frame_00004.ply")).unwrap();
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink("nowhere.ply", workplace.path("frames/frame_00004.ply")).unwrap();
+        let run = workplace.run("info frames");
+        assert!(run.code == 1 && run.stderr.contains("a link to nothing"), "{}", run.stderr);
+        fs::remove_file(workplace.path("frames/frame_00004.ply")).unwrap();
+    }
+    // Every other frame is no gap.
+    for odd in ["01", "03", "05", "07", "09"] {
+        fs::remove_file(workplace.path(&format!("frames/frame_000{odd}.ply"))).unwrap();
+    }
+    fs::rename(workplace.path("four.ply"), workplace.path("frames/frame_00004.ply")).unwrap();
+    workplace.done("info frames");
+}
+
+#[test]
+fn weights_that_contradict_cfg_args_are_believed_and_that_is_said() {
+    let workplace = Workplace::new();
+    for (name, bytes) in scene::files(&tiny()) {
+        let path = workplace.path("model").join(&name);
+        if tiny().join(&name).is_dir() {
+            fs::create_dir_all(path).unwrap();
+        } else {
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, bytes).unwrap();
+        }
+    }
+    let args = workplace.path("model/cfg_args");
+    let text = fs::read_to_string(&args).unwrap();
+    let line = "compress model -o out --dry-run --prune-only --no-refine --quiet";
+    assert!(!workplace.done(line).contains("believed"));
+    let at = text.find("net_width=").expect("a width") + "net_width=".len();
+    let end = at + text[at..].find(|c: char| !c.is_ascii_digit()).unwrap();
+    fs::write(&args, format!("{}4321{}", &text[..at], &text[end..])).unwrap();
+    let said = workplace.done(line);
+    assert!(said.contains("net_width = 4321") && said.contains("the weights are believed"), "{said}");
+}
+
+#[test]
+fn cameras_of_another_scene_are_warned_of() {
+    let workplace = Workplace::new();
+    let mut cameras: serde_json::Value =
+        serde_json::from_slice(&fs::read(tiny().join("transforms_train.json")).unwrap()).unwrap();
+    let line = "compress {tiny} --cameras far.json -o out --dry-run --prune-only --no-refine --quiet";
+    let write = |cameras: &serde_json::Value| fs::write(workplace.path("far.json"), cameras.to_string()).unwrap();
+    write(&cameras);
+    assert!(!workplace.done(line).contains("warning"));
+    for frame in cameras["frames"].as_array_mut().unwrap() {
+        // High above, where none of them looks down.
+        for (axis, place) in [1e4, 2e4, 9e4].into_iter().enumerate() {
+            frame["transform_matrix"][axis][3] = place.into();
+        }
+    }
+    write(&cameras);
+    let said = workplace.done(line);
+    assert!(said.contains("warning: the cameras see") && said.contains("are they of this scene?"), "{said}");
+}
+
+#[test]
+#[ignore = "needs Python"]
+fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
+    let workplace = Workplace::new();
+    fs::write(workplace.path("bad"), b"\xff\0no container, no table, no model").unwrap();
+    let mut named: Vec<_> = [scripts.clone(), scripts.join("slurm")]
+        .iter()
+        .flat_map(|folder| fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()))
+        .filter(|path| path.extension().is_some_and(|end| end == "py"))
+        .collect();
+    named.sort();
+    assert!(named.len() > 20, "{named:?}");
+    for script in &named {
+        for arguments in [
+            &[][..],
+            &["nowhere"],
+            &["nowhere", "nowhere"],
+            &["bad", "bad"],
+            &["nowhere", "nowhere", "nowhere"],
+            &["--no-such-option"],
+        ] {
+            let mut python = Command::new(std::env::var_os("PYTHON").unwrap_or_else(|| "python3".into()));
+            let output = python.arg(script).args(arguments).current_dir(workplace.path("")).output().unwrap();
+            let told = String::from_utf8_lossy(&output.stderr);
+            assert!(!told.contains("Traceback"), "{} {arguments:?}: {told}", script.display());
+        }
+    }
+    // Whoever reads the output has seen enough.
+    let line = format!(
+        "python3 {} {1} {1} | true; python3 -c 'raise SystemExit(0)'",
+        scripts.join("check_model_folder.py").display(),
+        tiny().display()
+    );
+    let output = Command::new("sh").args(["-c", &line]).output().unwrap();
+    assert_eq!(String::from_utf8_lossy(&output.stderr), "");
+}
+
+/// What of a run of 300 Gaussians and 10 frames is in buffers is no more than these.
+#[test]
+fn memory_asks_for_what_is_needed_and_keeps_to_it() {
+    let workplace = Workplace::new();
+    for output in ["out.gseq", "out"] {
+        let run = workplace.run(&format!("compress {{tiny}} -o {output} --memory 1KiB --threads 2"));
+        let said = run.stderr.split("expected at least ").nth(1).and_then(|rest| rest.split("MiB").next());
+        let least: u64 = said.expect(&run.stderr).parse().unwrap();
+        assert!(least <= 60, "{least} MiB for {output}");
+        let run = workplace.run(&format!("compress {{tiny}} -o {output} --memory {least}MiB --threads 2 --explain"));
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        assert!(scene::taken(&run.stderr).is_none_or(|taken| taken <= least as f64), "{}", run.stderr);
+    }
+}

@@ -8,6 +8,7 @@ use super::recipe_flags::RecipeFlags;
 use crate::emit::atomic::Replace;
 use crate::emit::bounds::MaxError;
 use crate::error::quoted;
+use crate::ingest::cameras::Times;
 use crate::verbs::method::Method;
 use crate::verbs::precision::Turned;
 use crate::work::Part;
@@ -112,6 +113,9 @@ pub(super) struct Input {
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K", hide_short_help = true)]
     pub(super) iteration: Option<u32>,
+    /// Take a folder of PLY frames with a gap in its numbers, or with entries that are no files, as it is
+    #[arg(long, hide_short_help = true)]
+    pub(super) allow_gaps: bool,
     /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
     /// --memory [default: that of the output, else the system's]
     #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
@@ -171,16 +175,22 @@ pub(super) struct Memory {
 /// The file of the cameras.
 #[derive(Debug, Args)]
 pub(super) struct CameraFile {
-    /// transforms*.json, cameras.json, poses_bounds.npy, or a folder with one [default: beside the model's
+    /// transforms*.json, cameras.json, poses_bounds.npy, a COLMAP reconstruction, dataset.json of NeRFies and HyperNeRF, or
+    /// a folder with one; a file stands for itself alone, a folder for all its splits [default: beside the model's
     /// data if cfg_args names it, else a virtual rig]
     #[arg(long, help_heading = CAMERAS, value_name = "PATH")]
     pub(super) cameras: Option<PathBuf>,
     /// Number of frames of a model that is continuous in time, evenly spaced [default: the cameras' times]
     #[arg(long, help_heading = CAMERAS, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) frames: Option<u32>,
-    /// Picture size where the cameras name none
+    /// Picture size where the cameras name none; pictures of COLMAP, NeRFies and LLFF are scaled to it
     #[arg(long, help_heading = CAMERAS, value_name = "WxH", value_parser = parse_size)]
     pub(super) size: Option<(u32, u32)>,
+    /// When pictures of COLMAP, or of a cameras.json without times, were taken: `names`, by the numbers in their names;
+    /// `none`, every picture shows every frame; or a CSV table of name,time [default: names of COLMAP where all have
+    /// numbers and the input is no still scene, else none]
+    #[arg(long, help_heading = CAMERAS, hide_short_help = true, value_name = "names|none|FILE", value_parser = parse_times)]
+    pub(super) times: Option<Times>,
 }
 
 /// From where to look.
@@ -198,9 +208,11 @@ pub(super) struct Cameras {
 pub(super) enum SplitArg {
     /// Pictures the model was trained on
     Train,
+    /// Pictures held out while it was trained (transforms_val.json)
+    Val,
     /// Held-out pictures
     Test,
-    /// Both
+    /// All of them
     All,
 }
 
@@ -408,6 +420,9 @@ pub(super) struct SideBySide {
     /// Training iteration of the original, if a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
+    /// Take folders of PLY frames with a gap in their numbers as they are
+    #[arg(long)]
+    pub(super) allow_gaps: bool,
     #[command(flatten)]
     pub(super) memory: Memory,
     #[command(flatten)]
@@ -726,6 +741,10 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
         (Ok(width @ 1..=65_535), Ok(height @ 1..=65_535)) => Ok((width, height)),
         _ => Err(expected()),
     }
+}
+
+fn parse_times(text: &str) -> Result<Times, String> {
+    Ok(Times::named(text))
 }
 
 fn parse_bytes(text: &str) -> Result<u64, String> {

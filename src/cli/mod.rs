@@ -21,6 +21,7 @@ use crate::emit::atomic::{Replace, as_named};
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
+use crate::ingest::cameras::Times;
 use crate::model::Split;
 use crate::recipe::preset_text;
 use crate::report::{self, ReportOptions, trade_off};
@@ -308,6 +309,9 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
             }
             input.cameras = input.cameras.or_else(|| run.cameras.clone());
             input.size = input.size.or(run.size);
+            if let (Times::Own, Some(times)) = (&input.times, &run.times) {
+                input.times = Times::named(times);
+            }
             input.iteration = input.iteration.or(run.iteration);
             run
         }
@@ -397,6 +401,7 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
 
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
+    original.allow_gaps = args.allow_gaps;
     original.use_cameras(args.cameras);
     original.memory = budget_of(args.memory);
     EvaluateOptions {
@@ -503,6 +508,7 @@ fn precision_options(args: args::Precision) -> Result<PrecisionOptions> {
 fn part_of(split: SplitArg) -> PictureSet {
     match split {
         SplitArg::Train => PictureSet::Split(Split::Train),
+        SplitArg::Val => PictureSet::Split(Split::Val),
         SplitArg::Test => PictureSet::Split(Split::Test),
         SplitArg::All => PictureSet::All,
     }
@@ -518,12 +524,14 @@ fn budget_of(memory: Memory) -> Budget {
 
 fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {
     let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
+    options.allow_gaps = input.allow_gaps;
     options.memory = budget_of(input.memory);
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         options.use_cameras(cameras.file);
         options.split = match cameras.split {
             Some(SplitArg::Train) | None => Some(Split::Train),
+            Some(SplitArg::Val) => Some(Split::Val),
             Some(SplitArg::Test) => Some(Split::Test),
             Some(SplitArg::All) => None,
         };
@@ -535,6 +543,7 @@ impl InputOptions {
     fn use_cameras(&mut self, file: CameraFile) {
         self.cameras = file.cameras;
         self.size = file.size;
+        self.times = file.times.unwrap_or_default();
         self.frames = file.frames.map(|frames| frames as usize);
     }
 }

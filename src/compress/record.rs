@@ -60,6 +60,9 @@ pub struct Run {
     pub frames: Option<usize>,
     /// Picture size where the cameras name none.
     pub size: Option<(u32, u32)>,
+    /// Where the times of pictures came from, as `--times` says it; none: their own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub times: Option<String>,
 }
 
 /// A recipe file's tables beside its hyper-parameters.
@@ -135,6 +138,7 @@ impl Record {
             split: input.split,
             frames: input.frames,
             size: input.size,
+            times: input.times.name(),
             ..run
         };
         let tool = TOOL.to_owned();

@@ -79,6 +79,11 @@ pub trait Family: Send + Sync {
     /// Times that are not finite or do not increase; another number of them than there are frames.
     fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>>;
 
+    /// Things a person should know of it.
+    fn notes(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Folder of the data it was trained on, as the input names it, where it does: there cameras may be.
     fn data_folder(&self) -> Option<&str> {
         None
@@ -298,6 +303,8 @@ impl Found<'_> {
 pub struct OpenOptions {
     /// Training iteration of a model folder; none: the largest.
     pub iteration: Option<u32>,
+    /// Whether frames may be missing from a folder of them.
+    pub allow_gaps: bool,
     /// Folder for what an archive decodes to, while it is open; none: the system's for such files.
     pub scratch: Option<PathBuf>,
 }

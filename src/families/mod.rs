@@ -44,6 +44,9 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
         let file = File::open(path).map_err(Error::io("open", path))?;
         file.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
     }
+    if is_folder {
+        refuse_inside_a_model(path)?;
+    }
     let found = Found { path, is_folder, head };
     match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
         Some(entry) => (entry.open)(path, options),
@@ -52,4 +55,21 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
             Err(Error::input(path, "", expected.join(", "), "another kind of file"))
         }
     }
+}
+
+/// Refuses a folder inside a model folder, naming that one.
+fn refuse_inside_a_model(path: &Path) -> Result<()> {
+    // A `.` has no name of its own.
+    let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
+    let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
+    let is_clouds = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
+    let (below, number) = match (iteration(&real), real.parent()) {
+        (Some(number), Some(clouds)) if is_clouds(clouds) && real.join("deformation.pth").exists() => (2, Some(number)),
+        _ if is_clouds(&real) => (1, None),
+        _ => return Ok(()),
+    };
+    let Some(root) = real.ancestors().nth(below).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
+    let option = number.map_or_else(String::new, |number| format!(" --iteration {number}"));
+    Err(Error::input(path, "", "a model folder", "a folder inside of one")
+        .hint(format!("give the folder above: {}{option}", root.display())))
 }

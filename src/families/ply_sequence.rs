@@ -26,7 +26,10 @@ use crate::stream::{HeldFrames, Progress, gather_all};
 pub(super) const FOLDER: Entry = Entry {
     expected: "a folder of PLY files",
     recognises: |found| found.is_folder,
-    open: |path, options| open(path, options, PlySequence::open),
+    open: |path, options| {
+        let by = if options.allow_gaps { PlySequence::open_with_gaps } else { PlySequence::open };
+        open(path, options, by)
+    },
 };
 
 /// One PLY.

@@ -34,18 +34,27 @@ impl PlySequence {
     /// Frame i of T has time i / T; all columns vary when T > 1.
     ///
     /// # Errors
-    /// A folder without PLY files; a file [`Ply::open`] refuses; frames that differ in their number of
+    /// A gap in the frames' numbers, or an entry called like a frame that is no file; a folder without PLY files; a file [`Ply::open`] refuses; frames that differ in their number of
     /// Gaussians or in their properties.
     pub fn open(folder: &Path) -> Result<PlySequence> {
-        let mut frames = Vec::new();
-        for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
-            let path = entry.map_err(Error::io("list", folder))?.path();
-            if is_frame(&path) {
-                frames.push(path);
-            }
+        let (frames, others) = frames_of(folder)?;
+        if let Some(other) = others.first() {
+            let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
+            return Err(Error::input(other, "", "a PLY file, as its name says", found).hint(ALLOW_GAPS));
         }
-        frames.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
+        if let Some((missing, before, after)) = first_gap(&frames) {
+            let found = format!("{before}, then {after}");
+            return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS));
+        }
         Self::of(folder, frames)
+    }
+
+    /// [`PlySequence::open`] of the files that are there, whatever is missing between them.
+    ///
+    /// # Errors
+    /// Those of [`PlySequence::open`] but gaps.
+    pub fn open_with_gaps(folder: &Path) -> Result<PlySequence> {
+        Self::of(folder, frames_of(folder)?.0)
     }
 
     /// One PLY file as a sequence of one frame, in which nothing varies.
@@ -185,11 +194,50 @@ fn file_name(path: &Path) -> &OsStr {
     path.file_name().unwrap_or_default()
 }
 
+/// What a sequence that is refused can be read with all the same.
+const ALLOW_GAPS: &str = "--allow-gaps takes the frames that are there as the whole sequence";
+
+/// The files of a folder's frames in natural order, and what is called like one and is no file.
+fn frames_of(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(folder).map_err(Error::io("list", folder))? {
+        let path = entry.map_err(Error::io("list", folder))?.path();
+        if is_called_frame(&path) {
+            found.push(path);
+        }
+    }
+    found.sort_by(|a, b| natural_order(file_name(a), file_name(b)));
+    Ok(found.into_iter().partition(|path| path.is_file()))
+}
+
+/// The name of the first frame that is missing, with its neighbours', where names differ in one number alone: of those
+/// that follow each other by the least step it is the one that would be next.
+fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
+    let parts = |path: &PathBuf| -> Option<(String, u64, String, usize)> {
+        let name = file_name(path).to_str()?;
+        let stem = name.rsplit_once('.')?.0;
+        let end = stem.rfind(|c: char| c.is_ascii_digit())? + 1;
+        let start = stem[..end].trim_end_matches(|c: char| c.is_ascii_digit()).len();
+        Some((name[..start].to_owned(), name[start..end].parse().ok()?, name[end..].to_owned(), end - start))
+    };
+    let named: Vec<_> = frames.iter().map(parts).collect::<Option<_>>()?;
+    let (before, _, after, _) = named.first()?;
+    if named.iter().any(|(b, _, a, _)| (b, a) != (before, after)) {
+        return None;
+    }
+    let steps: Vec<u64> = named.windows(2).map(|pair| pair[1].1.saturating_sub(pair[0].1)).collect();
+    let least = steps.iter().copied().min().filter(|&least| least > 0)?;
+    let at = steps.iter().position(|&step| step != least)?;
+    let width = named[at].3;
+    let missing = format!("{before}{:0width$}{after}", named[at].1 + least);
+    let name = |at: usize| file_name(&frames[at]).display().to_string();
+    Some((missing, name(at), name(at + 1)))
+}
+
 /// Hidden files are left out: a file manager's `._frame_1.ply` is no frame.
-fn is_frame(path: &Path) -> bool {
+fn is_called_frame(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
         && !file_name(path).as_encoded_bytes().starts_with(b".")
-        && path.is_file()
 }
 
 /// Numbers by value, then bytes: names equal to the natural comparison (`a 1`, `a1`) have an order too.

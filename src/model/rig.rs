@@ -14,6 +14,8 @@ use crate::error::{Error, Result};
 pub enum Split {
     /// Pictures the model was trained on; compression scores with these.
     Train,
+    /// Pictures held out while it was trained; evaluation uses these where there are no others.
+    Val,
     /// Held-out pictures; evaluation uses these.
     Test,
 }
@@ -61,6 +63,11 @@ impl Rig {
         let near = 0.5 * TIME_TOLERANCE * span(&times);
         times.dedup_by(|later, kept| *later - *kept <= near);
         times
+    }
+
+    /// The split that is held out: test, or val where there is none; none where every picture is for training.
+    pub fn held_out(&self) -> Option<Split> {
+        [Split::Test, Split::Val].into_iter().find(|split| self.shots.iter().any(|shot| shot.split == *split))
     }
 
     /// How far from a frame's time a picture of it may be taken, if the frames span the pictures' times.

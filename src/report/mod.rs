@@ -189,7 +189,7 @@ fn scored_pictures(scene: &Scene, run: &Run) -> Result<Schedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
     let mut first = None;
-    for split in [Some(Split::Train), None, Some(Split::Test)] {
+    for split in [Some(Split::Train), None, scene.rig.held_out()] {
         let schedule = scene.rig.schedule(times, split)?;
         if schedule.pairs() == 0 {
             continue;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::budget::Budget;
 use crate::error::Result;
 use crate::families::{Family, OpenOptions};
-use crate::ingest::cameras::{self, CameraOptions};
+use crate::ingest::cameras::{self, CameraOptions, Times};
 use crate::model::{Rig, Split};
 use crate::work;
 
@@ -16,12 +16,16 @@ pub struct InputOptions {
     pub path: PathBuf,
     /// Training iteration of a model folder; none: the largest.
     pub iteration: Option<u32>,
+    /// Whether frames may be missing from a folder of them.
+    pub allow_gaps: bool,
     /// Frames of a model that is continuous in time; none: the cameras' times.
     pub frames: Option<usize>,
     /// Camera file or folder; none: searched for.
     pub cameras: Option<PathBuf>,
     /// Picture size where the cameras name none.
     pub size: Option<(u32, u32)>,
+    /// Where the times of pictures come from whose cameras have none.
+    pub times: Times,
     /// Which pictures to score with; none: all.
     pub split: Option<Split>,
     /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
@@ -41,7 +45,7 @@ impl InputOptions {
 
     /// What is said of the input beside its path.
     pub fn opening(&self) -> OpenOptions {
-        OpenOptions { iteration: self.iteration, scratch: self.scratch.clone() }
+        OpenOptions { iteration: self.iteration, allow_gaps: self.allow_gaps, scratch: self.scratch.clone() }
     }
 
     /// Where scratch files go.
@@ -60,11 +64,11 @@ pub struct Opened {
     pub notes: Vec<String>,
 }
 
-/// The cameras of a file, if there is one.
+/// The cameras of a file, if there is one, with times as `times` says.
 ///
 /// # Errors
 /// A file that is not there, or holds no cameras.
-pub fn load_cameras(options: &InputOptions, path: Option<&Path>) -> Result<Option<Rig>> {
-    let camera_options = CameraOptions { size: options.size, frames: options.frames };
+pub fn load_cameras(options: &InputOptions, path: Option<&Path>, times: Times) -> Result<Option<Rig>> {
+    let camera_options = CameraOptions { size: options.size, frames: options.frames, times };
     path.map(|path| cameras::load(path, &camera_options)).transpose()
 }

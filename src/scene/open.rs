@@ -6,10 +6,11 @@ use glam::DVec3;
 
 use super::Scene;
 use super::input::{InputOptions, Opened, load_cameras};
+use super::pictures::no_picture;
 use super::stream::open_arriving;
 use crate::error::{Error, Result};
 use crate::families::{self, Family, Timing};
-use crate::ingest::cameras;
+use crate::ingest::cameras::{self, Times};
 use crate::model::{Columns, Rig};
 use crate::source::FrameSource;
 use crate::stats::RobustBox;
@@ -26,12 +27,18 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
     let path = &options.path;
     let mut notes = Vec::new();
     let input = families::open(path, &options.opening())?;
-    let rig = load_cameras(options, camera_path(options, &*input).as_deref())?;
+    notes.extend(input.notes());
+    // Numbers in the names of a still scene's pictures are no times.
+    let is_still = input.timing() != Timing::Continuous && input.source().info().times.len() == 1;
+    let times = if is_still && options.times == Times::Own { Times::None } else { options.times.clone() };
+    let rig = load_cameras(options, camera_path(options, &*input).as_deref(), times)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {
         Timing::Continuous => {
             let times = match options.frames {
                 None if !times.is_empty() => times,
+                // As many as there are: these.
+                Some(frames) if frames == times.len() => times,
                 given => evenly_spaced(given, &mut notes)?,
             };
             input.with_times(times)?
@@ -105,7 +112,7 @@ pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     };
     let scene = Scene::new(options.path.clone(), input, rig, options.split)?;
     if scene.schedule.pairs() == 0 && !scene.source().info().times.is_empty() {
-        return Err(Error::usage(format!("{}: no picture in this split (--split)", scene.rig.origin)));
+        return Err(no_picture(&scene.rig));
     }
     let mut scene = Scene { has_cameras, scratch: options.scratch_folder(), notes, ..scene };
     scene.keep_work(options)?;

@@ -18,26 +18,6 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Finds the photograph of every picture: `tNNN_vNN.png`, else the file its camera names, by as
-    /// much of its path as leads to one inside `folder`.
-    ///
-    /// # Errors
-    /// A folder that cannot be read; a picture without a photograph, or that shares one with another.
-    pub fn find(folder: &Path, rig: &Rig, times: &[f64], pictures: &[Picture]) -> Result<Photographs> {
-        check_folder(folder)?;
-        let file = |&picture: &Picture| {
-            let named = rig.image(picture, times);
-            let file = file_of(folder, named, picture).ok_or_else(|| {
-                let named = named.and_then(Path::file_name).map(|name| format!(" or {}", name.display()));
-                let expected = format!("{}.png{}", picture.name(), named.unwrap_or_default());
-                Error::input(folder, place(picture), expected, "no such file")
-                    .hint("--max-frames compares fewer frames, --split other pictures")
-            })?;
-            Ok((picture, file))
-        };
-        Photographs::at(folder, pictures.iter().map(file))
-    }
-
     /// Of pictures with the file of each, inside `folder`.
     fn at(folder: &Path, found: impl Iterator<Item = Result<(Picture, PathBuf)>>) -> Result<Photographs> {
         let mut files = HashMap::new();
@@ -55,10 +35,12 @@ impl Photographs {
         Ok(Photographs { files })
     }
 
-    /// Those of `pictures` that have a photograph, and their photographs.
+    /// Those of `pictures` that have a photograph, and their photographs: of each `tNNN_vNN.png`, else the file its camera
+    /// names, by as much of its path as leads to one inside `folder`, else `camNN/images/FFFF.png` as DyNeRF has them: of the
+    /// view's place among the folders called `cam…`, and the frame's number.
     ///
     /// # Errors
-    /// A folder that cannot be read; a picture that shares its photograph with another.
+    /// A folder that cannot be read; no photograph of any; a picture that shares its photograph with another.
     pub fn of_some(
         folder: &Path,
         rig: &Rig,
@@ -66,10 +48,23 @@ impl Photographs {
         pictures: Vec<Picture>,
     ) -> Result<(Vec<Picture>, Photographs)> {
         check_folder(folder)?;
-        let file = |picture: Picture| Some((picture, file_of(folder, rig.image(picture, times), picture)?));
-        let found: Vec<(Picture, PathBuf)> = pictures.into_iter().filter_map(file).collect();
+        let rigs = camera_folders(folder)?;
+        let file = |picture: Picture| Some((picture, file_of(folder, rig.image(picture, times), picture, &rigs)?));
+        let found: Vec<(Picture, PathBuf)> = pictures.iter().copied().filter_map(file).collect();
+        if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
+            let named = rig.image(picture, times).and_then(Path::file_name);
+            let named = named.map_or_else(String::new, |name| format!(", {}", name.display()));
+            let expected =
+                format!("{}.png{named} or {}", picture.name(), in_rig(Path::new("camNN"), picture).display());
+            return Err(Error::input(folder, place(picture), expected, "no such file, nor one of another picture"));
+        }
         let pictures = found.iter().map(|(picture, _)| *picture).collect();
         Ok((pictures, Photographs::at(folder, found.into_iter().map(Ok))?))
+    }
+
+    /// Whether there is one of `picture`.
+    pub fn has(&self, picture: Picture) -> bool {
+        self.files.contains_key(&(picture.frame, picture.view))
     }
 
     /// What says, without reading them, that the photographs of `pictures` are those that they were: of each its name,
@@ -109,10 +104,32 @@ fn check_folder(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The photograph of `picture`, which its camera calls `named`.
-fn file_of(folder: &Path, named: Option<&Path>, picture: Picture) -> Option<PathBuf> {
+/// The photograph of `picture`, which its camera calls `named`; `rigs` are the folders of a rig's cameras.
+fn file_of(folder: &Path, named: Option<&Path>, picture: Picture, rigs: &[PathBuf]) -> Option<PathBuf> {
     let numbered = folder.join(format!("{}.png", picture.name()));
-    if numbered.is_file() { Some(numbered) } else { inside(folder, named?) }
+    if numbered.is_file() {
+        return Some(numbered);
+    }
+    let of_rig = || rigs.get(picture.view as usize).map(|camera| in_rig(camera, picture)).filter(|file| file.is_file());
+    named.and_then(|named| inside(folder, named)).or_else(of_rig)
+}
+
+/// The folders of `folder` that are called `cam` and a number, by that: view after view.
+fn camera_folders(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(folder).and_then(|entries| entries.collect::<std::io::Result<Vec<_>>>());
+    let mut found: Vec<(u32, PathBuf)> = Vec::new();
+    for entry in entries.map_err(Error::io("list", folder))? {
+        let name = entry.file_name();
+        let number = name.to_str().and_then(|name| name.strip_prefix("cam")).and_then(|number| number.parse().ok());
+        found.extend(number.map(|number| (number, entry.path())).filter(|(_, path)| path.join("images").is_dir()));
+    }
+    found.sort();
+    Ok(found.into_iter().map(|(_, path)| path).collect())
+}
+
+/// Where a rig's camera has the photograph of `picture`.
+fn in_rig(camera: &Path, picture: Picture) -> PathBuf {
+    camera.join("images").join(format!("{:04}.png", picture.frame))
 }
 
 /// The file inside `folder` that ends as `image` does, by the longest such end.

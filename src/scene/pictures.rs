@@ -40,9 +40,22 @@ pub fn pictures(rig: &Rig, frame_times: &[f64], part: PictureSet) -> Result<Vec<
         )));
     }
     if found.is_empty() {
-        return Err(Error::usage(format!("{}: no picture in this split (--split)", rig.origin)));
+        return Err(no_picture(rig));
     }
     Ok(found)
+}
+
+/// That the cameras have no picture of the split that is asked for.
+pub fn no_picture(rig: &Rig) -> Error {
+    let has = |split: &Split| rig.shots.iter().any(|shot| shot.split == *split);
+    let named = [(Split::Train, "train"), (Split::Val, "val"), (Split::Test, "test")];
+    let there: Vec<&str> = named.iter().filter(|(split, _)| has(split)).map(|(_, name)| *name).collect();
+    Error::usage(format!(
+        "{}: no picture in this split\n  it has pictures of {}: --split {}, or --split all",
+        rig.origin,
+        there.join(" and "),
+        there.first().unwrap_or(&"all")
+    ))
 }
 
 /// The picture of `view` at `frame`.
@@ -118,7 +131,7 @@ impl PictureSet {
     /// The split it comes to with these cameras; none: every picture.
     pub fn split(self, rig: &Rig) -> Option<Split> {
         match self {
-            PictureSet::HeldOut => Some(Split::Test).filter(|_| rig.shots.iter().any(|shot| shot.split == Split::Test)),
+            PictureSet::HeldOut => rig.held_out(),
             PictureSet::Split(split) => Some(split),
             PictureSet::All => None,
         }

@@ -116,16 +116,19 @@ impl SideBySide {
     /// the same.
     pub fn open(options: &EvaluateOptions) -> Result<SideBySide> {
         let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
-        let compressed = open_compressed(&options.compressed, &scene)?;
+        let compressed = open_compressed(&options.compressed, &scene, options.original.allow_gaps)?;
         let background = background(options.background, &scene)?;
         let times = &scene.source().info().times;
         let mut chosen = pictures(&scene.rig, times, options.part)?;
         if let Some(frames) = options.max_frames {
             chosen = thin(chosen, frames);
         }
-        let truth = options.ground_truth.as_deref().map(|folder| Photographs::find(folder, &scene.rig, times, &chosen));
+        let truth = match &options.ground_truth {
+            Some(folder) => Some(Photographs::of_some(folder, &scene.rig, times, chosen.clone())?.1),
+            None => None,
+        };
         Ok(SideBySide {
-            truth: truth.transpose()?,
+            truth,
             truth_folder: options.ground_truth.clone(),
             compressed_path: options.compressed.clone(),
             pictures: chosen,
@@ -239,6 +242,7 @@ impl SideBySide {
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
                 folder: folder.display().to_string(),
+                of: self.pictures.len(),
                 compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
                 original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
             })
@@ -391,7 +395,10 @@ impl SideBySide {
         Ok(Taken {
             original: render(original, camera, self.background),
             compressed: render(compressed, camera, self.background),
-            truth: self.truth.as_ref().map(|truth| truth.read(picture, camera, self.background)).transpose()?,
+            truth: match &self.truth {
+                Some(truth) if truth.has(picture) => Some(truth.read(picture, camera, self.background)?),
+                _ => None,
+            },
         })
     }
 }
@@ -409,9 +416,9 @@ fn last_before(pictures: &[Picture], start: usize, these: &[Picture]) -> Vec<Pic
 const TIME_TOLERANCE: f64 = 1e-6;
 
 /// Opens the compressed model at the frames of the original.
-pub(super) fn open_compressed(path: &Path, original: &Scene) -> Result<Box<dyn Family>> {
+pub(super) fn open_compressed(path: &Path, original: &Scene, allow_gaps: bool) -> Result<Box<dyn Family>> {
     let times = &original.source().info().times;
-    let input = families::open(path, &OpenOptions::default())?;
+    let input = families::open(path, &OpenOptions { allow_gaps, ..OpenOptions::default() })?;
     let input = match input.timing() {
         Timing::Continuous => input.with_times(times.clone())?,
         Timing::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,

@@ -106,6 +106,8 @@ pub struct Comparison {
 pub struct TruthComparison {
     /// Folder of the pictures.
     pub folder: String,
+    /// Pictures compared with each other; those that have a photograph are `pairs`.
+    pub of: usize,
     /// The compressed model.
     #[serde(flatten)]
     pub compressed: Comparison,
@@ -166,9 +168,13 @@ impl Means {
 }
 
 impl Comparison {
-    /// Averages what `score` picks of each picture; none if a picture lacks it.
+    /// Averages what `score` picks of each picture; of those that have it; none if all lack it.
     pub fn of(pictures: &[PictureScores], score: impl Fn(&PictureScores) -> Option<Score>) -> Option<Comparison> {
-        let scores: Vec<Score> = pictures.iter().map(score).collect::<Option<_>>()?;
+        let (pictures, scores): (Vec<&PictureScores>, Vec<Score>) =
+            pictures.iter().filter_map(|picture| Some((picture, score(picture)?))).unzip();
+        if scores.is_empty() {
+            return None;
+        }
         let mut views: BTreeMap<u32, Vec<Score>> = BTreeMap::new();
         for (picture, &score) in pictures.iter().zip(&scores) {
             views.entry(picture.view).or_default().push(score);
@@ -226,6 +232,16 @@ impl Evaluation {
             line(&format!("worst view: {}", view.view), &view.means);
             line(&format!("worst frame: {}", frame.frame), &frame.means);
         }
+        if let Some(truth) = &self.ground_truth {
+            let pairs = truth.compressed.overall.pairs;
+            if pairs < truth.of {
+                let _ = writeln!(
+                    out,
+                    "  ground truth: {pairs} of {} pictures have a photograph in {}",
+                    truth.of, truth.folder
+                );
+            }
+        }
         for note in &self.notes {
             let _ = writeln!(out, "  note: {note}");
         }
@@ -248,6 +264,7 @@ impl Evaluation {
                 row.extend([score.psnr.to_string(), score.ssim.to_string(), known(score.temporal)]);
                 row.extend(with_flip.then(|| known(score.flip)));
             }
+            row.resize(names.len(), String::new());
             row
         };
         table(&names, self.pictures.iter().map(row))
@@ -294,6 +311,7 @@ mod tests {
             loss: Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap(),
             ground_truth: truth.map(|of| TruthComparison {
                 folder: String::new(),
+                of: 2,
                 compressed: of.clone(),
                 original: of,
             }),

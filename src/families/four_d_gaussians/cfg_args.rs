@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::deform::FieldConfig;
+use crate::deform::{FieldConfig, Tensors};
 use crate::error::{Error, Result};
 use crate::model::Columns;
 
@@ -101,6 +101,46 @@ impl ModelConfig {
             apply_rotation: get("apply_rotation").bool(false)?,
         };
         Ok(config)
+    }
+
+    /// A note for what it says of the network and the weights do not have; of both the weights are believed.
+    pub(super) fn contradicted_by(&self, tensors: &Tensors) -> Vec<String> {
+        const TRUNK: &str = "deformation_net.feature_out.";
+        const GRIDS: &str = "deformation_net.grid.grids.";
+        let side =
+            |name: String, axis: usize| -> Option<i64> { tensors.get(&name)?.shape.get(axis).map(|&side| side as i64) };
+        let count =
+            |name: &dyn Fn(usize) -> String| (0..).take_while(|&k| tensors.contains_key(&name(k))).count() as i64;
+        let mut found = vec![
+            ("net_width", self.net_width, side(format!("{TRUNK}0.weight"), 0)),
+            (
+                "defor_depth",
+                self.defor_depth.max(1),
+                Some(count(&|k| format!("{TRUNK}{}.weight", 2 * k))).filter(|&some| some > 0),
+            ),
+        ];
+        if !self.no_grid {
+            let least = |list: &[i64]| list.first().copied().unwrap_or(1);
+            let x = self.resolution.first().copied().unwrap_or(0) * least(&self.multires);
+            // Planes xy, xz, xt, yz, yt, zt, the first axis last.
+            found.extend([
+                (
+                    "multires (levels)",
+                    self.multires.len() as i64,
+                    Some(count(&|k| format!("{GRIDS}{k}.0"))).filter(|&some| some > 0),
+                ),
+                ("output_coordinate_dim", self.channels, side(format!("{GRIDS}0.0"), 1)),
+                ("resolution along x", x, side(format!("{GRIDS}0.0"), 3)),
+                ("resolution along t", self.resolution.get(3).copied().unwrap_or(0), side(format!("{GRIDS}0.2"), 2)),
+            ]);
+        }
+        let differs = |(what, said, there): (&str, i64, Option<i64>)| {
+            let there = there.filter(|&there| there != said)?;
+            Some(format!(
+                "cfg_args says {what} = {said}, the weights in deformation.pth have {there}: the weights are believed"
+            ))
+        };
+        found.into_iter().filter_map(differs).collect()
     }
 
     /// What decides the evaluation of the deformation field.

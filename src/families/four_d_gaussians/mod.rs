@@ -110,6 +110,10 @@ impl Family for ModelFolder {
         Ok(Box::new(ModelFolder::with_times(*self, times)?))
     }
 
+    fn notes(&self) -> Vec<String> {
+        ModelFolder::notes(self).to_vec()
+    }
+
     fn data_folder(&self) -> Option<&str> {
         self.config().source_path.as_deref()
     }

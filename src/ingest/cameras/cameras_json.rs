@@ -11,12 +11,12 @@
 //!
 //! `w2c` is world to camera, row-major, OpenCV axes; focal lengths and the principal point are in
 //! pixels, the middle of the picture at `width / 2`. Optional: `background` (linear RGB in [0, 1]),
-//! `v` (view number, else by distinct camera), `time` (else every frame), `split` (`train` or `test`,
+//! `v` (view number, else by distinct camera), `time` (else every frame), `split` (`train`, `val` or `test`,
 //! else train), `image` (relative to the file). Other keys are ignored.
 //!
 //! *3DGS's*, one entry per camera, written beside a trained model: `width`, `height`, `fx`, `fy`,
 //! `position` (of the camera), `rotation` (camera to world, row-major, OpenCV axes), `img_name`. It
-//! has no times, so each camera sees every frame; it does not tell test from train, so all are train.
+//! has no times, so each camera sees every frame unless `--times` says otherwise; it does not tell test from train, so all are train.
 
 use std::path::Path;
 
@@ -24,6 +24,7 @@ use serde_json::Value;
 
 use super::assemble::{Picture, assemble, from_camera_to_world, view_in_name};
 use super::fields::{Fields, describe};
+use super::times::{self, Times};
 use crate::error::{Error, Result};
 use crate::model::{Camera, Rig, Split};
 
@@ -47,7 +48,8 @@ fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
     let split = match own.optional_text("split")? {
         None | Some("train") => Split::Train,
         Some("test") => Split::Test,
-        Some(_) => return Err(own.wrong("split", "\"train\" or \"test\"")),
+        Some("val") => Split::Val,
+        Some(_) => return Err(own.wrong("split", "\"train\", \"val\" or \"test\"")),
     };
     let camera = Camera {
         width: own.side("width")?,
@@ -70,7 +72,7 @@ fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
 }
 
 /// Reads the file of a 3DGS model folder.
-pub(super) fn load_per_camera(file: &Path, document: &Value) -> Result<Rig> {
+pub(super) fn load_per_camera(file: &Path, document: &Value, times: &Times) -> Result<Rig> {
     let Value::Array(list) = document else {
         return Err(Error::input(file, "", "a list of cameras", describe(document)));
     };
@@ -78,7 +80,13 @@ pub(super) fn load_per_camera(file: &Path, document: &Value) -> Result<Rig> {
     for (index, entry) in list.iter().enumerate() {
         pictures.push(per_camera(file, Fields::of(file, Some(index), entry)?)?);
     }
-    assemble(vec![(file.to_owned(), pictures)], None, file.display().to_string())
+    let mut origin = file.display().to_string();
+    if *times != Times::Own {
+        let name = |entry: &Value| entry.get("img_name").and_then(Value::as_str).unwrap_or("").to_owned();
+        let names: Vec<String> = list.iter().map(name).collect();
+        origin += &format!(" ({})", times::give(file, &mut pictures, &names, times)?);
+    }
+    assemble(vec![(file.to_owned(), pictures)], None, origin)
 }
 
 fn per_camera(file: &Path, own: Fields<'_>) -> Result<Picture> {

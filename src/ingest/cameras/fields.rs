@@ -88,6 +88,15 @@ impl<'a> Fields<'a> {
         }
     }
 
+    /// Width and height in pixels.
+    pub(super) fn sides(&self, key: &str) -> Result<[u32; 2]> {
+        let side = |value: f64| {
+            (value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value)).then_some(value as u32)
+        };
+        let found = self.map.get(key).and_then(numbers).and_then(|[w, h]| Some([side(w)?, side(h)?]));
+        found.ok_or_else(|| self.wrong(key, format!("width and height, 1 to {MAX_SIDE_PX} pixels")))
+    }
+
     /// Three numbers, if the key is there.
     pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
         match self.map.get(key) {

@@ -2,19 +2,24 @@
 //!
 //! | file | times | splits |
 //! |---|---|---|
-//! | `transforms_train.json` + `transforms_test.json`, `transforms.json` (NeRF, D-NeRF) | `time` | from the names |
+//! | a folder with `transforms_train.json`, `_val` and `_test`, or `transforms.json` (NeRF, D-NeRF); one of them alone | `time` | from the names |
 //! | `cameras.json` of this project (`cameras_json.rs`) | `time` | `split` |
 //! | `cameras.json` of a 3DGS model folder (`cameras_json.rs`) | none: every frame | all train |
 //! | `poses_bounds.npy` (LLFF, DyNeRF; `llff.rs`) | i/n | camera 0 is test |
+//! | `dataset.json` with `camera/` (NeRFies, HyperNeRF; `nerfies.rs`) | `warp_id` by the largest | `val_ids` are test |
+//! | COLMAP's `cameras` and `images`, `.bin` or `.txt` (`colmap.rs`) | from names or a table (`times.rs`) | from folders in names |
 //!
 //! Everything leaves in OpenCV axes, world to camera, in f64, rotations checked to be rotations.
 //! Memory: the parsed file; one small record per picture.
 
 mod assemble;
 mod cameras_json;
+mod colmap;
 mod fields;
 mod llff;
 mod meta_json;
+mod nerfies;
+mod times;
 mod transforms;
 mod virtual_rig;
 
@@ -29,6 +34,7 @@ use crate::error::{Error, Result};
 use crate::ingest::text::read_json;
 use crate::model::Rig;
 
+pub use times::Times;
 pub use virtual_rig::virtual_rig;
 
 /// Largest picture side in pixels: beyond it the width times the height of one picture nears 2³².
@@ -38,18 +44,22 @@ const MAX_PICTURES: usize = 1 << 24;
 
 /// What a folder is searched for, first match wins. `transforms*.json` come before `cameras.json`
 /// because a 3DGS `cameras.json` beside them has lost the times.
-const NAMES: [&str; 7] = [
+const NAMES: [&str; 9] = [
     "transforms_train.json",
     "transforms_test.json",
+    "transforms_val.json",
     "transforms.json",
     "train_meta.json",
     "test_meta.json",
+    NERFIES,
     "cameras.json",
     "poses_bounds.npy",
 ];
+/// What NeRFies and HyperNeRF call the file that lists their pictures.
+const NERFIES: &str = "dataset.json";
 
 /// Where COLMAP puts a reconstruction inside a data set.
-const COLMAP: [&str; 5] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin"];
+const COLMAP: [&str; 6] = ["sparse/0", "sparse", "cameras.bin", "cameras.txt", "images.bin", "images.txt"];
 
 /// What the camera files may leave open.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -59,6 +69,8 @@ pub struct CameraOptions {
     pub size: Option<(u32, u32)>,
     /// Frames of a `poses_bounds.npy`, which does not count them: 300 if not given.
     pub frames: Option<usize>,
+    /// Where the times of pictures come from whose file has none.
+    pub times: Times,
 }
 
 /// Reads the cameras of `path`: a file, or a folder holding one, recognised by its name and content.
@@ -72,21 +84,30 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     let Some(file) = locate(path) else {
         // A path that cannot be looked at at all is the more useful thing to say.
         path.metadata().map_err(Error::io("open", path))?;
-        return Err(Error::input(path, "", format!("a folder with one of {}", NAMES.join(", ")), "none of them"));
+        let expected = format!("a folder with one of {}, or with COLMAP's sparse/0", NAMES.join(", "));
+        return Err(Error::input(path, "", expected, "none of them"));
     };
     if is_colmap(&file) {
-        return Err(Error::input(&file, "", "cameras as JSON or poses_bounds.npy", "a COLMAP reconstruction")
-            .hint("COLMAP is not read: convert it to transforms.json, e.g. with colmap2nerf.py of instant-ngp"));
+        return colmap::load(&file, options);
+    }
+    let timed = || match options.times {
+        Times::Own => Ok(()),
+        _ => Err(Error::usage(format!("{}: --times is for cameras without times of their own", file.display()))),
+    };
+    if file.ends_with(NERFIES) {
+        timed()?;
+        return nerfies::load(&file, options);
     }
     if file.extension().is_some_and(|extension| extension == "npy") {
+        timed()?;
         return llff::load(&file, options);
     }
     let document = read_json(&file)?;
     match kind(&document) {
-        Some(Kind::Transforms) => transforms::load(&file, document, options),
-        Some(Kind::PerPicture) => cameras_json::load_per_picture(&file, &document),
-        Some(Kind::PerCamera) => cameras_json::load_per_camera(&file, &document),
-        Some(Kind::PerFrame) => meta_json::load(&file, &document, path != file),
+        Some(Kind::Transforms) => timed().and_then(|()| transforms::load(&file, document, path.is_dir(), options)),
+        Some(Kind::PerPicture) => timed().and_then(|()| cameras_json::load_per_picture(&file, &document)),
+        Some(Kind::PerCamera) => cameras_json::load_per_camera(&file, &document, &options.times),
+        Some(Kind::PerFrame) => timed().and_then(|()| meta_json::load(&file, &document, path.is_dir())),
         None => Err(Error::input(
             &file,
             "",

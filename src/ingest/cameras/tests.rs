@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use serde_json::{Value, json};
 
-use super::{CameraOptions, find, load};
+use super::{CameraOptions, Times, find, load};
 use crate::model::{Camera, Rig, Split};
 
 /// The trained models in `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
@@ -124,7 +124,7 @@ fn transforms_and_cameras_json_of_the_trained_models_give_the_same_cameras() {
 }
 
 #[test]
-fn either_file_of_a_pair_or_their_folder_give_the_same_rig() {
+fn a_folder_has_all_its_splits_and_a_file_its_own() {
     let folder = folder(&[
         ("transforms_train.json", &transforms(&[0.0, 0.5, 1.0])),
         ("transforms_test.json", &transforms(&[0.25])),
@@ -133,9 +133,197 @@ fn either_file_of_a_pair_or_their_folder_give_the_same_rig() {
     let whole = load(folder.path(), &options).unwrap();
     assert_eq!(whole.shots.len(), 4);
     assert_eq!(whole.shots.iter().map(|s| s.split == Split::Test).collect::<Vec<_>>(), [false, false, false, true]);
-    for name in ["transforms_train.json", "transforms_test.json"] {
-        assert_eq!(load(&folder.path().join(name), &options).unwrap(), whole);
+    // A file that is named stands for itself alone, at the times that it has among all.
+    let alone = |name: &str| load(&folder.path().join(name), &options).unwrap();
+    for (name, split) in [("transforms_train.json", Split::Train), ("transforms_test.json", Split::Test)] {
+        let own: Vec<_> = whole.shots.iter().filter(|shot| shot.split == split).map(|shot| shot.time).collect();
+        let found: Vec<_> = alone(name).shots.iter().map(|shot| (shot.split, shot.time)).collect();
+        assert_eq!(found, own.into_iter().map(|time| (split, time)).collect::<Vec<_>>(), "{name}");
     }
+}
+
+#[test]
+fn val_is_a_split_of_its_own_and_held_out_where_there_is_no_test() {
+    let train = transforms(&[0.0, 0.5, 1.0]);
+    let val = transforms(&[0.25, 0.75]);
+    let files = [("transforms_train.json", &train), ("transforms_val.json", &val)];
+    let rig = load(folder(&files).path(), &CameraOptions::default()).unwrap();
+    let count = |rig: &Rig, split| rig.shots.iter().filter(|shot| shot.split == split).count();
+    assert_eq!((count(&rig, Split::Train), count(&rig, Split::Val), count(&rig, Split::Test)), (3, 2, 0));
+    assert_eq!(rig.held_out(), Some(Split::Val));
+    let test = transforms(&[0.6]);
+    let with_test = [&files[..], &[("transforms_test.json", &test)]].concat();
+    let rig = load(folder(&with_test).path(), &CameraOptions::default()).unwrap();
+    assert_eq!((count(&rig, Split::Val), count(&rig, Split::Test), rig.held_out()), (2, 1, Some(Split::Test)));
+    let mut document = per_picture(&[0.0]);
+    document["frames"][0]["split"] = json!("val");
+    assert_eq!(load_json("cameras.json", &document).unwrap().held_out(), Some(Split::Val));
+}
+
+/// Cameras and pictures as COLMAP writes them: text of `cameras.txt`, and of every picture its number, quaternion and
+/// translation, camera and name.
+fn colmap(folder: &Path, lens: &str, binary: bool) {
+    let images: [(u32, [f64; 7], u32, &str); 3] = [
+        (7, [0.5f64.sqrt(), 0.5f64.sqrt(), 0.0, 0.0, 1.0, 2.0, 3.0], 2, "cam1/frame_0003.png"),
+        (2, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 4.0], 2, "cam1/frame_0001.png"),
+        (9, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 5.0], 2, "test/frame_0002.png"),
+    ];
+    let sparse = folder.join("sparse/0");
+    fs::create_dir_all(&sparse).unwrap();
+    if !binary {
+        let mut text = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n".to_owned();
+        for (id, pose, camera, name) in images {
+            let pose = pose.map(|value| value.to_string()).join(" ");
+            text += &format!("{id} {pose} {camera} {name}\n{}\n", if id == 2 { "" } else { "1.5 2.5 -1" });
+        }
+        fs::write(sparse.join("cameras.txt"), format!("# Camera list\n2 {lens}\n")).unwrap();
+        fs::write(sparse.join("images.txt"), text).unwrap();
+        return;
+    }
+    let words: Vec<&str> = lens.split(' ').collect();
+    let model = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL"].iter().position(|name| *name == words[0]).unwrap();
+    let mut bytes = [&1u64.to_le_bytes()[..], &2u32.to_le_bytes(), &(model as u32).to_le_bytes()].concat();
+    for side in &words[1..3] {
+        bytes.extend(side.parse::<u64>().unwrap().to_le_bytes());
+    }
+    for value in &words[3..] {
+        bytes.extend(value.parse::<f64>().unwrap().to_le_bytes());
+    }
+    fs::write(sparse.join("cameras.bin"), bytes).unwrap();
+    let mut bytes = 3u64.to_le_bytes().to_vec();
+    for (id, pose, camera, name) in images {
+        bytes.extend(id.to_le_bytes());
+        bytes.extend(pose.iter().flat_map(|value| value.to_le_bytes()));
+        bytes.extend(camera.to_le_bytes());
+        bytes.extend([name.as_bytes(), &[0], &1u64.to_le_bytes(), &[1; 24]].concat());
+    }
+    fs::write(sparse.join("images.bin"), bytes).unwrap();
+}
+
+#[test]
+fn colmap_text_and_binary_give_the_same_cameras_with_times_from_names() {
+    let [text, binary] = [false, true].map(|binary| {
+        let folder = tempfile::tempdir().unwrap();
+        colmap(folder.path(), "PINHOLE 80 60 70 71 39.5 31", binary);
+        let rig = load(folder.path(), &CameraOptions::default()).unwrap();
+        for file in ["sparse", "sparse/0"] {
+            assert_eq!(load(&folder.path().join(file), &CameraOptions::default()).unwrap().shots, rig.shots, "{file}");
+        }
+        rig
+    });
+    assert_eq!(text.cameras, binary.cameras);
+    let [times, splits] =
+        [&text, &binary].map(|rig| rig.shots.iter().map(|shot| (shot.time, shot.split)).collect::<Vec<_>>());
+    assert_eq!(times, splits);
+    // In the natural order of names, whatever COLMAP's.
+    assert_eq!(times, [(Some(0.0), Split::Train), (Some(1.0), Split::Train), (Some(0.5), Split::Test)]);
+    let first = &text.cameras[0];
+    assert_eq!((first.width, first.height, first.fx, first.fy, first.cx, first.cy), (80, 60, 70.0, 71.0, 39.5, 31.0));
+    assert_eq!((first.rotation, first.translation), (DMat3::IDENTITY, DVec3::new(0.0, 0.0, 4.0)));
+    // A quarter turn about x takes y to z.
+    let turned = text.cameras[1].rotation * DVec3::Y;
+    assert!((turned - DVec3::Z).length() < 1e-15, "{turned}");
+    assert!(text.shots[0].image.as_ref().unwrap().ends_with("cam1/frame_0001.png"));
+}
+
+#[test]
+fn times_of_colmap_come_from_a_table_or_are_none_if_asked() {
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path(), "SIMPLE_PINHOLE 80 60 70 40 30", false);
+    let with = |times: Times| load(folder.path(), &CameraOptions { times, ..CameraOptions::default() });
+    let table = folder.path().join("t.csv");
+    fs::write(&table, "name,time\ncam1/frame_0001.png,0.25\nframe_0003.png, 0.5\nframe_0002,4\n").unwrap();
+    let times: Vec<_> = with(Times::Table(table.clone())).unwrap().shots.iter().map(|shot| shot.time).collect();
+    assert_eq!(times, [Some(0.25), Some(0.5), Some(4.0)]);
+    assert!(with(Times::None).unwrap().times().is_empty());
+    for (text, parts) in [
+        ("frame_0001,0\n", &["t.csv", "frame_0003.png"][..]),
+        ("frame_0001 0\n", &["line 1", "a comma"]),
+        ("a,0\nframe_0001,nan\n", &["line 2", "nan"]),
+        ("a,0\na,1\n", &["line 2", "once"]),
+    ] {
+        fs::write(&table, text).unwrap();
+        let message = with(Times::Table(table.clone())).unwrap_err().to_string();
+        assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} are not in {message:?}");
+    }
+}
+
+#[test]
+fn what_is_wrong_with_a_reconstruction_is_said() {
+    let message = |lens: &str, binary: bool, edit: &dyn Fn(&Path)| {
+        let folder = tempfile::tempdir().unwrap();
+        colmap(folder.path(), lens, binary);
+        edit(&folder.path().join("sparse/0"));
+        load(folder.path(), &CameraOptions::default()).err().map(|error| error.to_string())
+    };
+    let refused = |lens: &str, parts: &[&str]| {
+        for binary in [false, true] {
+            let message = message(lens, binary, &|_| ()).expect(lens);
+            assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} are not in {message:?}");
+        }
+    };
+    assert_eq!(message("SIMPLE_RADIAL 80 60 70 40 30 0", true, &|_| ()), None, "no distortion");
+    refused("SIMPLE_RADIAL 80 60 70 40 30 0.1", &["without distortion", "SIMPLE_RADIAL", "image_undistorter"]);
+    refused("PINHOLE 80 0 70 70 40 30", &["pixels a side", "80 × 0"]);
+    // Cut anywhere, a file is refused and never read past.
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path(), "PINHOLE 80 60 70 71 39.5 31", true);
+    for name in ["cameras.bin", "images.bin"] {
+        let file = folder.path().join("sparse/0").join(name);
+        let whole = fs::read(&file).unwrap();
+        for len in 0..whole.len() {
+            fs::write(&file, &whole[..len]).unwrap();
+            let message = load(folder.path(), &CameraOptions::default()).unwrap_err().to_string();
+            assert!(message.contains(name) && message.contains("byte"), "{len}: {message}");
+        }
+        fs::write(&file, [&u64::MAX.to_le_bytes()[..], &whole[8..]].concat()).unwrap();
+        assert!(load(folder.path(), &CameraOptions::default()).is_err());
+        fs::write(&file, whole).unwrap();
+    }
+}
+
+#[test]
+fn nerfies_cameras_are_those_of_the_loader_that_models_are_trained_with() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, value: Value| {
+        let path = folder.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, value.to_string()).unwrap();
+    };
+    let ids: Vec<String> = (0..10).map(|k| format!("{k:06}")).collect();
+    let metadata = |k: usize| (ids[k].clone(), json!({"warp_id": 2 * k, "appearance_id": k, "camera_id": 0}));
+    write("metadata.json", Value::Object((0..10).map(metadata).collect()));
+    write("scene.json", json!({"scale": 0.1, "center": [1, 2, 3], "near": 0.1, "far": 1}));
+    for (k, id) in ids.iter().enumerate() {
+        write(
+            &format!("camera/{id}.json"),
+            json!({"orientation": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "position": [k, 5, 6], "focal_length": 100.0,
+                   "principal_point": [41, 29], "image_size": [80, 60], "skew": 0.0, "pixel_aspect_ratio": 1.0,
+                   "radial_distortion": [0, 0, 0], "tangential_distortion": [0, 0]}),
+        );
+    }
+    write("dataset.json", json!({"ids": ids, "val_ids": [], "train_ids": []}));
+    let rig = load(folder.path(), &CameraOptions::default()).unwrap();
+    let camera = &rig.cameras[0];
+    // Half the size; world to camera row by row; scale and centre of the scene are not applied.
+    assert_eq!(
+        (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
+        (40, 30, 50.0, 50.0, 20.0, 15.0)
+    );
+    assert_eq!(camera.rotation * DVec3::Z, DVec3::X);
+    assert!((rig.cameras[1].center() - DVec3::new(2.0, 5.0, 6.0)).length() < 1e-12, "{}", rig.cameras[1].center());
+    let shots: Vec<_> = rig.shots.iter().map(|shot| (shot.time.unwrap(), shot.split)).collect();
+    let at = |k: usize| k as f64 / 9.0;
+    // Every fourth, and those two after, of which the last is left out.
+    let expected = [(0, Split::Train), (2, Split::Test), (4, Split::Train), (6, Split::Test), (8, Split::Train)];
+    assert_eq!(shots, expected.map(|(k, split)| (at(k), split)));
+    write("dataset.json", json!({"ids": ids, "val_ids": [ids[3]], "train_ids": [ids[0], ids[1]]}));
+    let rig = load(&folder.path().join("dataset.json"), &CameraOptions::default()).unwrap();
+    let shots: Vec<_> = rig.shots.iter().map(|shot| (shot.time.unwrap(), shot.split)).collect();
+    assert_eq!(shots, [(at(0), Split::Train), (at(1), Split::Train), (at(3), Split::Test)]);
+    write("camera/000001.json", json!({"orientation": 3}));
+    let message = load(folder.path(), &CameraOptions::default()).unwrap_err().to_string();
+    assert!(message.contains("000001.json") && message.contains("image_size"), "{message}");
 }
 
 #[test]
@@ -191,7 +379,7 @@ fn missing_size_comes_from_the_picture_then_the_option_else_is_asked_for() {
     assert_refused("transforms.json", &document, &["frame 0", "r_000", "--size"]);
 
     let folder = folder(&[("transforms.json", &document)]);
-    let options = CameraOptions { size: Some((30, 20)), frames: None };
+    let options = CameraOptions { size: Some((30, 20)), frames: None, ..CameraOptions::default() };
     let rig = load(folder.path(), &options).unwrap();
     assert_eq!((rig.cameras[0].width, rig.cameras[0].height, rig.cameras[0].cx), (30, 20, 15.0));
     assert_eq!(rig.cameras[0].fx, 15.0 / 0.5f64.tan());
@@ -254,7 +442,7 @@ fn dynerf_poses_are_used_at_half_size_with_camera_0_held_out() {
         &folder.path().join("poses_bounds.npy"),
         &[llff_row([0.0, -4.0, 1.0], 2028.0, 2704.0, 1400.0), llff_row([0.5, -4.0, 1.0], 2028.0, 2704.0, 1400.0)],
     );
-    let rig = load(folder.path(), &CameraOptions { size: None, frames: Some(4) }).unwrap();
+    let rig = load(folder.path(), &CameraOptions { size: None, frames: Some(4), ..CameraOptions::default() }).unwrap();
     let camera = &rig.cameras[1];
     assert_eq!((camera.width, camera.height, camera.fx, camera.fy), (1352, 1014, 700.0, 700.0));
     assert_eq!((camera.cx, camera.cy, camera.center()), (676.0, 507.0, DVec3::new(0.5, -4.0, 1.0)));
@@ -263,7 +451,9 @@ fn dynerf_poses_are_used_at_half_size_with_camera_0_held_out() {
     assert_eq!(rig.times(), [0.0, 0.25, 0.5, 0.75]);
     let held_out = rig.schedule(&rig.times(), Some(Split::Test)).unwrap();
     assert_eq!(held_out.iter().collect::<Vec<_>>(), [[(0, 0)]; 4]);
-    let default = load(folder.path(), &CameraOptions { size: Some((676, 507)), frames: None }).unwrap();
+    let default =
+        load(folder.path(), &CameraOptions { size: Some((676, 507)), frames: None, ..CameraOptions::default() })
+            .unwrap();
     assert_eq!((default.times().len(), default.cameras[0].fx), (300, 350.0));
     assert!(default.origin.contains("300 frames"));
 }
@@ -377,9 +567,9 @@ fn what_holds_no_cameras_is_said_to() {
 #[test]
 fn options_out_of_range_are_misuse() {
     for options in [
-        CameraOptions { size: Some((0, 10)), frames: None },
-        CameraOptions { size: Some((10, 1 << 20)), frames: None },
-        CameraOptions { size: None, frames: Some(0) },
+        CameraOptions { size: Some((0, 10)), frames: None, ..CameraOptions::default() },
+        CameraOptions { size: Some((10, 1 << 20)), frames: None, ..CameraOptions::default() },
+        CameraOptions { size: None, frames: Some(0), ..CameraOptions::default() },
     ] {
         let error = load(Path::new("anything"), &options).unwrap_err();
         assert!(matches!(error, crate::error::Error::Usage(_)), "{error}");

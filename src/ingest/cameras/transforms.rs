@@ -5,7 +5,7 @@
 //! the middle unless said otherwise. A frame has `file_path`, `transform_matrix` and, if the scene
 //! moves, `time`. Lens distortion (`k1` …) is ignored: pictures are taken to be undistorted.
 //!
-//! Times are divided by the largest of all files read, as the D-NeRF loaders do that the models were
+//! Times are divided by the largest of all splits' files, as the D-NeRF loaders do that the models were
 //! trained with (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames
 //! 0 … T−1 and files that reach 1 give the same times.
 
@@ -24,19 +24,26 @@ use crate::model::{Rig, Split};
 /// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
 const FLIP: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
-/// Reads `file`, parsed as `document`, and the other one of a train/test pair beside it.
-pub(super) fn load(file: &Path, document: Value, options: &CameraOptions) -> Result<Rig> {
+/// Reads `file`, parsed as `document`; if it stands for its folder, `with_others` of train, val and test beside it. Of those
+/// a file that was named itself takes the largest time alone.
+pub(super) fn load(file: &Path, document: Value, with_others: bool, options: &CameraOptions) -> Result<Rig> {
     let split = split_of(file);
     let mut listings = vec![(split, listing(file, &document, split, options)?)];
-    if let Some(partner) = partner(file).filter(|partner| partner.is_file()) {
-        let split = split_of(&partner);
-        listings.push((split, listing(&partner, &read_json(&partner)?, split, options)?));
+    let mut latest = 0.0;
+    for other in others(file) {
+        let document = read_json(&other)?;
+        if with_others {
+            let split = split_of(&other);
+            listings.push((split, listing(&other, &document, split, options)?));
+        } else {
+            latest = latest_in(&document).max(latest);
+        }
     }
-    listings.sort_by_key(|(split, _)| *split == Split::Test);
+    listings.sort_by_key(|(split, _)| *split as u8);
     let mut listings: Vec<Listing> = listings.into_iter().map(|(_, listing)| listing).collect();
 
     let pictures = || listings.iter().flat_map(|(_, pictures)| pictures);
-    let latest = pictures().filter_map(|picture| picture.time).fold(0.0, f64::max);
+    let latest = pictures().filter_map(|picture| picture.time).fold(latest, f64::max);
     if latest > 0.0 {
         for picture in listings.iter_mut().flat_map(|(_, pictures)| pictures) {
             picture.time = picture.time.map(|time| time / latest);
@@ -48,16 +55,29 @@ pub(super) fn load(file: &Path, document: Value, options: &CameraOptions) -> Res
 
 fn split_of(file: &Path) -> Split {
     let name = file.file_name().unwrap_or_default().to_string_lossy();
-    if name.contains("test") || name.contains("val") { Split::Test } else { Split::Train }
+    match () {
+        () if name.contains("test") => Split::Test,
+        () if name.contains("val") => Split::Val,
+        () => Split::Train,
+    }
 }
 
-fn partner(file: &Path) -> Option<PathBuf> {
-    let other = match file.file_name()?.to_str()? {
-        "transforms_train.json" => "transforms_test.json",
-        "transforms_test.json" => "transforms_train.json",
-        _ => return None,
-    };
-    Some(file.with_file_name(other))
+/// Those of train, val and test that lie beside `file`, if it is one of them.
+fn others(file: &Path) -> Vec<PathBuf> {
+    const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
+    let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
+    if !ALL.iter().any(|name| is_own(&name)) {
+        return Vec::new();
+    }
+    let others = ALL.iter().filter(|name| !is_own(name)).map(|name| file.with_file_name(name));
+    others.filter(|other| other.is_file()).collect()
+}
+
+/// The largest time in a file that need not be in order otherwise.
+fn latest_in(document: &Value) -> f64 {
+    let frames = document.get("frames").and_then(Value::as_array).map_or(&[][..], Vec::as_slice);
+    let times = frames.iter().filter_map(|frame| frame.get("time")?.as_f64()).filter(|time| time.is_finite());
+    times.fold(0.0, f64::max)
 }
 
 fn listing(file: &Path, document: &Value, split: Split, options: &CameraOptions) -> Result<Listing> {

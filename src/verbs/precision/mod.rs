@@ -28,7 +28,7 @@ use crate::compress::{Job, Request, Target};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
-use crate::model::{Rows, Schedule, Split};
+use crate::model::{Rows, Schedule};
 use crate::recipe::Recipe;
 use crate::report::precision::{PAGE, page};
 use crate::scene::{InputOptions, Scene, open_scene};
@@ -204,7 +204,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     let mut notes = scene.notes.clone();
     scene.schedule = thin(std::mem::take(&mut scene.schedule), options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
-    if scene.rig.shots.iter().all(|shot| shot.split != Split::Test) {
+    if scene.rig.held_out().is_none() {
         notes.push("no pictures are held out: those judged by are also looked at".to_owned());
     }
     let mut knobs = Turned::ALL.to_vec();

@@ -114,6 +114,7 @@ pub struct ModelFolder {
     tensor_bytes: u64,
     info: SequenceInfo,
     states: Count,
+    notes: Vec<String>,
 }
 
 impl ModelFolder {
@@ -122,12 +123,18 @@ impl ModelFolder {
     pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
         let tensors = read_state_dict(&paths.deformation)?;
+        let notes = config.contradicted_by(&tensors);
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let tensor_bytes = (values * size_of::<f32>()) as u64;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
         let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
         let (canonical, field, states) = (Arc::new(canonical), Arc::new(field), Count::default());
-        Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states })
+        Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes })
+    }
+
+    /// What `cfg_args` and the weights say differently, and which of them is believed.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
