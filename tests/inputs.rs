@@ -191,7 +191,7 @@ fn a_full_disk_is_blamed_on_what_was_being_written() {
         (format!("pack {tiny} -o disk/x.gseq"), "disk/x.gseq: No space"),
         (format!("unpack {tiny} -o disk/x"), "disk/x/frame_0000"),
         (format!("score {tiny} -o disk/x.npz"), "disk/x.npz: No space"),
-        (format!("render {tiny} --all -o disk/x"), "disk/x/t000_v"),
+        (format!("render {tiny} --all -o disk/x"), "disk/x/t00"),
         (format!("compress {tiny} --prune-only --no-refine -o disk/x"), "disk/x/"),
         (format!("compress {tiny} -o x.gseq --scratch-dir disk"), "write a scratch file in disk: No space"),
     ] {
@@ -347,7 +347,7 @@ fn weights_that_contradict_cfg_args_are_believed_and_that_is_said() {
 }
 
 #[test]
-fn cameras_of_another_scene_are_warned_of() {
+fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_word() {
     let workplace = Workplace::new();
     let mut cameras: serde_json::Value =
         serde_json::from_slice(&fs::read(tiny().join("transforms_train.json")).unwrap()).unwrap();
@@ -362,8 +362,7 @@ fn cameras_of_another_scene_are_warned_of() {
         }
     }
     write(&cameras);
-    let said = workplace.done(line);
-    assert!(said.contains("warning: the cameras see") && said.contains("are they of this scene?"), "{said}");
+    workplace.refused(1, line, &["far.json", "none of the 278 living Gaussians"]);
 }
 
 #[test]
@@ -376,6 +375,8 @@ fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
         .iter()
         .flat_map(|folder| fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()))
         .filter(|path| path.extension().is_some_and(|end| end == "py"))
+        // It is only imported.
+        .filter(|path| !path.ends_with("stream_writer.py"))
         .collect();
     named.sort();
     assert!(named.len() > 20, "{named:?}");

@@ -114,6 +114,16 @@ mod tests {
     use crate::recipe::Recipe;
 
     #[test]
+    fn cameras_that_see_hardly_a_living_gaussian_are_warned_of() {
+        let life: Vec<u32> = (0..100).map(|i| u32::from(i < 50)).collect();
+        let seeing = |some: usize| (0..100).map(|i| if i < some { 0.5 } else { 0.0 }).collect::<Vec<f64>>();
+        assert_eq!(foreign(&seeing(5), &life, "far.json"), None);
+        let said = foreign(&seeing(4), &life, "far.json").unwrap();
+        assert!(said.contains("see 4 of 50") && said.contains("far.json"), "{said}");
+        assert_eq!(foreign(&[], &[], "far.json"), None);
+    }
+
+    #[test]
     fn pictures_of_a_virtual_rig_are_looked_at_only_when_asked_for() {
         let mut recipe = Recipe::preset("default").unwrap().scan;
         let looks = |recipe: &recipe::Scan| [true, false].map(|cameras| Visible::of(recipe, cameras).is_some());
