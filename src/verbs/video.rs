@@ -84,7 +84,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = own_shots(&mut opened, options.input.frames.is_some());
     let mut scene = scene_of(opened, &InputOptions { split: None, ..options.input.clone() })?;
-    let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, options.input.allow_gaps)).transpose()?;
+    let beside =
+        options.beside.as_deref().map(|path| open_compressed(path, &scene, options.input.allow_gaps)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<Need> {
         // Two pictures, and the frame that they make up, with its bytes and, of a GIF, those that colours are chosen from.

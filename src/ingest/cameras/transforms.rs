@@ -66,7 +66,7 @@ fn split_of(file: &Path) -> Split {
 fn others(file: &Path) -> Vec<PathBuf> {
     const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
     let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
-    if !ALL.iter().any(|name| is_own(&name)) {
+    if !ALL.iter().any(&is_own) {
         return Vec::new();
     }
     let others = ALL.iter().filter(|name| !is_own(name)).map(|name| file.with_file_name(name));
