@@ -107,10 +107,11 @@ fn goals_that_contradict_each_other_are_refused() {
         ("--min-psnr many", "decibels"),
         ("--min-psnr 0", "above 0"),
         ("--min-psnr 35 --merge-only", "--merge-only"),
-        ("--max-loss 1 --ground-truth {tiny}", "found 0"),
     ] {
         workplace.refused(2, &format!("compress {{tiny}} --cameras {{tiny}} -o out {arguments}"), &[part]);
     }
+    let none = "compress {tiny} --cameras {tiny} -o out --max-loss 1 --ground-truth {tiny}";
+    workplace.refused(1, none, &["t000_v02.png", "no such file"]);
 }
 
 #[test]

@@ -25,7 +25,7 @@ fn recovering_nothing_is_no_success_and_writes_nothing() {
 #[test]
 fn a_result_of_no_gaussians_is_no_success() {
     let workplace = Workplace::new();
-    for options in ["-o out", "-o out.gseq --prune-only", "-o out.gsz", "-o out --no-refine --dry-run"] {
+    for options in ["-o out", "-o out.gseq --prune-only", "-o out.gsz", "-o out --no-refine"] {
         let parts = ["at least one Gaussian that stays", "none of 300", "--drop-ids"];
         workplace.refused(1, &format!("compress {{tiny}} --drop-ids 0-299 --quiet {options}"), &parts);
     }
@@ -351,7 +351,7 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
     let workplace = Workplace::new();
     let mut cameras: serde_json::Value =
         serde_json::from_slice(&fs::read(tiny().join("transforms_train.json")).unwrap()).unwrap();
-    let line = "compress {tiny} --cameras far.json -o out --dry-run --prune-only --no-refine --quiet";
+    let line = "compress {tiny} --cameras far.json -o out --force --prune-only --no-refine --quiet";
     let write = |cameras: &serde_json::Value| fs::write(workplace.path("far.json"), cameras.to_string()).unwrap();
     write(&cameras);
     assert!(!workplace.done(line).contains("warning"));

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-use super::recipe_flags::RecipeFlags;
+use super::recipe_flags::{RecipeFlags, numbers};
 use crate::emit::atomic::Replace;
 use crate::emit::bounds::MaxError;
 use crate::error::quoted;
@@ -760,12 +760,6 @@ fn parse_decibels(text: &str) -> Result<f64, String> {
         Ok(decibels) if decibels > 0.0 && decibels <= 100.0 => Ok(decibels),
         _ => Err(format!("expected decibels above 0 and at most 100, such as 0.5 or 35dB, found {}", quoted(text))),
     }
-}
-
-/// Numbers with commas or blanks between.
-pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> Result<Vec<T>, String> {
-    let parts = text.split([',', ' ']).filter(|part| !part.is_empty());
-    parts.map(|part| part.parse().map_err(|_| format!("{} is no number", quoted(part)))).collect()
 }
 
 fn parse_colour(text: &str) -> Result<[f32; 3], String> {

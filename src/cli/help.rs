@@ -73,7 +73,7 @@ const OF_VERBS: &[(&str, &[&str])] = &[
             "splatsieve precision model -o page --knobs look,rounds",
         ],
     ),
-    ("report", &["splatsieve report model small --cameras data -o page  then open page/report.html"]),
+    ("report", &["splatsieve report model small -o page                 open page/report.html"]),
     (
         "view",
         &[
@@ -102,10 +102,10 @@ const OF_VERBS: &[(&str, &[&str])] = &[
     ("recover", &["splatsieve recover cut.gseq -o saved.gseq"]),
     ("work", &["splatsieve work folder                               what is in it", "splatsieve work folder --clean"]),
     ("demo", &["splatsieve demo", "splatsieve demo -o folder --gaussians 20000          keep what it makes"]),
-    ("selfcheck", &["splatsieve selfcheck                                 are the numbers right here?"]),
+    ("selfcheck", &["splatsieve selfcheck                                 are the numbers right?"]),
     ("recipe", &["splatsieve recipe > recipe.toml                      every parameter"]),
     ("completions", &["splatsieve completions bash > splatsieve.bash"]),
-    ("man", &["splatsieve man share/man/man1                        then: man splatsieve-compress"]),
+    ("man", &["splatsieve man share/man/man1                       man splatsieve-compress"]),
 ];
 
 /// The command line with its examples.

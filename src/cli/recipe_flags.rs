@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use super::args::numbers;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use crate::compress::Record;
@@ -154,6 +153,12 @@ fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
         [epsilon, d0, rho, tau_m] => Ok(MergePass { epsilon, d0, rho, tau_m }),
         _ => Err(format!("expected four numbers EPSILON,D0,RHO,TAU_M, found {}", numbers.len())),
     }
+}
+
+/// Numbers with commas or blanks between.
+pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<Vec<T>, String> {
+    let parts = text.split([',', ' ']).filter(|part| !part.is_empty());
+    parts.map(|part| part.parse().map_err(|_| format!("{} is no number", quoted(part)))).collect()
 }
 
 #[cfg(test)]

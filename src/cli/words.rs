@@ -42,7 +42,8 @@ pub(super) fn regular(words: impl IntoIterator<Item = OsString>, command: &Comma
             continue;
         }
         if is_list(arg) {
-            let mut value = match given.or_else(|| words.peek()?.to_str().map(str::to_owned)) {
+            let next = || words.peek()?.to_str().filter(|next| !takes_none(arg, next)).map(str::to_owned);
+            let mut value = match given.or_else(next) {
                 Some(value) => value,
                 None => {
                     out.push(word);
@@ -70,7 +71,8 @@ pub(super) fn regular(words: impl IntoIterator<Item = OsString>, command: &Comma
         let takes_next = given.is_none() && matches!(arg.get_action(), ArgAction::Set | ArgAction::Append);
         let is_alone = text.starts_with("--") || text.len() == 2;
         out.push(word);
-        out.extend(words.next_if(|_| takes_next && is_alone));
+        let is_value = |next: &OsString| !next.to_str().is_some_and(|next| takes_none(arg, next));
+        out.extend(words.next_if(|next| takes_next && is_alone && is_value(next)));
     }
     out.extend(words);
     out
@@ -86,13 +88,19 @@ fn find<'a>(command: &'a Command, name: &str) -> Option<&'a Arg> {
 
 /// Whether an option is there or not, and takes no value or only that.
 fn is_flag(arg: &Arg) -> bool {
-    matches!(arg.get_action(), ArgAction::SetTrue) || arg.is_require_equals_set()
+    let is_truth = |names: &[clap::builder::Str]| names.iter().any(|name| name == "true|false");
+    matches!(arg.get_action(), ArgAction::SetTrue) || arg.get_value_names().is_some_and(is_truth)
 }
 
 /// Whether the value of an option is a list, by how its help shows it.
 fn is_list(arg: &Arg) -> bool {
     let named = |part: &str| arg.get_value_names().is_some_and(|names| names.iter().any(|name| name.contains(part)));
     arg.get_value_delimiter().is_some() || named(",") || named("IDS") || arg.get_long() == Some("refine")
+}
+
+/// Whether an option that may stand without a value does, before the word `next`.
+fn takes_none(arg: &Arg, next: &str) -> bool {
+    arg.get_num_args().is_some_and(|count| count.min_values() == 0) && is_option(next)
 }
 
 /// Whether a word is an option, and no negative number.

@@ -8,7 +8,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::forecast::Forecast;
-use super::summary::{BandsSummary, FieldSummary, LeftOut, Saved, Stage};
+use super::summary::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::error::{Error, Result};
 use crate::scene::Scene;
@@ -61,6 +61,8 @@ pub struct Journal {
     pub field: Option<FieldSummary>,
     /// What was found about the bands of spherical harmonics.
     pub bands: Option<BandsSummary>,
+    /// What refining gained.
+    pub refined: Option<RefinedSummary>,
     /// What the run was expected to take, where that was said.
     pub forecast: Option<Forecast>,
 }
@@ -132,6 +134,7 @@ impl Journal {
         self.notes.extend(own.notes);
         self.field = self.field.take().or(own.field);
         self.bands = self.bands.take().or(own.bands);
+        self.refined = own.refined.or(self.refined);
         Ok(found)
     }
 

@@ -231,6 +231,7 @@ fn reduce(
         goal,
         field: journal.field,
         bands: journal.bands,
+        refined: journal.refined,
         archive,
         left_out: journal.left_out,
         notes: journal.notes,

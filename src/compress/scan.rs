@@ -92,12 +92,13 @@ mod tests {
     }
 
     #[test]
-    fn memory_beside_the_rows_does_not_grow_with_gaussians() {
+    fn memory_beside_the_rows_does_not_grow_with_gaussians_beyond_a_block() {
         let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
         let need = |count| {
             let need = scan.need(&work(count), &Limits::NONE);
             (need.per_gaussian, need.fixed)
         };
-        assert_eq!(need(1_000), need(1_000_000));
+        assert_eq!(need(1_024), need(1_000_000));
+        assert!(need(100).1[0].1 < need(1_024).1[0].1);
     }
 }

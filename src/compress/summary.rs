@@ -298,6 +298,19 @@ impl FieldSummary {
     }
 }
 
+/// What refining the result gained.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct RefinedSummary {
+    /// Pictures that were compared, apart from those that were refined toward.
+    pub pictures: usize,
+    /// Their mean PSNR against the original's before, dB.
+    #[serde(deserialize_with = "number")]
+    pub before: f64,
+    /// And after, dB.
+    #[serde(deserialize_with = "number")]
+    pub result: f64,
+}
+
 /// What pictures of the result say of its bands of spherical harmonics.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BandsSummary {
@@ -395,6 +408,9 @@ pub struct Summary {
     /// What fewer bands of spherical harmonics do; none where they were not asked for or cannot be.
     #[serde(default)]
     pub bands: Option<BandsSummary>,
+    /// What refining gained; none where nothing was refined.
+    #[serde(default)]
+    pub refined: Option<RefinedSummary>,
     /// What an archive is made of, if one was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub archive: Option<ArchiveSummary>,
@@ -535,7 +551,8 @@ impl Summary {
         };
         let bands = self.bands.as_ref().map(|bands| (bands.result, bands.pictures));
         let field = self.field.as_ref().and_then(|field| Some((field.result?, field.pictures)));
-        match (&self.goal, bands.or(field)) {
+        let refined = self.refined.map(|refined| (refined.result, refined.pictures));
+        match (&self.goal, bands.or(field).or(refined)) {
             (Some(goal), _) if goal.name == "max_loss" => {
                 format!("{:.2} dB against photographs held back, {} asked for", goal.held, goal.asked)
             }

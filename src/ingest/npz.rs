@@ -135,7 +135,10 @@ impl Npz {
             if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
                 || !entry.is_compressed && entry.start as u64 + (file.size() - entry.header as u64) > map.len() as u64
             {
-                return Err(wrong(name, format!("{:?} values in {} bytes", entry.shape, file.size())));
+                return Err(wrong(name, {
+                    let (shape, bytes) = (&entry.shape, file.size());
+                    format!("{shape:?} values in {bytes} bytes")
+                }));
             }
             entries.push(entry);
         }

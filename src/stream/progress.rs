@@ -385,8 +385,8 @@ mod tests {
             "[3/9] rounds [=====                   ]  24% 1,234/5,000 pictures, 12 pictures/s, 5 min 13 s left, \
              the run 1 h 06 min"
         );
-        assert_eq!(moment.line(79), "[3/9] rounds [==        ]  24% 1,234/5,000 pictures, 5 min 13 s left");
-        assert_eq!(moment.line(30), "[3/9] rounds  24%");
+        assert_eq!(moment.line(79), "[3/9] rounds  24% 1,234/5,000 pictures, 12 pictures/s, 5 min 13 s left");
+        assert_eq!(moment.line(30), "[3/9] rounds [==       ]  24%");
         let nearly = Moment { left: Some(0.4), run: Some(0.2), ..moment };
         assert!(!nearly.line(119).contains("left") && !nearly.line(119).contains("run"), "{}", nearly.line(119));
         let counting = Moment { total: None, left: None, run: None, ..nearly };

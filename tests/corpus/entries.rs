@@ -77,7 +77,7 @@ const TILES: usize = 640 << 20;
 const CONTENT: usize = 256 << 20;
 
 /// Every way in.
-pub(crate) const ENTRIES: [Entry; 10] = [
+pub(crate) const ENTRIES: [Entry; 11] = [
     Entry { name: "archive", corpus: "archive", read: archive, mended: mended_archive, most_bytes: CONTENT },
     Entry {
         name: "archive_sections",
@@ -88,6 +88,7 @@ pub(crate) const ENTRIES: [Entry; 10] = [
     },
     Entry { name: "cameras", corpus: "cameras", read: cameras, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "cfg_args", corpus: "cfg_args", read: cfg_args, mended: |_| None, most_bytes: LITTLE },
+    Entry { name: "colmap", corpus: "colmap", read: colmap, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "container", corpus: "container", read: container, mended: mended_container, most_bytes: TILES },
     Entry { name: "pickle", corpus: "pickle", read: pickle, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "ply", corpus: "ply", read: ply, mended: |_| None, most_bytes: LITTLE },
@@ -191,6 +192,20 @@ fn cameras(bytes: &[u8], place: &Place) -> Outcome {
     let name = if bytes.first() == Some(&0x93) { "poses_bounds.npy" } else { "transforms.json" };
     cameras::load(&place.put(name, bytes), &CameraOptions::default())?;
     Ok(())
+}
+
+/// The length of `cameras`, then `cameras` and `images`: as both kinds of file.
+fn colmap(bytes: &[u8], place: &Place) -> Outcome {
+    let rest = bytes.get(4..).unwrap_or_default();
+    let (cameras, images) = rest.split_at((number::<4>(bytes, 0).unwrap_or(0) as usize).min(rest.len()));
+    let load = |kind: &str| {
+        let folder = format!("of_{kind}/sparse/0");
+        place.put(&format!("{folder}/images.{kind}"), images);
+        place.put(&format!("{folder}/cameras.{kind}"), cameras);
+        cameras::load(&place.path(&folder), &CameraOptions::default()).map(drop)
+    };
+    let (binary, text) = (load("bin"), load("txt"));
+    Ok(binary.or(text)?)
 }
 
 fn model(root: &Path) -> Outcome {

@@ -399,6 +399,42 @@ def make_cameras():
 TRACKS = 24
 
 
+def make_colmap():
+    """Length of the cameras' part, cameras, images: of the binary kind, and of the textual one."""
+
+    def both(cameras, images):
+        return struct.pack("<I", len(cameras)) + cameras + images
+
+    def lens(model, values, width=64):
+        return struct.pack(f"<IIQQ{len(values)}d", 1, model, width, 48, *values)
+
+    def image(name=b"cam00/0001.png", points=2, quaternion=(1, 0, 0, 0)):
+        return struct.pack("<I7dI", 1, *quaternion, 0.5, 0, 3, 1) + name + b"\0" + struct.pack("<Q", points) + bytes(24 * points)
+
+    one, pinhole = struct.pack("<Q", 1), (70.0, 71.0, 32.0, 24.0)
+    whole = both(one + lens(1, pinhole), one + image())
+    damaged("colmap", whole, (4, 12, 16, 20, 60, 68, 72, 132))
+    for name, data in {
+        "many": both(struct.pack("<Q", 1 << 60) + lens(1, pinhole), struct.pack("<Q", 1 << 60) + image()),
+        "points": both(one + lens(1, pinhole), one + image()[:-56] + struct.pack("<Q", 1 << 61)),
+        "distorted": both(one + lens(4, pinhole + (0.1, 0, 0, 0)), one + image()),
+        "undistorted": both(one + lens(4, pinhole + (0, 0, 0, 0)), one + image()),
+        "nan": both(one + lens(1, (math.nan,) * 4), one + image(quaternion=(math.nan,) * 4)),
+        "wide": both(one + lens(1, pinhole, 1 << 63), one + image()),
+        "unnamed": both(one + lens(1, pinhole), one + image(b"")),
+        "name": both(one + lens(1, pinhole), one + image(b"a" * 5000, 0)),
+        "twice": both(one + lens(1, pinhole), struct.pack("<Q", 2) + image() * 2),
+    }.items():
+        write("colmap", name, data)
+    cameras = "# a comment\n1 PINHOLE 64 48 70 71 32 24\n"
+    images = "1 1 0 0 0 0.5 0 3 1 cam 00/0001.png\n1 2 -1\n2 0 1 0 0 0 0 3 1 cam 00/0002.png\n\n"
+    for name, (before, after) in {
+        "text": ("", ""), "text_model": ("PINHOLE", "BOX"), "text_few": (" 24", ""), "text_number": ("70", "7e999"),
+        "text_side": ("64", "-64"), "text_name": ("cam 00/0001.png", ""), "text_camera": ("3 1 cam", "3 9 cam"),
+    }.items():
+        write("colmap", name, both(*(text.replace(before, after, 1).encode() for text in (cameras, images))))
+
+
 def stream(frames):
     """Frames whose positions move smoothly, so that tiles of them are filtered (format/STREAM.md)."""
     out = struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", 1, 0, TRACKS, 1, 0)
@@ -535,6 +571,7 @@ def main():
     make_pickle()
     make_recipe(program)
     make_cameras()
+    make_colmap()
     make_frames(program, ply)
 
 

@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
 use super::score::{Scored, scored};
+use super::summary::RefinedSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
@@ -567,6 +568,7 @@ impl<'a> Walk<'a> {
         let [start, best] = [end.before.psnr, end.best.psnr];
         if self.refine.loss.is_closer(&end.best, &end.before) {
             journal.notes.push(format!("refined: {count} pictures kept apart keep {best:.2} dB, not {start:.2}"));
+            journal.refined = Some(RefinedSummary { pictures: count, before: start, result: best });
         } else {
             journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
         }

@@ -153,6 +153,7 @@ impl Search {
             journal.left_out.extend(best.journal.left_out);
             journal.notes.extend(best.journal.notes);
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
+            journal.refined = best.journal.refined;
             journal.notes.push(note(&summary, gauge.searched(), count, does));
             Ok(((best.reduction, serde_json::to_string(&summary).expect("plain data")), count))
         });

@@ -54,9 +54,10 @@ impl Params {
                 return Err(Error::input(path, MEANS, "shape [T, N, 3], T at least 1", found));
             }
         };
+        let said = |shape: &[usize]| format!("shape {shape:?}");
         let floats = |name: &str, shape: &[usize]| match npz.entry(name) {
             Some(entry) if entry.shape == shape => npz.floats(name, scratch),
-            Some(entry) => Err(Error::input(path, name, format!("shape {shape:?}"), format!("{:?}", entry.shape))
+            Some(entry) => Err(Error::input(path, name, said(shape), said(&entry.shape))
                 .hint(format!("{MEANS} has {frames} frames of {count} Gaussians: all arrays must"))),
             None => npz.floats(name, scratch),
         };

@@ -557,7 +557,7 @@ fn what_holds_no_cameras_is_said_to() {
     let text = message(folder.path());
     assert!(text.contains("line 1, column") && text.contains("NaN"), "{text}");
     fs::write(&json, [0xff, 0xfe, 0]).unwrap();
-    assert!(message(&json).contains("JSON"));
+    assert!(message(&json).contains("UTF-16"));
     fs::remove_file(&json).unwrap();
     fs::create_dir_all(folder.path().join("sparse/0")).unwrap();
     assert!(message(folder.path()).contains("COLMAP"));

@@ -111,8 +111,11 @@ fn other_files_are_no_frames_and_none_is_an_error() {
     for name in ["._f_0.ply", "notes.txt", "ply"] {
         fs::write(folder.path().join(name), b"not a frame").unwrap();
     }
-    fs::create_dir(folder.path().join("more.ply")).unwrap();
     assert_eq!(PlySequence::open(folder.path()).unwrap().paths().len(), 2);
+    fs::create_dir(folder.path().join("more.ply")).unwrap();
+    let message = PlySequence::open(folder.path()).unwrap_err().to_string();
+    assert!(message.contains("more.ply") && message.contains("a folder"), "{message}");
+    assert_eq!(PlySequence::open_with_gaps(folder.path()).unwrap().paths().len(), 2);
     let empty = tempfile::tempdir().unwrap();
     assert!(PlySequence::open(empty.path()).unwrap_err().to_string().contains("no .ply file"));
 }
@@ -136,6 +139,8 @@ fn the_digest_follows_names_and_bytes_but_not_the_folder() {
     assert_eq!((before.len(), &before), (32, &digest(two.path())));
     write(two.path(), "f_2.ply", &state(1, N));
     assert_ne!(digest(two.path()), before);
-    fs::rename(one.path().join("f_2.ply"), one.path().join("f_3.ply")).unwrap();
+    for name in ["f_2.ply", "f_1.ply", "f_0.ply"] {
+        fs::rename(one.path().join(name), one.path().join(name.replace('f', "g"))).unwrap();
+    }
     assert_ne!(digest(one.path()), before);
 }
