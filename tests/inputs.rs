@@ -362,7 +362,7 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
         }
     }
     write(&cameras);
-    workplace.refused(1, line, &["far.json", "none of the 278 living Gaussians"]);
+    workplace.refused(2, line, &["far.json", "none of the 278 living Gaussians"]);
 }
 
 #[test]

@@ -181,7 +181,8 @@ fn reduce(
             (reduction, summary, None)
         }
     };
-    if reduction.is_empty() {
+    // Of nothing nothing stays, which is right.
+    if reduction.is_empty() && scored.count() > 0 {
         return Err(nothing_left(scene, &scored));
     }
     job.write_down(request, &work, &scene.limits, &mut journal);
@@ -248,13 +249,12 @@ fn reduce(
 fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let all = scored.count();
     let dropped = scored.selection.counts.forced_drop;
-    let found = match (all, dropped) {
-        (0, _) => "none in the input".to_owned(),
-        (_, 0) => format!("none of {all}"),
+    let found = match dropped {
+        0 => format!("none of {all}"),
         _ => format!("none of {all}, {dropped} of which --drop-ids drops"),
     };
-    let error = Error::input(&scene.path, "", "at least one Gaussian that stays", found);
-    if all == 0 { error } else { error.hint("nothing was written: drop fewer, or ask for a size with --target-ratio") }
+    Error::input(&scene.path, "", "at least one Gaussian that stays", found)
+        .hint("nothing was written: drop fewer, or ask for a size with --target-ratio")
 }
 
 /// Has places follow those of an archive, whose Gaussian `i` was at `order[i]`.

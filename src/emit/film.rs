@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
 
-use super::image::rgb;
+use super::image::{of_png, rgb};
 use crate::error::{Error, Result};
 use crate::render::Image;
 
@@ -112,8 +112,8 @@ impl Film {
                     encoder.set_animated(frames, 0)?;
                     encoder.set_frame_delay(1, fps.try_into().unwrap_or(u16::MAX))
                 };
-                begin().map_err(|error| failed(error.into()))?;
-                Writer::Apng(Box::new(encoder.write_header().map_err(|error| failed(error.into()))?))
+                begin().map_err(|error| failed(of_png(error)))?;
+                Writer::Apng(Box::new(encoder.write_header().map_err(|error| failed(of_png(error)))?))
             }
             FilmFormat::Gif => {
                 let [width, height] = gif_size(size).map_err(failed)?;
@@ -151,7 +151,7 @@ impl Film {
     fn write(&mut self, image: &Image) -> io::Result<()> {
         let bytes = rgb(image);
         match &mut self.writer {
-            Writer::Apng(writer) => Ok(writer.write_image_data(&bytes)?),
+            Writer::Apng(writer) => writer.write_image_data(&bytes).map_err(of_png),
             Writer::Gif(encoder) => {
                 let [width, height] = gif_size(self.size)?;
                 let mut frame = gif::Frame::from_rgb_speed(width, height, &bytes, GIF_SPEED);
@@ -174,7 +174,7 @@ impl Film {
             return Err(Error::io("write", &self.shown)(few));
         }
         let finished = match self.writer {
-            Writer::Apng(writer) => writer.finish().map_err(io::Error::from),
+            Writer::Apng(writer) => writer.finish().map_err(of_png),
             Writer::Gif(encoder) => encoder.into_inner().map_err(of_gif).and_then(|mut file| file.flush()),
             Writer::Encoder(encoder) => encoder.finish(),
         };

@@ -71,9 +71,17 @@ fn write_png(out: &mut impl Write, image: &Image) -> io::Result<()> {
     let mut encoder = png::Encoder::new(out, image.width, image.height);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
-    let mut writer = encoder.write_header()?;
-    writer.write_image_data(&rgb(image))?;
-    Ok(writer.finish()?)
+    let mut writer = encoder.write_header().map_err(of_png)?;
+    writer.write_image_data(&rgb(image)).map_err(of_png)?;
+    writer.finish().map_err(of_png)
+}
+
+/// A failure of the system as it was, by which a full disk is known.
+pub(super) fn of_png(error: png::EncodingError) -> io::Error {
+    match error {
+        png::EncodingError::IoError(error) => error,
+        other => other.into(),
+    }
 }
 
 /// What a screen shows, 8 bits a channel.
