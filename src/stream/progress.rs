@@ -219,10 +219,10 @@ impl<'a> Moment<'a> {
         let of = total.map_or(String::new(), |total| format!("/{}", HumanCount(total)));
         let pieces = [
             part.map(|part| format!("{:>3.0}%", (100.0 * part).floor())),
-            left.as_ref().filter(soon).map(|left| format!("{} left", duration(left.floor()))),
+            left.as_ref().filter(soon).map(|left| format!("{} left", whole(*left))),
             Some(format!("{}{of} {unit}", HumanCount(*done))).filter(|_| *done > 0 || total.is_some()),
             Some(rate(*per_second, unit)).filter(|_| *done > 0),
-            run.as_ref().filter(soon).map(|run| format!("the run {}", duration(run.floor()))),
+            run.as_ref().filter(soon).map(|run| format!("the run {}", whole(*run))),
         ];
         let mut shown = [false; 5];
         let mut width = name.chars().count().max(10);
@@ -247,6 +247,11 @@ impl<'a> Moment<'a> {
         }
         line.chars().take(columns).collect()
     }
+}
+
+/// A time to come, in whole seconds: nobody knows it better.
+fn whole(seconds: f64) -> String {
+    if seconds < 60.0 { format!("{:.0} s", seconds.floor()) } else { duration(seconds.floor()) }
 }
 
 /// A stage that is told of line by line.
