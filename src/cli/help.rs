@@ -12,14 +12,14 @@ const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\
 
 const EXAMPLES: &str = "\
 Examples:
-  splatsieve demo                                    a scene of its own, no files
-  splatsieve compress model --cameras data -o small  a 4DGaussians model, drop-in
-  splatsieve evaluate model small --cameras data     what it cost, on held-out pictures
-  splatsieve report model small -o page              the same, as a page to look at
-  splatsieve view model small -o scene.html          both in motion, in a browser
-  splatsieve compress model -o small.gsz             the smallest, to store, to send
+  splatsieve demo                                    a scene of its own
+  splatsieve compress model --cameras data -o small  a 4DGaussians model
+  splatsieve evaluate model small --cameras data     what it cost
+  splatsieve report model small -o page              the same, as a page
+  splatsieve view model small -o scene.html          both moving, in a browser
+  splatsieve compress model -o small.gsz             smallest, to send
   splatsieve unpack small.gsz -o small               the model folder in it
-`splatsieve VERB -h` has a verb's examples and usual options, `--help` all of them.";
+`splatsieve VERB -h`: its examples and usual options; `--help`: all of them.";
 
 /// Examples of every verb; two spaces stand before what is said about one.
 const OF_VERBS: &[(&str, &[&str])] = &[
