@@ -130,6 +130,21 @@ def efforts(binary, models, ratios):
                 print(f"| {model.stem} | {kept} | {' | '.join(cells)} |", flush=True)
 
 
+def rigs(binary, models, ratios):
+    """Static models by the cameras of the orbit, and by those that the program finds where none are given."""
+    print("| model | kept | PSNR dB, scored by the orbit | scored without cameras |")
+    print("|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        for model in (model for model in models if not model.is_dir()):
+            cameras = orbit(model, Path(folder) / f"{model.stem}.json")
+            for ratio in ratios:
+                given, found = (Path(folder) / f"{model.stem}{ratio}{name}.ply" for name in ("given", "found"))
+                best = point(binary, model, cameras, ratio, given)["psnr"]
+                run(binary, "compress", model, "-o", found, "--target-ratio", ratio, "--json")
+                alone = evaluated(binary, model, found, cameras)["psnr"]
+                print(f"| {model.stem} | {100 * float(ratio):.0f}% | {best:.1f} | {alone:.1f} |", flush=True)
+
+
 def main():
     if len(sys.argv) < 3:
         print(__doc__)
@@ -144,6 +159,9 @@ def main():
         return
     if sys.argv[3:4] == ["--efforts"]:
         efforts(binary, models, sys.argv[4:] or ["0.2", "0.1"])
+        return
+    if sys.argv[3:4] == ["--rigs"]:
+        rigs(binary, models, sys.argv[4:] or ["0.2", "0.1"])
         return
     ratios = sys.argv[3:] or ["0.4", "0.2", "0.1", "0.05"]
     print("| model | kept | PSNR dB to the original | SSIM | PSNR dB to photographs (unpruned) | s (before refining) | MiB |")

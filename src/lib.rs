@@ -5,8 +5,8 @@
 //! | layer | modules | what lives there |
 //! |---|---|---|
 //! | L0 | crate [`gseq`] | bytes, columns, tiles |
-//! | L1 | [`error`], [`machine`], [`model`], [`pass`], [`plan`], [`recipe`], [`reduction`] | the vocabulary |
-//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`render`], [`metrics`], [`archive`] | pure mathematics: slices in, values out |
+//! | L1 | [`error`], [`machine`], [`limits`], [`model`], [`recipe`], [`reduction`], [`source`] | the vocabulary |
+//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`link`], [`render`], [`metrics`], [`archive`], [`fit`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`work`], [`families`], [`demo`], [`player`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`], [`selfcheck`] | memory, the order of the passes, what verbs do |
 //! | L5 | [`cli`] | arguments and exit codes |
@@ -25,6 +25,7 @@ pub mod demo;
 pub mod emit;
 pub mod error;
 pub mod families;
+pub mod fit;
 pub mod ingest;
 pub mod machine;
 pub mod merge;
@@ -32,6 +33,7 @@ pub mod merge;
 #[doc = include_str!("method.md")]
 pub mod method {}
 pub mod limits;
+pub mod link;
 pub mod metrics;
 pub mod model;
 pub mod player;

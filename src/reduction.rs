@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians};
+use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians, Raw};
 use crate::recipe::{Merge, Precision};
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
@@ -30,7 +30,9 @@ pub struct Cluster {
 pub struct Proxies {
     /// Raw parameters, one row per cluster, of a family that has such; none where a proxy follows from its members
     /// frame by frame.
-    pub raw: Option<Gaussians>,
+    pub raw: Option<Raw>,
+    /// Clusters, by number, increasing, that no proxy stands for well enough: their leaders stay as they are, alone.
+    pub refused: Vec<usize>,
     /// Furthest that a proxy strays from its place among its members over sampled frames, scene units; none where it
     /// cannot stray.
     pub deviation: Option<f64>,
@@ -139,6 +141,19 @@ impl Reduction {
         Reduction { kept, ..self.clone() }
     }
 
+    /// Makes the clusters what `proxies` say that they are; those refused are their leaders, as these are.
+    pub fn make(&mut self, mut proxies: Proxies) {
+        let refused = std::mem::take(&mut proxies.refused);
+        if !refused.is_empty() {
+            let is_made: Vec<bool> = (0..self.clusters.len()).map(|k| refused.binary_search(&k).is_err()).collect();
+            let made: Vec<u32> = (0..).zip(&is_made).filter(|(_, is_made)| **is_made).map(|(k, _)| k).collect();
+            proxies.raw = proxies.raw.map(|raw| raw.pick(&made));
+            let mut is_made = is_made.into_iter();
+            self.clusters.retain(|_| is_made.next().unwrap_or(true));
+        }
+        self.proxies = proxies;
+    }
+
     /// Number of Gaussians in the output.
     pub fn len(&self) -> usize {
         self.kept.len()
@@ -199,6 +214,24 @@ mod tests {
         change.pick(&[1, 0]).add_to(&mut state, Columns::all());
         assert_eq!((state.position.row(0), state.sh.row(1)), ([1.0, 0.0, -2.0], [0.5, 0.0, 0.25]));
         assert!(Change::default().is_empty() && !change.is_empty());
+    }
+
+    #[test]
+    fn clusters_that_are_refused_are_their_leaders_and_the_others_keep_their_proxies() {
+        let rule = Recipe::preset("default").unwrap().merge;
+        let mut reduction = Reduction::pruned(vec![1, 4, 6], &rule);
+        let cluster = |output: u32, leader: u32, other: u32| Cluster {
+            output,
+            leader,
+            members: vec![(leader, 0.5), (other, 0.5)],
+        };
+        reduction.clusters = vec![cluster(0, 1, 2), cluster(1, 4, 5), cluster(2, 6, 7)];
+        let mut raw = Raw::from(Gaussians::zeros(3, 0));
+        (0..3).for_each(|row| raw.gaussians.position.set_row(row, [row as f32; 3]));
+        reduction.make(Proxies { raw: Some(raw), refused: vec![1], ..Proxies::default() });
+        assert_eq!(reduction.index_map(8), [None, Some(0), Some(0), None, Some(1), None, Some(2), Some(2)]);
+        assert_eq!(reduction.proxies.raw.unwrap().gaussians.position.plane(0), [0.0, 2.0]);
+        assert!(reduction.proxies.refused.is_empty());
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::model::{Columns, Gaussians, Jacobian, SequenceInfo};
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
 
 /// Which Gaussians of a sequence a reader covers.
 #[derive(Debug, Clone)]
@@ -175,6 +175,12 @@ pub trait FrameSource: Send + Sync {
         None
     }
 
+    /// How its pictures get their colours, where Gaussians have features in the place of colours; the colours of its states
+    /// are then near to what they look like.
+    fn decoder(&self) -> Option<&dyn Decoder> {
+        None
+    }
+
     /// What was read so far, by all readers; nothing where nobody counts.
     fn reads(&self) -> Reads {
         Reads::default()
@@ -189,7 +195,7 @@ pub trait FrameSource: Send + Sync {
 /// States that follow from what is stored, once for all frames, by a function that can be differentiated.
 pub trait Deformation: Sync {
     /// What is stored.
-    fn stored(&self) -> &Gaussians;
+    fn stored(&self) -> &Raw;
 
     /// Columns of what is stored that a derivative leads to.
     fn movable(&self) -> Columns;
@@ -199,13 +205,25 @@ pub trait Deformation: Sync {
     ///
     /// # Errors
     /// A frame that the sequence does not have.
-    fn state(&self, frame: usize, stored: &Gaussians, want: Columns, out: &mut Gaussians) -> Result<()>;
+    fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()>;
 
     /// How the columns `want` of that state change with what is stored in them.
     ///
     /// # Errors
     /// A frame that the sequence does not have.
-    fn jacobian(&self, frame: usize, stored: &Gaussians, want: Columns) -> Result<Jacobian>;
+    fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian>;
+}
+
+/// Features in the place of colours: they are blended without a background, and what comes of that decides, pixel by pixel.
+pub trait Decoder: Sync {
+    /// Writes the features of all Gaussians at `frame` into `out`: as many planes as there are features.
+    ///
+    /// # Errors
+    /// A frame that the sequence does not have.
+    fn features(&self, frame: usize, out: &mut Column) -> Result<()>;
+
+    /// Red, green and blue of a pixel that has blended `features`, seen from `centre` along the unit `ray`.
+    fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
 /// A source on a disk, whose bytes can be brought ahead of their use, from a thread that does nothing else.

@@ -366,6 +366,61 @@ fn cameras_that_see_nothing_of_the_scene_are_refused_and_its_own_pass_without_a_
 }
 
 #[test]
+fn a_still_scene_takes_cameras_of_every_kind_and_is_surrounded_where_there_are_none() {
+    let workplace = Workplace::new();
+    workplace.done("compress {tiny} --cameras {tiny} -o still.ply --target-ratio 0.9 --no-refine --quiet");
+    // The project's own kind, one camera per picture.
+    let camera = |k: u32| {
+        let (sin, cos) = f64::from(k).sin_cos();
+        serde_json::json!({
+            "v": k, "split": if k == 3 { "test" } else { "train" }, "width": 64, "height": 48, "fx": 60.0, "fy": 60.0,
+            "cx": 32.0, "cy": 24.0, "w2c": [[cos, 0.0, -sin, 0.0], [0.0, 1.0, 0.0, 0.0], [sin, 0.0, cos, 4.0], [0.0, 0.0, 0.0, 1.0]]
+        })
+    };
+    let cameras = serde_json::json!({ "background": [0, 0, 0], "frames": (0..4).map(camera).collect::<Vec<_>>() });
+    fs::write(workplace.path("orbit.json"), cameras.to_string()).unwrap();
+    let line = "compress still.ply -o small.ply --force --target-ratio 0.5 --no-refine --json";
+    let summary =
+        |more: &str| -> serde_json::Value { serde_json::from_str(&workplace.done(&format!("{line} {more}"))).unwrap() };
+    let given = summary("--cameras orbit.json");
+    assert_eq!(given["output"]["gaussians"], summary("")["output"]["gaussians"]);
+    // What is seen decides in both cases.
+    let stages = |summary: &serde_json::Value| summary["stages"].to_string();
+    assert!(stages(&given).contains("visible") && stages(&summary("")).contains("visible"), "{}", stages(&given));
+    assert!(summary("")["notes"].to_string().contains("24 cameras"), "{}", summary("")["notes"]);
+}
+
+#[test]
+fn everything_converts_to_what_others_open_and_what_does_not_fit_is_refused() {
+    let workplace = Workplace::new();
+    for output in ["a.splatv", "a.4dgs", "a.gseq", "frames --as ply-sequence", "model", "cloud.ply"] {
+        let said = workplace.done(&format!("convert {{tiny}} {output} --cameras {{tiny}}"));
+        assert!(said.contains("300 Gaussians x 10 frames"), "{said}");
+    }
+    let evaluate = |line: &str| -> f64 {
+        let found: serde_json::Value = serde_json::from_str(&workplace.done(line)).unwrap();
+        found["psnr"].as_f64().unwrap()
+    };
+    assert!(evaluate("evaluate {tiny} a.gseq --cameras {tiny} --json") > 90.0);
+    let fitted = evaluate("evaluate {tiny} a.splatv --cameras {tiny} --json");
+    assert!(fitted > 25.0, "{fitted} dB");
+    assert_eq!(&fs::read(workplace.path("a.4dgs")).unwrap()[1..5], b"4DGS");
+    workplace.refused(2, "convert {tiny} a.spz --cameras {tiny}", &["a.spz", "10 frames", ".splatv"]);
+    workplace.refused(2, "convert {tiny} a.gsz", &["splatsieve compress INPUT -o NAME.gsz"]);
+    workplace.refused(2, "convert {tiny} a.gseq --cameras {tiny}", &["a.gseq"]);
+    workplace.refused(2, "convert a.gseq b --as model", &["only a trained model"]);
+    for name in ["a.spz", "b"] {
+        assert!(!workplace.path(name).exists(), "{name}");
+    }
+    workplace.done("convert cloud.ply still.spz");
+    workplace.done("compress {tiny} --cameras {tiny} -o small.4dgs --target-ratio 0.5 --no-refine --quiet");
+    assert!(
+        fs::metadata(workplace.path("small.4dgs")).unwrap().len()
+            < fs::metadata(workplace.path("a.4dgs")).unwrap().len()
+    );
+}
+
+#[test]
 #[ignore = "needs Python"]
 fn scripts_end_with_a_sentence_and_never_with_a_traceback() {
     let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// Modules of each layer, from the vocabulary up.
 const LAYERS: [&[&str]; 5] = [
     &["error", "machine", "model", "limits", "recipe", "reduction", "source"],
-    &["deform", "stats", "score", "select", "merge", "render", "refine", "metrics", "archive"],
+    &["deform", "stats", "score", "select", "merge", "link", "render", "refine", "metrics", "archive", "fit"],
     &["ingest", "stream", "emit", "work", "families", "demo", "player"],
     &["budget", "scene", "compress", "verbs", "report", "selfcheck"],
     &["cli"],

@@ -1,10 +1,11 @@
 //! What measuring pairs of Gaussians keeps in memory, counted in bytes allocated: bounded by the pairs measured
 //! together, whatever the number of frames.
 
-use std::alloc::{GlobalAlloc, Layout, System};
+#[path = "corpus/memory.rs"]
+mod memory;
+
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use splatsieve::demo::Scene;
 use splatsieve::emit::container::write_container;
@@ -18,29 +19,8 @@ use splatsieve::recipe::Recipe;
 use splatsieve::stream::gather;
 use splatsieve::stream::motion::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
 
-/// The system's allocator, counting.
-struct Counting;
-
-static NOW: AtomicUsize = AtomicUsize::new(0);
-static PEAK: AtomicUsize = AtomicUsize::new(0);
-
-// SAFETY: every call is passed on to the system's allocator as it came; counting allocates nothing.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        PEAK.fetch_max(NOW.fetch_add(layout.size(), Relaxed) + layout.size(), Relaxed);
-        // SAFETY: the caller's promises are those that `System` asks for.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
-        NOW.fetch_sub(layout.size(), Relaxed);
-        // SAFETY: the caller's promises are those that `System` asks for.
-        unsafe { System.dealloc(at, layout) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: memory::Counting = memory::Counting;
 
 const COUNT: usize = 20_000;
 const FRAMES_HELD: usize = 2;
@@ -73,14 +53,17 @@ fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
         scratch: folder.to_owned(),
         gathered: None,
     };
-    let (count, before) = (pairs.len(), NOW.load(Relaxed));
-    PEAK.store(before, Relaxed);
-    let mut found = Vec::with_capacity(count);
-    for part in pairs.chunks(count.div_ceil(partitions)) {
-        found.extend(meter.measure(&ids, &reference, part.to_vec(), 0.1, partitions > 1).unwrap());
-    }
+    let count = pairs.len();
+    let measure = || {
+        let mut found = Vec::with_capacity(count);
+        for part in pairs.chunks(count.div_ceil(partitions)) {
+            found.extend(meter.measure(&ids, &reference, part.to_vec(), 0.1, partitions > 1).unwrap());
+        }
+        found
+    };
+    let (found, peak) = memory::peak(measure);
     assert_eq!(found.len(), count);
-    (PEAK.load(Relaxed) - before, count)
+    (peak, count)
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::DVec3;
 use splatsieve::families::ModelFolder;
-use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
+use splatsieve::model::{Camera, Columns, Gaussians, Gradients, Raw};
 use splatsieve::render::{Image, Renderer, render};
 use splatsieve::selfcheck::made::clouds::{Random, camera, plain_camera, scene, single};
 use splatsieve::selfcheck::oracle::picture as oracle;
@@ -290,8 +290,8 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
     let model = ModelFolder::open(&root, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap();
     let (deformation, frame) = (model.deformation().unwrap(), 1);
     let stored = deformation.stored();
-    let state_of = |stored: &Gaussians| {
-        let mut state = Gaussians::zeros(0, stored.sh_degree());
+    let state_of = |stored: &Raw| {
+        let mut state = Gaussians::zeros(0, stored.gaussians.sh_degree());
         deformation.state(frame, stored, Columns::all(), &mut state).unwrap();
         state
     };
@@ -312,7 +312,7 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
     let direct = found.clone();
     deformation.jacobian(frame, stored, Columns::all()).unwrap().pull_back(&mut found);
 
-    let loss = |stored: &Gaussians| -> f64 {
+    let loss = |stored: &Raw| -> f64 {
         // A step of the position moves other columns too, which a derivative by the position's head alone leaves out.
         let moved = Gaussians { position: state_of(stored).position, ..state.clone() };
         let pixels = oracle::decided(&moved, &camera, BACKGROUND, &blended);
@@ -325,9 +325,9 @@ fn positions_that_are_stored_take_what_the_picture_of_a_deformed_state_takes_of_
     let (mut off, mut through_field) = (0, 0);
     for &at in largest.iter().take(60) {
         let mut changed = stored.clone();
-        let (both, apart) = nudged(stored.position.planes()[at], 2e-4);
+        let (both, apart) = nudged(stored.gaussians.position.planes()[at], 2e-4);
         let losses = both.map(|x| {
-            changed.position.planes_mut()[at] = x;
+            changed.gaussians.position.planes_mut()[at] = x;
             loss(&changed)
         });
         let expected = (losses[1] - losses[0]) / apart;

@@ -57,6 +57,27 @@ fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
 }
 
 #[test]
+#[ignore = "needs numpy and zstandard"]
+fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
+    let python = python("numpy, zstandard");
+    let workplace = Workplace::new();
+    workplace.done("pack {tiny} --frames 9 -o tiny.gseq");
+    workplace.done("unpack tiny.gseq -o frames");
+    let cut = script("cut_lives.py");
+    let mut command = Command::new(&python);
+    let said = run(
+        command.arg(&cut).args(["frames", "cut", "--lives", "3-5", "--overlap", "1", "--noise", "0.01"]),
+        &workplace,
+    );
+    let said = String::from_utf8(said).unwrap();
+    assert!(said.contains("in 9 frames"), "{said}");
+    workplace.done("pack cut -o linked.gseq");
+    let score = run(Command::new(&python).arg(&cut).args(["--score", "cut", "linked.gseq"]), &workplace);
+    let score = String::from_utf8(score).unwrap();
+    assert!(score.contains("by gaussian: ") && score.contains(" tracks, "), "{score}");
+}
+
+#[test]
 #[ignore = "needs numpy"]
 fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
     let python = python("numpy");

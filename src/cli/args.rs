@@ -8,6 +8,7 @@ use super::recipe_flags::{RecipeFlags, numbers};
 use crate::emit::atomic::Replace;
 use crate::emit::bounds::MaxError;
 use crate::error::quoted;
+use crate::families::Link;
 use crate::ingest::cameras::Times;
 use crate::verbs::method::Method;
 use crate::verbs::precision::Turned;
@@ -54,6 +55,8 @@ pub(super) enum Verb {
     Report(Report),
     /// Write a page that plays a scene in any browser: one model, or the original and the compressed one side by side
     View(View),
+    /// Write an input as another kind of file: for a viewer, a player, another program
+    Convert(Convert),
     /// Pack any input into a .gseq container
     Pack(Pack),
     /// Say what an input holds
@@ -86,6 +89,7 @@ impl Verb {
             Verb::Score(Score { input, .. })
             | Verb::Render(Render { input, .. })
             | Verb::View(View { input, .. })
+            | Verb::Convert(Convert { input, .. })
             | Verb::Pack(Pack { input, .. })
             | Verb::Info(Info { input, .. })
             | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
@@ -107,21 +111,60 @@ impl Verb {
 /// What to read.
 #[derive(Debug, Args)]
 pub(super) struct Input {
-    /// 4DGaussians model folder, folder of PLY frames, one .ply, .gsz, .gseq, or - for a frame stream on standard
-    /// input
+    /// Model folder or checkpoint of any family (README, Formats), folder of PLY frames, one .ply, .splatv, .gsz, .gseq,
+    /// or - for a frame stream on standard input
     pub(super) input: PathBuf,
     /// Training iteration of a model folder [default: the largest]
     #[arg(long, value_name = "K", hide_short_help = true)]
     pub(super) iteration: Option<u32>,
+    #[command(flatten)]
+    pub(super) trained: Trained,
     /// Take a folder of PLY frames with a gap in its numbers, or with entries that are no files, as it is
     #[arg(long, hide_short_help = true)]
     pub(super) allow_gaps: bool,
-    /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
-    /// --memory [default: that of the output, else the system's]
+    /// Whether to find out which Gaussian of a folder's frames is which: where they differ in number, or their order does
+    /// not tell, `always`, or `never` [default: auto]
+    #[arg(long, hide_short_help = true)]
+    pub(super) link: Option<LinkArg>,
+    /// Folder for scratch files while the run lasts: the packed frames of a stream or of linked frames, what does not fit
+    /// into --memory [default: that of the output, else the system's]
     #[arg(long, value_name = "FOLDER", help_heading = MACHINE, hide_short_help = true)]
     pub(super) scratch_dir: Option<PathBuf>,
     #[command(flatten)]
     pub(super) memory: Memory,
+}
+
+/// What a model's files do not say of how it was trained.
+#[derive(Debug, Args)]
+pub(super) struct Trained {
+    /// Length of a 4D Gaussian Splatting checkpoint's time_duration, or both its ends A,B [default: 10 where frames lie
+    /// beyond 1, else 1]
+    #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration)]
+    pub(super) time_duration: Option<f64>,
+    /// How its rotations of four dimensions are written: unflipped before 15 September 2024 [default: flipped]
+    #[arg(long, value_name = "HOW", hide_short_help = true)]
+    pub(super) rot4d: Option<Rot4d>,
+}
+
+/// How rotations of four dimensions are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum Rot4d {
+    /// With the order of both axes reversed
+    Flipped,
+    /// As the product of both quaternions
+    Unflipped,
+}
+
+/// A length, or the ends of a span.
+fn parse_duration(text: &str) -> Result<f64, String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse::<f64>()).collect();
+    let length = match numbers.as_deref() {
+        Ok(&[length]) => length,
+        Ok(&[start, end]) => end - start,
+        _ => return Err("expected a length such as 10, or two times such as 0,10".to_owned()),
+    };
+    let is_length = length.is_finite() && length > 0.0;
+    is_length.then_some(length).ok_or_else(|| format!("expected a length above 0, found {length}"))
 }
 
 /// Where results of stages stay, so that a run goes on where another was cut short, and several runs share the work.
@@ -203,6 +246,27 @@ pub(super) struct Cameras {
     pub(super) split: Option<SplitArg>,
 }
 
+/// Whether frames are linked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum LinkArg {
+    /// Where they differ in number, or their order does not tell which Gaussian is which
+    Auto,
+    /// Whatever their order tells
+    Always,
+    /// The same place means the same Gaussian
+    Never,
+}
+
+impl From<LinkArg> for Link {
+    fn from(given: LinkArg) -> Link {
+        match given {
+            LinkArg::Auto => Link::Auto,
+            LinkArg::Always => Link::Always,
+            LinkArg::Never => Link::Never,
+        }
+    }
+}
+
 /// A part of a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(super) enum SplitArg {
@@ -221,7 +285,7 @@ pub(super) enum SplitArg {
 pub(super) struct Compress {
     #[command(flatten)]
     pub(super) cameras: Cameras,
-    /// Where to write: a folder, NAME.gsz, NAME.gseq or NAME.ply
+    /// Where to write: a folder, NAME.gsz, .gseq, .ply, .splatv, .4dgs or .spz
     #[arg(short, long, value_name = "PATH")]
     pub(super) output: PathBuf,
     /// What to write [default: by the output's name; a folder is of the input's own kind]
@@ -326,6 +390,13 @@ pub(super) enum OutputKind {
     Ply,
     /// Archive of a model or of one PLY, the smallest: to store and to send
     Archive,
+    /// Curved motion in windows of time, for splaTV and WebGS
+    Splatv,
+    /// Pieces of straight motion, for readers of 4dgs
+    #[value(name = "4dgs")]
+    FourDgs,
+    /// One frame, for most web viewers
+    Spz,
 }
 
 /// `score`
@@ -420,6 +491,8 @@ pub(super) struct SideBySide {
     /// Training iteration of the original, if a model folder [default: the largest]
     #[arg(long, value_name = "K")]
     pub(super) iteration: Option<u32>,
+    #[command(flatten)]
+    pub(super) trained: Trained,
     /// Take folders of PLY frames with a gap in their numbers as they are
     #[arg(long)]
     pub(super) allow_gaps: bool,
@@ -617,6 +690,26 @@ pub(super) struct Pack {
     pub(super) level: Option<i32>,
     #[command(flatten)]
     pub(super) kept: Kept,
+    #[command(flatten)]
+    pub(super) earlier: Earlier,
+}
+
+/// `convert`
+#[derive(Debug, Args)]
+pub(super) struct Convert {
+    #[command(flatten)]
+    pub(super) input: Input,
+    /// What to write: NAME.splatv, .4dgs, .spz, .gseq, .ply, or a folder of the input's own kind
+    #[arg(value_name = "OUTPUT")]
+    pub(super) output: PathBuf,
+    #[command(flatten)]
+    pub(super) cameras: Cameras,
+    /// Kind of result, whatever it is called
+    #[arg(long = "as", value_name = "KIND", value_enum)]
+    pub(super) kind: Option<OutputKind>,
+    /// Print what was written as JSON
+    #[arg(long)]
+    pub(super) json: bool,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }

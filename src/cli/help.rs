@@ -83,6 +83,15 @@ const OF_VERBS: &[(&str, &[&str])] = &[
         ],
     ),
     (
+        "convert",
+        &[
+            "splatsieve convert model scene.splatv --cameras data  for splaTV and WebGS",
+            "splatsieve convert small.gseq scene.4dgs             pieces of straight motion",
+            "splatsieve convert scan.ply scan.spz                 for most web viewers",
+            "splatsieve convert model frames --as ply-sequence    a PLY per frame",
+        ],
+    ),
+    (
         "pack",
         &[
             "splatsieve pack frames -o scene.gseq                 every bit kept",

@@ -21,6 +21,7 @@ use crate::emit::atomic::{Replace, as_named};
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
+use crate::families::{Conventions, Link};
 use crate::ingest::cameras::Times;
 use crate::model::Split;
 use crate::recipe::preset_text;
@@ -37,11 +38,11 @@ use crate::verbs::render::{RenderOptions, Wanted};
 use crate::verbs::sweep::SweepOptions;
 use crate::verbs::video::{VideoOptions, Way, places, video};
 use crate::verbs::view::ViewOptions;
-use crate::verbs::{archive, container, demo, evaluate, precision, render, score, sweep, view};
+use crate::verbs::{archive, container, convert, demo, evaluate, precision, render, score, sweep, view};
 use crate::work;
 use args::{
-    CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, SideBySide, SplitArg,
-    Sweep, Verb, View,
+    CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, Rot4d, SideBySide,
+    SplitArg, Sweep, Trained, Verb, View,
 };
 
 /// Runs the program on the arguments of this process.
@@ -171,6 +172,21 @@ fn run(cli: Cli) -> Result<()> {
             print(&format!("{}\n{}\n", found.verdict, page.display()))
         }
         Verb::View(args) => print(&(viewed(&view_options(args))? + "\n")),
+        Verb::Convert(args) => {
+            let input = input_options(args.input, Some(args.cameras), Some(&args.output));
+            let done = convert::convert(&input, &args.output, args.kind.map(kind_of), args.earlier.replace())?;
+            if args.json {
+                return print(&json(&done));
+            }
+            notes(&done.notes);
+            print(&format!(
+                "{}: {} Gaussians x {} frames in {} bytes\n",
+                done.path.display(),
+                done.gaussians,
+                done.frames,
+                done.bytes
+            ))
+        }
         Verb::Pack(args) => {
             let storing = match (args.raw, args.max_error) {
                 (true, _) => Storing::Exact(Compression::Raw),
@@ -281,17 +297,25 @@ fn run(cli: Cli) -> Result<()> {
     }
 }
 
-fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
-    let recipe = args.recipe.recipe()?;
-    let kind = args.kind.map(|kind| match kind {
+fn kind_of(asked: args::OutputKind) -> OutputKind {
+    match asked {
         args::OutputKind::Model => OutputKind::Model,
         args::OutputKind::Gseq => OutputKind::Gseq,
         args::OutputKind::PlySequence => OutputKind::PlySequence,
         args::OutputKind::Ply => OutputKind::Ply,
         args::OutputKind::Archive => OutputKind::Archive,
-    });
+        args::OutputKind::Splatv => OutputKind::Splatv,
+        args::OutputKind::FourDgs => OutputKind::FourDgs,
+        args::OutputKind::Spz => OutputKind::Spz,
+    }
+}
+
+fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
+    let recipe = args.recipe.recipe()?;
+    let kind = args.kind.map(kind_of);
     let record = args.recipe.record()?;
     let (has_split, has_cameras) = (args.cameras.split.is_some(), args.cameras.file.cameras.is_some());
+    let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
     input.work = work_of(args.kept);
     if input.memory.tell == Tell::Nothing && !quiet {
@@ -313,6 +337,12 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
                 input.times = Times::named(times);
             }
             input.iteration = input.iteration.or(run.iteration);
+            let said = &mut input.conventions;
+            said.time_duration = said.time_duration.or(run.time_duration);
+            said.rot4d_unflipped |= run.rot4d_unflipped && !is_flipped;
+            if let (Link::Auto, Some(link)) = (input.link, run.link) {
+                input.link = link;
+            }
             run
         }
         None => Run::default(),
@@ -402,6 +432,7 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
+    original.conventions = conventions(&args.trained);
     original.use_cameras(args.cameras);
     original.memory = budget_of(args.memory);
     EvaluateOptions {
@@ -522,9 +553,15 @@ fn budget_of(memory: Memory) -> Budget {
     Budget { bytes: memory.memory, tell: if memory.explain { Tell::Plan } else { Tell::Nothing } }
 }
 
+fn conventions(trained: &Trained) -> Conventions {
+    Conventions { time_duration: trained.time_duration, rot4d_unflipped: trained.rot4d == Some(Rot4d::Unflipped) }
+}
+
 fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) -> InputOptions {
     let mut options = InputOptions { path: input.input, iteration: input.iteration, ..InputOptions::default() };
     options.allow_gaps = input.allow_gaps;
+    options.conventions = conventions(&input.trained);
+    options.link = input.link.map_or(Link::Auto, Link::from);
     options.memory = budget_of(input.memory);
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {

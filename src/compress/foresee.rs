@@ -73,6 +73,7 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     let outlook = Outlook::of(&scene);
     let job = Job::within(request, outlook, &scene.workload())?;
     job.emit.check(&[&request.input.path])?;
+    job.emit.kind.check_frames(scene.source().info().times.len(), &request.output)?;
     scene.input.check_output(job.emit.kind, &request.output)?;
     let needs = |work: &Workload, limits: &_| job.needs(work, limits);
     let plan = Plan::fit(scene.workload(), Budget { tell: Tell::Nothing, ..input.memory }, needs)?;

@@ -147,9 +147,11 @@ impl Merge {
                 drop(trial);
                 scene.work.not_divided(NAME)?;
                 let Outcome { reduction, summary } = &mut merged;
-                reduction.proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
+                let proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
+                reduction.make(proxies);
                 if let Some(summary) = summary {
                     summary.deviation = reduction.proxies.deviation;
+                    summary.count(&reduction.clusters);
                 }
                 let left = reduction.len();
                 Ok((merged, left))
@@ -321,14 +323,15 @@ fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, m
             Cluster { output: group, leader: id(groups.leaders()[group as usize]), members }
         })
         .collect();
-    let summary = MergeSummary {
+    let mut summary = MergeSummary {
         reference_frame,
-        proxies: clusters.len(),
-        members: clusters.iter().map(|cluster| cluster.members.len()).sum(),
+        proxies: 0,
+        members: 0,
         opacity: merge.opacity,
         passes: merged.passes.clone(),
         deviation: None,
     };
+    summary.count(&clusters);
     let kept = groups.leaders().iter().map(|&row| id(row)).collect();
     Outcome { reduction: Reduction { clusters, ..Reduction::pruned(kept, merge) }, summary: Some(summary) }
 }

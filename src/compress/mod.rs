@@ -116,6 +116,7 @@ fn reduce(
     request: &Request,
     mut journal: Journal,
 ) -> Result<(Summary, Vec<Option<u32>>)> {
+    job.emit.kind.check_frames(scene.source().info().times.len(), &request.output)?;
     scene.input.check_output(job.emit.kind, &request.output)?;
     journal.notes.extend(scene.notes.iter().cloned());
     journal.whole = scene.whole()?;

@@ -11,6 +11,7 @@ use super::request::{Goal, Only, Quality, Request, Target, decibels};
 use super::score::UserOverrides;
 use crate::TOOL;
 use crate::emit::kind::OutputKind;
+use crate::families::Link;
 use crate::model::{Split, ranges};
 
 /// Where a recipe comes from.
@@ -52,6 +53,12 @@ pub struct Run {
     pub output: Option<OutputKind>,
     /// Training iteration of a model folder.
     pub iteration: Option<u32>,
+    /// `--time-duration` of a model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub time_duration: Option<f64>,
+    /// Whether `--rot4d unflipped` was said of it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub rot4d_unflipped: bool,
     /// File or folder of the cameras.
     pub cameras: Option<PathBuf>,
     /// Part of their pictures that was scored; none: all.
@@ -63,6 +70,9 @@ pub struct Run {
     /// Where the times of pictures came from, as `--times` says it; none: their own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
+    /// Whether frames were linked, where that was not left to them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<Link>,
 }
 
 /// A recipe file's tables beside its hyper-parameters.
@@ -134,11 +144,14 @@ impl Record {
             keep_box: request.keep_box,
             output: request.kind,
             iteration: input.iteration,
+            time_duration: input.conventions.time_duration,
+            rot4d_unflipped: input.conventions.rot4d_unflipped,
             cameras: input.cameras.clone(),
             split: input.split,
             frames: input.frames,
             size: input.size,
             times: input.times.name(),
+            link: (input.link != Link::Auto).then_some(input.link),
             ..run
         };
         let tool = TOOL.to_owned();
@@ -176,6 +189,7 @@ mod tests {
             cameras: Some("data, \"odd\" name".into()),
             split: Some(Split::Test),
             frames: Some(12),
+            link: Link::Always,
             size: Some((320, 200)),
             ..InputOptions::default()
         };

@@ -18,6 +18,7 @@ use crate::families::{Family, Size};
 use crate::merge::PassCounts;
 use crate::metrics::PSNR_CAP_DB;
 use crate::recipe::ProxyOpacity;
+use crate::reduction::Cluster;
 use crate::scene::Scene;
 use crate::select::Counts;
 use crate::source::Reads;
@@ -267,6 +268,14 @@ pub struct MergeSummary {
     /// Furthest that a proxy strays from its place among its members over sampled frames, scene units;
     /// none without a deformation field.
     pub deviation: Option<f64>,
+}
+
+impl MergeSummary {
+    /// Counts what became of `clusters`.
+    pub(super) fn count(&mut self, clusters: &[Cluster]) {
+        self.proxies = clusters.len();
+        self.members = clusters.iter().map(|cluster| cluster.members.len()).sum();
+    }
 }
 
 /// What half precision of the field does to pictures of the result.

@@ -29,7 +29,7 @@ impl<'a> Lookup<'a> {
     pub(super) fn get(&self, name: &str, why: &str) -> Result<&'a Tensor> {
         let tensor = self.tensors.get(name).ok_or_else(|| {
             Error::input(self.path, format!("tensor {name}"), format!("a tensor of this name ({why})"), "none")
-                .hint("does cfg_args belong to this deformation.pth?")
+                .hint("does cfg_args belong to this file?")
         })?;
         if let Some(at) = tensor.data.iter().position(|value| !value.is_finite()) {
             return Err(self.mismatch(name, "finite values", format!("{} at element {at}", tensor.data[at])));
@@ -47,6 +47,12 @@ impl<'a> Lookup<'a> {
         }
         let want: Vec<String> = shape.iter().map(|w| w.map_or("any".to_owned(), |w| w.to_string())).collect();
         Err(self.mismatch(name, format!("shape [{}] ({why})", want.join(", ")), format!("{:?}", tensor.shape)))
+    }
+
+    /// Outputs and inputs of the matrix `name`. `why` says what asks for it.
+    pub(super) fn matrix(&self, name: &str, why: &str) -> Result<[usize; 2]> {
+        let shape = &self.get_shaped(name, &[None, None], why)?.shape;
+        Ok([shape[0], shape[1]])
     }
 
     pub(super) fn has(&self, name: &str) -> bool {

@@ -111,7 +111,8 @@ pub fn spill_blocks(
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     for block in blocks {
-        encode_frames(source, packing.frames(source, block), block == 0, &packing, &advance, |_, _, tile| {
+        let lives = all_blocks(source, block == 0);
+        encode_frames(source, packing.frames(source, block), &lives, &packing, &advance, |_, _, tile| {
             to.write_record(&tile.map_or(Vec::new(), EncodedTile::to_bytes))
         })?;
     }
@@ -222,9 +223,24 @@ impl ContainerWriter {
         advance: impl Fn(u64) + Sync,
     ) -> Result<()> {
         let (first, packing) = ((first / GAUSSIAN_BLOCK) as u32, self.packing);
-        encode_frames(source, frames, self.frame_blocks == 1, &packing, advance, |gaussian_block, column, tile| {
+        let lives = all_blocks(source, self.frame_blocks == 1);
+        encode_frames(source, frames, &lives, &packing, advance, |gaussian_block, column, tile| {
             self.put(first + gaussian_block, column, tile)
         })
+    }
+
+    /// [`ContainerWriter::append`] of `frames` of `source` at `times`, where `lives` says of every block of Gaussians
+    /// whether it changes: what does not is read and encoded once for all frames, or not at all.
+    pub fn append_lives(
+        &mut self,
+        source: &dyn FrameSource,
+        frames: Range<usize>,
+        times: &[f64],
+        lives: &[Lives],
+    ) -> Result<()> {
+        self.begin(times)?;
+        let packing = self.packing;
+        encode_frames(source, frames, lives, &packing, |_| (), |block, column, tile| self.put(block, column, tile))
     }
 
     /// Adds a tile to the frame block; none: it is that of the block before.
@@ -244,19 +260,38 @@ impl ContainerWriter {
     }
 }
 
-/// Encodes `source` at the `frames` of a block, which is the first one or not, and hands every tile to `each` in the order of
-/// the container, with its block of Gaussians and its column; none: it is that of the block before.
+/// How a block of Gaussians goes through a block of frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lives {
+    /// It changes in its columns that vary; others are those of the frame block before.
+    Varying,
+    /// It changes in its columns that vary, and others are new.
+    New,
+    /// It is as in the first of the frames.
+    Still,
+    /// It is as in the frame block before, where it was still.
+    Repeating,
+}
+
+/// Every block of Gaussians of `source`, in the first block of frames or a later one.
+fn all_blocks(source: &dyn FrameSource, is_first: bool) -> Vec<Lives> {
+    // A column that never varies is encoded for the first block alone.
+    let lives = if is_first { Lives::New } else { Lives::Varying };
+    vec![lives; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
+}
+
+/// Encodes `source` at the `frames` of a block, of which `lives` says how each block of Gaussians goes through it, and hands
+/// every tile to `each` in the order of the container, with its block of Gaussians and its column; none: it is that of the
+/// block before.
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
-    is_first: bool,
+    lives: &[Lives],
     packing: &Packing,
     advance: impl Fn(u64) + Sync,
     mut each: impl FnMut(u32, u32, Option<&EncodedTile>) -> Result<()>,
 ) -> Result<()> {
     let info = source.info();
-    // A column that never varies is encoded for the first block alone.
-    let columns = if is_first { Columns::all() } else { info.varying };
     let blocks: Vec<u32> = (0..info.count.div_ceil(GAUSSIAN_BLOCK) as u32).collect();
     // One batch of blocks at a time bounds the tiles that wait for the writer.
     for batch in blocks.chunks(2 * rayon::current_num_threads()) {
@@ -265,6 +300,12 @@ fn encode_frames(
             .map(|&block| {
                 let start = block as usize * GAUSSIAN_BLOCK;
                 let end = (start + GAUSSIAN_BLOCK).min(info.count);
+                let (columns, frames) = match lives[block as usize] {
+                    Lives::New => (Columns::all(), frames.clone()),
+                    Lives::Varying => (info.varying, frames.clone()),
+                    Lives::Still => (Columns::all(), frames.start..frames.start + 1),
+                    Lives::Repeating => (Columns::empty(), 0..0),
+                };
                 let tiles = encode_block(source, start..end, frames.clone(), columns, packing);
                 advance(((end - start) * frames.len()) as u64);
                 tiles
@@ -288,6 +329,9 @@ fn encode_block(
     packing: &Packing,
 ) -> Result<Vec<Option<EncodedTile>>> {
     let info = source.info();
+    if columns.is_empty() {
+        return Ok(Columns::all().iter().map(|_| None).collect());
+    }
     let len = gaussians.len();
     let mut reader = source.open(Ids::Range(gaussians))?;
     let mut state = Gaussians::zeros(len, info.sh_degree);

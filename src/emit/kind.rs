@@ -20,6 +20,13 @@ pub enum OutputKind {
     Ply,
     /// An archive: to store and to send.
     Archive,
+    /// A `.splatv`: Gaussians on cubic paths, for viewers of them.
+    Splatv,
+    /// A `.4dgs`: pieces of straight motion.
+    #[serde(rename = "4dgs")]
+    FourDgs,
+    /// A `.spz`: one frame, in few bytes.
+    Spz,
 }
 
 impl OutputKind {
@@ -40,8 +47,11 @@ impl OutputKind {
              NAME.gsz       archive of a model or of one PLY, the smallest\n  \
              NAME.gseq      container of all frames\n  \
              NAME.ply       one PLY\n  \
+             NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \
+             NAME.4dgs      pieces of straight motion, for readers of 4dgs\n  \
+             NAME.spz       one frame, for most web viewers\n  \
              a folder       of the input's kind: model folder, or PLY files; its name has no such ending\n  \
-             or say outright with --as model|gseq|ply-sequence|ply|archive what {} is to be",
+             or say outright with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz what {} is to be",
             path.display(),
             path.display()
         )))
@@ -52,6 +62,9 @@ impl OutputKind {
             "gseq" => Some(OutputKind::Gseq),
             "ply" => Some(OutputKind::Ply),
             "gsz" => Some(OutputKind::Archive),
+            "splatv" => Some(OutputKind::Splatv),
+            "4dgs" => Some(OutputKind::FourDgs),
+            "spz" => Some(OutputKind::Spz),
             _ => None,
         }
     }
@@ -63,7 +76,21 @@ impl OutputKind {
 
     /// Whether it holds every frame, as opposed to what frames are made of.
     pub fn holds_frames(self) -> bool {
-        matches!(self, OutputKind::Gseq | OutputKind::PlySequence)
+        !matches!(self, OutputKind::Model | OutputKind::Ply | OutputKind::Archive)
+    }
+
+    /// Confirms that a result of this kind, named `path`, can hold so many frames.
+    ///
+    /// # Errors
+    /// More frames, or fewer.
+    pub fn check_frames(self, frames: usize, path: &Path) -> Result<()> {
+        match self {
+            OutputKind::Spz if frames != 1 => Err(Error::usage(format!(
+                "{}: {frames} frames do not fit one .spz\n  write a .splatv, a .4dgs or a .gseq",
+                path.display()
+            ))),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -112,7 +139,7 @@ mod tests {
     #[test]
     fn names_that_no_output_has_are_refused_with_what_can_be_written() {
         let refused = |name: &str| OutputKind::check_name(Path::new(name)).err().map(|error| error.to_string());
-        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.spz"] {
+        for name in ["x.txt", "a/b.json", "x.ZIP", "x.mp4", "small.gsq", "x.sog"] {
             let message = refused(name).expect(name);
             for part in [name, "NAME.gsz", "NAME.gseq", "NAME.ply", "a folder", "--as"] {
                 assert!(message.contains(part), "{part:?} is not in {message:?}");

@@ -5,8 +5,11 @@
 
 pub mod atomic;
 pub mod bounds;
+pub(crate) mod checkpoint;
 pub mod container;
+pub mod curves;
 pub mod film;
+pub mod four_dgs;
 pub mod frame_stream;
 pub mod image;
 pub mod index_map;
@@ -14,4 +17,6 @@ pub mod kind;
 pub(crate) mod npz;
 pub mod ply;
 pub mod rows;
+pub mod splatv;
+pub mod spz;
 pub(crate) mod zip_output;

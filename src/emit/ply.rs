@@ -53,8 +53,34 @@ pub fn write_like(
     path: &Path,
 ) -> Result<()> {
     check_rows(template, rows, proxies, change)?;
-    template.check_unshrunk()?;
     let name = |name: &str| name_without_bands(name, template.sh_degree(), sh_degree);
+    let big_endian = template.header().encoding == Encoding::BigEndian;
+    let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
+    write_rows_like(template, &sources, name, path, |place, bytes| {
+        if let Some(proxy) = rows[place].proxy {
+            replace(bytes, template.layout(), big_endian, proxies, proxy as usize);
+        }
+        add(bytes, template, change, place);
+    })
+}
+
+/// Writes the rows `sources` of `template`, each as `edit` leaves its bytes, given its place; properties get other names or
+/// go. Further elements and bytes after the last one are copied.
+///
+/// # Errors
+/// A source that does not exist; a template cut short since it was opened; a failed write.
+pub(crate) fn write_rows_like(
+    template: &Ply,
+    sources: &[u32],
+    name: impl Fn(&str) -> Option<String>,
+    path: &Path,
+    mut edit: impl FnMut(usize, &mut [u8]),
+) -> Result<()> {
+    template.check_unshrunk()?;
+    if let Some(source) = sources.iter().find(|&&source| source as usize >= template.count()) {
+        let (path, count) = (template.path().display(), template.count());
+        return Err(Error::usage(format!("{path}: Gaussian {source} is to be kept, of {count} from 0")));
+    }
     let mut left: Vec<Range<usize>> = Vec::new();
     for property in template.properties().iter().filter(|property| name(&property.name).is_some()) {
         let end = property.offset + property.scalar.bytes();
@@ -64,18 +90,13 @@ pub fn write_like(
         }
     }
     create(path, |out| {
-        out.write_all(&template.header().text_for(rows.len(), name))?;
+        out.write_all(&template.header().text_for(sources.len(), name))?;
         out.write_all(template.lead())?;
         let mut changed = Vec::new();
-        for (place, row) in rows.iter().enumerate() {
-            let source = template.row(row.source as usize);
+        for (place, &source) in sources.iter().enumerate() {
             changed.clear();
-            changed.extend_from_slice(source);
-            if let Some(proxy) = row.proxy {
-                let big_endian = template.header().encoding == Encoding::BigEndian;
-                replace(&mut changed, template.layout(), big_endian, proxies, proxy as usize);
-            }
-            add(&mut changed, template, change, place);
+            changed.extend_from_slice(template.row(source as usize));
+            edit(place, &mut changed);
             left.iter().try_for_each(|range| out.write_all(&changed[range.clone()]))?;
         }
         out.write_all(template.tail())
@@ -214,10 +235,6 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Cha
         )));
     }
     for row in rows {
-        if row.source as usize >= template.count() {
-            let (path, count) = (template.path().display(), template.count());
-            return Err(Error::usage(format!("{path}: Gaussian {} is to be kept, of {count} from 0", row.source)));
-        }
         if let Some(proxy) = row.proxy.filter(|&proxy| proxy as usize >= proxies.len()) {
             return Err(Error::usage(format!("proxy {proxy} is to be written, of {} counted from 0", proxies.len())));
         }
@@ -244,15 +261,21 @@ fn add(row: &mut [u8], template: &Ply, change: &Change, place: usize) {
         for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
             let by = by.plane(c)[place];
             if let (Plane::Property(property), true) = (plane, by != 0.0) {
-                let mut value = [0.0];
-                read_plane(row, &[0], property, big_endian, &mut value);
-                put(row, property, big_endian, value[0] + by);
+                put(row, property, big_endian, value(row, property, big_endian) + by);
             }
         }
     }
 }
 
-fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
+/// A value in the bytes of a row, as the nearest f32.
+pub(crate) fn value(row: &[u8], property: &Property, big_endian: bool) -> f32 {
+    let mut value = [0.0];
+    read_plane(row, &[0], property, big_endian, &mut value);
+    value[0]
+}
+
+/// Writes a value into the bytes of a row, in the type of its property.
+pub(crate) fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
     let rounded = value.round();
     let mut bytes = [0; 8];
     let used = &mut bytes[..property.scalar.bytes()];

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::size::{Size, bytes_below};
 use super::trajectories::{NO_ARCHIVE, OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
@@ -10,6 +10,7 @@ use crate::archive::Content;
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
+use crate::ingest::cameras::Clock;
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
 use crate::recipe::Merge;
@@ -72,6 +73,16 @@ pub trait Family: Send + Sync {
 
     /// Where its frames get their times.
     fn timing(&self) -> Timing;
+
+    /// What its time counts, where cameras say when its frames are.
+    fn clock(&self) -> Clock {
+        Clock::Normalised
+    }
+
+    /// How long it lasts in its own time, where nothing says when its frames are.
+    fn span(&self) -> f64 {
+        1.0
+    }
 
     /// The same input with frames at `times`; refused where [`Timing::Stamped`].
     ///
@@ -181,8 +192,7 @@ pub trait Family: Send + Sync {
     /// # Errors
     /// Frames that cannot be read, a failed write.
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
-        write_trajectories(self.source(), reduction, kind, path, limits)?;
-        Ok(Vec::new())
+        write_trajectories(self.source(), reduction, kind, path, limits)
     }
 }
 
@@ -274,7 +284,7 @@ pub struct ColumnInfo {
 
 /// How a family takes part.
 pub(super) struct Entry {
-    /// What to give, for the message that nothing fits.
+    /// What to give, for the message that nothing fits; empty: nothing that would be read.
     pub(super) expected: &'static str,
     /// Whether a path is of this family, told by what is there.
     pub(super) recognises: fn(&Found) -> bool,
@@ -291,6 +301,12 @@ pub(super) struct Found<'a> {
 }
 
 impl Found<'_> {
+    /// Whether a file looks like one of `torch.save`: an archive that is not numpy's.
+    pub(super) fn is_checkpoint(&self) -> bool {
+        let of_numpy = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));
+        !self.is_folder && self.head.starts_with(b"PK") && !of_numpy
+    }
+
     /// Whether a file begins with `magic`, or, where it is so damaged that it does not, has that extension.
     pub(super) fn is_file_of(&self, magic: &[u8], extension: &str) -> bool {
         let named = || self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension));
@@ -305,8 +321,35 @@ pub struct OpenOptions {
     pub iteration: Option<u32>,
     /// Whether frames may be missing from a folder of them.
     pub allow_gaps: bool,
-    /// Folder for what an archive decodes to, while it is open; none: the system's for such files.
+    /// Whether frames are linked.
+    pub link: Link,
+    /// Folder for what an archive decodes to and linked frames are packed into, while they are open; none: the system's
+    /// for such files.
     pub scratch: Option<PathBuf>,
+    /// What its files do not say.
+    pub conventions: Conventions,
+}
+
+/// What the files of some families do not say of how their models were trained.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Conventions {
+    /// Length of `time_duration`, after which colours repeat; none: the family's guess, with a note.
+    pub time_duration: Option<f64>,
+    /// Whether rotations of four dimensions are those of before 15 September 2024, without the reversal of axes.
+    pub rot4d_unflipped: bool,
+}
+
+/// Whether the frames of a folder are linked, so that they say which Gaussian is which.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Link {
+    /// Where they have different numbers of Gaussians, or their order does not tell.
+    #[default]
+    Auto,
+    /// Whatever their order tells.
+    Always,
+    /// The same place means the same Gaussian.
+    Never,
 }
 
 impl OpenOptions {

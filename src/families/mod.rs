@@ -4,11 +4,26 @@
 
 pub mod archive;
 mod container;
+mod deform_folder;
+mod deformable_3d_gaussians;
 mod dynamic_3d_gaussians;
 mod family;
+mod files;
+mod foreign;
 mod four_d_gaussians;
+mod free_time_gs;
+mod in_checkpoint;
+mod iterations;
+mod law;
+mod linked;
+mod native_4d_gaussians;
 mod ply_sequence;
+mod pth;
+mod python_literal;
+mod sc_gs;
 pub mod size;
+mod spacetime_gaussians;
+mod static_3d_gaussians;
 pub mod stream;
 pub mod trajectories;
 
@@ -16,7 +31,7 @@ use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
 
-pub use family::{ColumnInfo, Family, OpenOptions, Residence, Timing};
+pub use family::{ColumnInfo, Conventions, Family, Link, OpenOptions, Residence, Timing};
 pub use four_d_gaussians::ModelFolder;
 pub use size::Size;
 
@@ -24,7 +39,15 @@ use crate::error::{Error, Result};
 use family::{Entry, Found};
 
 /// Every family that lies in files; the first that recognises a path opens it.
-const FAMILIES: [Entry; 6] = [
+const FAMILIES: [Entry; 14] = [
+    spacetime_gaussians::ENTRY,
+    spacetime_gaussians::SPLATV,
+    sc_gs::ENTRY,
+    deformable_3d_gaussians::ENTRY,
+    native_4d_gaussians::ENTRY,
+    free_time_gs::ENTRY,
+    foreign::ENTRY,
+    static_3d_gaussians::ENTRY,
     four_d_gaussians::ENTRY,
     dynamic_3d_gaussians::ENTRY,
     ply_sequence::FOLDER,
@@ -51,7 +74,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
     match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None => {
-            let expected: Vec<&str> = FAMILIES.iter().map(|entry| entry.expected).collect();
+            let expected = FAMILIES.iter().map(|entry| entry.expected).filter(|expected| !expected.is_empty());
+            let expected: Vec<&str> = expected.collect();
             Err(Error::input(path, "", expected.join(", "), "another kind of file"))
         }
     }
@@ -63,8 +87,12 @@ fn refuse_inside_a_model(path: &Path) -> Result<()> {
     let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
     let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
     let is_clouds = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
+    // A PLY that stands for itself in such a folder is a model of its own.
+    let is_part = |folder: &Path| {
+        folder.join("deformation.pth").exists() || spacetime_gaussians::is_marked(&folder.join("point_cloud.ply"))
+    };
     let (below, number) = match (iteration(&real), real.parent()) {
-        (Some(number), Some(clouds)) if is_clouds(clouds) && real.join("deformation.pth").exists() => (2, Some(number)),
+        (Some(number), Some(clouds)) if is_clouds(clouds) && is_part(&real) => (2, Some(number)),
         _ if is_clouds(&real) => (1, None),
         _ => return Ok(()),
     };

@@ -1,4 +1,5 @@
-//! Frames in PLY files: a folder with one for each, or a single one.
+//! Frames in PLY files: a folder with one for each, or a single one. Where they do not say which Gaussian is which, they
+//! are [linked](super::linked).
 //!
 //! What is written back has the properties, comments and names that the files had.
 
@@ -7,7 +8,8 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::archive::files::add_cloud;
-use super::family::{Entry, Family, OpenOptions, Residence, Timing};
+use super::family::{Entry, Family, Link, OpenOptions, Residence, Timing};
+use super::linked::Linked;
 use super::size::bytes_of;
 use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
 use crate::archive::Content;
@@ -15,8 +17,10 @@ use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
 use crate::error::Result;
+use crate::ingest::ply_frames::PlyFrames;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::limits::Limits;
+use crate::link::identity;
 use crate::model::{Columns, Gaussians};
 use crate::reduction::Reduction;
 use crate::source::{FrameSource, Ids};
@@ -27,8 +31,8 @@ pub(super) const FOLDER: Entry = Entry {
     expected: "a folder of PLY files",
     recognises: |found| found.is_folder,
     open: |path, options| {
-        let by = if options.allow_gaps { PlySequence::open_with_gaps } else { PlySequence::open };
-        open(path, options, by)
+        let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
+        open_frames(by(path)?, path, options)
     },
 };
 
@@ -36,13 +40,56 @@ pub(super) const FOLDER: Entry = Entry {
 pub(super) const FILE: Entry = Entry {
     expected: "a .ply",
     recognises: |found| found.is_file_of(b"ply", "ply"),
-    open: |path, options| open(path, options, PlySequence::single),
+    open: |path, options| open_frames(PlyFrames::single(path)?, path, options),
 };
 
-fn open(path: &Path, options: &OpenOptions, by: impl FnOnce(&Path) -> Result<PlySequence>) -> Result<Box<dyn Family>> {
-    let sequence = by(path)?;
+/// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
+fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
     options.refuse_for(path)?;
-    Ok(Box::new(sequence))
+    let why = match options.link {
+        _ if frames.paths().len() == 1 => None,
+        Link::Never => None,
+        Link::Always => Some("as asked".to_owned()),
+        Link::Auto => why_linked(&frames)?,
+    };
+    match why {
+        None => Ok(Box::new(PlySequence::new(frames)?)),
+        Some(why) => {
+            let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
+            Ok(Box::new(Linked::open(frames, &why, &scratch)?))
+        }
+    }
+}
+
+/// Pairs of frames whose order is measured.
+const MEASURED: usize = 5;
+
+/// Why order does not tell which Gaussian is which, if it does not: it does where it holds in most pairs of neighbouring
+/// frames, of five that are evenly spread.
+fn why_linked(frames: &PlyFrames) -> Result<Option<String>> {
+    if let Some(other) = frames.other_count() {
+        let (counts, path) = (frames.counts(), &frames.paths()[other]);
+        return Ok(Some(format!("{} has {} Gaussians, the first {}", path.display(), counts[other], counts[0])));
+    }
+    let pairs = frames.paths().len() - 1;
+    let mut found = Vec::new();
+    for k in 0..pairs.min(MEASURED) {
+        let first = k * pairs / pairs.min(MEASURED);
+        let state = |frame: usize| -> Result<Gaussians> {
+            let mut state = Gaussians::zeros(0, frames.sh_degree());
+            frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Columns::all(), &mut state)?;
+            Ok(state)
+        };
+        found.push(identity(&state(first)?, &state(first + 1)?));
+    }
+    let lost: Vec<_> = found.iter().filter(|identity| !identity.holds).collect();
+    Ok((2 * lost.len() > found.len()).then(|| {
+        let worst = lost[0];
+        format!(
+            "those of the same place are as far apart as strangers ({:.1} sizes, {:.1}) or look as different ({:.2}, {:.2})",
+            worst.moved, worst.apart, worst.unlike, worst.strangers
+        )
+    }))
 }
 
 impl Family for PlySequence {
@@ -111,10 +158,9 @@ impl Family for PlySequence {
 
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
         match kind {
-            OutputKind::Gseq => write_trajectories(self, reduction, kind, path, limits)?,
-            _ => write_files(self, reduction, kind, path)?,
+            OutputKind::Ply | OutputKind::PlySequence => write_files(self, reduction, kind, path).map(|()| Vec::new()),
+            _ => write_trajectories(self, reduction, kind, path, limits),
         }
-        Ok(Vec::new())
     }
 }
 

@@ -8,14 +8,17 @@ use std::path::Path;
 use gseq::Compression;
 
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
+use crate::emit::curves::write_curves;
+use crate::emit::four_dgs::write_four_dgs;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::write_inria;
+use crate::emit::spz::write_spz;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::reduction::Reduction;
 use crate::source::{FrameSource, Wanted};
-use crate::stream::{Changed, HeldFrames, MergedSequence, Progress, States};
+use crate::stream::{Changed, HeldFrames, MergedSequence, Progress, States, gather_all};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -61,16 +64,17 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
     }
 }
 
-/// Writes what is left of `source` as `kind`, to `path`.
+/// Writes what is left of `source` as `kind`, to `path`; gives things a person should know.
 pub(super) fn write_trajectories(
     source: &dyn FrameSource,
     reduction: &Reduction,
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
-) -> Result<()> {
+) -> Result<Vec<String>> {
     if kind == OutputKind::Gseq && !reduction.clusters.is_empty() {
-        return write_merged(source, reduction, path, limits.gaussians_together);
+        write_merged(source, reduction, path, limits.gaussians_together)?;
+        return Ok(Vec::new());
     }
     write_sequence(&*reduced_trajectories(source, reduction), kind, path, limits.frames_held)
 }
@@ -126,16 +130,27 @@ fn parts(merged: &MergedSequence<'_>, most: usize) -> Vec<Range<usize>> {
     parts
 }
 
-/// Writes every frame of `source`: as a container, as a folder of PLY files, or its only frame as one. Readers of whole
+/// Writes every frame of `source` as any kind that is made of frames; gives things a person should know. Readers of whole
 /// frames hold at most `held` of those they decode together.
 ///
 /// # Errors
 /// Frames that cannot be read, a failed write.
-pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, held: usize) -> Result<()> {
+pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, held: usize) -> Result<Vec<String>> {
     let info = source.info();
-    if kind == OutputKind::Gseq {
-        let progress = Progress::new("emit", "states", info.count as u64 * info.times.len() as u64);
-        return write_container(source, path, Compression::Zstd(LEVEL), BTreeMap::new(), |done| progress.advance(done));
+    match kind {
+        OutputKind::Splatv => return Ok(vec![write_curves(source, path)?]),
+        OutputKind::FourDgs => return Ok(vec![write_four_dgs(source, path)?]),
+        OutputKind::Spz => {
+            let off = write_spz(&gather_all(source, 0, Columns::all())?, path)?;
+            return Ok(vec![format!("positions are {off:.2e} scene units off at most")]);
+        }
+        OutputKind::Gseq => {
+            let progress = Progress::new("emit", "states", info.count as u64 * info.times.len() as u64);
+            let compression = Compression::Zstd(LEVEL);
+            write_container(source, path, compression, BTreeMap::new(), |done| progress.advance(done))?;
+            return Ok(Vec::new());
+        }
+        _ => (),
     }
     let progress = Progress::new("emit", "frames", info.times.len() as u64);
     let mut states = States::open(source, &Wanted::every().holding(held))?;
@@ -147,5 +162,5 @@ pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, h
         write_inria(states.at(frame)?, &[], &file)?;
         progress.advance(1);
     }
-    Ok(())
+    Ok(Vec::new())
 }

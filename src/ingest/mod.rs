@@ -1,6 +1,7 @@
 //! Formats that files come in: PLY files and sequences, containers, streams, cameras, pictures.
 
 pub mod cameras;
+pub(crate) mod checkpoint;
 pub mod container;
 pub(crate) mod digest;
 pub mod frame_stream;
@@ -8,6 +9,9 @@ pub mod image;
 mod map;
 pub(crate) mod npy;
 pub(crate) mod npz;
+mod pickle;
 pub mod ply;
+pub mod ply_frames;
 pub mod ply_sequence;
+pub mod splatv;
 pub mod text;

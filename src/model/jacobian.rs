@@ -46,6 +46,27 @@ impl Jacobian {
         Jacobian { columns: self.columns.each_ref().map(of) }
     }
 
+    /// Of `len` Gaussians, cut into `blocks` in order, all with values in the same columns.
+    pub fn joined(blocks: &[Jacobian], len: usize) -> Jacobian {
+        let mut whole = Jacobian::default();
+        for (place, to) in whole.columns.iter_mut().enumerate() {
+            let width = blocks.first().map_or(0, |block| block.columns[place].width());
+            if width == 0 {
+                continue;
+            }
+            *to = Column::zeros(width, len);
+            for c in 0..width {
+                let mut rest = to.plane_mut(c);
+                for part in blocks.iter().map(|block| &block.columns[place]) {
+                    let (here, after) = rest.split_at_mut(part.len());
+                    here.copy_from_slice(part.plane(c));
+                    rest = after;
+                }
+            }
+        }
+        whole
+    }
+
     /// Adds what the state changes by to first order when what is stored changes by `change`, in the columns that this
     /// has rows of; harmonics of a lower degree than the state's leave those above as they are.
     pub fn add_to(&self, change: &Gaussians, state: &mut Gaussians) {

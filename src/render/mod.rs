@@ -18,6 +18,7 @@ mod blend;
 mod colour;
 mod contribution;
 mod convention;
+mod features;
 mod lanes;
 mod project;
 mod removal;
@@ -25,6 +26,7 @@ mod renderer;
 
 pub use backward::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 pub use contribution::Contribution;
+pub use features::blend_features;
 pub use removal::RemovalError;
 pub use renderer::{BYTES_PER_VISIBLE, Image, Renderer, STRIP_BYTES, contribution, render};
 

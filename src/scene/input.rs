@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
 use crate::error::Result;
-use crate::families::{Family, OpenOptions};
-use crate::ingest::cameras::{self, CameraOptions, Times};
+use crate::families::{Conventions, Family, Link, OpenOptions};
+use crate::ingest::cameras::{self, CameraOptions, Clock, Times};
 use crate::model::{Rig, Split};
 use crate::work;
 
@@ -16,8 +16,12 @@ pub struct InputOptions {
     pub path: PathBuf,
     /// Training iteration of a model folder; none: the largest.
     pub iteration: Option<u32>,
+    /// What the files of a model do not say.
+    pub conventions: Conventions,
     /// Whether frames may be missing from a folder of them.
     pub allow_gaps: bool,
+    /// Whether frames of a folder are linked.
+    pub link: Link,
     /// Frames of a model that is continuous in time; none: the cameras' times.
     pub frames: Option<usize>,
     /// Camera file or folder; none: searched for.
@@ -45,7 +49,13 @@ impl InputOptions {
 
     /// What is said of the input beside its path.
     pub fn opening(&self) -> OpenOptions {
-        OpenOptions { iteration: self.iteration, allow_gaps: self.allow_gaps, scratch: self.scratch.clone() }
+        OpenOptions {
+            iteration: self.iteration,
+            allow_gaps: self.allow_gaps,
+            link: self.link,
+            scratch: self.scratch.clone(),
+            conventions: self.conventions,
+        }
     }
 
     /// Where scratch files go.
@@ -64,11 +74,11 @@ pub struct Opened {
     pub notes: Vec<String>,
 }
 
-/// The cameras of a file, if there is one, with times as `times` says.
+/// The cameras of a file, if there is one, with times as `times` and `clock` say.
 ///
 /// # Errors
 /// A file that is not there, or holds no cameras.
-pub fn load_cameras(options: &InputOptions, path: Option<&Path>, times: Times) -> Result<Option<Rig>> {
-    let camera_options = CameraOptions { size: options.size, frames: options.frames, times };
+pub fn load_cameras(options: &InputOptions, path: Option<&Path>, times: Times, clock: Clock) -> Result<Option<Rig>> {
+    let camera_options = CameraOptions { size: options.size, frames: options.frames, times, clock };
     path.map(|path| cameras::load(path, &camera_options)).transpose()
 }

@@ -35,7 +35,8 @@ pub struct Scene {
     pub rig: Rig,
     /// The cameras of the chosen split, frame by frame.
     pub schedule: Schedule,
-    /// Whether the cameras were given or found; else they are a virtual rig.
+    /// Whether the cameras were given or found, or surround a still scene: what they see is then the scene. Else they are a
+    /// virtual rig, which may see only what is in front of it.
     pub has_cameras: bool,
     /// Colour behind the scene, red, green, blue in [0, 1]: the cameras' own, else the one that the input was trained
     /// with, else black.

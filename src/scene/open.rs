@@ -10,8 +10,8 @@ use super::pictures::no_picture;
 use super::stream::open_arriving;
 use crate::error::{Error, Result};
 use crate::families::{self, Family, Timing};
-use crate::ingest::cameras::{self, Times};
-use crate::model::{Columns, Rig};
+use crate::ingest::cameras::{self, Clock, Times};
+use crate::model::{Columns, Rig, opacity};
 use crate::source::FrameSource;
 use crate::stats::RobustBox;
 use crate::stream::gather_all;
@@ -27,11 +27,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
     let path = &options.path;
     let mut notes = Vec::new();
     let input = families::open(path, &options.opening())?;
-    notes.extend(input.notes());
-    // Numbers in the names of a still scene's pictures are no times.
-    let is_still = input.timing() != Timing::Continuous && input.source().info().times.len() == 1;
-    let times = if is_still && options.times == Times::Own { Times::None } else { options.times.clone() };
-    let rig = load_cameras(options, camera_path(options, &*input).as_deref(), times)?;
+    let rig = cameras_of(options, &*input)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {
         Timing::Continuous => {
@@ -39,7 +35,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
                 None if !times.is_empty() => times,
                 // As many as there are: these.
                 Some(frames) if frames == times.len() => times,
-                given => evenly_spaced(given, &mut notes)?,
+                given => evenly_spaced(given, input.span(), &mut notes)?,
             };
             input.with_times(times)?
         }
@@ -63,11 +59,33 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
         }
         Timing::Numbered | Timing::Stamped => input,
     };
+    // Some depend on the times.
+    let notes = [input.notes(), notes].concat();
     check_frames(Opened { input, rig, notes }, path)
 }
 
-/// Times of the frames of a model for which no camera names any.
-fn evenly_spaced(given: Option<usize>, notes: &mut Vec<String>) -> Result<Vec<f64>> {
+/// The cameras that `options` name or `input` leads to. Frames that carry their times may have those of a model that counts
+/// time as its cameras' file does: where divided times are no frame's, the file's own are tried.
+fn cameras_of(options: &InputOptions, input: &dyn Family) -> Result<Option<Rig>> {
+    let path = camera_path(options, input);
+    // Numbers in the names of a still scene's pictures are no times.
+    let is_still = input.timing() != Timing::Continuous && input.source().info().times.len() == 1;
+    let by_name = path.as_deref().is_some_and(cameras::are_timed_by_name);
+    let times = match options.times {
+        Times::Own if is_still && by_name => Times::None,
+        _ => options.times.clone(),
+    };
+    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock);
+    let rig = load(input.clock())?;
+    let fits = |rig: &Rig| rig.schedule(&input.source().info().times, options.split).is_ok();
+    match rig.as_ref().is_some_and(|rig| input.timing() == Timing::Stamped && !fits(rig)) {
+        true => Ok(load(Clock::Given)?.filter(fits).or(rig)),
+        false => Ok(rig),
+    }
+}
+
+/// Times of the frames of a model for which no camera names any, in `span`.
+fn evenly_spaced(given: Option<usize>, span: f64, notes: &mut Vec<String>) -> Result<Vec<f64>> {
     let frames = given.unwrap_or(DEFAULT_FRAMES);
     if !(1..=MAX_FRAMES).contains(&frames) {
         return Err(Error::usage(format!("--frames: expected 1 to {MAX_FRAMES}, found {frames}")));
@@ -75,7 +93,7 @@ fn evenly_spaced(given: Option<usize>, notes: &mut Vec<String>) -> Result<Vec<f6
     if given.is_none() {
         notes.push(format!("nothing names the model's frames: {frames} evenly spaced ones (--frames)"));
     }
-    Ok((0..frames).map(|i| i as f64 / frames as f64).collect())
+    Ok((0..frames).map(|i| span * i as f64 / frames as f64).collect())
 }
 
 fn check_frames(opened: Opened, path: &Path) -> Result<Opened> {
@@ -101,11 +119,13 @@ pub fn open_scene(options: &InputOptions) -> Result<Scene> {
 /// Cameras of another scene; a split without pictures.
 pub fn scene_of(opened: Opened, options: &InputOptions) -> Result<Scene> {
     let Opened { input, rig, mut notes } = check_frames(opened, &options.path)?;
-    let has_cameras = rig.is_some();
+    // What a stream has is not known when its run is planned.
+    let is_still = !options.is_stream() && input.source().info().times.len() == 1;
+    let has_cameras = rig.is_some() || is_still;
     let rig = match rig {
         Some(rig) => rig,
         None => {
-            let rig = virtual_rig(input.source())?;
+            let rig = if is_still { surrounding_rig(input.source())? } else { virtual_rig(input.source())? };
             notes.push(format!("no cameras given or found: {}", rig.origin));
             rig
         }
@@ -126,6 +146,20 @@ const MAX_FRAMES: usize = 1_000_000;
 
 fn camera_path(options: &InputOptions, input: &dyn Family) -> Option<PathBuf> {
     options.cameras.clone().or_else(|| cameras::find(input.data_folder()?, &options.path))
+}
+
+/// A rig around the surface of the only frame. Memory: 64 bytes a Gaussian.
+fn surrounding_rig(source: &dyn FrameSource) -> Result<Rig> {
+    let state = gather_all(source, 0, Columns::POSITION | Columns::LOG_SCALE | Columns::OPACITY)?;
+    let places: Vec<DVec3> =
+        (0..state.len()).map(|i| DVec3::from_array(state.position.row::<3>(i).map(f64::from))).collect();
+    let covered = |i: usize| {
+        let mut scales = state.log_scale.row::<3>(i).map(f64::from);
+        scales.sort_by(f64::total_cmp);
+        opacity(state.opacity_logit.row::<1>(i)[0]) * (scales[1] + scales[2]).exp()
+    };
+    let weights: Vec<f64> = (0..state.len()).map(covered).collect();
+    Ok(cameras::surrounding_rig(&places, &weights))
 }
 
 /// A rig around the robust middle of the first frame.

@@ -33,12 +33,12 @@ impl Scene {
         self.digest.clone().map_or_else(|| self.input.digest(), Ok)
     }
 
-    /// Digest of another input, opened from `path`, which is kept, too.
+    /// Digest of another input, opened as `options` say, which is kept, too.
     ///
     /// # Errors
     /// A file that cannot be read, and those of the work folder.
-    pub fn digest_of(&self, path: &Path, input: &dyn Family) -> Result<String> {
-        known_digest(&self.work, path, None, input)
+    pub fn digest_of(&self, options: &InputOptions, input: &dyn Family) -> Result<String> {
+        known_digest(&self.work, options, input)
     }
 
     /// From where the input is looked at.
@@ -56,7 +56,7 @@ pub fn kept_work(options: &InputOptions, input: &dyn Family) -> Result<(Work, Op
     let Some(asked) = &options.work else { return Ok((Work::none(), None)) };
     let instructions = render::instructions();
     let mut work = Work::open(asked, format!("{} ({TOOL}, {instructions})", options.path.display()))?;
-    let digest = known_digest(&work, &options.path, options.iteration, input)?;
+    let digest = known_digest(&work, options, input)?;
     // This program and this machine, the input's content as it was opened; not where it lies.
     let info = input.source().info();
     work.follow_from(Key::of(&(TOOL, instructions, &digest)).and(&(
@@ -70,20 +70,20 @@ pub fn kept_work(options: &InputOptions, input: &dyn Family) -> Result<(Work, Op
 }
 
 /// Digest of `input`, which is read for it only if it may have changed since.
-fn known_digest(work: &Work, path: &Path, iteration: Option<u32>, input: &dyn Family) -> Result<String> {
+fn known_digest(work: &Work, options: &InputOptions, input: &dyn Family) -> Result<String> {
     match work.keeps() {
-        true => work.known(DIGEST, stamp(path, iteration)?, || input.digest()),
+        true => work.known(DIGEST, stamp(options)?, || input.digest()),
         false => input.digest(),
     }
 }
 
 /// What says, without reading it, that an input is the one that it was: its path, and of all of its files names, lengths
 /// and times of their last change.
-fn stamp(path: &Path, iteration: Option<u32>) -> Result<Key> {
-    let path = fs::canonicalize(path).map_err(Error::io("find", path))?;
+fn stamp(options: &InputOptions) -> Result<Key> {
+    let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
     stamps(&path, &mut files)?;
-    Ok(Key::of(&(TOOL, path, iteration, files)))
+    Ok(Key::of(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
 /// Of every file at `path` and below, in order: name, length, and when it was last changed, ns.

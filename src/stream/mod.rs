@@ -16,12 +16,13 @@ mod sample;
 mod scan;
 mod stages;
 mod states;
+mod tracks;
 mod trajectories;
 
 pub use changed::Changed;
 pub use contribution::{RunningContribution, Seen, visible_contribution};
 pub use frames::Frames;
-pub use gather::{gather, gather_all};
+pub use gather::{InBlocks, gather, gather_all};
 pub use held::HeldFrames;
 pub use merged::MergedSequence;
 pub use parts::Parts;
@@ -31,6 +32,7 @@ pub use removal::removal_error;
 pub use sample::{Sampler, VIEWS_AT_ONCE, frames_to_see, looked_at, spread, spread_over};
 pub use scan::{RunningScan, Scanned, scan, scan_blocks, scan_units};
 pub use states::States;
+pub use tracks::{TRACKED, tracks};
 
 /// Gaussians per unit of parallel work: their state at a frame and their accumulators fit the caches.
 /// Results do not depend on it.

@@ -6,14 +6,16 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Frames;
 use super::frames::open_all;
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::model::{Camera, Columns, Gaussians, Picture};
-use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::model::{Camera, Column, Columns, Gaussians, Picture};
+use crate::render::{Image, blend_features, render};
+use crate::source::{BlockReader, Decoder, FrameSource, Ids, Wanted};
 
 /// Pictures of a batch for each thread: enough that the last ones to finish cost little.
 pub const PICTURES_PER_THREAD: usize = 4;
@@ -33,6 +35,11 @@ impl<'a> Subject<'a> {
     /// All there is to see of `source`.
     pub fn all(source: &'a dyn FrameSource) -> Subject<'a> {
         Subject { source, ids: None, columns: Columns::all() }
+    }
+
+    /// What decodes its features, where all Gaussians are looked at and have some.
+    fn decoder(&self) -> Option<&'a dyn Decoder> {
+        self.source.decoder().filter(|_| self.ids.is_none())
     }
 
     fn open(&self, wanted: &Wanted) -> Result<Box<dyn BlockReader + 'a>> {
@@ -88,12 +95,36 @@ pub struct View<'a, const S: usize> {
     pub camera: &'a Camera,
     /// What it shows.
     pub states: [&'a Gaussians; S],
+    /// Of subjects with features in the place of colours, what decodes them, and the features.
+    decoded: [Option<(&'a dyn Decoder, &'a Column)>; S],
+}
+
+impl<const S: usize> View<'_, S> {
+    /// The picture of the subject numbered `subject` before `background`, on all threads of the pool, as its own renderer
+    /// makes it: of one with features these are blended and decoded, and there is no background.
+    pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
+        let (state, camera) = (self.states[subject], self.camera);
+        let Some((decoder, features)) = self.decoded[subject] else { return render(state, camera, background) };
+        let mut image = Image { width: camera.width, height: camera.height, data: Vec::new() };
+        let values = blend_features(state, features, camera);
+        let (centre, to_world) = (camera.center().to_array().map(|x| x as f32), camera.rotation.transpose());
+        let colour = |(pixel, values): (usize, &[f32])| {
+            let [x, y] = [pixel % camera.width as usize, pixel / camera.width as usize].map(|at| at as f64 + 0.5);
+            let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
+            decoder.colour(values, centre, (to_world * ray).to_array().map(|x| x as f32))
+        };
+        let colours = values.par_chunks_exact(features.width().max(1)).enumerate().map(colour);
+        image.data = colours.collect::<Vec<[f32; 3]>>().into_flattened();
+        image
+    }
 }
 
 /// States of all subjects at a frame, to be read into again.
 struct Slot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
+    /// Features of subjects that have some.
+    features: [Column; S],
 }
 
 /// Hands `pictures` (by frame; cameras by their index in `cameras`) to `visit`, in order, in batches; every state is
@@ -129,7 +160,7 @@ pub fn show<const S: usize>(
             let is_new = place == slots.len();
             if is_new {
                 let states = std::array::from_fn(|k| Gaussians::zeros(0, subjects[k].source.info().sh_degree));
-                slots.push(Slot { frame, states });
+                slots.push(Slot { frame, states, features: std::array::from_fn(|_| Column::default()) });
             } else if slots[place].frame == frame {
                 continue;
             }
@@ -139,15 +170,22 @@ pub fn show<const S: usize>(
                 let want = if is_new { subject.columns } else { subject.columns & varying };
                 reader.read(frame, want, state)?;
             }
+            for (subject, features) in subjects.iter().zip(&mut slot.features) {
+                if let Some(decoder) = subject.decoder() {
+                    decoder.features(frame, features)?;
+                }
+            }
             slot.frame = frame;
         }
         let of_frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
         let views: Vec<View<'_, S>> = of_frames
-            .flat_map(|(of_frame, Slot { states, .. })| {
-                of_frame.iter().map(|&picture| View {
+            .flat_map(|(of_frame, Slot { states, features, .. })| {
+                let decoded = std::array::from_fn(|k| Some((subjects[k].decoder()?, &features[k])));
+                of_frame.iter().map(move |&picture| View {
                     picture,
                     camera: &cameras[picture.camera as usize],
                     states: states.each_ref(),
+                    decoded,
                 })
             })
             .collect();
@@ -230,7 +268,7 @@ mod tests {
                 assert!(views.len() <= most.max(1), "{} pictures of at most {most}", views.len());
                 let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
                 assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
-                for View { picture, camera, states: [state, places] } in views {
+                for View { picture, camera, states: [state, places], .. } in views {
                     assert!(**state == expected[picture.frame], "frame {}", picture.frame);
                     assert!(places.position == state.position && places.sh.is_empty());
                     assert!(std::ptr::eq(*camera, &rig.cameras[picture.camera as usize]));
@@ -241,6 +279,63 @@ mod tests {
             .unwrap();
             assert_eq!(seen, all, "{frames} frames, {most} pictures");
         }
+    }
+
+    /// A scene whose Gaussians have features, and whose colours are the rays that pixels are seen along.
+    struct Rays(Scene);
+
+    impl FrameSource for Rays {
+        fn info(&self) -> &crate::model::SequenceInfo {
+            self.0.info()
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            self.0.open(ids)
+        }
+
+        fn decoder(&self) -> Option<&dyn Decoder> {
+            Some(self)
+        }
+    }
+
+    impl Decoder for Rays {
+        fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
+            *out = Column::zeros(2, self.info().count);
+            out.plane_mut(1).fill(frame as f32);
+            Ok(())
+        }
+
+        fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+            assert!(features[0].abs() < 1e-6 && features[1] >= 0.0, "{features:?}");
+            std::array::from_fn(|c| centre[c] + ray[c])
+        }
+    }
+
+    #[test]
+    fn features_are_decoded_along_the_ray_of_each_pixel_and_only_where_all_gaussians_are_looked_at() {
+        let scene = Rays(Scene::new(200, 3));
+        let rig = scene.0.rig();
+        let some: Vec<u32> = (0..200).collect();
+        let batch = Batch { frames: 2, pictures: 4, held: 4 };
+        let few = Subject { source: &scene, ids: Some(Ids::List(&some)), columns: Columns::all() };
+        show([Subject::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
+            for view in views {
+                let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
+                assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
+                for (at, colour) in image.data.as_chunks::<3>().0.iter().enumerate() {
+                    let seen = DVec3::from(colour.map(f64::from));
+                    assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
+                    // Where the camera sees that point is the middle of the pixel.
+                    let point = camera.rotation * seen + camera.translation;
+                    let found = [camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy];
+                    let pixel = [at % camera.width as usize, at / camera.width as usize];
+                    assert!((0..2).all(|c| (found[c] - pixel[c] as f64 - 0.5).abs() < 0.02), "{found:?} {pixel:?}");
+                }
+                assert_eq!(view.render(1, [1.0; 3]), render(view.states[1], camera, [1.0; 3]));
+            }
+            Ok(())
+        })
+        .unwrap();
     }
 
     #[test]

@@ -23,7 +23,7 @@ use crate::families::{self, Family, OpenOptions, Timing};
 use crate::limits::Limits;
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Picture};
-use crate::render::{Image, render};
+use crate::render::Image;
 use crate::scene::photographs::Photographs;
 use crate::scene::pictures::{self, PictureSet, background, pictures, thin};
 use crate::scene::{InputOptions, Scene, open_scene};
@@ -100,7 +100,8 @@ pub struct SideBySide {
     /// The original and its cameras, those of every split.
     pub scene: Scene,
     compressed: Box<dyn Family>,
-    compressed_path: PathBuf,
+    /// How the compressed one was opened.
+    compressed_as: InputOptions,
     background: [f32; 3],
     flip: bool,
     pictures: Vec<Picture>,
@@ -116,7 +117,7 @@ impl SideBySide {
     /// the same.
     pub fn open(options: &EvaluateOptions) -> Result<SideBySide> {
         let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
-        let compressed = open_compressed(&options.compressed, &scene, options.original.allow_gaps)?;
+        let compressed = open_compressed(&options.compressed, &scene, &options.original)?;
         let background = background(options.background, &scene)?;
         let times = &scene.source().info().times;
         let mut chosen = pictures(&scene.rig, times, options.part)?;
@@ -130,7 +131,11 @@ impl SideBySide {
         Ok(SideBySide {
             truth,
             truth_folder: options.ground_truth.clone(),
-            compressed_path: options.compressed.clone(),
+            compressed_as: InputOptions {
+                path: options.compressed.clone(),
+                iteration: None,
+                ..options.original.clone()
+            },
             pictures: chosen,
             scene,
             compressed,
@@ -249,8 +254,10 @@ impl SideBySide {
         });
         let scene = &self.scene;
         let count = |input: &dyn Family| input.source().info().count;
-        let path =
-            Both { original: scene.path.display().to_string(), compressed: self.compressed_path.display().to_string() };
+        let path = Both {
+            original: scene.path.display().to_string(),
+            compressed: self.compressed_as.path.display().to_string(),
+        };
         let size = Both { original: scene.input.size()?, compressed: self.compressed.size()? };
         Ok(Evaluation {
             tool: TOOL.to_owned(),
@@ -277,7 +284,7 @@ impl SideBySide {
         if !self.scene.work.keeps() {
             return Ok(Key::NONE);
         }
-        let compressed = self.scene.digest_of(&self.compressed_path, &*self.compressed)?;
+        let compressed = self.scene.digest_of(&self.compressed_as, &*self.compressed)?;
         let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.pictures)).transpose()?;
         Ok(Key::of(&(compressed, photographs, &self.pictures, self.background, self.flip)))
     }
@@ -318,8 +325,8 @@ impl SideBySide {
     pub fn both<O: Send>(&self, pictures: &[Picture], see: impl Fn([&Image; 2]) -> Result<O> + Sync) -> Result<Vec<O>> {
         let mut found = Vec::with_capacity(pictures.len());
         self.show(pictures, |views| {
-            let of = |&View { camera, states, .. }: &View<'_, 2>| {
-                let images = states.map(|state| render(state, camera, self.background));
+            let of = |view: &View<'_, 2>| {
+                let images = [0, 1].map(|subject| view.render(subject, self.background));
                 see([&images[0], &images[1]])
             };
             found.extend(views.par_iter().map(of).collect::<Result<Vec<O>>>()?);
@@ -391,10 +398,11 @@ impl SideBySide {
         Ok((all, observed))
     }
 
-    fn take(&self, &View { picture, camera, states: [original, compressed] }: &View<'_, 2>) -> Result<Taken> {
+    fn take(&self, view: &View<'_, 2>) -> Result<Taken> {
+        let &View { picture, camera, .. } = view;
         Ok(Taken {
-            original: render(original, camera, self.background),
-            compressed: render(compressed, camera, self.background),
+            original: view.render(0, self.background),
+            compressed: view.render(1, self.background),
             truth: match &self.truth {
                 Some(truth) if truth.has(picture) => Some(truth.read(picture, camera, self.background)?),
                 _ => None,
@@ -415,10 +423,11 @@ fn last_before(pictures: &[Picture], start: usize, these: &[Picture]) -> Vec<Pic
 /// Most that time stamps of the same frame may differ, in parts of the time span: files round them.
 const TIME_TOLERANCE: f64 = 1e-6;
 
-/// Opens the compressed model at the frames of the original.
-pub(super) fn open_compressed(path: &Path, original: &Scene, allow_gaps: bool) -> Result<Box<dyn Family>> {
+/// Opens the compressed model, of which holds what `options` say of the original but its iteration, at the original's
+/// frames.
+pub(super) fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn Family>> {
     let times = &original.source().info().times;
-    let input = families::open(path, &OpenOptions { allow_gaps, ..OpenOptions::default() })?;
+    let input = families::open(path, &OpenOptions { iteration: None, ..options.opening() })?;
     let input = match input.timing() {
         Timing::Continuous => input.with_times(times.clone())?,
         Timing::Numbered if input.source().info().times.len() == times.len() => input.with_times(times.clone())?,

@@ -3,6 +3,7 @@
 pub mod archive;
 pub mod baseline;
 pub mod container;
+pub mod convert;
 pub mod cost;
 pub(crate) mod csv;
 pub mod demo;

@@ -15,7 +15,7 @@ use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture};
-use crate::render::{self, Image};
+use crate::render::Image;
 use crate::scene::pictures::{self, PictureSet, background, picture, pictures};
 use crate::scene::{InputOptions, open_scene};
 use crate::source::FrameSource;
@@ -182,8 +182,8 @@ impl Job<'_> {
         let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
         show([Subject::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
-            let made = views.par_iter().map(|&View { picture, camera, states: [state] }| {
-                let made = of_each(picture, &render::render(state, camera, self.background))?;
+            let made = views.par_iter().map(|view: &View<'_, 1>| {
+                let made = of_each(view.picture, &view.render(0, self.background))?;
                 progress.advance(1);
                 Ok(made)
             });

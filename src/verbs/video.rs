@@ -13,7 +13,7 @@ use crate::emit::film::{Film, FilmFormat};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture, Rig, Shot};
-use crate::render::{Image, render};
+use crate::render::Image;
 use crate::scene::path::along;
 use crate::scene::pictures::{self, PictureSet, background};
 use crate::scene::{InputOptions, Opened, open_input, scene_of};
@@ -84,8 +84,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let mut opened = open_input(&InputOptions { split: None, ..options.input.clone() })?;
     let own = own_shots(&mut opened, options.input.frames.is_some());
     let mut scene = scene_of(opened, &InputOptions { split: None, ..options.input.clone() })?;
-    let beside =
-        options.beside.as_deref().map(|path| open_compressed(path, &scene, options.input.allow_gaps)).transpose()?;
+    let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<Need> {
         // Two pictures, and the frame that they make up, with its bytes and, of a GIF, those that colours are chosen from.
@@ -202,8 +201,8 @@ impl Shown<'_> {
         show(subjects, self.cameras, self.pictures, Batch::of_frame(self.limits), |views| {
             let made: Vec<Image> = views
                 .par_iter()
-                .map(|&View { camera, states, .. }| {
-                    let of_models = states.par_iter().map(|state| render(state, camera, self.background));
+                .map(|view: &View<'_, S>| {
+                    let of_models = (0..S).into_par_iter().map(|subject| view.render(subject, self.background));
                     side_by_side(of_models.collect())
                 })
                 .collect();

@@ -86,11 +86,8 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     if scene.source().info().times.is_empty() {
         return Err(Error::input(&options.original.path, "", "at least one frame to show", "none"));
     }
-    let compressed = options
-        .compressed
-        .as_deref()
-        .map(|path| open_compressed(path, &scene, options.original.allow_gaps))
-        .transpose()?;
+    let compressed =
+        options.compressed.as_deref().map(|path| open_compressed(path, &scene, &options.original)).transpose()?;
     let background = background(options.background, &scene)?;
     let limits = {
         let most = compressed.as_ref().map_or(0, |model| model.source().info().count as u64);

@@ -63,7 +63,8 @@ fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
     let one = balls(1).pick(&[0; 100]);
     workplace.ply("same.ply", &one);
     for preset in ["paper", "default"] {
-        let request = format!("same.ply --overwrite -o out.ply --prune-only --preset {preset}");
+        // What pictures show of them is told apart by who is drawn first.
+        let request = format!("same.ply --overwrite -o out.ply --prune-only --preset {preset} --coverage projected");
         let summary = workplace.summary(&format!("{request} --target-count 37"));
         assert_eq!(summary["gaussians"], 37);
         assert!(says(&summary, "left_out", "grading by coverage"), "{}", summary["left_out"]);
@@ -303,5 +304,7 @@ fn frames_that_disagree_are_named() {
     workplace.ply("frames/frame_1.ply", &balls(5));
     workplace.ply("frames/frame_2.ply", &balls(5));
     workplace.ply("frames/frame_3.ply", &balls(4));
-    workplace.refused(1, "compress frames -o out", &["frame_3.ply", "5", "4"]);
+    workplace.refused(1, "compress frames -o out --link never", &["frame_3.ply", "5", "4"]);
+    // Where nobody forbids it they are linked.
+    assert!(workplace.summary("frames -o out")["notes"].to_string().contains("linked"));
 }

@@ -229,13 +229,21 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
     let names: Vec<String> = archive.array_names().map(str::to_owned).collect();
     let mut read = |name: &str| -> Vec<f64> {
         let file = archive.by_name(name).unwrap().unwrap();
-        match file.dtype().descr().as_str() {
+        let columns_first = (file.order() == npyz::Order::Fortran).then(|| file.shape().to_vec());
+        let values: Vec<f64> = match file.dtype().descr().as_str() {
             "'<f4'" => file.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
             "'<i4'" => file.into_vec::<i32>().unwrap().into_iter().map(f64::from).collect(),
             "'<u4'" => file.into_vec::<u32>().unwrap().into_iter().map(f64::from).collect(),
             "'<i8'" => file.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect(),
             "'|b1'" => file.into_vec::<bool>().unwrap().into_iter().map(|value| f64::from(u8::from(value))).collect(),
             _ => file.into_vec::<f64>().unwrap(),
+        };
+        match columns_first.as_deref() {
+            Some(&[rows, columns]) => {
+                let at = |k: u64| values[((k % columns) * rows + k / columns) as usize];
+                (0..rows * columns).map(at).collect()
+            }
+            _ => values,
         }
     };
     names.iter().map(|name| (name.clone(), read(name))).collect()

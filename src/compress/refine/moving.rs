@@ -7,7 +7,7 @@ use super::local::{Keeping, Local, Locals};
 use super::loss::{Closeness, Loss};
 use super::targets::Targets;
 use crate::error::{Error, Result};
-use crate::model::{Columns, Gaussians, Gradients, SequenceInfo};
+use crate::model::{Columns, Gaussians, Gradients, Raw, SequenceInfo};
 use crate::reduction::Change;
 use crate::refine::{Descent, Schedule};
 use crate::render::{RemovalError, Renderer};
@@ -46,7 +46,7 @@ pub(super) struct Moving<'a> {
     /// What is at each of them, before `descent` moved anything.
     locals: Locals,
     /// What is stored, before `descent` moved anything, where states follow from it by more than a sum.
-    stored: Gaussians,
+    stored: Raw,
     /// What was added to what is stored before that.
     before: Change,
     fixed: Vec<bool>,
@@ -68,7 +68,7 @@ pub(super) struct Moving<'a> {
 type Standing<Stored, Added, Means> = (Option<(Stored, Added)>, (Added, Means, usize), usize);
 
 /// A [`Standing`] that was kept.
-pub(super) type Kept = Standing<Gaussians, Change, [Gaussians; 2]>;
+pub(super) type Kept = Standing<Raw, Change, [Gaussians; 2]>;
 
 impl<'a> Moving<'a> {
     /// What `result` shows of `targets`, to move in that manner but for those `fixed`.
@@ -94,7 +94,7 @@ impl<'a> Moving<'a> {
             targets,
             deformation,
             locals: Keeping::new(&scene.scratch, varying)?.finish()?,
-            stored: deformation.map_or(nothing.clone(), |deformation| deformation.stored().clone()),
+            stored: deformation.map_or_else(|| nothing.clone().into(), |deformation| deformation.stored().clone()),
             before: Change::default(),
             descent: Descent::new(&nothing, columns, sh_degree, &[]),
             gradients: Gradients::new(0, columns, sh_degree),
@@ -164,7 +164,7 @@ impl<'a> Moving<'a> {
     /// What is needed to go on from here, for [`Moving::go_on`].
     pub(super) fn standing(&self) -> impl Serialize + '_ {
         let found = self.found.then_some((&self.stored, &self.before));
-        let standing: Standing<&Gaussians, &Change, &[Gaussians; 2]> = (found, self.descent.standing(), self.steps);
+        let standing: Standing<&Raw, &Change, &[Gaussians; 2]> = (found, self.descent.standing(), self.steps);
         standing
     }
 
@@ -199,7 +199,7 @@ impl<'a> Moving<'a> {
         }
         let moved = self.descent.take();
         if self.deformation.is_some() {
-            moved.add_to(&mut self.stored, Columns::all());
+            moved.add_to(&mut self.stored.gaussians, Columns::all());
         }
         self.before = std::mem::take(&mut self.before).and(moved);
     }

@@ -19,11 +19,11 @@ use crate::emit::npz::write_like;
 use crate::error::Result;
 use crate::ingest::digest::hash_file;
 use crate::limits::Limits;
-use crate::model::{Columns, Gaussians, SH_C0};
+use crate::model::{Columns, Gaussians, SH_C0, colour};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::{FrameSource, Ids};
-use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS, colour};
+use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
 use proxies::Settled;
 
 /// What a model's file is called.
@@ -122,10 +122,9 @@ impl Family for Params {
 
     fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
         match kind {
-            OutputKind::Model => self.write_params(reduction, path.join(FILE))?,
-            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?,
+            OutputKind::Model => self.write_params(reduction, path.join(FILE)).map(|()| Vec::new()),
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
         }
-        Ok(Vec::new())
     }
 }
 
@@ -158,7 +157,7 @@ impl Params {
                 for (proxy, &place) in places.iter().enumerate() {
                     for c in 0..width {
                         let value = state.column(column).plane(c)[proxy];
-                        values[place as usize * width + c] = if is_colour { colour(value) } else { value };
+                        values[place as usize * width + c] = if is_colour { colour(value) as f32 } else { value };
                     }
                 }
                 let by = by.column(column);

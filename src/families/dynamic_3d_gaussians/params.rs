@@ -7,9 +7,10 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::emit::npz::Axis;
 use crate::error::{Error, Result};
 use crate::ingest::npz::{Entry, Floats, Npz};
-use crate::model::{Columns, Gaussians, SH_C0, SequenceInfo};
+use crate::model::{Columns, Gaussians, SequenceInfo, harmonic};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
 pub(super) const MEANS: &str = "means3D";
@@ -88,14 +89,7 @@ impl Params {
     /// # Errors
     /// A number of times other than T; times that are not finite or do not increase.
     pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<Params> {
-        if times.len() != self.info.times.len() {
-            let found = format!("{} times were given for {} frames", times.len(), self.info.times.len());
-            return Err(Error::usage(found));
-        }
-        if !times.iter().all(|time| time.is_finite()) || !times.is_sorted_by(|a, b| a < b) {
-            return Err(Error::usage("times of frames must be finite and increase"));
-        }
-        self.info.times = times;
+        self.info = self.info.with_times(times)?;
         Ok(self)
     }
 
@@ -115,8 +109,7 @@ impl Params {
     }
 
     /// Along which axis Gaussians are counted in an array.
-    pub(super) fn axis(entry: &Entry) -> crate::emit::npz::Axis {
-        use crate::emit::npz::Axis;
+    pub(super) fn axis(entry: &Entry) -> Axis {
         match entry.name.as_str() {
             MEANS | ROTATIONS | COLOURS => Axis::Second,
             LOG_SCALES | OPACITIES | SEGMENTS => Axis::First,
@@ -166,20 +159,10 @@ impl BlockReader for Block<'_> {
                     Columns::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
                     Columns::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
                     Columns::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
-                    _ => out.sh.set_row(row, colours.row::<3>(3 * at).map(harmonic)),
+                    _ => out.sh.set_row(row, colours.row::<3>(3 * at).map(|colour| harmonic(colour.into()))),
                 }
             }
         }
         Ok(())
     }
-}
-
-/// The harmonic coefficient of a colour.
-fn harmonic(colour: f32) -> f32 {
-    ((f64::from(colour) - 0.5) / SH_C0) as f32
-}
-
-/// The colour of a harmonic coefficient.
-pub(super) fn colour(harmonic: f32) -> f32 {
-    (0.5 + SH_C0 * f64::from(harmonic)) as f32
 }

@@ -6,7 +6,7 @@
 use super::params::Params;
 use crate::error::Result;
 use crate::families::trajectories::merged;
-use crate::model::{Columns, Gaussians, SequenceInfo, opacity};
+use crate::model::{Columns, Gaussians, SequenceInfo, logit, opacity};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction};
 use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
@@ -41,9 +41,9 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &Merge) -> Res
     for (row, sum) in sums.iter().enumerate() {
         let [a, b, c, visible] = sum.map(|sum| sum / sampled as f64);
         raw.log_scale.set_row(row, [a, b, c].map(|size| size as f32));
-        raw.opacity_logit.set_row(row, [(visible / (1.0 - visible)).ln() as f32]);
+        raw.opacity_logit.set_row(row, [logit(visible) as f32]);
     }
-    Ok(Proxies { raw: Some(raw), ..Proxies::default() })
+    Ok(Proxies { raw: Some(raw.into()), ..Proxies::default() })
 }
 
 /// The frames of what `reduction` leaves of `params`.
@@ -75,7 +75,8 @@ impl<'a> Settled<'a> {
     }
 
     fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
-        Box::new(SettledReader { reader, proxies: self.proxies(ids.iter()), raw: self.reduction.proxies.raw.as_ref() })
+        let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
+        Box::new(SettledReader { reader, proxies: self.proxies(ids.iter()), raw })
     }
 }
 

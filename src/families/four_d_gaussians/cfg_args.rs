@@ -7,12 +7,12 @@ use crate::deform::{FieldConfig, Tensors};
 use crate::error::{Error, Result};
 use crate::model::Columns;
 
-use super::python_literal::{Literal, parse_call};
+use crate::families::python_literal::{Literal, parse_call};
 
 /// Larger than any namespace an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
 /// What is called in it.
-const NAME: &str = "Namespace";
+pub(in crate::families) const NAME: &str = "Namespace";
 const SH_DEGREE: &str = "sh_degree";
 
 /// The hyper-parameters of a model, with the defaults of the original where `cfg_args` lacks a key.
@@ -164,7 +164,7 @@ impl ModelConfig {
 }
 
 /// The text of the `cfg_args` file at `path`.
-pub(super) fn read(path: &Path) -> Result<String> {
+pub(in crate::families) fn read(path: &Path) -> Result<String> {
     let bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
     if bytes > MAX_BYTES {
         return Err(Error::input(path, "", format!("at most {MAX_BYTES} bytes"), format!("{bytes} bytes")));
@@ -178,7 +178,7 @@ pub(super) fn read(path: &Path) -> Result<String> {
 
 /// `text`, that of `path`, with harmonics of `degree`, and all other bytes as they were. Where it does not say the degree,
 /// that comes first.
-pub(super) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
+pub(in crate::families) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
     let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
     let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
         Some(key) => (key.place.clone(), degree.to_string()),
@@ -193,18 +193,18 @@ pub(super) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<S
 
 /// One key and its value; `None` stands for a missing key too, and takes the default.
 #[derive(Clone, Copy)]
-struct Key<'a> {
-    name: &'static str,
-    value: &'a Literal,
-    path: &'a Path,
+pub(in crate::families) struct Key<'a> {
+    pub(in crate::families) name: &'static str,
+    pub(in crate::families) value: &'a Literal,
+    pub(in crate::families) path: &'a Path,
 }
 
 impl<'a> Key<'a> {
-    fn wrong(&self, expected: &str) -> Error {
+    pub(in crate::families) fn wrong(&self, expected: &str) -> Error {
         Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
     }
 
-    fn bool(&self, default: bool) -> Result<bool> {
+    pub(in crate::families) fn bool(&self, default: bool) -> Result<bool> {
         match self.value {
             Literal::None => Ok(default),
             Literal::Bool(value) => Ok(*value),
@@ -214,7 +214,7 @@ impl<'a> Key<'a> {
     }
 
     /// Python's `True` is the integer 1; `grid_pe=False` is written by some forks.
-    fn int(&self, default: i64) -> Result<i64> {
+    pub(in crate::families) fn int(&self, default: i64) -> Result<i64> {
         match self.value {
             Literal::None => Ok(default),
             Literal::Int(value) => Ok(*value),
@@ -223,7 +223,7 @@ impl<'a> Key<'a> {
         }
     }
 
-    fn float(&self, default: f64) -> Result<f64> {
+    pub(in crate::families) fn float(&self, default: f64) -> Result<f64> {
         match self.value {
             Literal::None => Ok(default),
             Literal::Float(value) => Ok(*value),
@@ -232,7 +232,7 @@ impl<'a> Key<'a> {
         }
     }
 
-    fn string(&self) -> Result<Option<String>> {
+    pub(in crate::families) fn string(&self) -> Result<Option<String>> {
         match self.value {
             Literal::None => Ok(None),
             Literal::Str(value) => Ok(Some(value.clone())),

@@ -4,19 +4,19 @@
 //! was, but for the SH degree where that is lower; so does the field, or its tensors keep their names and shapes and take
 //! fewer bytes.
 
-mod cfg_args;
+pub(super) mod cfg_args;
 mod model_folder;
 mod proxies;
-mod pth;
-mod python_literal;
 mod small_field;
 
-use std::fs::{self, File};
-use std::io;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
 use super::family::{Entry, Family, Residence, Timing};
+use super::files::copy;
+use super::law::left;
+use super::pth::{Stored, Values, is_floating, read_state_dict, write_state_dict};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::{Content, Role};
@@ -30,10 +30,9 @@ use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
 use crate::recipe::{Merge, Precision};
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
-use crate::source::FrameSource;
+use crate::source::{Deformation, FrameSource};
 use cfg_args::with_sh_degree;
 pub use model_folder::ModelFolder;
-use pth::{Stored, Values, is_floating, read_state_dict, write_state_dict};
 
 /// A model folder.
 pub(super) const ENTRY: Entry = Entry {
@@ -74,8 +73,8 @@ impl Family for ModelFolder {
                 size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
             }
             OutputKind::Ply => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
-            // No archive is written here.
-            OutputKind::Gseq | OutputKind::PlySequence | OutputKind::Archive => Ok(Size::of_frames(bytes_below(path)?)),
+            // Neither archive nor .splatv is written here.
+            _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }
 
@@ -157,7 +156,7 @@ impl Family for ModelFolder {
         };
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
-        let cloud = canonical_cloud(self, reduction);
+        let cloud = left(self.stored(), reduction).gaussians;
         let cfg_args = self.cfg_args(cloud.sh_degree())?;
         let mut content = Content {
             cloud,
@@ -179,7 +178,7 @@ impl Family for ModelFolder {
     }
 
     fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
-        let model = self.with_canonical(canonical_cloud(self, reduction));
+        let model = self.with_canonical(left(self.stored(), reduction).gaussians);
         Ok(Box::new(match reduction.field {
             Precision::Exact => model,
             Precision::Half => model.rounded()?,
@@ -216,9 +215,7 @@ impl Family for ModelFolder {
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
             OutputKind::Archive => return Err(Error::usage("an archive is made of a content")),
-            OutputKind::Gseq | OutputKind::PlySequence => {
-                write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?
-            }
+            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?),
         }
         Ok(notes)
     }
@@ -249,7 +246,7 @@ impl ModelFolder {
     /// Writes the canonical cloud of what is left with the properties and comments that the model's has.
     fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
-        let proxies = reduction.proxies.raw.as_ref().unwrap_or(&none);
+        let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let template = Ply::open(&self.paths().point_cloud)?;
         write_like(&template, &out_rows(reduction), proxies, &reduction.change, reduction.sh_degree, path)
     }
@@ -264,24 +261,6 @@ pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
 fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
     let (cloud, field, rest) = (bytes_of([cloud])?, bytes_of([field])?, bytes_of([configuration])?);
     Ok(Size { cloud, field, rest, ..Size::default() })
-}
-
-/// The canonical cloud of what is left, changed, with what stays of its harmonics: what the field adds to it stays as it
-/// is.
-fn canonical_cloud(model: &ModelFolder, reduction: &Reduction) -> Gaussians {
-    let mut cloud = ModelFolder::canonical(model).pick(&reduction.kept);
-    if let Some(raw) = &reduction.proxies.raw {
-        for (proxy, cluster) in reduction.clusters.iter().enumerate() {
-            for column in Columns::all().iter() {
-                for c in 0..raw.column(column).width() {
-                    cloud.column_mut(column).plane_mut(c)[cluster.output as usize] = raw.column(column).plane(c)[proxy];
-                }
-            }
-        }
-    }
-    cloud.drop_bands(reduction.sh_degree);
-    reduction.change.add_to(&mut cloud, Columns::all());
-    cloud
 }
 
 /// What a tensor is to the evaluation of a field.
@@ -319,12 +298,4 @@ pub(super) fn write_field(tensors: &Tensors, path: &Path) -> Result<()> {
         .iter()
         .map(|(name, tensor)| Stored::dense(name.clone(), tensor.shape.clone(), Values::F32(tensor.data.clone())));
     write_state_dict(path, &stored.collect::<Vec<_>>())
-}
-
-/// Copies the bytes, not the permissions: a result of a read-only model can be replaced.
-fn copy(from: &Path, to: &Path) -> Result<()> {
-    let mut source = File::open(from).map_err(Error::io("open", from))?;
-    let mut target = File::create(to).map_err(Error::io("create", to))?;
-    io::copy(&mut source, &mut target).map_err(Error::io("copy", from))?;
-    Ok(())
 }

@@ -26,7 +26,7 @@ pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, 
     let mut raw = of_leaders.clone();
     let mut notes = Vec::new();
     if leaders.is_empty() {
-        return Ok(Proxies { raw: Some(raw), deviation: None, notes });
+        return Ok(Proxies { raw: Some(raw.into()), notes, ..Proxies::default() });
     }
     // At the leader, the canonical position is the leader's to the bit, and so is the path.
     let solved = match merge.placement {
@@ -57,7 +57,8 @@ pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, 
         notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
         deviations = self::deviations(model, reference, all, &raw, &placements)?;
     }
-    Ok(Proxies { raw: Some(raw), deviation: deviations.into_iter().reduce(f64::max), notes })
+    let deviation = deviations.into_iter().reduce(f64::max);
+    Ok(Proxies { raw: Some(raw.into()), deviation, notes, ..Proxies::default() })
 }
 
 /// States of the proxies of `clusters` at the reference frame.

@@ -7,8 +7,8 @@ use half::f16;
 use half::slice::HalfFloatSliceExt;
 use half::vec::HalfFloatVecExt;
 
-use super::pth::{MAX_EXPANSION, Stored, Values};
 use crate::deform::{Tensor, Tensors, rows_before_zero};
+use crate::families::pth::{MAX_EXPANSION, Stored, Values};
 
 /// Tensors of fewer values keep theirs: biases, the ends of heads and the field's box take next to no bytes, and
 /// whatever passes through the field passes through them.

@@ -35,7 +35,7 @@ use crate::ingest::text::read_json;
 use crate::model::Rig;
 
 pub use times::Times;
-pub use virtual_rig::virtual_rig;
+pub use virtual_rig::{surrounding_rig, virtual_rig};
 
 /// Largest picture side in pixels: beyond it the width times the height of one picture nears 2³².
 const MAX_SIDE_PX: u32 = 1 << 15;
@@ -71,6 +71,18 @@ pub struct CameraOptions {
     pub frames: Option<usize>,
     /// Where the times of pictures come from whose file has none.
     pub times: Times,
+    /// What the times of `transforms*.json` count.
+    pub clock: Clock,
+}
+
+/// What the times of `transforms*.json` count.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Clock {
+    /// Anything: they are divided by the largest, as the D-NeRF loaders do.
+    #[default]
+    Normalised,
+    /// What the model's time counts.
+    Given,
 }
 
 /// Reads the cameras of `path`: a file, or a folder holding one, recognised by its name and content.
@@ -129,6 +141,11 @@ pub fn find(source_path: &str, model_folder: &Path) -> Option<PathBuf> {
     let model_folder = std::path::absolute(model_folder).ok()?;
     let beside = model_folder.ancestors().skip(1).map(|folder| folder.join(source_path));
     std::iter::once(PathBuf::from(source_path)).chain(beside).find(|path| locate(path).is_some())
+}
+
+/// Whether the pictures of the cameras at `path` get their times from their names.
+pub fn are_timed_by_name(path: &Path) -> bool {
+    locate(path).is_some_and(|file| is_colmap(&file))
 }
 
 /// The camera file `path` stands for: itself, or the first known name inside the folder.

@@ -7,16 +7,17 @@
 //!
 //! Times are divided by the largest of all splits' files, as the D-NeRF loaders do that the models were
 //! trained with (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames
-//! 0 … T−1 and files that reach 1 give the same times.
+//! 0 … T−1 and files that reach 1 give the same times. Models whose time counts something else take them as they are
+//! ([`Clock`]).
 
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 use serde_json::Value;
 
-use super::CameraOptions;
 use super::assemble::{Listing, Picture, assemble, from_camera_to_world, view_in_name};
 use super::fields::Fields;
+use super::{CameraOptions, Clock};
 use crate::error::Result;
 use crate::ingest::text::read_json;
 use crate::model::{Rig, Split};
@@ -44,7 +45,7 @@ pub(super) fn load(file: &Path, document: Value, with_others: bool, options: &Ca
 
     let pictures = || listings.iter().flat_map(|(_, pictures)| pictures);
     let latest = pictures().filter_map(|picture| picture.time).fold(latest, f64::max);
-    if latest > 0.0 {
+    if latest > 0.0 && options.clock == Clock::Normalised {
         for picture in listings.iter_mut().flat_map(|(_, pictures)| pictures) {
             picture.time = picture.time.map(|time| time / latest);
         }

@@ -1,4 +1,5 @@
-//! A stated rig for scenes that come without cameras.
+//! Stated rigs for scenes that come without cameras: one around a scene that moves, and one that looks at the surface of a
+//! still one from all sides.
 
 use glam::DVec3;
 
@@ -23,12 +24,8 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     let center = if center.is_finite() { center } else { DVec3::ZERO };
     let extent = if extent.is_finite() && extent > 0.0 { extent } else { 1.0 };
     let radius = DISTANCE * extent;
-    let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let cameras = (0..CAMERAS).map(|k| {
-        let z = 1.0 - f64::from(2 * k + 1) / f64::from(CAMERAS);
-        let (sin, cos) = (golden_angle * f64::from(k)).sin_cos();
-        let outward = DVec3::new(cos, sin, 0.0) * (1.0 - z * z).sqrt() + DVec3::Z * z;
-        let (eye, angle) = (center + radius * outward, FIELD_OF_VIEW_DEGREES.to_radians());
+        let (eye, angle) = (center + radius * on_sphere(k, CAMERAS), FIELD_OF_VIEW_DEGREES.to_radians());
         Camera { near: NEAR * extent, ..Camera::look_at(eye, center, angle, (SIDE_PX, SIDE_PX)) }
     });
     let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
@@ -42,6 +39,72 @@ pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
             center.x, center.y, center.z
         ),
     }
+}
+
+/// Cameras around a still scene: so many that no part of a surface is seen at a grazing angle alone.
+const AROUND: u32 = 24;
+/// Their distance in radii of what is to be seen, and a field of view that nearly fills the picture with it.
+const AROUND_DISTANCE: f64 = 2.2;
+const AROUND_DEGREES: f64 = 49.0;
+const AROUND_SIDE_PX: u32 = 320;
+/// Part of what is to be seen that lies within its radius: what is further away, mostly floaters and ground, is seen where it
+/// is in front.
+const WITHIN: f64 = 0.9;
+
+/// Cameras on a Fibonacci sphere around the bulk of a still scene's visible surface, all for training: the middle is the
+/// weighted median of `places` axis by axis, the radius the distance within which nine tenths of the weight lie. Weights
+/// are what a Gaussian covers, opacity times the product of its two larger scales, none above the 99th percentile: floaters
+/// are many and thin, and a backdrop is few and huge.
+pub fn surrounding_rig(places: &[DVec3], weights: &[f64]) -> Rig {
+    let mut all: Vec<(DVec3, f64)> = places
+        .iter()
+        .copied()
+        .zip(weights.iter().copied())
+        .filter(|(place, weight)| place.is_finite() && *weight > 0.0)
+        .collect();
+    let mut sorted: Vec<f64> = all.iter().map(|&(_, weight)| weight).collect();
+    sorted.sort_by(f64::total_cmp);
+    let most = sorted.get(sorted.len() * 99 / 100).copied().unwrap_or(1.0);
+    all.iter_mut().for_each(|(_, weight)| *weight = weight.min(most));
+    let quantile = |part: f64, of: &dyn Fn(DVec3) -> f64| -> f64 {
+        let mut values: Vec<(f64, f64)> = all.iter().map(|&(place, weight)| (of(place), weight)).collect();
+        values.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let wanted = part * values.iter().map(|value| value.1).sum::<f64>();
+        let mut sum = 0.0;
+        let found = values.iter().find(|value| {
+            sum += value.1;
+            sum >= wanted
+        });
+        found.or(values.last()).map_or(0.0, |value| value.0)
+    };
+    let middle = DVec3::from_array([0, 1, 2].map(|axis| quantile(0.5, &|place| place[axis])));
+    let radius = quantile(WITHIN, &|place| place.distance(middle));
+    let radius = if radius > 0.0 { radius } else { 1.0 };
+    let distance = AROUND_DISTANCE * radius;
+    let camera = |k: u32| {
+        let eye = middle + distance * on_sphere(k, AROUND);
+        let camera = Camera::look_at(eye, middle, AROUND_DEGREES.to_radians(), (AROUND_SIDE_PX, AROUND_SIDE_PX));
+        Camera { near: NEAR * radius, ..camera }
+    };
+    let shot = |view| Shot { view, camera: view, time: None, split: Split::Train, image: None };
+    Rig {
+        cameras: (0..AROUND).map(camera).collect(),
+        shots: (0..AROUND).map(shot).collect(),
+        background: None,
+        origin: format!(
+            "virtual rig: {AROUND} cameras on a Fibonacci sphere of radius {distance:.6} around the surface at ({:.6}, {:.6}, \
+             {:.6}), {AROUND_DEGREES}° field of view, {AROUND_SIDE_PX}×{AROUND_SIDE_PX} pixels",
+            middle.x, middle.y, middle.z
+        ),
+    }
+}
+
+/// Direction `k` of `n`, evenly over the sphere: latitude asin(1 − (2k + 1)/n), longitude k·π(3 − √5).
+fn on_sphere(k: u32, n: u32) -> DVec3 {
+    let golden_angle = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let z = 1.0 - f64::from(2 * k + 1) / f64::from(n);
+    let (sin, cos) = (golden_angle * f64::from(k)).sin_cos();
+    DVec3::new(cos, sin, 0.0) * (1.0 - z * z).sqrt() + DVec3::Z * z
 }
 
 #[cfg(test)]
@@ -73,6 +136,25 @@ mod tests {
                 rig.cameras[..i].iter().map(move |b| a.center().angle_between(b.center()).to_degrees())
             });
         assert!(closest.fold(f64::MAX, f64::min) > 40.0);
+    }
+
+    #[test]
+    fn a_still_scene_is_surrounded_where_its_surface_is_whatever_floats_around_it() {
+        let shell: Vec<DVec3> = (0..500).map(|k| DVec3::new(5.0, -2.0, 1.0) + on_sphere(k, 500)).collect();
+        let alone = surrounding_rig(&shell, &[1.0; 500]);
+        for camera in &alone.cameras {
+            assert!((camera.center().distance(DVec3::new(5.0, -2.0, 1.0)) - 2.2).abs() < 0.2, "{}", camera.center());
+            let seen = camera.rotation * DVec3::new(5.0, -2.0, 1.0) + camera.translation;
+            assert!(seen.truncate().length() < 0.1 && seen.z > 1.9, "{seen}");
+        }
+        let floating = (0..400).map(|k| 80.0 * on_sphere(k, 400));
+        let places: Vec<DVec3> = shell.iter().copied().chain(floating).collect();
+        let weights: Vec<f64> = (0..900).map(|k| if k < 500 { 1.0 } else { 0.01 }).collect();
+        let rig = surrounding_rig(&places, &weights);
+        for (a, b) in rig.cameras.iter().zip(&alone.cameras) {
+            assert!(a.center().distance(b.center()) < 0.1, "{} {}", a.center(), b.center());
+        }
+        assert_eq!(surrounding_rig(&[], &[]).cameras.len(), 24);
     }
 
     #[test]

@@ -89,7 +89,7 @@ fn missing(path: &Path, vertex: &Element, name: &str) -> Error {
     let hint = if has("packed_position") {
         "this is a compressed PLY; convert it to the plain layout first"
     } else if has("trbf_center") {
-        "this is a SpacetimeGaussians model, which is not a plain cloud of Gaussians"
+        "a SpacetimeGaussians model has x y z f_dc_0..2 opacity scale_0..2 rot_0..3 too"
     } else if has("red") || has("face") {
         "this looks like a point cloud or a mesh, not a trained Gaussian model"
     } else {

@@ -158,6 +158,20 @@ impl Ply {
         Ok(())
     }
 
+    /// The property `name` of all Gaussians, as the nearest f32; none where there is no such property.
+    ///
+    /// # Errors
+    /// A file cut short since it was opened.
+    pub(crate) fn values(&self, name: &str) -> Result<Option<Vec<f32>>> {
+        self.check_unshrunk()?;
+        let Some(property) = self.properties.iter().find(|property| property.name == name) else { return Ok(None) };
+        let starts: Vec<usize> = (0..self.count).map(|i| i * self.stride).collect();
+        let mut values = vec![0.0; self.count];
+        let rows = &self.body.bytes()[self.rows.clone()];
+        read_plane(rows, &starts, property, self.header.encoding == Encoding::BigEndian, &mut values);
+        Ok(Some(values))
+    }
+
     /// Bytes of the file that reading `rows` Gaussians takes, whatever their columns: of a text file all.
     pub(crate) fn bytes_of(&self, rows: usize) -> u64 {
         match &self.body {

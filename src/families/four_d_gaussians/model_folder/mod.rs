@@ -5,7 +5,6 @@
 //! per Gaussian), the field's tensors, and per open reader the canonical rows again plus
 //! [`Field::bytes_per_gaussian`].
 
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -14,13 +13,14 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
-use crate::model::{Column, Columns, Gaussians, Jacobian, SequenceInfo};
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
 use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, Reads, Wanted};
-use crate::stream::{BLOCK, Parts, gather};
+use crate::stream::{BLOCK, InBlocks, Parts};
 
 use super::cfg_args::ModelConfig;
-use super::pth::read_state_dict;
 use super::small_field::rounded;
+use crate::families::iterations::iteration as iteration_folder;
+use crate::families::pth::read_state_dict;
 use crate::ingest::digest::hash_file;
 use crate::ingest::ply::Ply;
 
@@ -50,26 +50,7 @@ impl ModelPaths {
     /// A folder or file that is missing; optional files may be.
     pub fn locate(root: &Path, iteration: Option<u32>) -> Result<Self> {
         let clouds = root.join("point_cloud");
-        let entries = fs::read_dir(&clouds).map_err(Error::io("open", &clouds))?;
-        let mut found = Vec::new();
-        for entry in entries {
-            let name = entry.map_err(Error::io("list", &clouds))?.file_name();
-            let number = name.to_str().and_then(|name| name.strip_prefix("iteration_"));
-            found.extend(number.and_then(|number| number.parse::<u32>().ok()));
-        }
-        found.sort_unstable();
-        let available = || {
-            let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();
-            if names.is_empty() { "none".to_owned() } else { names.join(", ") }
-        };
-        let iteration = match iteration {
-            Some(k) if found.contains(&k) => k,
-            Some(k) => return Err(Error::input(&clouds, "", format!("a folder iteration_{k}"), available())),
-            None => {
-                *found.last().ok_or_else(|| Error::input(&clouds, "", "a folder iteration_<number>", available()))?
-            }
-        };
-        let folder = clouds.join(format!("iteration_{iteration}"));
+        let (iteration, folder) = iteration_folder(&clouds, iteration)?;
         let optional = |name: &str| Some(folder.join(name)).filter(|path| path.exists());
         let paths = ModelPaths {
             root: root.to_owned(),
@@ -109,7 +90,7 @@ impl ModelPaths {
 pub struct ModelFolder {
     paths: ModelPaths,
     config: ModelConfig,
-    canonical: Arc<Gaussians>,
+    canonical: Arc<Raw>,
     field: Arc<Field>,
     tensor_bytes: u64,
     info: SequenceInfo,
@@ -128,7 +109,7 @@ impl ModelFolder {
         let tensor_bytes = (values * size_of::<f32>()) as u64;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
         let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
-        let (canonical, field, states) = (Arc::new(canonical), Arc::new(field), Count::default());
+        let (canonical, field, states) = (Arc::new(canonical.into()), Arc::new(field), Count::default());
         Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes })
     }
 
@@ -150,7 +131,7 @@ impl ModelFolder {
     pub fn with_canonical(&self, canonical: Gaussians) -> Self {
         let (count, sh_degree) = (canonical.len(), canonical.sh_degree());
         let info = SequenceInfo { count, sh_degree, ..self.info.clone() };
-        ModelFolder { canonical: Arc::new(canonical), info, ..self.clone() }
+        ModelFolder { canonical: Arc::new(canonical.into()), info, ..self.clone() }
     }
 
     /// The same model with the field that it has once that is stored in half precision.
@@ -173,18 +154,7 @@ impl ModelFolder {
     /// # Errors
     /// Times that are not finite or not strictly increasing; the error names the frames.
     pub fn with_times(mut self, times: Vec<f64>) -> Result<Self> {
-        if let Some(frame) = times.iter().position(|time| !time.is_finite()) {
-            return Err(Error::usage(format!("frame {frame} has time {}", times[frame])));
-        }
-        if let Some(frame) = times.windows(2).position(|pair| pair[0] >= pair[1]) {
-            return Err(Error::usage(format!(
-                "times must increase: frame {frame} is at {}, frame {} at {}",
-                times[frame],
-                frame + 1,
-                times[frame + 1]
-            )));
-        }
-        self.info.times = times;
+        self.info = self.info.at(times)?;
         Ok(self)
     }
 
@@ -200,7 +170,7 @@ impl ModelFolder {
 
     /// The raw parameters of every Gaussian, before any deformation.
     pub fn canonical(&self) -> &Gaussians {
-        &self.canonical
+        &self.canonical.gaussians
     }
 
     /// The deformation field.
@@ -241,7 +211,7 @@ impl FrameSource for ModelFolder {
         }
         let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
         for column in Columns::all().iter() {
-            let (from, to) = (self.canonical.column(column), raw.column_mut(column));
+            let (from, to) = (self.canonical().column(column), raw.column_mut(column));
             for c in 0..from.width() {
                 let plane = from.plane(c);
                 to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(to, id)| *to = plane[id]);
@@ -258,7 +228,7 @@ impl FrameSource for ModelFolder {
 
     /// Nothing is decoded together, so that nothing is gained by what readers of all Gaussians would keep.
     fn open_all(&self, _: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
-        Some(Ok(Box::new(WholeModel { model: self, ids: (0..self.info.count as u32).collect() })))
+        Some(Ok(Box::new(InBlocks::new(self))))
     }
 
     fn deformation(&self) -> Option<&dyn Deformation> {
@@ -272,7 +242,7 @@ impl FrameSource for ModelFolder {
 
 /// Blocks at once.
 impl Deformation for ModelFolder {
-    fn stored(&self) -> &Gaussians {
+    fn stored(&self) -> &Raw {
         &self.canonical
     }
 
@@ -281,7 +251,7 @@ impl Deformation for ModelFolder {
         if self.field.has_mask() { Columns::all().difference(Columns::POSITION) } else { Columns::all() }
     }
 
-    fn state(&self, frame: usize, stored: &Gaussians, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
@@ -290,7 +260,7 @@ impl Deformation for ModelFolder {
             || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
             |(raw, state, scratch, deltas), (ids, parts)| {
                 for column in (want | Columns::POSITION).iter() {
-                    *raw.column_mut(column) = stored.column(column).pick(ids);
+                    *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
                 }
                 self.field.deltas(&self.field.prepare(&raw.position), time, want, scratch, deltas)?;
                 deltas.apply(raw, want, state);
@@ -300,50 +270,18 @@ impl Deformation for ModelFolder {
         )
     }
 
-    fn jacobian(&self, frame: usize, stored: &Gaussians, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {
             let mut raw = Gaussians::zeros(0, self.info.sh_degree);
             for column in (want & Columns::ROTATION | Columns::POSITION).iter() {
-                *raw.column_mut(column) = stored.column(column).pick(ids);
+                *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
             }
             self.field.jacobian(&raw, time, want)
         };
         let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;
-        let mut whole = Jacobian::default();
-        for (place, to) in whole.columns_mut().iter_mut().enumerate() {
-            let parts: Vec<&Column> = blocks.iter().map(|block| &block.columns()[place]).collect();
-            let width = parts.first().map_or(0, |part| part.width());
-            if width > 0 {
-                *to = Column::zeros(width, ids.len());
-                for c in 0..width {
-                    let mut rest = to.plane_mut(c);
-                    for part in &parts {
-                        let (here, after) = rest.split_at_mut(part.len());
-                        here.copy_from_slice(part.plane(c));
-                        rest = after;
-                    }
-                }
-            }
-        }
-        Ok(whole)
-    }
-}
-
-/// Reads all Gaussians of a model, each block by a reader that lasts for one frame.
-struct WholeModel<'a> {
-    model: &'a ModelFolder,
-    ids: Vec<u32>,
-}
-
-impl BlockReader for WholeModel<'_> {
-    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        // What is replaced goes first.
-        out.columns_mut(want).for_each(|column| *column = Column::default());
-        let mut found = gather(self.model, &self.ids, frame, want)?;
-        out.columns_mut(want).zip(found.columns_mut(want)).for_each(|(to, from)| std::mem::swap(to, from));
-        Ok(())
+        Ok(Jacobian::joined(&blocks, ids.len()))
     }
 }
 

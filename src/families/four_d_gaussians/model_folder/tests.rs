@@ -1,7 +1,9 @@
 use std::collections::BTreeMap;
+use std::fs;
 
 use super::*;
 use crate::model::Gradients;
+use crate::stream::gather;
 
 /// A trained model in `SPLATSIEVE_DATA`, else `../shared/data`, which must be there.
 fn shared_model(name: &str) -> PathBuf {
@@ -269,11 +271,11 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
         sums.for_each(|(k, sum)| *sum = (k as f32 * 0.618_034).fract() - 0.5);
     }
     let mut by_raw = by_state.clone();
-    let jacobian = model.jacobian(1, model.canonical(), Columns::all()).unwrap();
+    let jacobian = model.jacobian(1, model.stored(), Columns::all()).unwrap();
     jacobian.pull_back(&mut by_raw);
     for threads in [1, 2, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let again = pool.install(|| model.jacobian(1, model.canonical(), Columns::all())).unwrap();
+        let again = pool.install(|| model.jacobian(1, model.stored(), Columns::all())).unwrap();
         assert!(again == jacobian, "{threads} threads");
     }
     for column in Columns::all().difference(Columns::POSITION).iter() {
@@ -304,5 +306,5 @@ fn derivatives_of_the_tiny_model_agree_with_differences_of_its_states_for_any_nu
     // Within a step some cross the edge of a texel or a ReLU, where there is no one derivative.
     assert!(off * 50 < 3 * n, "{off} of {} derivatives are off", 3 * n);
     assert!(through_field > n, "the field adds to {through_field} of {} derivatives only", 3 * n);
-    assert!(model.jacobian(3, model.canonical(), Columns::all()).is_err(), "there are three frames");
+    assert!(model.jacobian(3, model.stored(), Columns::all()).is_err(), "there are three frames");
 }

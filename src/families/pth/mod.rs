@@ -53,6 +53,14 @@ pub(super) fn read_state_dict(path: &Path) -> Result<Tensors> {
     Ok(tensors)
 }
 
+/// Names of the tensors of the state dict at `path`, in order; no value is read.
+///
+/// # Errors
+/// A file that is no state dict.
+pub(super) fn names(path: &Path) -> Result<Vec<String>> {
+    Ok(open(path)?.tensors().keys().cloned().collect())
+}
+
 /// Whether every tensor of the state dict at `path` is one that [`read_state_dict`] reads.
 ///
 /// # Errors

@@ -1,0 +1,193 @@
+//! Deformable-3D-Gaussians as a family: a canonical cloud, moved by a network of position and time.
+//!
+//! State at t, with what the network says of the canonical position: x = xyz + warp, or where a screw takes it;
+//! scale = exp(scale) + d_scaling, of which only the square counts; rotation = rot/|rot| + d_rotation, which nothing makes unit again: for
+//! a quaternion of length n the rasteriser's formula gives R(q) = (1 − n²)·I + n²·R(q/n), no rotation. Here the covariance
+//! R(q)·S²·R(q)ᵀ is decomposed. Opacity and harmonics never change. Source: Yang et al., "Deformable 3D Gaussians for
+//! High-Fidelity Monocular Dynamic Scene Reconstruction", 2024, and its public code.
+
+mod screw;
+
+use glam::{DMat3, DVec3};
+
+use super::deform_folder::{Deforming, Folder, Parts, has_network};
+use super::family::Entry;
+use super::law::{Law, copy_stored};
+use crate::deform::{Encoded, Motion, Network};
+use crate::error::{Error, Result};
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
+
+/// A model folder.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a Deformable-3D-Gaussians model folder",
+    recognises: |found| found.is_folder && has_network(found.path),
+    open: |path, options| Folder::open(path, options, Deformation::new),
+};
+
+/// Columns that follow from the covariance.
+const SHAPE: Columns = Columns::ROTATION.union(Columns::LOG_SCALE);
+
+/// How the network deforms.
+#[derive(Debug)]
+struct Deformation {
+    network: Network,
+}
+
+impl Deformation {
+    fn new(parts: &Parts<'_>) -> Result<(Deformation, Vec<String>)> {
+        if !parts.tensors.contains_key("linear.0.weight") {
+            let names: Vec<&str> = parts.tensors.keys().map(String::as_str).take(6).collect();
+            let found = if names.is_empty() { "none".to_owned() } else { format!("{}, …", names.join(", ")) };
+            return Err(Error::input(parts.file, "", "tensors linear.0.weight and so on", found)
+                .hint("networks of Deformable-3D-Gaussians and of SC-GS are read"));
+        }
+        let network = Network::new(parts.tensors, "", parts.file)?;
+        let mut notes = Vec::new();
+        let time = parts.tensors.contains_key("timenet.0.weight");
+        for (key, there) in [("is_blender", time), ("is_6dof", network.has_screws())] {
+            let said = parts.arguments.get(key).bool(there)?;
+            if said != there {
+                let [said, there] = [said, there].map(|yes| if yes { "True" } else { "False" });
+                notes.push(format!(
+                    "cfg_args says {key} = {said}, the weights in deform.pth are those of {key} = {there}: the weights are \
+                     believed"
+                ));
+            }
+        }
+        Ok((Deformation { network }, notes))
+    }
+}
+
+impl Deformation {
+    /// What the network says of the columns `want` of a block.
+    fn motion(&self, time: f64, encoded: &Encoded, want: Columns) -> Result<Motion> {
+        let mut motion = Motion::default();
+        let shape = if (want & SHAPE).is_empty() { Columns::empty() } else { SHAPE };
+        let want = want & Columns::POSITION | shape;
+        if !want.is_empty() {
+            self.network.motion(encoded, time, want, &mut motion)?;
+        }
+        Ok(motion)
+    }
+}
+
+impl Law for Deformation {
+    type Prepared = Encoded;
+
+    fn prepare(&self, raw: &Raw) -> Encoded {
+        self.network.encode(&raw.gaussians.position)
+    }
+
+    fn varying(&self) -> Columns {
+        Columns::POSITION | SHAPE
+    }
+
+    fn movable(&self) -> Columns {
+        Columns::all().difference(SHAPE)
+    }
+
+    fn state(&self, time: f64, raw: &Raw, encoded: &Encoded, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let raw_state = &raw.gaussians;
+        copy_stored(raw, want.difference(self.varying()), out);
+        let motion = self.motion(time, encoded, want)?;
+        if want.contains(Columns::POSITION) {
+            for row in 0..raw.len() {
+                let at = raw_state.position.row::<3>(row);
+                let to = match self.network.has_screws() {
+                    true => {
+                        let [x, w, v] = screw(at, motion.warp.row::<6>(row));
+                        screw::moved(x, w, v).as_vec3().to_array()
+                    }
+                    false => {
+                        let by = motion.warp.row::<3>(row);
+                        [0, 1, 2].map(|c| at[c] + by[c])
+                    }
+                };
+                out.position.set_row(row, to);
+            }
+        }
+        if !(want & SHAPE).is_empty() {
+            for row in 0..raw.len() {
+                let scales = raw_state.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
+                let rotation = raw_state.rotation.row::<4>(row).map(f64::from);
+                let by = (motion.scaling.row::<3>(row), motion.rotation.row::<4>(row));
+                let (scales, rotation) = scale_rotation(covariance(scales, rotation, by), rotation);
+                if want.contains(Columns::LOG_SCALE) {
+                    out.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
+                }
+                if want.contains(Columns::ROTATION) {
+                    out.rotation.set_row(row, rotation.map(|x| x as f32));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Of positions. A covariance changes with scales and rotations too, but its factors here are named anew at every frame.
+    fn jacobian(&self, time: f64, raw: &Raw, encoded: &Encoded, want: Columns) -> Result<Jacobian> {
+        let mut found = Jacobian::default();
+        if want.contains(Columns::POSITION) {
+            let position = &raw.gaussians.position;
+            let slopes = self.network.slopes(position, time)?;
+            let motion = match self.network.has_screws() {
+                true => self.motion(time, encoded, Columns::POSITION)?,
+                false => Motion::default(),
+            };
+            let mut out = Column::zeros(9, raw.len());
+            for row in 0..raw.len() {
+                for (axis, unit) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate() {
+                    let along = |first: usize| {
+                        DVec3::from([0, 1, 2].map(|c| f64::from(slopes.plane(3 * (first + c) + axis)[row])))
+                    };
+                    let change = match self.network.has_screws() {
+                        true => {
+                            let [x, w, v] = screw(position.row::<3>(row), motion.warp.row::<6>(row));
+                            screw::slope(x, w, v, unit, [along(0), along(3)])
+                        }
+                        false => unit + along(0),
+                    };
+                    // Where the network has no derivative, a position's state changes as it does.
+                    let change = if change.is_finite() { change } else { unit };
+                    (0..3).for_each(|i| out.plane_mut(3 * i + axis)[row] = change[i] as f32);
+                }
+            }
+            *found.column_mut(Columns::POSITION) = out;
+        }
+        Ok(found)
+    }
+}
+
+impl Deforming for Deformation {
+    const KIND: &'static str = "Deformable-3D-Gaussians model";
+    const NORMALISES: bool = true;
+
+    fn bytes_per_gaussian(&self) -> usize {
+        Network::BYTES_PER_GAUSSIAN
+    }
+
+    /// `benches/families.rs`, by the size of the network.
+    fn seconds_per_state(&self) -> f64 {
+        1e-6 + 2e-11 * self.network.multiplications() as f64
+    }
+}
+
+/// Position, axis and way.
+fn screw(x: [f32; 3], [a, b, c, d, e, f]: [f32; 6]) -> [DVec3; 3] {
+    [x, [a, b, c], [d, e, f]].map(|row| DVec3::from(row.map(f64::from)))
+}
+
+/// R(q)·S²·R(q)ᵀ of what a renderer hands to the rasteriser: xx xy xz yy yz zz.
+fn covariance(scales: [f64; 3], rotation: [f64; 4], by: ([f32; 3], [f32; 4])) -> [f64; 6] {
+    let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-12);
+    let [w, x, y, z] = [0, 1, 2, 3].map(|c| rotation[c] / length + f64::from(by.1[c]));
+    let scales = DVec3::from([0, 1, 2].map(|c| scales[c] + f64::from(by.0[c])));
+    // The formula of unit quaternions, which this one need not be.
+    let turn = DMat3::from_cols(
+        DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+        DVec3::new(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+        DVec3::new(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+    );
+    let axes = turn * DMat3::from_diagonal(scales);
+    let sigma = axes * axes.transpose();
+    [sigma.x_axis.x, sigma.x_axis.y, sigma.x_axis.z, sigma.y_axis.y, sigma.y_axis.z, sigma.z_axis.z]
+}

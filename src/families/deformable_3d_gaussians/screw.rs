@@ -1,0 +1,75 @@
+//! Motion by screws, of the variant with six degrees of freedom.
+//!
+//! A network says w and v. θ = |w|; w ← w/θ + 1e-5 and v ← v/θ + 1e-5 in every component, so that w is not quite unit; with W
+//! the matrix of w×: x′ = (I + sin θ·W + (1 − cos θ)·W²)·x + (θ·I + (1 − cos θ)·W + (θ − sin θ)·W²)·v. Source: `exp_se3` of the
+//! family's code.
+
+use glam::DVec3;
+
+/// Added to axes.
+const EPSILON: f64 = 1e-5;
+/// Angles below it are none: the limit is x + v, where the original divides by zero.
+const LEAST_ANGLE: f64 = 1e-30;
+/// Half the way over which a derivative is taken, of numbers of size 1: the cube root of an f64's precision.
+const SMALL: f64 = 6e-6;
+
+/// Where a screw takes `x`.
+pub(super) fn moved(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
+    let angle = w.length();
+    if angle < LEAST_ANGLE {
+        return x + v;
+    }
+    let (w, v) = (w / angle + EPSILON, v / angle + EPSILON);
+    let (sine, rest) = (angle.sin(), 1.0 - angle.cos());
+    let turned = x + sine * w.cross(x) + rest * w.cross(w.cross(x));
+    turned + angle * v + rest * w.cross(v) + (angle - sine) * w.cross(w.cross(v))
+}
+
+/// How the place changes along an axis of x, where w and v change with it by `slopes`: central differences along all of
+/// them together.
+pub(super) fn slope(x: DVec3, w: DVec3, v: DVec3, axis: DVec3, [of_w, of_v]: [DVec3; 2]) -> DVec3 {
+    // Screws change fast along with x: the way is short for them too.
+    let step = SMALL / (1.0 + of_w.abs().max_element() + of_v.abs().max_element());
+    let at = |by: f64| moved(x + by * axis, w + by * of_w, v + by * of_v);
+    (at(step) - at(-step)) / (2.0 * step)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+
+    /// The formula with matrices.
+    fn by_matrices(x: DVec3, w: DVec3, v: DVec3) -> DVec3 {
+        let angle = w.length();
+        let (w, v) = (w / angle + DVec3::splat(1e-5), v / angle + DVec3::splat(1e-5));
+        let skew = DMat3::from_cols_array(&[0.0, w.z, -w.y, -w.z, 0.0, w.x, w.y, -w.x, 0.0]);
+        let turn = DMat3::IDENTITY + skew * angle.sin() + skew * skew * (1.0 - angle.cos());
+        let along = DMat3::IDENTITY * angle + skew * (1.0 - angle.cos()) + skew * skew * (angle - angle.sin());
+        turn * x + along * v
+    }
+
+    #[test]
+    fn screws_are_those_of_the_matrices_and_none_at_no_angle() {
+        let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
+        for size in [1e-9, 1e-3, 1.0, 20.0] {
+            let off = (moved(x, size * w, v) - by_matrices(x, size * w, v)).length();
+            assert!(off < 1e-13, "size {size}: off by {off:e}");
+        }
+        assert_eq!(moved(x, DVec3::ZERO, v), x + v);
+        assert!((moved(x, 1e-20 * w, v) - x - v).length() < 1e-15);
+    }
+
+    #[test]
+    fn slopes_follow_x_and_what_the_network_changes_with_it() {
+        let [x, w, v] = [DVec3::new(0.3, -1.2, 2.0), DVec3::new(0.02, -0.5, 0.1), DVec3::new(-0.4, 0.1, 0.7)];
+        let of = [DVec3::new(3.0, 1.0, -2.0), DVec3::new(0.5, -4.0, 1.0)];
+        let wide = |by: f64| moved(x + by * DVec3::Y, w + by * of[0], v + by * of[1]);
+        // Richardson's extrapolation of wider differences.
+        let [one, two] = [1e-3, 2e-3].map(|by| (wide(by) - wide(-by)) / (2.0 * by));
+        let expected = (4.0 * one - two) / 3.0;
+        let found = slope(x, w, v, DVec3::Y, of);
+        assert!((found - expected).length() < 1e-8, "{found} {expected}");
+    }
+}

@@ -1,0 +1,38 @@
+//! Folders `iteration_K` of a model, as 3DGS and what came of it name them.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::error::{Error, Result};
+
+/// K of the folders `iteration_K` in `within`, increasing.
+///
+/// # Errors
+/// A folder that cannot be listed.
+pub(super) fn numbers(within: &Path) -> Result<Vec<u32>> {
+    let entries = fs::read_dir(within).map_err(Error::io("open", within))?;
+    let mut found = Vec::new();
+    for entry in entries {
+        let name = entry.map_err(Error::io("list", within))?.file_name();
+        let number = name.to_str().and_then(|name| name.strip_prefix("iteration_"));
+        found.extend(number.and_then(|number| number.parse::<u32>().ok()));
+    }
+    found.sort_unstable();
+    Ok(found)
+}
+
+/// K and the folder `iteration_K` in `within`: the one that is asked for, else the largest.
+///
+/// # Errors
+/// A folder that cannot be listed, or has no such one.
+pub(super) fn iteration(within: &Path, asked: Option<u32>) -> Result<(u32, PathBuf)> {
+    let found = numbers(within)?;
+    let chosen = asked.map_or(found.last().copied(), |k| found.contains(&k).then_some(k));
+    let Some(k) = chosen else {
+        let names: Vec<String> = found.iter().map(|k| format!("iteration_{k}")).collect();
+        let available = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        let wanted = asked.map_or("a folder iteration_<number>".to_owned(), |k| format!("a folder iteration_{k}"));
+        return Err(Error::input(within, "", wanted, available));
+    };
+    Ok((k, within.join(format!("iteration_{k}"))))
+}

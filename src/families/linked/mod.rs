@@ -1,0 +1,132 @@
+//! PLY frames that do not know one another: linked, packed into a container, and read from that.
+//!
+//! Every frame is read twice: to link it, then to pack its tracks. A track that is not there in a frame is held as it was,
+//! or as it will be first, with an opacity of nothing, so that it is seen nowhere and costs next to nothing.
+//!
+//! Memory of opening: two frames and what [`Linker`](crate::link::Linker) keeps; then, while packing, 8 bytes per track,
+//! 12 per Gaussian of a block of frames, and a tile of every column and thread. On the disk, in a file without a name,
+//! 4 bytes per Gaussian and frame, beside the container.
+
+mod tracks;
+mod write;
+
+use std::path::{Path, PathBuf};
+
+use xxhash_rust::xxh3::xxh3_128;
+
+use self::tracks::Tracks;
+use super::family::{Family, Residence, Timing};
+use super::size::bytes_of;
+use super::trajectories::write_trajectories;
+use crate::emit::atomic::ScratchFile;
+use crate::emit::kind::OutputKind;
+use crate::error::Result;
+use crate::ingest::container::Container;
+use crate::ingest::ply_frames::PlyFrames;
+use crate::limits::Limits;
+use crate::model::SequenceInfo;
+use crate::reduction::Reduction;
+use crate::source::{Ahead, BlockReader, FrameSource, Ids, Reads, Wanted};
+
+/// Linked frames.
+pub(super) struct Linked {
+    tracks: Tracks,
+    /// The tracks at every frame.
+    container: Container,
+    /// Of the container, at times that may be others.
+    info: SequenceInfo,
+    notes: Vec<String>,
+    /// Keeps the container's file until nobody reads it any more.
+    _scratch: ScratchFile,
+}
+
+impl Linked {
+    /// Links `frames`, which the notes say `why` of, with scratch files in `scratch`.
+    ///
+    /// # Errors
+    /// A frame that cannot be read or has changed meanwhile; a failed write.
+    pub(super) fn open(frames: PlyFrames, why: &str, scratch: &Path) -> Result<Linked> {
+        let (tracks, births, found) = Tracks::link(frames, scratch)?;
+        let packed = ScratchFile::new(scratch)?;
+        tracks.pack(births, packed.path())?;
+        let container = Container::open(packed.path())?;
+        let info = container.info().clone();
+        let mut notes = vec![format!("frames were linked: {why}")];
+        notes.extend(found.notes(tracks.frames()));
+        Ok(Linked { tracks, container, info, notes, _scratch: packed })
+    }
+}
+
+impl FrameSource for Linked {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        self.container.open(ids)
+    }
+
+    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        self.container.open_all(wanted)
+    }
+
+    fn reads(&self) -> Reads {
+        self.container.reads()
+    }
+
+    fn ahead(&self) -> Option<&dyn Ahead> {
+        self.container.ahead()
+    }
+}
+
+impl Family for Linked {
+    fn kind(&self) -> &'static str {
+        "linked PLY frames"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        // Another linking of the same files is another input.
+        let both = format!("{:032x} {}", self.tracks.frames().digest()?, self.container.digest());
+        Ok(format!("{:032x}", xxh3_128(both.as_bytes())))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_of(self.tracks.frames().paths().iter().map(PathBuf::as_path))
+    }
+
+    fn stored_bytes(&self) -> Result<u64> {
+        self.container.bytes()
+    }
+
+    fn residence(&self) -> Residence {
+        self.container.residence()
+    }
+
+    fn hold_decoded(&self) {
+        Family::hold_decoded(&self.container);
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Numbered
+    }
+
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        self.info = self.info.with_times(times)?;
+        Ok(self)
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.notes.clone()
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        match kind {
+            OutputKind::PlySequence => self.write_files(reduction, path).map(|()| Vec::new()),
+            _ => write_trajectories(self, reduction, kind, path, limits),
+        }
+    }
+}

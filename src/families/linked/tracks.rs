@@ -1,0 +1,262 @@
+//! Which row of which file is which track, and what follows: every track at every frame.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use gseq::Compression;
+
+use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, Lives};
+use crate::error::Result;
+use crate::ingest::ply::Ply;
+use crate::ingest::ply_frames::PlyFrames;
+use crate::link::Linker;
+use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::source::{BlockReader, FrameSource, Ids};
+use crate::stream::Progress;
+use crate::work::{Spill, Spilling};
+
+/// Opacity logit of a track where it is not: an opacity of 4·10⁻¹⁸.
+const NOT_THERE: f32 = -40.0;
+
+/// A row of a frame's file, and its track.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Row {
+    pub(super) track: u32,
+    pub(super) row: u32,
+}
+
+/// A frame in which a track is, and the row there.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct At {
+    frame: u32,
+    row: u32,
+}
+
+/// Frames, and the track of every row of them.
+pub(super) struct Tracks {
+    frames: PlyFrames,
+    count: usize,
+    /// Tracks of the rows of all frames, one after the other, and where those of each frame begin.
+    of_rows: Spill,
+    starts: Vec<u64>,
+}
+
+/// What linking found.
+pub(super) struct Found {
+    count: u32,
+    states: u64,
+    /// Frames that begin something new.
+    cuts: Vec<usize>,
+    /// Frames that tracks are there, in the median.
+    median_length: u32,
+}
+
+impl Found {
+    /// Things a person should know.
+    pub(super) fn notes(&self, frames: &PlyFrames) -> Vec<String> {
+        let mut notes = vec![format!(
+            "{} Gaussians of {} frames are {} tracks, of {} frames in the median",
+            self.states,
+            frames.paths().len(),
+            self.count,
+            self.median_length
+        )];
+        if let Some(&first) = self.cuts.first() {
+            let name = frames.paths()[first].file_name().unwrap_or_default().display();
+            notes.push(match self.cuts.len() {
+                1 => format!("a cut: {name} shows nothing of the frame before, all tracks end there"),
+                cuts => format!("{cuts} cuts, the first at {name}: such a frame shows nothing of the one before, all tracks end there"),
+            });
+        }
+        notes
+    }
+}
+
+impl Tracks {
+    /// Links `frames`; gives where each track is first, too. Scratch files are in `scratch`.
+    pub(super) fn link(frames: PlyFrames, scratch: &Path) -> Result<(Tracks, Vec<At>, Found)> {
+        let mut linker = Linker::default();
+        let (mut births, mut lengths, mut cuts) = (Vec::new(), Vec::<u32>::new(), Vec::new());
+        let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
+        let mut state = Gaussians::zeros(0, frames.sh_degree());
+        let progress = Progress::new("link", "frames", frames.paths().len() as u64);
+        for frame in 0..frames.paths().len() {
+            let ply = frames.frame(frame)?;
+            ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
+            let linked = linker.link(&state);
+            if linked.is_cut {
+                cuts.push(frame);
+            }
+            for (row, &track) in linked.tracks.iter().enumerate() {
+                // Those that begin here are numbered in the order of their rows.
+                if track as usize == births.len() {
+                    births.push(At { frame: frame as u32, row: row as u32 });
+                    lengths.push(0);
+                }
+                lengths[track as usize] += 1;
+            }
+            spilling.write(bytemuck::cast_slice(&linked.tracks))?;
+            end += linked.tracks.len() as u64;
+            starts.push(end);
+            progress.advance(1);
+        }
+        let middle = lengths.len() / 2;
+        let median_length = if lengths.is_empty() { 0 } else { *lengths.select_nth_unstable(middle).1 };
+        let found = Found { count: linker.tracks(), states: end, cuts, median_length };
+        let tracks = Tracks { count: births.len(), frames, of_rows: spilling.finish()?, starts };
+        Ok((tracks, births, found))
+    }
+
+    /// The files.
+    pub(super) fn frames(&self) -> &PlyFrames {
+        &self.frames
+    }
+
+    /// Number of tracks.
+    pub(super) fn count(&self) -> usize {
+        self.count
+    }
+
+    /// The rows of a frame by their tracks.
+    pub(super) fn rows(&self, frame: usize) -> Result<Vec<Row>> {
+        let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
+        self.of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
+        let rows = tracks.into_iter().enumerate();
+        let mut rows: Vec<Row> = rows.map(|(row, track)| Row { track, row: row as u32 }).collect();
+        rows.sort_unstable();
+        Ok(rows)
+    }
+
+    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbours, so that where a
+    /// block of them is not there yet, or no longer, nothing is written.
+    pub(super) fn pack(&self, mut held: Vec<At>, path: &Path) -> Result<()> {
+        let (times, degree) = (self.frames.times(), self.frames.sh_degree());
+        let compression = Compression::Zstd(1);
+        let mut writer = ContainerWriter::create(path, self.count, degree, FRAME_BLOCK, compression, BTreeMap::new())?;
+        let progress = Progress::new("pack", "frames", times.len() as u64);
+        let mut was_still = vec![false; self.count.div_ceil(GAUSSIAN_BLOCK)];
+        for start in (0..times.len()).step_by(FRAME_BLOCK) {
+            let of_block = start..times.len().min(start + FRAME_BLOCK);
+            let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
+            let rows: Vec<Vec<Row>> = of_block.clone().map(|frame| self.rows(frame)).collect::<Result<_>>()?;
+            let mut lives: Vec<Lives> =
+                was_still.iter().map(|&still| if still { Lives::Repeating } else { Lives::Still }).collect();
+            for row in rows.iter().flatten() {
+                lives[row.track as usize / GAUSSIAN_BLOCK] = Lives::New;
+            }
+            let info = SequenceInfo {
+                count: self.count,
+                times: times[of_block.clone()].to_vec(),
+                sh_degree: degree,
+                varying: Columns::all(),
+            };
+            let block = FrameBlock { info, tracks: self, start, files: &files, rows: &rows, held: &held };
+            writer.append_lives(&block, 0..of_block.len(), &times[of_block.clone()], &lives)?;
+            for (frame, rows) in of_block.clone().zip(&rows) {
+                for row in rows {
+                    held[row.track as usize] = At { frame: frame as u32, row: row.row };
+                }
+            }
+            was_still = lives.iter().map(|lives| *lives != Lives::New).collect();
+            progress.advance(of_block.len() as u64);
+        }
+        writer.finish()
+    }
+}
+
+/// All tracks at the frames of a block.
+struct FrameBlock<'a> {
+    info: SequenceInfo,
+    tracks: &'a Tracks,
+    /// The first of the frames.
+    start: usize,
+    files: &'a [Ply],
+    /// By track, of each of them.
+    rows: &'a [Vec<Row>],
+    /// Where each track was last before them, or will be first.
+    held: &'a [At],
+}
+
+impl FrameSource for FrameBlock<'_> {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let ids: Vec<usize> = ids.iter().collect();
+        let range = ids.first().map_or(0..0, |&first| first..first + ids.len());
+        let mut state = Gaussians::zeros(range.len(), self.info.sh_degree);
+        self.hold(range.clone(), &mut state)?;
+        Ok(Box::new(Reader { block: self, range, next: 0, state, part: Gaussians::zeros(0, self.info.sh_degree) }))
+    }
+}
+
+impl FrameBlock<'_> {
+    /// Writes the tracks of `range` as they are held before the first of the frames.
+    fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
+        let mut by_frame: Vec<(At, usize)> = self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
+        by_frame.sort_by_key(|(at, i)| (at.frame, *i));
+        let mut part = Gaussians::zeros(0, self.info.sh_degree);
+        for of_frame in by_frame.chunk_by(|(a, _), (b, _)| a.frame == b.frame) {
+            let frame = of_frame[0].0.frame as usize;
+            let rows: Vec<u32> = of_frame.iter().map(|(at, _)| at.row).collect();
+            let opened;
+            let ply = match frame.checked_sub(self.start).and_then(|at| self.files.get(at)) {
+                Some(ply) => ply,
+                None => {
+                    opened = self.tracks.frames.frame(frame)?;
+                    &opened
+                }
+            };
+            ply.gather(&Ids::List(&rows), Columns::all(), &mut part)?;
+            scatter(&part, of_frame.iter().map(|&(_, i)| i), state);
+        }
+        Ok(())
+    }
+}
+
+/// Tracks that follow one another, frame by frame.
+struct Reader<'a> {
+    block: &'a FrameBlock<'a>,
+    range: Range<usize>,
+    /// The frame that `state` is to become.
+    next: usize,
+    state: Gaussians,
+    part: Gaussians,
+}
+
+impl BlockReader for Reader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        if frame + 1 < self.next {
+            self.block.hold(self.range.clone(), &mut self.state)?;
+            self.next = 0;
+        }
+        while self.next <= frame {
+            let rows = &self.block.rows[self.next];
+            let first = rows.partition_point(|row| (row.track as usize) < self.range.start);
+            let rows = &rows[first..];
+            let rows = &rows[..rows.partition_point(|row| (row.track as usize) < self.range.end)];
+            self.state.opacity_logit.planes_mut().fill(NOT_THERE);
+            let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
+            self.block.files[self.next].gather(&Ids::List(&of_file), Columns::all(), &mut self.part)?;
+            scatter(&self.part, rows.iter().map(|row| row.track as usize - self.range.start), &mut self.state);
+            self.next += 1;
+        }
+        for column in want.iter() {
+            out.column_mut(column).clone_from(self.state.column(column));
+        }
+        Ok(())
+    }
+}
+
+/// Writes the rows of `part` to the `places` of `state`.
+fn scatter(part: &Gaussians, places: impl Iterator<Item = usize> + Clone, state: &mut Gaussians) {
+    for column in Columns::all().iter() {
+        let (from, to) = (part.column(column), state.column_mut(column));
+        for c in 0..to.width() {
+            let to = to.plane_mut(c);
+            places.clone().zip(from.plane(c)).for_each(|(place, &value)| to[place] = value);
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! What is left of linked frames, as files like those that came: in each the Gaussians that are there, with the properties,
+//! comments and name it had.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::Linked;
+use crate::emit::ply::{OutRow, out_rows, write_like};
+use crate::error::Result;
+use crate::families::trajectories::merged;
+use crate::model::{Columns, Gaussians};
+use crate::reduction::Reduction;
+use crate::source::{FrameSource, Ids};
+use crate::stream::Progress;
+
+/// What no row of a frame is of.
+const NONE: u32 = u32::MAX;
+
+impl Linked {
+    /// Writes every frame's file into `folder`. A merged Gaussian is there where one of its members is, in the row of the
+    /// first of them.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, a failed write.
+    pub(super) fn write_files(&self, reduction: &Reduction, folder: &Path) -> Result<()> {
+        let (frames, result) = (self.tracks.frames(), merged(self, reduction));
+        let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
+        let all = out_rows(reduction);
+        let progress = Progress::new("emit", "frames", frames.paths().len() as u64);
+        let write = |&frame: &usize| {
+            let mut row_of = vec![NONE; self.tracks.count()];
+            self.tracks.rows(frame)?.iter().for_each(|row| row_of[row.track as usize] = row.row);
+            let (mut rows, mut written) = (Vec::new(), Vec::new());
+            for (place, row) in all.iter().enumerate() {
+                let members = row.proxy.map_or(&[][..], |proxy| &reduction.clusters[proxy as usize].members[..]);
+                let tracks = [row.source].into_iter().chain(members.iter().map(|member| member.0));
+                if let Some(source) = tracks.map(|track| row_of[track as usize]).find(|&row| row != NONE) {
+                    rows.push(OutRow { source, proxy: row.proxy });
+                    written.push(place as u32);
+                }
+            }
+            let mut proxies = Gaussians::zeros(0, self.info.sh_degree);
+            result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut proxies)?;
+            let (template, change) = (frames.frame(frame)?, reduction.change.pick(&written));
+            let name = template.path().file_name().unwrap_or_default();
+            write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &folder.join(name))?;
+            progress.advance(1);
+            Ok(())
+        };
+        // A batch at a time: a thread that waits for proxies would begin another frame.
+        let numbers: Vec<usize> = (0..frames.paths().len()).collect();
+        numbers.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
+    }
+}

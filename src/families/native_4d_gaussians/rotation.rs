@@ -1,0 +1,181 @@
+//! Rotations of four dimensions as pairs of quaternions.
+//!
+//! R = L(l)·R̄(r): L multiplies from the left by the unit quaternion l, R̄ from the right by the conjugate of r, on (w, x, y, z).
+//! Rows and columns are then x, y, z, t once both axes are reversed. Source: `build_rotation_4d` of the repository.
+
+/// Rows of a matrix.
+pub(super) type Matrix = [[f64; 4]; 4];
+
+fn left([a, b, c, d]: [f64; 4]) -> Matrix {
+    [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
+}
+
+fn right([p, q, r, s]: [f64; 4]) -> Matrix {
+    [[p, q, r, s], [-q, p, -s, r], [-r, s, p, -q], [-s, -r, q, p]]
+}
+
+fn product(a: &Matrix, b: &Matrix) -> Matrix {
+    [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| a[i][k] * b[k][j]).sum()))
+}
+
+/// Both axes reversed; its own inverse.
+fn reversed(a: &Matrix) -> Matrix {
+    [3, 2, 1, 0].map(|i| [3, 2, 1, 0].map(|j| a[i][j]))
+}
+
+fn unit(q: [f64; 4]) -> [f64; 4] {
+    let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    if length > 0.0 { q.map(|x| x / length) } else { [1.0, 0.0, 0.0, 0.0] }
+}
+
+/// The rotation of two quaternions of any length but 0, which counts as 1; not `flipped`: as in checkpoints from before
+/// 15 September 2024, without the reversal.
+pub(super) fn rotation([l, r]: [[f64; 4]; 2], flipped: bool) -> Matrix {
+    let whole = product(&left(unit(l)), &right(unit(r)));
+    if flipped { reversed(&whole) } else { whole }
+}
+
+/// Unit quaternions whose rotation is `matrix`, one of determinant 1.
+pub(super) fn quaternions(matrix: &Matrix, flipped: bool) -> [[f64; 4]; 2] {
+    let matrix = if flipped { reversed(matrix) } else { *matrix };
+    let axis = |i: usize| {
+        let mut axis = [0.0; 4];
+        axis[i] = 1.0;
+        axis
+    };
+    // Products of the basis are orthogonal, each of squared length 4: these are the coefficients l_i·r_j, of rank 1.
+    let coefficient = |i: usize, j: usize| -> f64 {
+        let of = product(&left(axis(i)), &right(axis(j)));
+        of.iter().flatten().zip(matrix.iter().flatten()).map(|(a, b)| a * b).sum::<f64>() / 4.0
+    };
+    let rows: [[f64; 4]; 4] = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| coefficient(i, j)));
+    let square = |row: &[f64; 4]| row.iter().map(|x| x * x).sum::<f64>();
+    let strongest = (1..4).fold(0, |most, i| if square(&rows[i]) > square(&rows[most]) { i } else { most });
+    let r = unit(rows[strongest]);
+    let l = rows.map(|row| row.iter().zip(r).map(|(a, b)| a * b).sum::<f64>());
+    [unit(l), r]
+}
+
+/// R diag(s)² Rᵀ.
+pub(super) fn covariance(rotation: &Matrix, scales: [f64; 4]) -> Matrix {
+    [0, 1, 2, 3]
+        .map(|i| [0, 1, 2, 3].map(|j| (0..4).map(|k| rotation[i][k] * scales[k].powi(2) * rotation[j][k]).sum()))
+}
+
+/// Scales and rotation (determinant 1) of a covariance, by Jacobi's method: the axis that goes furthest along time is last.
+/// Squares of scales are at least 1e-14.
+pub(super) fn decomposed(covariance: &Matrix) -> ([f64; 4], Matrix) {
+    const SWEEPS: usize = 16;
+    const LEAST: f64 = 1e-14;
+    let mut a = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| 0.5 * (covariance[i][j] + covariance[j][i])));
+    // Row i is axis i.
+    let mut axes = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| f64::from(u8::from(i == j))));
+    let most = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
+    for _ in 0..SWEEPS {
+        let mut off = 0.0f64;
+        for p in 0..4 {
+            for q in p + 1..4 {
+                off = off.max(a[p][q].abs());
+                if a[p][q].abs() <= 1e-19 * most {
+                    continue;
+                }
+                let zeta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+                let tangent = 1f64.copysign(zeta) / (zeta.abs() + zeta.hypot(1.0));
+                let cosine = 1.0 / tangent.hypot(1.0);
+                let sine = cosine * tangent;
+                for row in &mut a {
+                    (row[p], row[q]) = (cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]);
+                }
+                for of in [&mut a, &mut axes] {
+                    let (first, second) = (of[p], of[q]);
+                    of[p] = std::array::from_fn(|k| cosine * first[k] - sine * second[k]);
+                    of[q] = std::array::from_fn(|k| sine * first[k] + cosine * second[k]);
+                }
+            }
+        }
+        if off <= 1e-18 * most {
+            break;
+        }
+    }
+    let along = (0..3).fold(3, |last, i| if axes[i][3].abs() > axes[last][3].abs() { i } else { last });
+    let mut order = [0, 1, 2, 3];
+    order.swap(along, 3);
+    let scales = order.map(|i| a[i][i].max(LEAST).sqrt());
+    let mut rotation = [0, 1, 2, 3].map(|row| order.map(|i| axes[i][row]));
+    if determinant(&rotation) < 0.0 {
+        rotation.iter_mut().for_each(|row| row[0] = -row[0]);
+    }
+    (scales, rotation)
+}
+
+fn determinant(a: &Matrix) -> f64 {
+    let minor = |row: [usize; 3], column: [usize; 3]| {
+        let of = |i: usize, j: usize| a[row[i]][column[j]];
+        of(0, 0) * (of(1, 1) * of(2, 2) - of(1, 2) * of(2, 1)) - of(0, 1) * (of(1, 0) * of(2, 2) - of(1, 2) * of(2, 0))
+            + of(0, 2) * (of(1, 0) * of(2, 1) - of(1, 1) * of(2, 0))
+    };
+    let columns = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];
+    (0..4).map(|j| if j % 2 == 0 { 1.0 } else { -1.0 } * a[0][j] * minor([1, 2, 3], columns[j])).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Of quaternions as (w, x, y, z).
+    fn hamilton([a, b, c, d]: [f64; 4], [p, q, r, s]: [f64; 4]) -> [f64; 4] {
+        [
+            a * p - b * q - c * r - d * s,
+            a * q + b * p + c * s - d * r,
+            a * r - b * s + c * p + d * q,
+            a * s + b * r - c * q + d * p,
+        ]
+    }
+
+    fn quaternion() -> impl Strategy<Value = [f64; 4]> {
+        prop::array::uniform4(-2.0..2.0f64).prop_filter("direction", |q| q.iter().map(|x| x * x).sum::<f64>() > 0.05)
+    }
+
+    fn off(a: &Matrix, b: &Matrix) -> f64 {
+        let most = b.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
+        a.iter().flatten().zip(b.iter().flatten()).fold(0.0f64, |off, (a, b)| off.max((a - b).abs())) / most
+    }
+
+    proptest! {
+        #[test]
+        fn a_rotation_multiplies_by_one_quaternion_and_the_conjugate_of_the_other(
+            l in quaternion(), r in quaternion(), at in quaternion()
+        ) {
+            let conjugate = |[a, b, c, d]: [f64; 4]| [a, -b, -c, -d];
+            let expected = hamilton(hamilton(unit(l), at), conjugate(unit(r)));
+            let apply = |matrix: &Matrix, at: [f64; 4]| matrix.map(|row| (0..4).map(|k| row[k] * at[k]).sum::<f64>());
+            let got = apply(&rotation([l, r], false), at);
+            prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");
+            // Reversed: of (z, y, x, w), as (z, y, x, w).
+            let back = |[a, b, c, d]: [f64; 4]| [d, c, b, a];
+            let got = back(apply(&rotation([l, r], true), back(at)));
+            prop_assert!((0..4).all(|i| (got[i] - expected[i]).abs() < 1e-13), "{got:?} {expected:?}");
+        }
+
+        #[test]
+        fn quaternions_are_those_of_the_rotation(l in quaternion(), r in quaternion(), flipped: bool) {
+            let matrix = rotation([l, r], flipped);
+            prop_assert!((determinant(&matrix) - 1.0).abs() < 1e-13);
+            prop_assert!(off(&rotation(quaternions(&matrix, flipped), flipped), &matrix) < 1e-14);
+        }
+
+        #[test]
+        fn a_decomposed_covariance_is_made_again(
+            l in quaternion(), r in quaternion(), logs in prop::array::uniform4(-5.0..1.0f64), flipped: bool
+        ) {
+            let expected = covariance(&rotation([l, r], flipped), logs.map(f64::exp));
+            let (scales, found) = decomposed(&expected);
+            prop_assert!((determinant(&found) - 1.0).abs() < 1e-12);
+            prop_assert!((0..3).all(|i| found[3][i].abs() <= found[3][3].abs()));
+            let again = covariance(&rotation(quaternions(&found, flipped), flipped), scales);
+            prop_assert!(off(&again, &expected) < 1e-14, "{}", off(&again, &expected));
+        }
+    }
+}

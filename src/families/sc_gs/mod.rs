@@ -1,0 +1,357 @@
+//! SC-GS as a family: a canonical cloud that follows a few nodes, which a network of position and time moves.
+//!
+//! State at t: what the network says of each node is summed with the shares that a Gaussian has in the nodes nearest to it
+//! ([`Nodes`]) and multiplied by its mask, σ of its last feature (1 without one). x = xyz + warp; scale = exp(scale) + d_scaling, of
+//! which only the square counts; rotation = rot + d_rotation, of the raw rot, made unit afterwards. Where the network predicts
+//! them, opacity = σ(opacity) + d_opacity, and a colour is added to harmonics of degree 0. With `deform_type='mlp'` there are
+//! neither nodes nor mask, and the network sees each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian
+//! Splatting for Editable Dynamic Scenes", 2024, and its public code.
+
+mod nodes;
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::deform_folder::{Arguments, Deforming, Folder, LEAST_SCALE, Parts, has_network, names_of_network};
+use super::family::Entry;
+use super::law::Law;
+use crate::deform::{Encoded, Motion, Network};
+use crate::error::{Error, Result, quoted};
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, logit, opacity};
+use nodes::Nodes;
+
+/// A model folder, told from the other family of such by a key of its configuration or by its nodes.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "an SC-GS model folder",
+    recognises: |found| {
+        let typed = || {
+            let arguments = Arguments::read(&found.path.join("cfg_args")).ok();
+            arguments.is_some_and(|arguments| arguments.get("deform_type").string().is_ok_and(|kind| kind.is_some()))
+        };
+        found.is_folder
+            && has_network(found.path)
+            && (typed() || names_of_network(found.path).iter().any(|name| name == "nodes"))
+    },
+    open: |path, options| Folder::open(path, options, Control::new),
+};
+
+/// Bytes of the outputs that are kept, each of all nodes at one time.
+const KEPT_BYTES: usize = 16 << 20;
+/// Largest logit of an opacity that the network adds to.
+const MOST_LOGIT: f64 = 40.0;
+
+/// How a network moves Gaussians.
+#[derive(Debug)]
+struct Control {
+    network: Network,
+    nodes: Option<Sparse>,
+}
+
+/// By nodes.
+#[derive(Debug)]
+struct Sparse {
+    nodes: Nodes,
+    encoded: Encoded,
+    masked: bool,
+    /// Outputs at times (their f32 bits) that were asked for last, the oldest first.
+    kept: Mutex<VecDeque<(u32, Arc<Motion>)>>,
+}
+
+/// What is known of a block of Gaussians for all times.
+enum Prepared {
+    /// Their shares, K of each, times the mask.
+    Shares(Vec<(u32, f64)>),
+    Encoded(Encoded),
+}
+
+impl Control {
+    fn new(parts: &Parts<'_>) -> Result<(Control, Vec<String>)> {
+        let arguments = parts.arguments;
+        let refuse = |key: &'static str, found: &str| {
+            Error::input(arguments.path(), format!("key {key}"), "a model of SC-GS as it is trained by default", found)
+                .hint("write what it renders from as a PLY for each time, and give the folder of them")
+        };
+        for key in ["skinning", "use_hash", "local_frame", "progressive_brand_time"] {
+            if arguments.get(key).bool(false)? {
+                return Err(refuse(key, "True, which is not read"));
+            }
+        }
+        if !arguments.get("d_rot_as_res").bool(true)? {
+            return Err(refuse("d_rot_as_res", "False, which is not read"));
+        }
+        let largest = arguments.get("max_d_scale").float(-1.0)?;
+        if largest > 0.0 {
+            return Err(refuse("max_d_scale", &format!("{largest}: a bound of scales, which is not read")));
+        }
+        let kind = arguments.get("deform_type").string()?;
+        let has_nodes = parts.tensors.contains_key("nodes");
+        match kind.as_deref() {
+            Some("node") | None if has_nodes => (),
+            Some("mlp") if !has_nodes => (),
+            Some(kind @ ("node" | "mlp")) => {
+                let found = format!("deform_type = '{kind}'");
+                let expected = if has_nodes { "'node': there are nodes" } else { "'mlp': there are no nodes" };
+                return Err(Error::input(parts.file, "tensor nodes", format!("what goes with {expected}"), found));
+            }
+            kind => {
+                return Err(refuse("deform_type", &format!("{}, which is not read", quoted(kind.unwrap_or_default()))));
+            }
+        }
+        let prefix = if has_nodes { "network." } else { "" };
+        // Other ways to a colour have layers within, and a frame of a node has a head.
+        for inner in ["gaussian_color.0.weight", "gaussian_color.layers.0.weight", "local_rotation.weight"] {
+            let name = format!("{prefix}{inner}");
+            if parts.tensors.contains_key(&name) {
+                return Err(Error::input(
+                    parts.file,
+                    format!("tensor {name}"),
+                    "a network as it is trained by default",
+                    "more",
+                )
+                .hint("write what it renders from as a PLY for each time, and give the folder of them"));
+            }
+        }
+        let network = Network::new(parts.tensors, prefix, parts.file)?;
+        let mut notes = Vec::new();
+        if !has_nodes {
+            return Ok((Control { network, nodes: None }, notes));
+        }
+        let nearest = arguments.get("K").int(3)?;
+        let Some(nearest) = usize::try_from(nearest).ok().filter(|&nearest| nearest > 0) else {
+            return Err(Error::input(arguments.path(), "key K", "at least 1", nearest.to_string()));
+        };
+        let nodes = Nodes::new(parts.tensors, nearest, parts.file)?;
+        let masked = match parts.features.checked_sub(nodes.features()) {
+            Some(more @ (0 | 1)) => more == 1,
+            _ => {
+                let expected = format!("{} properties fea_*, as nodes have, or one more, a mask", nodes.features());
+                return Err(Error::input(parts.cloud, "element vertex", expected, parts.features.to_string()));
+            }
+        };
+        if arguments.get("gs_with_motion_mask").bool(masked)? != masked {
+            let there = if masked { "there is one" } else { "there is none" };
+            notes.push(format!(
+                "cfg_args says otherwise of a motion mask, and in the cloud {there}: the cloud is believed"
+            ));
+        }
+        let encoded = network.encode(&nodes.position());
+        let nodes = Sparse { nodes, encoded, masked, kept: Mutex::default() };
+        Ok((Control { network, nodes: Some(nodes) }, notes))
+    }
+}
+
+impl Sparse {
+    /// σ of the mask of a Gaussian.
+    fn mask(&self, raw: &Raw, row: usize) -> f64 {
+        if self.masked { opacity(raw.own.plane(self.nodes.features())[row]) } else { 1.0 }
+    }
+
+    /// What the network says of all nodes at `time`. The same for all blocks, so it is kept for a while; two threads that want
+    /// a time at once find the same.
+    fn motion(&self, network: &Network, time: f64) -> Result<Arc<Motion>> {
+        let key = (time as f32).to_bits();
+        let kept = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, found)) = kept().iter().find(|(of, _)| *of == key) {
+            return Ok(Arc::clone(found));
+        }
+        let mut motion = Motion::default();
+        network.motion(&self.encoded, time, Columns::all(), &mut motion)?;
+        let motion = Arc::new(motion);
+        let mut kept = kept();
+        if !kept.iter().any(|(of, _)| *of == key) {
+            if kept.len() >= self.most_kept() {
+                kept.pop_front();
+            }
+            kept.push_back((key, Arc::clone(&motion)));
+        }
+        Ok(motion)
+    }
+
+    /// Times of which outputs are kept.
+    fn most_kept(&self) -> usize {
+        (KEPT_BYTES / (4 * 14 * self.nodes.len())).max(2)
+    }
+}
+
+/// Sums the rows of `of` with the shares of Gaussians, `each` of every one.
+fn blend(of: &Column, shares: &[(u32, f64)], each: usize) -> Column {
+    let mut out = Column::zeros(of.width(), shares.len() / each.max(1));
+    for c in 0..of.width() {
+        let plane = of.plane(c);
+        for (out, shares) in out.plane_mut(c).iter_mut().zip(shares.chunks_exact(each)) {
+            *out = shares.iter().map(|&(node, share)| share * f64::from(plane[node as usize])).sum::<f64>() as f32;
+        }
+    }
+    out
+}
+
+impl Control {
+    /// What the network says of the columns `want` of a block.
+    fn motion(&self, time: f64, prepared: &Prepared, want: Columns) -> Result<Motion> {
+        let (mut motion, want) = (Motion::default(), want & self.network.active());
+        match (prepared, &self.nodes) {
+            _ if want.is_empty() => (),
+            (Prepared::Encoded(encoded), _) => self.network.motion(encoded, time, want, &mut motion)?,
+            (Prepared::Shares(shares), Some(sparse)) => {
+                let (of_nodes, each) = (sparse.motion(&self.network, time)?, sparse.nodes.nearest());
+                let of = |column: Columns, of: &Column| match want.contains(column) {
+                    true => blend(of, shares, each),
+                    false => Column::default(),
+                };
+                motion = Motion {
+                    warp: of(Columns::POSITION, &of_nodes.warp),
+                    rotation: of(Columns::ROTATION, &of_nodes.rotation),
+                    scaling: of(Columns::LOG_SCALE, &of_nodes.scaling),
+                    opacity: of(Columns::OPACITY, &of_nodes.opacity),
+                    colour: of(Columns::SH, &of_nodes.colour),
+                };
+            }
+            (Prepared::Shares(_), None) => return Err(Error::usage("a block prepared by another law was given")),
+        }
+        Ok(motion)
+    }
+}
+
+impl Law for Control {
+    type Prepared = Prepared;
+
+    fn prepare(&self, raw: &Raw) -> Prepared {
+        let Some(sparse) = &self.nodes else { return Prepared::Encoded(self.network.encode(&raw.gaussians.position)) };
+        let (mut all, mut found) = (Vec::with_capacity(raw.len() * sparse.nodes.nearest()), Vec::new());
+        for row in 0..raw.len() {
+            found.clear();
+            sparse.nodes.shares(raw, row, &mut found);
+            let mask = sparse.mask(raw, row);
+            all.extend(found.iter().map(|share| (share.node, mask * share.weight)));
+        }
+        Prepared::Shares(all)
+    }
+
+    fn varying(&self) -> Columns {
+        self.network.active()
+    }
+
+    fn movable(&self) -> Columns {
+        Columns::all()
+    }
+
+    fn state(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let motion = self.motion(time, prepared, want)?;
+        for column in want.iter() {
+            let (from, to) = (raw.gaussians.column(column), out.column_mut(column));
+            *to = from.clone();
+            match column {
+                Columns::POSITION => add(&motion.warp, to),
+                Columns::ROTATION => add(&motion.rotation, to),
+                Columns::LOG_SCALE => each(&motion.scaling, to, |log, by| {
+                    (f64::from(log).exp() + f64::from(by)).abs().max(LEAST_SCALE).ln() as f32
+                }),
+                Columns::OPACITY => each(&motion.opacity, to, |logit, by| added(logit, by) as f32),
+                _ => add(&motion.colour, to),
+            }
+        }
+        Ok(())
+    }
+
+    fn jacobian(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns) -> Result<Jacobian> {
+        let mut found = Jacobian::default();
+        let motion = self.motion(time, prepared, want.difference(Columns::POSITION))?;
+        if want.contains(Columns::POSITION) {
+            *found.column_mut(Columns::POSITION) = match &self.nodes {
+                Some(sparse) => of_shares(sparse, &self.network, raw, time)?,
+                None => {
+                    let mut slopes = self.network.slopes(&raw.gaussians.position, time)?;
+                    (0..3).for_each(|c| slopes.plane_mut(4 * c).iter_mut().for_each(|slope| *slope += 1.0));
+                    slopes
+                }
+            };
+        }
+        if want.contains(Columns::LOG_SCALE) {
+            // Each of the three by its own.
+            let mut out = Column::zeros(9, raw.len());
+            for c in 0..3 {
+                let of = raw.gaussians.log_scale.plane(c).iter().zip(motion.scaling.plane(c));
+                for (out, (&log, &by)) in out.plane_mut(4 * c).iter_mut().zip(of) {
+                    let (own, by) = (f64::from(log).exp(), f64::from(by));
+                    *out = if (own + by).abs() > LEAST_SCALE { (own / (own + by)) as f32 } else { 0.0 };
+                }
+            }
+            *found.column_mut(Columns::LOG_SCALE) = out;
+        }
+        if want.contains(Columns::OPACITY) && !motion.opacity.is_empty() {
+            let mut out = raw.gaussians.opacity_logit.clone();
+            each(&motion.opacity, &mut out, |logit, by| {
+                let (own, state) = (opacity(logit), added(logit, by));
+                let whole = opacity(state as f32);
+                if state.abs() < MOST_LOGIT { (own * (1.0 - own) / (whole * (1.0 - whole))) as f32 } else { 0.0 }
+            });
+            *found.column_mut(Columns::OPACITY) = out;
+        }
+        Ok(found)
+    }
+}
+
+/// Adds `by`, where there is some, to the first planes of `to`.
+fn add(by: &Column, to: &mut Column) {
+    each(by, to, |value, by| value + by);
+}
+
+/// Applies `f` to the values of the planes that `by` has, and to those of `by`.
+fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
+    for c in 0..by.width().min(to.width()) {
+        to.plane_mut(c).iter_mut().zip(by.plane(c)).for_each(|(value, &by)| *value = f(*value, by));
+    }
+}
+
+/// The logit of an opacity with `by` added to it.
+fn added(stored: f32, by: f32) -> f64 {
+    let alpha = opacity(stored) + f64::from(by);
+    logit(alpha.clamp(0.0, 1.0)).clamp(-MOST_LOGIT, MOST_LOGIT)
+}
+
+/// How positions change that follow nodes: as the shares in them do.
+fn of_shares(sparse: &Sparse, network: &Network, raw: &Raw, time: f64) -> Result<Column> {
+    let motion = sparse.motion(network, time)?;
+    let (mut out, mut shares) = (Column::zeros(9, raw.len()), Vec::new());
+    for row in 0..raw.len() {
+        shares.clear();
+        sparse.nodes.shares(raw, row, &mut shares);
+        let slopes = sparse.nodes.slopes(raw.gaussians.position.row::<3>(row), &shares);
+        let mask = sparse.mask(raw, row);
+        for i in 0..3 {
+            for axis in 0..3 {
+                let by = shares
+                    .iter()
+                    .zip(&slopes)
+                    .map(|(share, slope)| slope[axis] * f64::from(motion.warp.plane(i)[share.node as usize]));
+                let own = if i == axis { 1.0 } else { 0.0 };
+                out.plane_mut(3 * i + axis)[row] = (own + mask * by.sum::<f64>()) as f32;
+            }
+        }
+    }
+    Ok(out)
+}
+
+impl Deforming for Control {
+    const KIND: &'static str = "SC-GS model";
+    const NORMALISES: bool = false;
+
+    fn bytes_per_gaussian(&self) -> usize {
+        match &self.nodes {
+            Some(sparse) => size_of::<(u32, f64)>() * sparse.nodes.nearest(),
+            None => Network::BYTES_PER_GAUSSIAN,
+        }
+    }
+
+    fn bytes(&self) -> usize {
+        self.nodes.as_ref().map_or(0, |sparse| KEPT_BYTES + Network::BYTES_PER_GAUSSIAN * sparse.nodes.len())
+    }
+
+    /// `benches/families.rs`.
+    fn seconds_per_state(&self) -> f64 {
+        match &self.nodes {
+            Some(_) => 2e-7,
+            None => 1e-6 + 2e-11 * self.network.multiplications() as f64,
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! Control nodes: which of them move a Gaussian, and by how much of each.
+//!
+//! Of a Gaussian at x with features f: the K nodes nearest to [x, f] by squared distance d² over all values, ties to the first;
+//! u = exp(−d²/(2r²))·σ(weight) + 1e-7, divided by their sum. All of it is constant in time. Source: `cal_nn_weight` of the
+//! family's code.
+
+use std::path::Path;
+
+use crate::deform::{Tensor, Tensors};
+use crate::error::{Error, Result};
+use crate::model::{Column, Raw, opacity};
+
+/// Added to what a node counts.
+const FLOOR: f64 = 1e-7;
+
+/// The nodes of a model.
+#[derive(Debug)]
+pub(super) struct Nodes {
+    /// `[M, 3 + h]`
+    values: Vec<f32>,
+    width: usize,
+    /// 1/(2r²) and σ(weight) by node.
+    kernels: Vec<[f64; 2]>,
+    /// K.
+    nearest: usize,
+}
+
+/// What moves a Gaussian.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Share {
+    pub(super) node: u32,
+    /// u, between 0 and 1.
+    pub(super) weight: f64,
+    /// What the node counts before 1e-7 is added.
+    counts: f64,
+}
+
+impl Nodes {
+    /// The nodes among `tensors`, of which `nearest` move a Gaussian.
+    ///
+    /// # Errors
+    /// Tensors that are missing, of other shapes, or not finite.
+    pub(super) fn new(tensors: &Tensors, nearest: usize, file: &Path) -> Result<Nodes> {
+        let get = |name: &str, expected: &str, fits: &dyn Fn(&[usize]) -> bool| -> Result<&Tensor> {
+            let place = format!("tensor {name}");
+            let wrong = |found: String| Error::input(file, &place, expected, found);
+            let tensor = tensors.get(name).ok_or_else(|| wrong("none".to_owned()))?;
+            if !fits(&tensor.shape) {
+                return Err(wrong(format!("{:?}", tensor.shape)));
+            }
+            match tensor.data.iter().position(|value| !value.is_finite()) {
+                Some(at) => {
+                    Err(Error::input(file, &place, "finite values", format!("{} at element {at}", tensor.data[at])))
+                }
+                None => Ok(tensor),
+            }
+        };
+        let nodes = get(
+            "nodes",
+            "shape [M, 3 + hyper_dim], M at least 1",
+            &|shape| matches!(*shape, [count, width] if count > 0 && width >= 3 && u32::try_from(count).is_ok()),
+        )?;
+        let (count, width) = (nodes.shape[0], nodes.shape[1]);
+        let expected = format!("shape [{count}], of {count} nodes");
+        let radius = get("_node_radius", &expected, &|shape| matches!(*shape, [found] | [found, 1] if found == count))?;
+        let weight = get("_node_weight", &expected, &|shape| matches!(*shape, [found] | [found, 1] if found == count))?;
+        let kernel = |(&radius, &weight): (&f32, &f32)| [0.5 * (-2.0 * f64::from(radius)).exp(), opacity(weight)];
+        let kernels = radius.data.iter().zip(&weight.data).map(kernel).collect();
+        Ok(Nodes { values: nodes.data.clone(), width, kernels, nearest: nearest.clamp(1, count) })
+    }
+
+    /// h.
+    pub(super) fn features(&self) -> usize {
+        self.width - 3
+    }
+
+    /// M.
+    pub(super) fn len(&self) -> usize {
+        self.kernels.len()
+    }
+
+    /// K.
+    pub(super) fn nearest(&self) -> usize {
+        self.nearest
+    }
+
+    /// Where they are, `[M, 3]`.
+    pub(super) fn position(&self) -> Column {
+        let planes = (0..3).flat_map(|c| self.values.iter().skip(c).step_by(self.width).copied());
+        Column::from_planes(3, planes.collect())
+    }
+
+    /// What moves Gaussian `row` of `raw`, nearest first, into `out`.
+    pub(super) fn shares(&self, raw: &Raw, row: usize, out: &mut Vec<Share>) {
+        let mut at: Vec<f32> = raw.gaussians.position.row::<3>(row).to_vec();
+        at.extend((0..self.features()).map(|k| raw.own.plane(k)[row]));
+        let mut nearest: Vec<(f64, u32)> = Vec::with_capacity(self.nearest + 1);
+        for (node, values) in self.values.chunks_exact(self.width).enumerate() {
+            let distance = values.iter().zip(&at).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum::<f64>();
+            if nearest.len() < self.nearest || nearest.last().is_some_and(|last| distance < last.0) {
+                let place = nearest.partition_point(|found| found.0 <= distance);
+                nearest.insert(place, (distance, node as u32));
+                nearest.truncate(self.nearest);
+            }
+        }
+        let counts = |&(distance, node): &(f64, u32)| {
+            let [sharpness, weight] = self.kernels[node as usize];
+            (-distance * sharpness).exp() * weight
+        };
+        let sum: f64 = nearest.iter().map(|found| counts(found) + FLOOR).sum();
+        out.extend(nearest.iter().map(|found| {
+            let counts = counts(found);
+            Share { node: found.1, weight: (counts + FLOOR) / sum, counts }
+        }));
+    }
+
+    /// How the shares of a Gaussian at `x` change along each axis.
+    pub(super) fn slopes(&self, x: [f32; 3], shares: &[Share]) -> Vec<[f64; 3]> {
+        let sum: f64 = shares.iter().map(|share| share.counts + FLOOR).sum();
+        let own = |share: &Share| {
+            let node = &self.values[share.node as usize * self.width..][..3];
+            let by = -2.0 * self.kernels[share.node as usize][0] * share.counts;
+            [0, 1, 2].map(|c| by * (f64::from(x[c]) - f64::from(node[c])))
+        };
+        let all: Vec<[f64; 3]> = shares.iter().map(own).collect();
+        let total = [0, 1, 2].map(|c| all.iter().map(|own| own[c]).sum::<f64>());
+        let of = |(share, own): (&Share, &[f64; 3])| [0, 1, 2].map(|c| (own[c] - share.weight * total[c]) / sum);
+        shares.iter().zip(&all).map(of).collect()
+    }
+}

@@ -1,0 +1,168 @@
+//! What makes colours of the nine features that the full model blends.
+//!
+//! Of a pixel's features F, camera centre o and unit ray d: act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])). W₁ is `mlp1.weight`
+//! [6, 12, 1, 1], W₂ `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias. Source: `helper_model.py` of the
+//! authors' code.
+
+use std::path::Path;
+
+use crate::deform::Tensors;
+use crate::error::{Error, Result, quoted};
+
+/// Features that are blended.
+pub(super) const FEATURES: usize = 9;
+/// Inputs of the network: features 3 to 8, camera centre, ray.
+const INPUTS: usize = 12;
+const HIDDEN: usize = 6;
+
+/// What is done to a colour last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Act {
+    /// The logistic function.
+    Sigmoid,
+    /// Confined to 0 … 1.
+    Clamp,
+    /// Nothing.
+    None,
+}
+
+impl Act {
+    /// As `rgbfunction` of `cfg_args` calls it.
+    pub(super) fn named(name: &str) -> Option<Act> {
+        match name {
+            "sandwich" => Some(Act::Sigmoid),
+            "sandwichnoact" => Some(Act::Clamp),
+            "sandwichnoactss" => Some(Act::None),
+            _ => None,
+        }
+    }
+
+    /// Of a colour before it.
+    pub(super) fn of(self, x: f64) -> f64 {
+        match self {
+            Act::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+            Act::Clamp => x.clamp(0.0, 1.0),
+            Act::None => x,
+        }
+    }
+}
+
+/// The network.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Decoder {
+    first: [[f64; INPUTS]; HIDDEN],
+    second: [[f64; HIDDEN]; 3],
+    act: Act,
+}
+
+impl Decoder {
+    /// The network of the state dict `tensors`, read from `path`.
+    ///
+    /// # Errors
+    /// Weights that are missing, of other shapes, or no finite numbers.
+    pub(super) fn new(tensors: &Tensors, act: Act, path: &Path) -> Result<Decoder> {
+        let weights = |name: &str, shape: [usize; 4]| {
+            let place = || format!("tensor {name}");
+            let expected = format!("shape {shape:?}");
+            let Some(tensor) = tensors.get(name) else {
+                let names: Vec<String> = tensors.keys().map(|name| quoted(name).to_string()).collect();
+                let found =
+                    if names.is_empty() { "no tensors".to_owned() } else { format!("only {}", names.join(", ")) };
+                return Err(Error::input(path, place(), expected, found));
+            };
+            if tensor.shape != shape {
+                return Err(Error::input(path, place(), expected, format!("shape {:?}", tensor.shape)));
+            }
+            match tensor.data.iter().position(|x| !x.is_finite()) {
+                Some(at) => Err(Error::input(
+                    path,
+                    format!("{}, value {at}", place()),
+                    "a finite number",
+                    tensor.data[at].to_string(),
+                )),
+                None => Ok(&tensor.data),
+            }
+        };
+        let first = weights("mlp1.weight", [HIDDEN, INPUTS, 1, 1])?;
+        let second = weights("mlp2.weight", [3, HIDDEN, 1, 1])?;
+        Ok(Decoder {
+            first: std::array::from_fn(|i| std::array::from_fn(|j| first[i * INPUTS + j].into())),
+            second: std::array::from_fn(|i| std::array::from_fn(|j| second[i * HIDDEN + j].into())),
+            act,
+        })
+    }
+
+    /// The colour of a pixel whose [`FEATURES`] are `features`, seen from `centre` along the unit `ray`.
+    pub(super) fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+        let mut inputs = [0.0; INPUTS];
+        let all = features[3..].iter().chain(&centre).chain(&ray);
+        inputs.iter_mut().zip(all).for_each(|(to, &of)| *to = of.into());
+        let sum = |weights: &[f64], of: &[f64]| weights.iter().zip(of).map(|(w, x)| w * x).sum::<f64>();
+        let hidden = self.first.map(|row| sum(&row, &inputs).max(0.0));
+        std::array::from_fn(|c| self.act.of(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::deform::Tensor;
+    use crate::model::opacity;
+
+    /// Weights of a small network, as a state dict has them.
+    pub(in super::super) fn weights() -> Tensors {
+        let ramp = |n: usize, by: f32| (0..n).map(|i| by * ((i * 7 % 11) as f32 - 5.0)).collect::<Vec<f32>>();
+        [
+            ("mlp1.weight".to_owned(), Tensor { shape: vec![6, 12, 1, 1], data: ramp(72, 0.05) }),
+            ("mlp2.weight".to_owned(), Tensor { shape: vec![3, 6, 1, 1], data: ramp(18, 0.1) }),
+        ]
+        .into()
+    }
+
+    #[test]
+    fn a_network_without_hidden_light_leaves_the_first_features() {
+        let mut tensors = weights();
+        tensors.get_mut("mlp2.weight").unwrap().data.fill(0.0);
+        let features = [0.5, -1.0, 2.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0];
+        let colour =
+            |act| Decoder::new(&tensors, act, Path::new("x.pt")).unwrap().colour(&features, [1.0; 3], [1.0; 3]);
+        assert_eq!(colour(Act::None), [0.5, -1.0, 2.0]);
+        assert_eq!(colour(Act::Clamp), [0.5, 0.0, 1.0]);
+        let sigmoid = colour(Act::Sigmoid);
+        assert!((0..3).all(|c| (f64::from(sigmoid[c]) - opacity(features[c])).abs() < 1e-7), "{sigmoid:?}");
+    }
+
+    #[test]
+    fn hidden_light_is_cut_at_zero_before_it_is_summed() {
+        let mut tensors = weights();
+        let first = &mut tensors.get_mut("mlp1.weight").unwrap().data;
+        first.fill(0.0);
+        // Hidden 0 sees feature 3, hidden 1 the ray's z.
+        (first[0], first[12 + 11]) = (2.0, 3.0);
+        let second = &mut tensors.get_mut("mlp2.weight").unwrap().data;
+        second.fill(0.0);
+        (second[0], second[1], second[6 + 1]) = (1.0, 10.0, -1.0);
+        let decoder = Decoder::new(&tensors, Act::None, Path::new("x.pt")).unwrap();
+        let mut features = [0.0; 9];
+        features[3] = 0.25;
+        assert_eq!(decoder.colour(&features, [0.0; 3], [0.0, 0.0, 1.0]), [0.5 + 30.0, -3.0, 0.0]);
+        assert_eq!(decoder.colour(&features, [0.0; 3], [0.0, 0.0, -1.0]), [0.5, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn weights_that_are_missing_or_wrong_are_named_with_what_is_there() {
+        let said = |change: &dyn Fn(&mut Tensors)| {
+            let mut tensors = weights();
+            change(&mut tensors);
+            Decoder::new(&tensors, Act::None, Path::new("some/point_cloud.pt")).unwrap_err().to_string()
+        };
+        let missing = said(&|tensors| drop(tensors.remove("mlp2.weight")));
+        for part in ["some/point_cloud.pt", "mlp2.weight", "[3, 6, 1, 1]", "mlp1.weight"] {
+            assert!(missing.contains(part), "{missing}");
+        }
+        let wide = said(&|tensors| tensors.get_mut("mlp1.weight").unwrap().shape = vec![6, 6, 2, 1]);
+        assert!(wide.contains("[6, 12, 1, 1]") && wide.contains("[6, 6, 2, 1]"), "{wide}");
+        let nan = said(&|tensors| tensors.get_mut("mlp1.weight").unwrap().data[5] = f32::NAN);
+        assert!(nan.contains("mlp1.weight") && nan.contains("value 5") && nan.contains("NaN"), "{nan}");
+    }
+}

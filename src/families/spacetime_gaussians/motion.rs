@@ -1,0 +1,273 @@
+//! How a Gaussian moves: a cubic path, a quaternion that is linear in time, a window.
+//!
+//! With dt = t − centre: x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; q = rotation + dt·omega, of any length; the opacity is multiplied
+//! by exp(−(dt/e^log_width)²). Source: Li et al., "Spacetime Gaussian Feature Splatting", 2024, and its public code, which has no
+//! factor ½ in that exponent. All in f64.
+
+use crate::fit::polynomial;
+
+/// The motion of a Gaussian.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Motion {
+    /// Unit of time.
+    pub(super) centre: f64,
+    /// Natural log of √2 × the standard deviation in time.
+    pub(super) log_width: f64,
+    /// Coefficients of 1, dt, dt², dt³.
+    pub(super) path: [[f64; 3]; 4],
+    /// wxyz at the centre, of any length.
+    pub(super) rotation: [f64; 4],
+    /// Its change per unit of time.
+    pub(super) omega: [f64; 4],
+}
+
+impl Motion {
+    /// Where it is at `time`.
+    pub(super) fn position(&self, time: f64) -> [f64; 3] {
+        let (dt, [p0, p1, p2, p3]) = (time - self.centre, self.path);
+        std::array::from_fn(|c| p0[c] + dt * (p1[c] + dt * (p2[c] + dt * p3[c])))
+    }
+
+    /// How it is turned at `time`, wxyz of any length.
+    pub(super) fn rotation(&self, time: f64) -> [f64; 4] {
+        let dt = time - self.centre;
+        std::array::from_fn(|c| self.rotation[c] + dt * self.omega[c])
+    }
+
+    /// What its opacity is multiplied by at `time`.
+    pub(super) fn window(&self, time: f64) -> f64 {
+        let dt = (time - self.centre) / self.log_width.exp();
+        (-dt * dt).exp()
+    }
+
+    /// The same motion, of another window, told from `centre`: positions are those that they were to rounding, and so are
+    /// rotations, but that `rotation` has length 1 where it has any.
+    pub(super) fn about(&self, centre: f64) -> Motion {
+        let (by, [_, p1, p2, p3]) = (centre - self.centre, self.path);
+        let path = [
+            self.position(centre),
+            std::array::from_fn(|c| p1[c] + by * (2.0 * p2[c] + by * 3.0 * p3[c])),
+            std::array::from_fn(|c| p2[c] + by * 3.0 * p3[c]),
+            p3,
+        ];
+        // The state depends on the ratio of both alone.
+        let rotation = self.rotation(centre);
+        let length = dot(&rotation, &rotation).sqrt();
+        let length = if length.is_normal() { length } else { 1.0 };
+        let [rotation, omega] = [rotation, self.omega].map(|q| q.map(|x| x / length));
+        Motion { centre, path, rotation, omega, ..*self }
+    }
+}
+
+/// Product of two quaternions, wxyz.
+pub(super) fn product(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+    let ([a, x, y, z], [b, u, v, w]) = (a, b);
+    [
+        a * b - x * u - y * v - z * w,
+        a * u + x * b + y * w - z * v,
+        a * v - x * w + y * b + z * u,
+        a * w + x * v - y * u + z * b,
+    ]
+}
+
+pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Centre and log width of the window of several, by weights and theirs: the second moments in time of their sum.
+pub(super) fn merged_window(members: &[(f64, Motion)]) -> (f64, f64) {
+    // Areas in time count; the longest has 1, so that none overflows.
+    let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
+    let area = |(weight, motion): &(f64, Motion)| weight * (motion.log_width - longest).exp();
+    let total: f64 = members.iter().map(area).sum();
+    let share = |member: &(f64, Motion)| area(member) / total;
+    let centre: f64 = members.iter().map(|member| share(member) * member.1.centre).sum();
+    let unit = longest.exp();
+    let second = |(_, motion): &(f64, Motion)| {
+        let [width, off] = [(motion.log_width - longest).exp(), (motion.centre - centre) / unit];
+        width * width + 2.0 * off * off
+    };
+    let squared: f64 = members.iter().map(|member| share(member) * second(member)).sum();
+    (centre, longest + 0.5 * squared.ln())
+}
+
+/// The weighted mean of motions that are told from one centre: at every time its state is the weighted mean of theirs,
+/// quaternions in the sign of the heaviest one's.
+pub(super) fn mean(members: &[(f64, Motion)]) -> Option<Motion> {
+    let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
+    let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);
+    for (weight, member) in members {
+        let sign = if dot(&member.rotation, &heaviest.rotation) < 0.0 { -weight } else { *weight };
+        for (to, of) in path.iter_mut().flatten().zip(member.path.iter().flatten()) {
+            *to += weight * of;
+        }
+        for c in 0..4 {
+            rotation[c] += sign * member.rotation[c];
+            omega[c] += sign * member.omega[c];
+        }
+    }
+    Some(Motion { path, rotation, omega, ..heaviest })
+}
+
+/// A state that a motion should be near to.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wanted {
+    pub(super) time: f64,
+    pub(super) weight: f64,
+    pub(super) position: [f64; 3],
+    /// In the sign of those before it.
+    pub(super) rotation: [f64; 4],
+}
+
+/// The motion that is nearest to the `wanted` states in least squares, told from `about`'s centre; `about` where nothing says
+/// anything else. A ridge holds what the times do not determine.
+///
+/// Lengths of time are in units of the window: coefficients then weigh alike, so that one ridge serves all.
+pub(super) fn fitted(about: &Motion, wanted: &[Wanted]) -> Motion {
+    let unit = about.log_width.exp().clamp(1e-6, 1e6);
+    let ridge = if wanted.len() < 4 { 1e-3 } else { 1e-6 };
+    // What is still missing of each: nothing moves where `about` is right already.
+    let missing = |of: &Wanted| {
+        let [x, at] = [of.position, about.position(of.time)];
+        let [q, turned] = [of.rotation, about.rotation(of.time)];
+        (
+            (of.time - about.centre) / unit,
+            std::array::from_fn(|c| x[c] - at[c]),
+            std::array::from_fn(|c| q[c] - turned[c]),
+        )
+    };
+    let path: [[f64; 3]; 4] = polynomial(wanted.iter().map(|of| (missing(of).0, missing(of).1, of.weight)), ridge);
+    let turn: [[f64; 4]; 2] = polynomial(wanted.iter().map(|of| (missing(of).0, missing(of).2, of.weight)), ridge);
+    let mut found = *about;
+    for (k, (to, more)) in found.path.iter_mut().zip(path).enumerate() {
+        (0..3).for_each(|c| to[c] += more[c] / unit.powi(k as i32));
+    }
+    let [turned, turning] = turn;
+    (0..4).for_each(|c| {
+        found.rotation[c] += turned[c];
+        found.omega[c] += turning[c] / unit;
+    });
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn motion() -> impl Strategy<Value = Motion> {
+        let values = |most: f64, count: usize| prop::collection::vec(-most..most, count);
+        (-0.5..1.5f64, -3.0..2.0f64, values(3.0, 12), values(1.0, 8)).prop_map(|(centre, log_width, path, turn)| {
+            Motion {
+                centre,
+                log_width,
+                path: std::array::from_fn(|k| std::array::from_fn(|c| path[3 * k + c])),
+                // Away from no direction at all.
+                rotation: std::array::from_fn(|c| turn[c] + if c == 0 { 3.0 } else { 0.0 }),
+                omega: std::array::from_fn(|c| turn[4 + c]),
+            }
+        })
+    }
+
+    fn unit(q: [f64; 4]) -> [f64; 4] {
+        let length = dot(&q, &q).sqrt();
+        q.map(|x| x / length)
+    }
+
+    fn furthest<const N: usize>(a: [f64; N], b: [f64; N]) -> f64 {
+        a.iter().zip(b).fold(0.0, |most, (a, b)| most.max((a - b).abs()))
+    }
+
+    proptest! {
+        #[test]
+        fn told_from_another_centre_a_motion_is_the_same(motion in motion(), centre in -0.5..1.5f64) {
+            let about = motion.about(centre);
+            prop_assert_eq!(about.centre, centre);
+            prop_assert!((dot(&about.rotation, &about.rotation) - 1.0).abs() < 1e-12);
+            for k in 0..=10 {
+                let time = f64::from(k) / 10.0;
+                let size = 1.0 + motion.position(time).iter().fold(0.0f64, |most, x| most.max(x.abs()));
+                let off = furthest(motion.position(time), about.position(time)) / size;
+                prop_assert!(off < 1e-12, "{} at {}", off, time);
+                let off = furthest(unit(motion.rotation(time)), unit(about.rotation(time)));
+                prop_assert!(off < 1e-12, "{} at {}", off, time);
+            }
+        }
+
+        #[test]
+        fn the_mean_of_motions_is_the_mean_of_their_states_at_every_time(
+            some in prop::collection::vec((0.1..1.0f64, motion()), 1..5),
+            flip in 0..4usize,
+        ) {
+            let total: f64 = some.iter().map(|member| member.0).sum();
+            let centre = merged_window(&some).0;
+            let mut about: Vec<(f64, Motion)> =
+                some.iter().map(|(weight, motion)| (weight / total, motion.about(centre))).collect();
+            let expected = mean(&about).unwrap();
+            // The same turns under the other sign.
+            let other = flip % about.len();
+            let flipped = &mut about[other].1;
+            (flipped.rotation, flipped.omega) = (flipped.rotation.map(|x| -x), flipped.omega.map(|x| -x));
+            let found = mean(&about).unwrap();
+            for k in 0..=4 {
+                let time = f64::from(k) / 4.0;
+                let of = |c: usize| some.iter().map(|(w, motion)| w / total * motion.position(time)[c]).sum::<f64>();
+                let size = 1.0 + (0..3).fold(0.0f64, |most, c| most.max(of(c).abs()));
+                prop_assert!(furthest(found.position(time), std::array::from_fn(of)) / size < 1e-11);
+                let off = 1.0 - dot(&unit(found.rotation(time)), &unit(expected.rotation(time))).abs();
+                prop_assert!(off < 1e-12, "{}", off);
+            }
+        }
+
+        #[test]
+        fn windows_have_the_second_moments_of_the_sum_of_theirs(
+            some in prop::collection::vec((0.1..1.0f64, motion()), 1..5),
+        ) {
+            let (centre, log_width) = merged_window(&some);
+            // By sums over time, of windows as they are.
+            let widest = some.iter().fold(0.0f64, |most, (_, motion)| most.max(motion.log_width.exp()));
+            // As far as the furthest is, and the widest reaches.
+            let (mut sums, step) = ([0.0; 3], (8.0 * widest + 2.0) / 20000.0);
+            for k in -20000..=20000 {
+                let time = centre + f64::from(k) * step;
+                let height: f64 = some.iter().map(|(weight, motion)| weight * motion.window(time)).sum();
+                let terms = [1.0, time, time * time];
+                sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += height * term);
+            }
+            let mean = sums[1] / sums[0];
+            let variance = sums[2] / sums[0] - mean * mean;
+            prop_assert!((mean - centre).abs() < 1e-6 * (1.0 + widest), "{} for {}", centre, mean);
+            // The width is √2 times the standard deviation.
+            let expected = (2.0 * variance).sqrt();
+            prop_assert!((log_width.exp() / expected - 1.0).abs() < 1e-4, "{} for {}", log_width.exp(), expected);
+        }
+
+        #[test]
+        fn a_path_is_fitted_to_states_that_follow_one(about in motion(), motion in motion()) {
+            let about = Motion { log_width: 0.0, ..about };
+            let motion = Motion { log_width: 0.0, ..motion.about(about.centre) };
+            let times = (0..20).map(|k| f64::from(k) / 20.0);
+            let state = |time| {
+                Wanted { time, weight: 1.0 + time, position: motion.position(time), rotation: motion.rotation(time) }
+            };
+            let wanted: Vec<Wanted> = times.map(state).collect();
+            let found = fitted(&about, &wanted);
+            for Wanted { time, position, rotation, .. } in wanted {
+                // The ridge takes a millionth, of powers that are hard to tell from one another here.
+                prop_assert!(furthest(found.position(time), position) < 0.05, "{:?} {:?}", found.position(time), position);
+                prop_assert!(furthest(found.rotation(time), rotation) < 1e-4);
+            }
+            // Nothing that is wanted changes nothing.
+            prop_assert_eq!(fitted(&about, &[]), about);
+        }
+    }
+
+    #[test]
+    fn products_of_quaternions_are_those_of_their_rotations() {
+        let q = |[w, x, y, z]: [f64; 4]| glam::DQuat::from_xyzw(x, y, z, w);
+        let (a, b) = ([0.3, -1.0, 2.0, 0.5], [-0.7, 0.2, 0.1, 4.0]);
+        let expected = q(a) * q(b);
+        assert!(furthest(product(a, b), [expected.w, expected.x, expected.y, expected.z]) < 1e-14);
+    }
+}

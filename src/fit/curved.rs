@@ -1,0 +1,280 @@
+//! Cubic motion and linear rotation under soft windows of time: what the players of SpacetimeGaussians know.
+//!
+//! A window is exp(−((t − centre)/width)²). A Gaussian that never changes its opacity and moves as a cubic does takes one
+//! of no end; one that fades once takes one; whatever else it does, curves take it over from one another, 3, 5, 9 … of
+//! them, their centres evenly over its life, each window three quarters of their distance wide: the sum of such windows is
+//! 1 within 2·exp(−(3π/4)²), .8%. Optical depths −ln(1 − α) add up where Gaussians overlap, so that it is these that are
+//! shared out: by multiplicative updates that keep them positive (Richardson 1972, Lucy 1974).
+
+use super::least_squares::polynomial;
+use super::{Misfit, SEEN, Tolerance, Track};
+
+/// A Gaussian on its way.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Curve {
+    /// Centre of its window, and the instant that the polynomials count from.
+    pub centre: f64,
+    /// Width of its window; infinite where it has no end.
+    pub width: f64,
+    /// Coefficients of dt⁰ to dt³, scene units.
+    pub position: [[f64; 3]; 4],
+    /// Coefficients of dt⁰ and dt¹, wxyz.
+    pub rotation: [[f64; 4]; 2],
+    /// Natural logarithms of scene units.
+    pub log_scale: [f64; 3],
+    /// At the centre, in [0, 1].
+    pub opacity: f64,
+    /// Harmonic coefficients.
+    pub sh: Vec<f32>,
+}
+
+impl Curve {
+    /// Where it is at `time`.
+    pub fn place(&self, time: f64) -> [f64; 3] {
+        let dt = time - self.centre;
+        std::array::from_fn(|c| self.position.iter().rev().fold(0.0, |sum, row| sum * dt + row[c]))
+    }
+
+    /// How opaque it is at `time`.
+    pub fn visible(&self, time: f64) -> f64 {
+        self.opacity * window(time, self.centre, self.width)
+    }
+}
+
+/// Most curves that take a life over from one another.
+const MOST: usize = 32;
+/// Updates of shared optical depths, at most, and the change by which they have settled.
+const UPDATES: usize = 60;
+const SETTLED: f64 = 1e-3;
+/// Opacities count as at most this: an optical depth has to be a number.
+const OPAQUE: f64 = 0.999;
+/// What coefficients that frames do not determine are held by.
+const RIDGE: f64 = 1e-6;
+/// Part of the weight below which a frame is no matter of a curve.
+const LIGHT: f64 = 1e-3;
+
+/// The curves of `track`, as few as hold what `tolerance` says at every frame that is seen; the closest if none do. How
+/// far they are off goes into `misfit`.
+pub fn curved(track: &Track, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<Curve> {
+    let Some(first) = (0..track.len()).find(|&frame| track.is_seen(frame)) else { return Vec::new() };
+    let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
+    let mut best: Option<(f64, Vec<Curve>, Misfit)> = None;
+    let mut attempt = |curves: Vec<Curve>| {
+        let (excess, found) = misfit_of(track, &curves, tolerance);
+        if best.as_ref().is_none_or(|(least, _, _)| excess < *least) {
+            best = Some((excess, curves, found));
+        }
+        excess <= 1.0
+    };
+    let mut done = attempt(vec![endless(track)]) || attempt(vec![once(track)]);
+    let mut count = 2;
+    while !done && count <= MOST.min((last - first + 1).max(2)) {
+        done = attempt(handing_over(track, [track.times[first], track.times[last]], count));
+        count *= 2;
+    }
+    let (_, curves, found) = best.unwrap_or_default();
+    *misfit = misfit.and(found);
+    curves.into_iter().filter(|curve| curve.opacity >= SEEN).collect()
+}
+
+fn window(time: f64, centre: f64, width: f64) -> f64 {
+    (-((time - centre) / width).powi(2)).exp()
+}
+
+fn depth(opacity: f64) -> f64 {
+    -(-opacity.clamp(0.0, OPAQUE)).ln_1p()
+}
+
+/// One curve without an end.
+fn endless(track: &Track) -> Curve {
+    let centre = track.times[0].midpoint(track.times[track.len() - 1]);
+    let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
+    let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
+    let curve = moving(track, centre, f64::INFINITY, |_| 1.0);
+    Curve { opacity: sum / f64::max(count, 1.0), ..curve }
+}
+
+/// One curve whose window has the middle and the spread of the opacities.
+fn once(track: &Track) -> Curve {
+    let moment = |of: &dyn Fn(f64) -> f64| -> f64 {
+        (0..track.len()).map(|frame| track.opacity[frame] * of(track.times[frame])).sum()
+    };
+    let whole = moment(&|_| 1.0);
+    let centre = moment(&|t| t) / whole;
+    let variance = moment(&|t| (t - centre).powi(2)) / whole;
+    let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
+    // exp(−(dt/w)²) has variance w²/2; frames a step apart cannot tell less than half of one.
+    let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9);
+    let windows = |frame: usize| window(track.times[frame], centre, width);
+    let (mut right, mut normal) = (0.0, 0.0);
+    for frame in 0..track.len() {
+        right += windows(frame) * track.opacity[frame];
+        normal += windows(frame).powi(2);
+    }
+    let curve = moving(track, centre, width, |frame| window(track.times[frame], centre, width));
+    Curve { opacity: (right / normal.max(1e-300)).min(OPAQUE), ..curve }
+}
+
+/// `count` + 1 curves over the life between two instants.
+fn handing_over(track: &Track, [start, end]: [f64; 2], count: usize) -> Vec<Curve> {
+    let apart = ((end - start) / count as f64).max(1e-9);
+    let width = 0.75 * apart;
+    let centres: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
+    let wanted: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
+    // Of each curve the frames that it is a matter of.
+    let shares: Vec<Vec<(usize, f64)>> = centres
+        .iter()
+        .map(|&centre| {
+            let share = |frame: usize| (frame, window(track.times[frame], centre, width));
+            (0..track.len()).map(share).filter(|(_, share)| *share > LIGHT).collect()
+        })
+        .collect();
+    let most = wanted.iter().copied().fold(0.0, f64::max);
+    let mut depths = vec![most / 2.0; centres.len()];
+    let mut shown = vec![0.0; track.len()];
+    for _ in 0..UPDATES {
+        // Opacities, not depths, follow windows: what a curve adds is the depth of its share.
+        shown.fill(0.0);
+        for (shares, d) in shares.iter().zip(&depths) {
+            let opacity = 1.0 - (-d).exp();
+            shares.iter().for_each(|&(frame, share)| shown[frame] += depth(opacity * share));
+        }
+        let mut moved = 0.0f64;
+        for (shares, depth) in shares.iter().zip(&mut depths) {
+            let ratio: f64 = shares.iter().map(|&(frame, share)| share * wanted[frame] / shown[frame].max(1e-9)).sum();
+            let weight: f64 = shares.iter().map(|(_, share)| share).sum();
+            let by = if weight > 0.0 { (ratio / weight).min(4.0) } else { 0.0 };
+            moved = moved.max((by - 1.0).abs().min(*depth));
+            *depth = (*depth * by).min(self::depth(OPAQUE));
+        }
+        if moved < SETTLED {
+            break;
+        }
+    }
+    let curve = |(k, depth): (usize, f64)| {
+        let curve = moving(track, centres[k], width, |frame| window(track.times[frame], centres[k], width));
+        Curve { opacity: 1.0 - (-depth).exp(), ..curve }
+    };
+    depths.into_iter().enumerate().map(curve).collect()
+}
+
+/// A curve that moves and turns as `track` does where `weight` is, by least squares; its opacity is still to be said.
+fn moving(track: &Track, centre: f64, width: f64, weight: impl Fn(usize) -> f64) -> Curve {
+    let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
+    let heavy: Vec<(usize, f64)> =
+        (0..track.len()).map(|frame| (frame, weight(frame))).filter(|(_, weight)| *weight > LIGHT * SEEN).collect();
+    let reach = heavy.iter().map(|&(frame, _)| (track.times[frame] - centre).abs()).fold(1e-9, f64::max);
+    let scaled = |frame: usize| (track.times[frame] - centre) / reach;
+    let position: [[f64; 3]; 4] =
+        polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
+    let rotation: [[f64; 4]; 2] =
+        polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.rotation[frame], weight)), RIDGE);
+    let whole: f64 = heavy.iter().map(|&(_, weight)| weight).sum();
+    let mean = |of: &dyn Fn(usize) -> f64| {
+        heavy.iter().map(|&(frame, weight)| weight * of(frame)).sum::<f64>() / whole.max(1e-300)
+    };
+    let width_of_sh = track.sh(0).len();
+    let unscaled = |k: usize| reach.powi(k as i32);
+    Curve {
+        centre,
+        width,
+        position: std::array::from_fn(|k| position[k].map(|value| value / unscaled(k))),
+        rotation: std::array::from_fn(|k| rotation[k].map(|value| value / unscaled(k))),
+        log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
+        opacity: 0.0,
+        sh: (0..width_of_sh).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
+    }
+}
+
+/// How far `curves` are off, in tolerances at worst and altogether. Where several are seen, each has to be where the
+/// Gaussian is, as much as it is seen.
+fn misfit_of(track: &Track, curves: &[Curve], tolerance: &Tolerance) -> (f64, Misfit) {
+    let (mut worst, mut misfit) = (0.0f64, Misfit::default());
+    for frame in 0..track.len() {
+        let time = track.times[frame];
+        let (mut shown, mut away) = (0.0, 0.0);
+        for curve in curves {
+            let share = depth(curve.visible(time));
+            shown += share;
+            if curve.visible(time) < SEEN {
+                continue;
+            }
+            let dt = time - curve.centre;
+            let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
+            let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
+            let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
+            let distance = track.distance(frame, curve.place(time));
+            away += share * distance;
+            worst = [
+                distance / tolerance.position,
+                track.turned(frame, rotation) / tolerance.rotation,
+                scale / tolerance.log_scale,
+                sh / tolerance.sh,
+            ]
+            .into_iter()
+            // One that is hardly seen need not be as close.
+            .map(|excess| excess * (share / depth(track.opacity[frame]).max(SEEN)).min(1.0))
+            .fold(worst, f64::max);
+        }
+        let apart = 1.0 - (-shown).exp() - track.opacity[frame];
+        if track.is_seen(frame) || apart > SEEN {
+            worst = worst.max(apart.abs() / tolerance.opacity);
+            misfit.add(if shown > 0.0 { away / shown } else { 0.0 }, apart);
+        }
+    }
+    (if worst.is_nan() { f64::INFINITY } else { worst }, misfit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn track(frames: usize, position: impl Fn(f64) -> [f64; 3], opacity: impl Fn(f64) -> f64) -> Track {
+        let times: Vec<f64> = (0..frames).map(|i| i as f64 / frames as f64).collect();
+        Track {
+            position: times.iter().map(|&t| position(t)).collect(),
+            rotation: times.iter().map(|t| [(0.3 * t).cos(), (0.3 * t).sin(), 0.0, 0.0]).collect(),
+            log_scale: vec![[-3.0, -2.0, -3.0]; frames],
+            opacity: times.iter().map(|&t| opacity(t)).collect(),
+            sh: vec![vec![0.5, -0.5, 0.0]],
+            times,
+        }
+    }
+
+    #[test]
+    fn what_the_format_says_itself_is_found_again() {
+        let cubic = |t: f64| [t - 2.0 * t * t + t.powi(3), 0.3, -t];
+        let mut misfit = Misfit::default();
+        let one = curved(&track(60, cubic, |_| 0.8), &Tolerance::default(), &mut misfit);
+        assert!(one.len() == 1 && one[0].width.is_infinite() && (one[0].opacity - 0.8).abs() < 1e-9);
+        assert!(misfit.position < 1e-3 && misfit.states == 60, "{misfit:?}");
+        let fading = track(60, cubic, |t| 0.9 * window(t, 0.4, 0.15));
+        let one = curved(&fading, &Tolerance::default(), &mut misfit);
+        assert_eq!(one.len(), 1);
+        assert!((one[0].centre - 0.4).abs() < 1e-3 && (one[0].width - 0.15).abs() < 2e-3, "{:?}", one[0]);
+        assert!((one[0].opacity - 0.9).abs() < 0.01 && misfit.opacity < 0.01);
+    }
+
+    #[test]
+    fn longer_stories_are_handed_over_and_their_opacities_add_up() {
+        let wave = |t: f64| [(18.0 * t).sin(), 0.0, 0.0];
+        let mut misfit = Misfit::default();
+        let many = curved(&track(120, wave, |_| 0.6), &Tolerance::default(), &mut misfit);
+        assert!((4..=MOST + 1).contains(&many.len()), "{} curves", many.len());
+        assert!(misfit.opacity < 0.05 && misfit.rms() < 0.1, "{misfit:?}");
+        let mut misfit = Misfit::default();
+        let step =
+            curved(&track(120, |_| [0.0; 3], |t| if t < 0.5 { 0.7 } else { 0.0 }), &Tolerance::default(), &mut misfit);
+        assert!(step.len() > 2 && misfit.opacity < 0.4, "{} curves, {misfit:?}", step.len());
+    }
+
+    #[test]
+    fn what_is_never_seen_takes_none_and_a_single_frame_takes_one() {
+        let mut misfit = Misfit::default();
+        assert!(curved(&track(20, |_| [0.0; 3], |_| 1e-3), &Tolerance::default(), &mut misfit).is_empty());
+        let still = curved(&track(1, |_| [1.0; 3], |_| 0.5), &Tolerance::default(), &mut misfit);
+        assert!(still.len() == 1 && still[0].place(0.0).iter().all(|x| (x - 1.0).abs() < 1e-9), "{still:?}");
+        let flash = track(30, |_| [0.0; 3], |t| if (t - 0.5).abs() < 1e-9 { 0.5 } else { 0.0 });
+        assert!(!curved(&flash, &Tolerance::default(), &mut misfit).is_empty());
+    }
+}

@@ -1,0 +1,60 @@
+//! Weighted least squares of polynomials of low degree, in f64.
+
+/// Coefficients c of Σ cₖ·uᵏ, k below `K`, that make Σ w·(y − Σ cₖ uᵏ)² least for every component, plus `ridge` times
+/// Σw·cₖ² for k ≥ 1 (a proportion of the weight: what frames do not determine stays small). `u` should be about within ±1.
+pub(crate) fn polynomial<const K: usize, const C: usize>(
+    samples: impl Iterator<Item = (f64, [f64; C], f64)>,
+    ridge: f64,
+) -> [[f64; C]; K] {
+    let mut normal = [[0.0; K]; K];
+    let mut right = [[0.0; C]; K];
+    let mut whole = 0.0;
+    for (u, y, w) in samples {
+        let powers: [f64; K] = std::array::from_fn(|k| u.powi(k as i32));
+        whole += w;
+        for i in 0..K {
+            normal[i].iter_mut().zip(powers).for_each(|(to, power)| *to += w * powers[i] * power);
+            right[i].iter_mut().zip(y).for_each(|(to, y)| *to += w * powers[i] * y);
+        }
+    }
+    for (k, row) in normal.iter_mut().enumerate().skip(1) {
+        row[k] += ridge * whole + f64::MIN_POSITIVE;
+    }
+    // Gauss and Jordan, with pivots: the matrix is positive definite but for rounding.
+    for k in 0..K {
+        let pivot = (k..K).max_by(|&a, &b| normal[a][k].abs().total_cmp(&normal[b][k].abs())).unwrap_or(k);
+        normal.swap(k, pivot);
+        right.swap(k, pivot);
+        let by = normal[k][k];
+        if by == 0.0 || !by.is_finite() {
+            return [[0.0; C]; K];
+        }
+        for i in (0..K).filter(|&i| i != k) {
+            let factor = normal[i][k] / by;
+            let (of_normal, of_right) = (normal[k], right[k]);
+            normal[i].iter_mut().zip(of_normal).for_each(|(to, of)| *to -= factor * of);
+            right[i].iter_mut().zip(of_right).for_each(|(to, of)| *to -= factor * of);
+        }
+    }
+    std::array::from_fn(|k| right[k].map(|value| value / normal[k][k]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn polynomials_are_found_again_and_what_is_not_determined_stays_small() {
+        let cubic = |u: f64| [1.0 - 2.0 * u + 0.5 * u * u - 3.0 * u.powi(3), 4.0];
+        let found: [[f64; 2]; 4] = polynomial(
+            (0..9).map(|i| (f64::from(i) / 4.0 - 1.0, cubic(f64::from(i) / 4.0 - 1.0), 1.0 + f64::from(i))),
+            0.0,
+        );
+        for (found, expected) in found.iter().zip([[1.0, 4.0], [-2.0, 0.0], [0.5, 0.0], [-3.0, 0.0]]) {
+            assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{found:?}, expected {expected:?}");
+        }
+        let alone: [[f64; 1]; 4] = polynomial([(0.3, [7.0], 2.0)].into_iter(), 1e-6);
+        let at = (0..4).map(|k| alone[k][0] * 0.3f64.powi(k as i32)).sum::<f64>();
+        assert!((at - 7.0).abs() < 1e-3 && alone[3][0].abs() < 8.0, "{alone:?}");
+    }
+}

@@ -1,0 +1,159 @@
+//! Pieces of straight motion: within each, everything else stands still.
+
+use std::ops::Range;
+
+use super::least_squares::polynomial;
+use super::{Misfit, Tolerance, Track};
+
+/// What a Gaussian is for some frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Piece {
+    /// Its frames.
+    pub frames: Range<usize>,
+    /// The instant at which it is at `position`.
+    pub at: f64,
+    /// Scene units.
+    pub position: [f64; 3],
+    /// Scene units per unit of time.
+    pub velocity: [f64; 3],
+    /// Unit quaternion wxyz.
+    pub rotation: [f64; 4],
+    /// Natural logarithms of scene units.
+    pub log_scale: [f64; 3],
+    /// In [0, 1].
+    pub opacity: f64,
+    /// Harmonic coefficients.
+    pub sh: Vec<f32>,
+}
+
+/// The pieces of `track`, in order: halves of the sequence, of its halves and so on (of 2ᵏ frames from a multiple of 2ᵏ on),
+/// each the largest that holds what `tolerance` says at every frame; nothing where it is not seen. Of all Gaussians together
+/// there are so no more different spans than twice the frames. How far the pieces are off goes into `misfit`.
+pub fn straight(track: &Track, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    cut(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
+    for piece in &pieces {
+        for frame in piece.frames.clone() {
+            misfit.add(track.distance(frame, place(piece, track.times[frame])), track.opacity[frame] - piece.opacity);
+        }
+    }
+    pieces
+}
+
+/// Adds the pieces of a span of 2ᵏ frames, of which the last ones may not exist.
+fn cut(track: &Track, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<Piece>) {
+    let frames = span.start..span.end.min(track.len());
+    let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
+    if seen == 0 {
+        return;
+    }
+    if seen == frames.len() {
+        let whole = piece(track, frames.clone());
+        if frames.len() == 1 || holds(track, &whole, tolerance) {
+            return pieces.push(whole);
+        }
+    }
+    let middle = span.start.midpoint(span.end);
+    cut(track, span.start..middle, tolerance, pieces);
+    cut(track, middle..span.end, tolerance, pieces);
+}
+
+/// Where `piece` is at `time`.
+fn place(piece: &Piece, time: f64) -> [f64; 3] {
+    std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
+}
+
+/// The best piece of these frames: positions by least squares, all else their mean.
+fn piece(track: &Track, frames: Range<usize>) -> Piece {
+    let count = frames.len() as f64;
+    let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
+    let (at, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
+    let samples = frames.clone().map(|frame| ((track.times[frame] - at) / half, track.position[frame], 1.0));
+    let [position, velocity] =
+        if frames.len() > 1 { polynomial(samples, 0.0) } else { [track.position[frames.start], [0.0; 3]] };
+    let mean = |of: &dyn Fn(usize) -> f64| frames.clone().map(of).sum::<f64>() / count;
+    let rotation: [f64; 4] = std::array::from_fn(|c| mean(&|frame| track.rotation[frame][c]));
+    let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let width = track.sh(frames.start).len();
+    Piece {
+        at,
+        position,
+        velocity: if frames.len() > 1 { velocity.map(|v| v / half) } else { velocity },
+        rotation: if length > 1e-6 { rotation.map(|x| x / length) } else { track.rotation[frames.start] },
+        log_scale: std::array::from_fn(|c| mean(&|frame| track.log_scale[frame][c])),
+        opacity: mean(&|frame| track.opacity[frame]),
+        sh: (0..width).map(|c| mean(&|frame| f64::from(track.sh(frame)[c])) as f32).collect(),
+        frames,
+    }
+}
+
+/// Whether `piece` is as close as `tolerance` asks at every one of its frames.
+fn holds(track: &Track, piece: &Piece, tolerance: &Tolerance) -> bool {
+    let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
+    piece.frames.clone().all(|frame| {
+        track.distance(frame, place(piece, track.times[frame])) <= tolerance.position
+            && track.turned(frame, piece.rotation) <= tolerance.rotation
+            && near(track.opacity[frame], piece.opacity, tolerance.opacity)
+            && (0..3).all(|c| near(track.log_scale[frame][c], piece.log_scale[c], tolerance.log_scale))
+            && track.sh(frame).iter().zip(&piece.sh).all(|(a, b)| near(f64::from(*a), f64::from(*b), tolerance.sh))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A Gaussian of size e⁻³ at `position`, seen with `opacity`.
+    pub(super) fn track(frames: usize, position: impl Fn(f64) -> [f64; 3], opacity: impl Fn(f64) -> f64) -> Track {
+        let times: Vec<f64> = (0..frames).map(|i| i as f64 / frames as f64).collect();
+        Track {
+            position: times.iter().map(|&t| position(t)).collect(),
+            rotation: vec![[1.0, 0.0, 0.0, 0.0]; frames],
+            log_scale: vec![[-3.0; 3]; frames],
+            opacity: times.iter().map(|&t| opacity(t)).collect(),
+            sh: vec![vec![0.5, -0.5, 0.0]],
+            times,
+        }
+    }
+
+    #[test]
+    fn straight_motion_is_one_piece_and_an_edge_begins_another() {
+        let mut misfit = Misfit::default();
+        let one = straight(&track(50, |t| [1.0 + 2.0 * t, -t, 0.0], |_| 0.7), &Tolerance::default(), &mut misfit);
+        assert_eq!(one.len(), 1);
+        assert!((one[0].velocity[0] - 2.0).abs() < 1e-9 && one[0].frames == (0..50) && misfit.position < 1e-9);
+        let bent = track(50, |t| [(t - 0.4).abs(), 0.0, 0.0], |_| 0.7);
+        let pieces = straight(&bent, &Tolerance::default(), &mut misfit);
+        // The edge lies in frame 20: 0 to 15, 16 to 19 and 20 on.
+        assert!(pieces.len() >= 3 && pieces.len() <= 8, "{} pieces", pieces.len());
+        assert_eq!(pieces.iter().map(|piece| piece.frames.len()).sum::<usize>(), 50);
+        assert!(misfit.position <= 0.1 && misfit.states == 100, "{misfit:?}");
+    }
+
+    #[test]
+    fn what_is_not_seen_takes_no_piece_and_a_life_may_pause() {
+        let mut misfit = Misfit::default();
+        let blink = track(60, |_| [0.0; 3], |t| if (0.2..0.4).contains(&t) || t > 0.7 { 0.5 } else { 0.001 });
+        let pieces = straight(&blink, &Tolerance::default(), &mut misfit);
+        let frames: Vec<_> = pieces.iter().map(|piece| piece.frames.clone()).collect();
+        assert_eq!(frames, [12..16, 16..24, 43..44, 44..48, 48..60]);
+        let mut broken = track(5, |_| [0.0; 3], |_| 0.5);
+        broken.position[2][1] = f64::NAN;
+        // 0 and 1, 3, 4.
+        assert_eq!(straight(&broken, &Tolerance::default(), &mut misfit).len(), 3);
+    }
+
+    #[test]
+    fn every_frame_of_a_wild_one_is_held_within_the_tolerance() {
+        let mut misfit = Misfit::default();
+        let mut wild = track(200, |t| [(37.0 * t).sin(), (23.0 * t).cos(), t * t], |t| 0.5 + 0.4 * (50.0 * t).sin());
+        for (frame, (rotation, scale)) in wild.rotation.iter_mut().zip(&mut wild.log_scale).enumerate() {
+            let angle = frame as f64 / 40.0;
+            (*rotation, *scale) = ([angle.cos(), angle.sin(), 0.0, 0.0], [-3.0, -2.0, -4.0 + angle]);
+        }
+        let pieces = straight(&wild, &Tolerance::default(), &mut misfit);
+        assert!(pieces.iter().all(|piece| holds(&wild, piece, &Tolerance::default()) || piece.frames.len() == 1));
+        assert!(pieces.windows(2).all(|pair| pair[0].frames.end == pair[1].frames.start));
+        assert!(misfit.position <= 0.1 && misfit.opacity <= 0.02 && misfit.states == 200, "{misfit:?}");
+    }
+}

@@ -1,0 +1,102 @@
+//! One Gaussian along all frames.
+
+use crate::model::{Gaussians, opacity};
+
+/// Opacity below which a Gaussian is not drawn (1/255): there nothing has to fit.
+pub const SEEN: f64 = 1.0 / 255.0;
+
+/// What one Gaussian does.
+#[derive(Debug, Clone, Default)]
+pub struct Track {
+    /// Of every frame, increasing.
+    pub times: Vec<f64>,
+    /// Scene units.
+    pub position: Vec<[f64; 3]>,
+    /// Unit quaternions wxyz, each on the side of the one before.
+    pub rotation: Vec<[f64; 4]>,
+    /// Natural logarithms of scene units.
+    pub log_scale: Vec<[f64; 3]>,
+    /// In [0, 1].
+    pub opacity: Vec<f64>,
+    /// Harmonic coefficients, a row for every frame, or one for all.
+    pub sh: Vec<Vec<f32>>,
+}
+
+impl Track {
+    /// Of Gaussian `row` of the states at `times`, in order.
+    pub fn of(times: &[f64], states: &[Gaussians], row: usize) -> Track {
+        let mut track = Track { times: times.to_vec(), ..Track::default() };
+        let mut last = [1.0, 0.0, 0.0, 0.0];
+        for state in states {
+            track.position.push(state.position.row::<3>(row).map(f64::from));
+            let q = state.rotation.row::<4>(row).map(f64::from);
+            let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let dot: f64 = q.iter().zip(last).map(|(a, b)| a * b).sum();
+            // One without a direction stays as the last was.
+            if length > 0.0 && length.is_finite() {
+                last = q.map(|x| if dot < 0.0 { -x / length } else { x / length });
+            }
+            track.rotation.push(last);
+            track.log_scale.push(state.log_scale.row::<3>(row).map(f64::from));
+            track.opacity.push(opacity(state.opacity_logit.row::<1>(row)[0]));
+            let sh: Vec<f32> = (0..state.sh.width()).map(|c| state.sh.plane(c)[row]).collect();
+            if track.sh.last() != Some(&sh) {
+                track.sh.resize(track.position.len() - 1, track.sh.last().cloned().unwrap_or_default());
+                track.sh.push(sh);
+            }
+        }
+        if track.sh.len() > 1 {
+            let last = track.sh[track.sh.len() - 1].clone();
+            track.sh.resize(track.position.len(), last);
+        }
+        track
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.times.len()
+    }
+
+    /// Whether there are no frames.
+    pub fn is_empty(&self) -> bool {
+        self.times.is_empty()
+    }
+
+    /// Whether it is drawn at `frame`, with values that can be drawn.
+    pub fn is_seen(&self, frame: usize) -> bool {
+        let finite = |values: &[f64]| values.iter().all(|x| x.is_finite());
+        self.opacity[frame] >= SEEN && finite(&self.position[frame]) && finite(&self.log_scale[frame])
+    }
+
+    /// Harmonic coefficients at `frame`.
+    pub fn sh(&self, frame: usize) -> &[f32] {
+        &self.sh[frame.min(self.sh.len() - 1)]
+    }
+
+    /// The middle one of the three scales at `frame`, scene units.
+    pub fn size(&self, frame: usize) -> f64 {
+        let mut scales = self.log_scale[frame];
+        scales.sort_by(f64::total_cmp);
+        scales[1].exp().max(1e-12)
+    }
+
+    /// How far `position` is from where it is at `frame`, in middle scales.
+    pub fn distance(&self, frame: usize, position: [f64; 3]) -> f64 {
+        let apart = position.iter().zip(self.position[frame]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        apart / self.size(frame)
+    }
+
+    /// Angle between the rotation at `frame` and `rotation`, radians; 0 where no axis differs from another by more than a
+    /// tenth.
+    pub fn turned(&self, frame: usize, rotation: [f64; 4]) -> f64 {
+        let scales = self.log_scale[frame];
+        let [least, most] =
+            [scales.iter().copied().fold(f64::MAX, f64::min), scales.iter().copied().fold(f64::MIN, f64::max)];
+        if most - least < 0.1 {
+            return 0.0;
+        }
+        let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-300);
+        let dot: f64 = rotation.iter().zip(self.rotation[frame]).map(|(a, b)| a * b).sum();
+        2.0 * (dot.abs() / length).min(1.0).acos()
+    }
+}

@@ -1,0 +1,151 @@
+//! Checkpoints made by hand, for tests.
+
+use std::io::{Cursor, Write};
+
+use zip::write::FileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+/// What is pickled.
+#[derive(Debug, Clone)]
+pub(crate) enum Made {
+    None,
+    Bool(bool),
+    Int(i64),
+    Float(f64),
+    Text(&'static str),
+    Tuple(Vec<Made>),
+    List(Vec<Made>),
+    Dict(Vec<(Made, Made)>),
+    Ordered(Vec<(Made, Made)>),
+    Tensor(MadeTensor),
+    Parameter(MadeTensor),
+}
+
+/// A tensor of f32, or of another class with these bytes.
+#[derive(Debug, Clone)]
+pub(crate) struct MadeTensor {
+    pub(crate) class: &'static str,
+    /// One that several tensors name is there once.
+    pub(crate) storage: usize,
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) width: usize,
+    pub(crate) offset: usize,
+    pub(crate) shape: Vec<usize>,
+    pub(crate) stride: Vec<usize>,
+}
+
+/// Dense, of f32, in the storage of that number.
+pub(crate) fn tensor(storage: usize, shape: &[usize], values: &[f32]) -> MadeTensor {
+    let mut stride = vec![1; shape.len()];
+    (1..shape.len()).rev().for_each(|axis| stride[axis - 1] = stride[axis] * shape[axis].max(1));
+    MadeTensor {
+        class: "FloatStorage",
+        storage,
+        bytes: values.iter().flat_map(|value| value.to_le_bytes()).collect(),
+        width: 4,
+        offset: 0,
+        shape: shape.to_vec(),
+        stride,
+    }
+}
+
+/// Keys that are texts.
+pub(crate) fn named(items: Vec<(&'static str, Made)>) -> Vec<(Made, Made)> {
+    items.into_iter().map(|(key, value)| (Made::Text(key), value)).collect()
+}
+
+impl Made {
+    /// The pickle, of protocol 2, without memo.
+    fn pickle(&self, out: &mut Vec<u8>) {
+        let items = |items: &[(Made, Made)], out: &mut Vec<u8>| {
+            out.push(b'(');
+            items.iter().for_each(|(key, value)| {
+                key.pickle(out);
+                value.pickle(out);
+            });
+            out.push(b'u');
+        };
+        let several = |open: &[u8], elements: &[Made], close: u8, out: &mut Vec<u8>| {
+            out.extend(open);
+            elements.iter().for_each(|element| element.pickle(out));
+            out.push(close);
+        };
+        match self {
+            Made::None => out.push(b'N'),
+            Made::Bool(value) => out.push(0x89 - u8::from(*value)),
+            Made::Int(value) => out.extend([&[b'J'][..], &(*value as i32).to_le_bytes()].concat()),
+            Made::Float(value) => out.extend([&[b'G'][..], &value.to_be_bytes()].concat()),
+            Made::Text(text) => out.extend([b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()),
+            Made::Tuple(elements) => several(b"(", elements, b't', out),
+            Made::List(elements) => several(b"](", elements, b'e', out),
+            Made::Dict(of) => {
+                out.push(b'}');
+                items(of, out);
+            }
+            Made::Ordered(of) => {
+                out.extend(b"ccollections\nOrderedDict\n)R");
+                items(of, out);
+            }
+            Made::Tensor(tensor) => tensor.pickle(out),
+            Made::Parameter(tensor) => {
+                out.extend(b"ctorch._utils\n_rebuild_parameter\n(");
+                tensor.pickle(out);
+                out.extend(b"\x88ccollections\nOrderedDict\n)RtR");
+            }
+        }
+    }
+
+    fn storages(&self, found: &mut Vec<(usize, Vec<u8>)>) {
+        match self {
+            Made::Tensor(tensor) | Made::Parameter(tensor) => found.push((tensor.storage, tensor.bytes.clone())),
+            Made::Tuple(elements) | Made::List(elements) => elements.iter().for_each(|of| of.storages(found)),
+            Made::Dict(items) | Made::Ordered(items) => items.iter().for_each(|(_, of)| of.storages(found)),
+            _ => (),
+        }
+    }
+
+    /// The file.
+    pub(crate) fn file(&self) -> Vec<u8> {
+        let mut pickle = b"\x80\x02".to_vec();
+        self.pickle(&mut pickle);
+        pickle.push(b'.');
+        let mut storages = Vec::new();
+        self.storages(&mut storages);
+        storages.sort_by_key(|storage| storage.0);
+        storages.dedup_by_key(|storage| storage.0);
+        let mut files = vec![("data.pkl".to_owned(), pickle), ("byteorder".to_owned(), b"little".to_vec())];
+        files.extend(storages.into_iter().map(|(key, bytes)| (format!("data/{key}"), bytes)));
+        files.push(("version".to_owned(), b"3\n".to_vec()));
+        zip(&files)
+    }
+}
+
+impl MadeTensor {
+    fn pickle(&self, out: &mut Vec<u8>) {
+        let numbers = |of: &[usize]| Made::Tuple(of.iter().map(|&x| Made::Int(x as i64)).collect());
+        out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n((");
+        Made::Text("storage").pickle(out);
+        out.extend(format!("ctorch\n{}\n", self.class).bytes());
+        // Keys are numbers, as texts.
+        let key = self.storage.to_string();
+        out.extend([b"X", &(key.len() as u32).to_le_bytes()[..], key.as_bytes()].concat());
+        Made::Text("cuda:0").pickle(out);
+        Made::Int((self.bytes.len() / self.width) as i64).pickle(out);
+        out.extend(b"tQ");
+        Made::Int(self.offset as i64).pickle(out);
+        numbers(&self.shape).pickle(out);
+        numbers(&self.stride).pickle(out);
+        out.extend(b"\x89ccollections\nOrderedDict\n)RtR");
+    }
+}
+
+/// An archive of stored files, in a folder.
+pub(crate) fn zip(files: &[(String, Vec<u8>)]) -> Vec<u8> {
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    for (name, bytes) in files {
+        let options = FileOptions::default().compression_method(CompressionMethod::Stored);
+        archive.start_file_aligned(format!("made/{name}"), options, 64).unwrap();
+        archive.write_all(bytes).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}

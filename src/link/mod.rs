@@ -1,0 +1,39 @@
+//! Which Gaussian of one frame is which of the next, where the frames themselves do not say.
+//!
+//! In: frames one after the other, of any number of Gaussians in any order. Out: for every Gaussian the number of its
+//! *track*. Memory: the frame that is being linked, [`Linker::BYTES_PER_GAUSSIAN`] each, and
+//! [`Linker::BYTES_PER_TRACK`] for every track that was seen within the last [`GAP`] frames and in this one.
+//! Time: linear in the number of Gaussians, however they lie.
+//!
+//! A Gaussian is compared by its position x, its size s, the root mean square of its three scales, its shape Ŝ, the
+//! covariance over its trace, its opacity α and its base colour c. A track, last seen n frames ago, is expected at
+//! p = x + n·v, with v its velocity per frame: its first step, then half of the old one and half of the last step.
+//!
+//! 1. What is repeated to the bit (position, rotation, scales, opacity, base colour) is the same, the k-th of equal tracks
+//!    the k-th of equal Gaussians.
+//! 2. The cost that Gaussian b goes on with track a is
+//!    |x_b − p_a|² / (r·u)² + q·A, with u = s_a + min(½·n·|v_a|, 3·s_a) and
+//!    A = (ln s_b/s_a / ln √2)² + ‖Ŝ_b − Ŝ_a‖² / ¼² + (α_b − α_a)² / ½² + |c_b − c_a|² / 0.1².
+//!    It goes on with it only if that is at most 1. Each track names the four Gaussians that cost least, ties by their
+//!    number; those are taken by cost, then track, then Gaussian, each track and each Gaussian once, which is the same
+//!    as to take those that are best for one another until none are left.
+//! 3. First with r = ¼ and q = 4, tracks of the frame before alone; of what is left with r = 1 and q = 1, all tracks; then
+//!    with r = 4 and q = 4.
+//! 4. Where less than a quarter goes on, of at least 16, everything has moved at once: a cut, at which all tracks end.
+//!
+//! Tracks are numbered by their births, those of one frame by its order. What is not a number is never compared: it goes on
+//! if it is repeated only. Colours are compared without harmonics, which turn with the Gaussian.
+//!
+//! Gaussians are found by cells of a grid for every octave of sizes. In a cell of more than 64 only 64 are looked at,
+//! those of the nearest brightness, so that thousands at one place cost no more than elsewhere.
+
+mod grid;
+mod identity;
+mod linker;
+mod look;
+
+pub use identity::{Identity, identity};
+pub use linker::{GAP, Linked, Linker};
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,375 @@
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::*;
+use crate::model::{Gaussians, SH_C0, opacity};
+use crate::select::hash_id;
+
+/// Even numbers in [0, 1) that follow from a seed.
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self) -> f32 {
+        self.0 += 1;
+        (hash_id(self.0) >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    fn around(&mut self, middle: f32, width: f32) -> f32 {
+        middle + width * (2.0 * self.roll() - 1.0)
+    }
+
+    fn order(&mut self, count: usize) -> Vec<u32> {
+        let mut order: Vec<u32> = (0..count as u32).collect();
+        (1..count).rev().for_each(|i| order.swap(i, (self.roll() * (i + 1) as f32) as usize % (i + 1)));
+        order
+    }
+}
+
+/// A cloud in a cube of side 1 in which about `crowd` lie within the largest scale of each.
+fn cloud(count: usize, crowd: f32, dice: &mut Dice) -> Gaussians {
+    let mut state = Gaussians::zeros(count, 1);
+    let size = (crowd / count as f32).cbrt() * 0.5;
+    for i in 0..count {
+        state.position.set_row(i, [0; 3].map(|_| dice.roll()));
+        state.rotation.set_row(i, [0; 4].map(|_| dice.around(0.0, 1.0)));
+        state.log_scale.set_row(i, [0; 3].map(|_| dice.around(size.ln(), 1.0)));
+        state.opacity_logit.set_row(i, [dice.around(0.0, 3.0)]);
+        state.sh.set_row(i, [0; 3].map(|_| dice.around(0.0, 1.5)));
+    }
+    state
+}
+
+fn rms_size(state: &Gaussians, i: usize) -> f64 {
+    let squares = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
+    (squares.iter().sum::<f64>() / 3.0).sqrt()
+}
+
+/// The cloud `t` frames later: each half of it moves on a circle, and all tremble by `noise` of their size.
+fn later(cloud: &Gaussians, t: usize, noise: f32, dice: &mut Dice) -> Gaussians {
+    let mut state = cloud.clone();
+    for i in 0..cloud.len() {
+        let angle = 0.2 * t as f32 * if i % 2 == 0 { 1.0 } else { -1.0 };
+        let size = rms_size(cloud, i) as f32;
+        let [x, y, z] = cloud.position.row::<3>(i);
+        let moved = [x + 0.05 * angle.cos(), y + 0.05 * angle.sin(), z];
+        state.position.set_row(i, moved.map(|x| dice.around(x, noise * size)));
+    }
+    state
+}
+
+/// What the documentation of the module says, pair by pair, in f64.
+#[derive(Default)]
+struct Slow {
+    tracks: Vec<SlowTrack>,
+    born: u32,
+}
+
+struct SlowTrack {
+    number: u32,
+    ago: f64,
+    velocity: Option<[f64; 3]>,
+    seen: Seen,
+}
+
+#[derive(Clone)]
+struct Seen {
+    at: [f64; 3],
+    size: f64,
+    shape: [[f64; 3]; 3],
+    opacity: f64,
+    colour: [f64; 3],
+    bits: Vec<u32>,
+}
+
+fn seen(state: &Gaussians, i: usize) -> Seen {
+    let [w, x, y, z] = {
+        let q = state.rotation.row::<4>(i).map(f64::from);
+        let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+        q.map(|x| x / length)
+    };
+    // Columns: what the quaternion makes of the axes.
+    let r = glam::DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w));
+    let variance = state.log_scale.row::<3>(i).map(|log| (2.0 * f64::from(log)).exp());
+    let covariance = r * glam::DMat3::from_diagonal(variance.into()) * r.transpose();
+    let trace: f64 = variance.iter().sum();
+    let columns = (covariance * trace.recip()).to_cols_array_2d();
+    let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<u32>>();
+    Seen {
+        at: state.position.row::<3>(i).map(f64::from),
+        size: rms_size(state, i),
+        shape: columns,
+        opacity: opacity(state.opacity_logit.plane(0)[i]),
+        colour: state.sh.row::<3>(i).map(|dc| 0.5 + SH_C0 * f64::from(dc)),
+        bits: [
+            bits(&state.position.row::<3>(i)),
+            bits(&state.rotation.row::<4>(i)),
+            bits(&state.log_scale.row::<3>(i)),
+            bits(&state.opacity_logit.row::<1>(i)),
+            bits(&state.sh.row::<3>(i)),
+        ]
+        .concat(),
+    }
+}
+
+impl SlowTrack {
+    fn cost(&self, b: &Seen, r: f64, q: f64) -> f64 {
+        let v = self.velocity.unwrap_or_default();
+        let speed = v.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let u = self.seen.size + (0.5 * self.ago * speed).min(3.0 * self.seen.size);
+        let distance: f64 = (0..3).map(|c| (b.at[c] - self.seen.at[c] - self.ago * v[c]).powi(2)).sum();
+        let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - self.seen.shape[k / 3][k % 3]).powi(2)).sum();
+        let colour: f64 = (0..3).map(|c| (b.colour[c] - self.seen.colour[c]).powi(2)).sum();
+        let size = (b.size / self.seen.size).ln() / 2f64.sqrt().ln();
+        let unlike = size * size
+            + shape / 0.25f64.powi(2)
+            + ((b.opacity - self.seen.opacity) / 0.5).powi(2)
+            + colour / 0.1f64.powi(2);
+        distance / (r * u).powi(2) + q * unlike
+    }
+}
+
+impl Slow {
+    fn link(&mut self, state: &Gaussians) -> Vec<u32> {
+        let all: Vec<Seen> = (0..state.len()).map(|i| seen(state, i)).collect();
+        let mut of_track: BTreeMap<usize, usize> = BTreeMap::new();
+        let mut taken: BTreeSet<usize> = BTreeSet::new();
+        for (a, track) in self.tracks.iter().enumerate() {
+            if let Some(b) = (0..all.len()).find(|b| !taken.contains(b) && all[*b].bits == track.seen.bits) {
+                of_track.insert(a, b);
+                taken.insert(b);
+            }
+        }
+        for (r, q, missing) in [(0.25, 4.0, false), (1.0, 1.0, true), (4.0, 4.0, true)] {
+            let mut offers: Vec<(f64, usize, usize)> = Vec::new();
+            for (a, track) in self.tracks.iter().enumerate() {
+                if of_track.contains_key(&a) || !(missing || track.ago == 1.0) {
+                    continue;
+                }
+                let free = (0..all.len()).filter(|b| !taken.contains(b));
+                let mut own: Vec<(f64, usize, usize)> = free.map(|b| (track.cost(&all[b], r, q), a, b)).collect();
+                own.retain(|offer| offer.0 <= 1.0);
+                own.sort_by(|x, y| x.partial_cmp(y).unwrap());
+                offers.extend(own.into_iter().take(4));
+            }
+            offers.sort_by(|x, y| x.partial_cmp(y).unwrap());
+            for (_, a, b) in offers {
+                if !of_track.contains_key(&a) && taken.insert(b) {
+                    of_track.insert(a, b);
+                }
+            }
+        }
+        let mut numbers = vec![u32::MAX; all.len()];
+        for (a, track) in self.tracks.iter_mut().enumerate() {
+            let Some(&b) = of_track.get(&a) else {
+                track.ago += 1.0;
+                continue;
+            };
+            numbers[b] = track.number;
+            let step: [f64; 3] = std::array::from_fn(|c| (all[b].at[c] - track.seen.at[c]) / track.ago);
+            let velocity = track.velocity.map(|v| std::array::from_fn(|c| 0.5 * (v[c] + step[c])));
+            (track.velocity, track.seen, track.ago) = (velocity.or(Some(step)), all[b].clone(), 1.0);
+        }
+        self.tracks.retain(|track| track.ago <= 4.0);
+        for b in 0..all.len() {
+            if numbers[b] == u32::MAX {
+                numbers[b] = self.born;
+                self.tracks.push(SlowTrack { number: self.born, ago: 1.0, velocity: None, seen: all[b].clone() });
+                self.born += 1;
+            }
+        }
+        numbers
+    }
+}
+
+/// A frame of `cloud`, of those that `lives` lets live, in any order; gives the order too.
+fn shuffled(cloud: &Gaussians, dice: &mut Dice, lives: impl Fn(u32) -> bool) -> (Gaussians, Vec<u32>) {
+    let order: Vec<u32> = dice.order(cloud.len()).into_iter().filter(|&i| lives(i)).collect();
+    (cloud.pick(&order), order)
+}
+
+#[test]
+fn tracks_are_those_of_every_pair_compared() {
+    for (seed, crowd) in [(1, 0.5), (2, 4.0), (3, 30.0)] {
+        let mut dice = Dice(seed * 1_000_000);
+        let cloud = cloud(250, crowd, &mut dice);
+        let (mut linker, mut slow) = (Linker::default(), Slow::default());
+        let mut linked = 0;
+        for t in 0..8 {
+            let state = later(&cloud, t, 0.3, &mut dice);
+            // Every Gaussian is away for some frames of its own; a sixth does not move at all.
+            let is_away = |i: u32| (t as u32 + i).is_multiple_of(7) || (t as u32 + i) % 11 < 2;
+            let mut state = state;
+            (0..250).step_by(6).for_each(|i| state.position.set_row(i, cloud.position.row::<3>(i)));
+            let (state, _) = shuffled(&state, &mut dice, |i| !is_away(i));
+            let found = linker.link(&state);
+            assert_eq!(found.tracks, slow.link(&state), "frame {t}, crowd {crowd}");
+            assert_eq!(linker.tracks(), slow.born);
+            linked += found.linked;
+        }
+        assert!(linked > 600, "{linked} links hold nothing against one another");
+    }
+}
+
+#[test]
+fn permuted_frames_with_noise_keep_their_tracks() {
+    let mut dice = Dice(77);
+    let cloud = cloud(3000, 4.0, &mut dice);
+    let mut linker = Linker::default();
+    let mut last: Option<Vec<u32>> = None;
+    let (mut right, mut wrong) = (0, 0);
+    for t in 0..20 {
+        let (state, order) = shuffled(&later(&cloud, t, 0.02, &mut dice), &mut dice, |_| true);
+        let tracks = linker.link(&state).tracks;
+        let mut of_gaussian = vec![0; order.len()];
+        order.iter().zip(&tracks).for_each(|(&i, &track)| of_gaussian[i as usize] = track);
+        if let Some(last) = last.replace(of_gaussian.clone()) {
+            let whose: BTreeSet<u32> = last.iter().copied().collect();
+            for (before, now) in last.iter().zip(&of_gaussian) {
+                right += usize::from(before == now);
+                wrong += usize::from(before != now && whose.contains(now));
+            }
+        }
+    }
+    let all = 19 * 3000;
+    assert!(right * 1000 >= 998 * all && wrong * 1000 <= all, "{right} right, {wrong} wrong of {all}");
+}
+
+#[test]
+fn threads_change_nothing() {
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut dice = Dice(5);
+            let cloud = cloud(9000, 10.0, &mut dice);
+            let mut linker = Linker::default();
+            let frames =
+                (0..4).map(|t| shuffled(&later(&cloud, t, 0.4, &mut dice), &mut dice, |i| i % 9 != t as u32).0);
+            frames.map(|frame| linker.link(&frame)).collect::<Vec<_>>()
+        })
+    };
+    let one = run(1);
+    assert!(one[3].linked > 5000, "{}", one[3].linked);
+    assert_eq!(run(2), one);
+    assert_eq!(run(3), one);
+}
+
+#[test]
+fn a_track_goes_on_after_three_frames_and_ends_after_four() {
+    let mut dice = Dice(9);
+    let cloud = cloud(40, 0.1, &mut dice);
+    for (away, goes_on) in [(3, true), (4, false)] {
+        let mut linker = Linker::default();
+        for t in 0..3 + away + 1 {
+            let mut state = cloud.clone();
+            // In a straight line, by its size in each frame: only where it is expected it is found again.
+            let size = rms_size(&cloud, 0) as f32;
+            let [x, y, z] = cloud.position.row::<3>(0);
+            state.position.set_row(0, [x + t as f32 * size, y, z]);
+            let is_away = (3..3 + away).contains(&t);
+            let rows: Vec<u32> = (0..40).rev().filter(|&i| i > 0 || !is_away).collect();
+            let tracks = linker.link(&state.pick(&rows)).tracks;
+            if t == 3 + away {
+                assert_eq!(tracks[39] == 39, goes_on, "{away} frames away");
+                assert_eq!(linker.tracks(), if goes_on { 40 } else { 41 });
+            }
+        }
+    }
+}
+
+#[test]
+fn everything_moving_at_once_is_a_cut_and_begins_new_tracks() {
+    let mut dice = Dice(11);
+    let cloud = cloud(2000, 4.0, &mut dice);
+    let mut elsewhere = cloud.clone();
+    elsewhere.position.planes_mut().iter_mut().for_each(|x| *x += 100.0);
+    let other = self::cloud(2000, 4.0, &mut dice);
+    for next in [&elsewhere, &other] {
+        let mut linker = Linker::default();
+        linker.link(&cloud);
+        assert!(!linker.link(&later(&cloud, 1, 0.02, &mut dice)).is_cut);
+        let found = linker.link(next);
+        assert!(found.is_cut && found.linked == 0);
+        assert_eq!(found.tracks, (2000..4000).collect::<Vec<u32>>());
+        // Nothing of before the cut goes on after it.
+        assert!(linker.link(&cloud).is_cut);
+    }
+}
+
+#[test]
+fn frames_without_gaussians_and_alone_are_linked() {
+    let mut dice = Dice(13);
+    let cloud = cloud(30, 1.0, &mut dice);
+    let mut linker = Linker::default();
+    assert!(linker.link(&Gaussians::zeros(0, 1)).tracks.is_empty());
+    let first = linker.link(&cloud);
+    assert_eq!((first.tracks, first.linked, first.is_cut), ((0..30).collect(), 0, false));
+    assert_eq!(linker.link(&Gaussians::zeros(0, 1)).linked, 0);
+    assert_eq!(linker.link(&cloud).repeated, 30, "a gap of one frame");
+}
+
+#[test]
+fn thousands_at_one_place_are_linked_without_comparing_all() {
+    let count = 100_000;
+    let mut dice = Dice(17);
+    let mut cloud = Gaussians::zeros(count, 0);
+    (0..count).for_each(|i| cloud.sh.set_row(i, [0; 3].map(|_| dice.around(0.0, 1.7))));
+    let mut linker = Linker::default();
+    linker.link(&cloud);
+    let mut next = cloud.clone();
+    next.sh.planes_mut().iter_mut().for_each(|x| *x += 1e-6);
+    // Every pair: 10¹⁰ comparisons, a minute and more.
+    let start = std::time::Instant::now();
+    let found = linker.link(&next);
+    assert!(start.elapsed().as_secs() < 20, "{:?}", start.elapsed());
+    let right = found.tracks.iter().enumerate().filter(|&(i, &track)| i as u32 == track).count();
+    assert!(right * 100 > 95 * count, "{right} of {count}");
+    // All the same to the bit: by their order.
+    let same = Gaussians::zeros(count, 0);
+    let mut linker = Linker::default();
+    linker.link(&same);
+    assert_eq!(linker.link(&same).tracks, (0..count as u32).collect::<Vec<_>>());
+}
+
+#[test]
+fn what_is_not_a_number_goes_on_only_if_it_repeats() {
+    let mut dice = Dice(19);
+    let mut cloud = cloud(40, 1.0, &mut dice);
+    cloud.position.set_row(3, [f32::NAN, 0.0, f32::INFINITY]);
+    cloud.log_scale.set_row(4, [f32::NAN; 3]);
+    cloud.log_scale.set_row(5, [f32::INFINITY; 3]);
+    cloud.rotation.set_row(6, [0.0; 4]);
+    cloud.opacity_logit.set_row(7, [f32::NEG_INFINITY]);
+    let mut linker = Linker::default();
+    linker.link(&cloud);
+    assert_eq!(linker.link(&cloud).repeated, 40);
+    let mut next = cloud.clone();
+    (0..40).for_each(|i| next.sh.set_row(i, cloud.sh.row::<3>(i).map(|x| x + 1e-4)));
+    let tracks = linker.link(&next).tracks;
+    let gone: Vec<usize> = (0..40).filter(|&i| tracks[i] != i as u32).collect();
+    assert_eq!(gone, [3, 4]);
+}
+
+#[test]
+fn order_is_believed_where_it_holds_and_not_where_it_was_shuffled() {
+    let mut dice = Dice(23);
+    let cloud = cloud(5000, 4.0, &mut dice);
+    let next = later(&cloud, 1, 0.02, &mut dice);
+    let kept = identity(&cloud, &next);
+    assert!(kept.holds && kept.moved < 2.0 && kept.apart > 5.0 && kept.unlike < 1e-6, "{kept:?}");
+    let (mixed, _) = shuffled(&next, &mut dice, |_| true);
+    let lost = identity(&cloud, &mixed);
+    assert!(!lost.holds && lost.moved > 5.0, "{lost:?}");
+    // Sorted by where they lie, each frame by itself: near, but strangers.
+    let sorted = |state: &Gaussians| {
+        let mut order: Vec<u32> = (0..5000).collect();
+        order.sort_by(|&a, &b| state.position.plane(1)[a as usize].total_cmp(&state.position.plane(1)[b as usize]));
+        state.pick(&order)
+    };
+    let sorted = identity(&sorted(&cloud), &sorted(&next));
+    assert!(!sorted.holds, "{sorted:?}");
+    // All alike, all still, a few: nothing speaks against the order.
+    let alike = Gaussians::zeros(100, 0);
+    assert!(identity(&alike, &alike).holds && identity(&cloud, &cloud).holds);
+    let few: Vec<u32> = (0..9).collect();
+    assert!(identity(&cloud.pick(&few), &mixed.pick(&few)).holds);
+    assert!(identity(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).holds);
+}

@@ -1,0 +1,75 @@
+//! Raw parameters that all frames of a model follow from.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Column, Columns, Gaussians};
+
+/// Raw parameters of N Gaussians of a model whose frames all follow from them.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Raw {
+    /// What every family has, as it is stored.
+    pub gaussians: Gaussians,
+    /// What a family has besides (velocities, windows, features), planes in an order of its own; of width 0 where there
+    /// is nothing.
+    pub own: Column,
+}
+
+impl Raw {
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.gaussians.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.gaussians.is_empty()
+    }
+
+    /// The Gaussians `rows`, in that order.
+    pub fn pick(&self, rows: &[u32]) -> Raw {
+        Raw { gaussians: self.gaussians.pick(rows), own: self.own.pick(rows) }
+    }
+
+    /// Makes row `to` that of Gaussian `row` of `from`, which has as many values or more.
+    pub fn set_row(&mut self, to: usize, from: &Raw, row: usize) {
+        let set = |column: &mut Column, from: &Column| {
+            (0..column.width()).for_each(|c| column.plane_mut(c)[to] = from.plane(c)[row]);
+        };
+        for column in Columns::all().iter() {
+            set(self.gaussians.column_mut(column), from.gaussians.column(column));
+        }
+        set(&mut self.own, &from.own);
+    }
+}
+
+impl From<Gaussians> for Raw {
+    /// Of a family that has nothing besides.
+    fn from(gaussians: Gaussians) -> Raw {
+        let own = Column::zeros(0, gaussians.len());
+        Raw { gaussians, own }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_picked_and_set_with_all_they_have() {
+        let mut raw = Raw { gaussians: Gaussians::zeros(3, 1), own: Column::zeros(2, 3) };
+        raw.gaussians.columns_mut(Columns::all()).for_each(|column| {
+            column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = k as f32);
+        });
+        raw.own.set_row(2, [7.0, 8.0]);
+        let picked = raw.pick(&[2, 0]);
+        assert_eq!(
+            (picked.len(), picked.own.row(0), picked.gaussians.position.row(0)),
+            (2, [7.0, 8.0], [2.0, 5.0, 8.0])
+        );
+        let mut other = raw.clone();
+        other.set_row(1, &picked, 0);
+        assert_eq!(other.pick(&[1]), raw.pick(&[2]));
+        let plain = Raw::from(raw.gaussians.clone()).pick(&[1]);
+        assert_eq!((plain.own.width(), plain.own.len(), plain.gaussians), (0, 1, raw.gaussians.pick(&[1])));
+    }
+}

@@ -1,0 +1,265 @@
+//! Frames that do not know one another: what a folder of PLY files whose Gaussians differ in number and order becomes.
+
+mod scene;
+
+use std::collections::BTreeMap;
+use std::fs;
+
+use scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
+use splatsieve::families::Link;
+use splatsieve::model::Gaussians;
+use splatsieve::scene::{InputOptions, Scene, open_scene};
+use splatsieve::select::hash_id;
+
+const FRAMES: usize = 37;
+
+/// Even numbers in [0, 1) that follow from what they are for.
+fn uniform(of: u64) -> f32 {
+    (hash_id(of) >> 40) as f32 / (1u64 << 24) as f32
+}
+
+/// Gaussian `i` of a cloud at a frame: on a circle of its own.
+fn row(i: usize, frame: usize, out: &mut Gaussians, at: usize) {
+    let value = |k: u64| uniform(64 * i as u64 + k);
+    let angle = 0.05 * frame as f32 + 6.0 * value(0);
+    let size = -4.5 + value(1);
+    out.position.set_row(at, [value(2) + 0.1 * angle.cos(), value(3) + 0.1 * angle.sin(), value(4)]);
+    out.rotation.set_row(at, [5, 6, 7, 8].map(|k| value(k) - 0.5));
+    out.log_scale.set_row(at, [9, 10, 11].map(|k| size + value(k)));
+    out.opacity_logit.set_row(at, [4.0 * value(12) - 1.0]);
+    out.sh.set_row(at, [13, 14, 15].map(|k| 3.0 * value(k) - 1.5));
+}
+
+/// Frame `frame` of `count` Gaussians of which those that `lives` names are there, in an order of its own.
+fn frame(count: usize, frame: usize, lives: impl Fn(usize) -> bool) -> (Gaussians, Vec<usize>) {
+    let mut order: Vec<usize> = (0..count).filter(|&i| lives(i)).collect();
+    order.sort_by_key(|&i| hash_id((i as u64) << 20 | frame as u64));
+    let mut out = Gaussians::zeros(order.len(), 1);
+    order.iter().enumerate().for_each(|(at, &i)| row(i, frame, &mut out, at));
+    (out, order)
+}
+
+/// Whether a Gaussian lives: all begin and end at frames of their own, and are away for two frames in between.
+fn lives(i: usize, frame: usize) -> bool {
+    let begins = (hash_id(i as u64) % 60) as usize;
+    let age = (frame + 30).wrapping_sub(begins);
+    age < 25 && !(8..10).contains(&age)
+}
+
+fn write_frames(workplace: &Workplace, folder: &str, count: usize) -> Vec<Vec<usize>> {
+    let write = |t: usize| {
+        let (gaussians, order) = frame(count, t, |i| lives(i, t));
+        workplace.ply(&format!("{folder}/f_{t}.ply"), &gaussians);
+        order
+    };
+    (0..FRAMES).map(write).collect()
+}
+
+fn open(workplace: &Workplace, folder: &str, link: Link) -> Scene {
+    let options = InputOptions { path: workplace.path(folder), link, ..InputOptions::default() };
+    open_scene(&options).unwrap()
+}
+
+#[test]
+fn frames_of_other_numbers_become_tracks_that_hold_every_row_to_the_bit() {
+    let workplace = Workplace::new();
+    // Several blocks of Gaussians, so that some are not there yet for a while, and others no longer.
+    let orders = write_frames(&workplace, "frames", 4000);
+    let scene = open(&workplace, "frames", Link::Auto);
+    let count = scene.source().info().count;
+    let lived = (0..4000).filter(|&i| (0..FRAMES).any(|t| lives(i, t))).count();
+    assert_eq!(count, lived, "one track per Gaussian, across gaps of two frames");
+    let mut whose: BTreeMap<usize, usize> = BTreeMap::new();
+    for (t, order) in orders.iter().enumerate() {
+        let (given, found) = (frame(4000, t, |i| lives(i, t)).0, state(scene.source(), t));
+        let rows: BTreeMap<Vec<u32>, usize> = (0..count).map(|track| (bits(&found, track), track)).collect();
+        for (at, &i) in order.iter().enumerate() {
+            let track = rows.get(&bits(&given, at)).unwrap_or_else(|| panic!("Gaussian {i} is not in frame {t}"));
+            assert_eq!(*whose.entry(i).or_insert(*track), *track, "Gaussian {i} at frame {t}");
+        }
+        let there = found.opacity_logit.plane(0).iter().filter(|&&logit| logit > -40.0).count();
+        assert_eq!(there, order.len(), "those of frame {t} alone are seen");
+    }
+    // Held where they are not, so that nothing moves.
+    for (&i, &track) in &whose {
+        let alive: Vec<usize> = (0..FRAMES).filter(|&t| lives(i, t)).collect();
+        for t in [0, FRAMES - 1] {
+            let nearest = if t == 0 { alive[0] } else { *alive.last().unwrap() };
+            let (there, held) = (state(scene.source(), nearest), state(scene.source(), t));
+            assert_eq!(held.position.row::<3>(track), there.position.row::<3>(track), "Gaussian {i} at frame {t}");
+        }
+        if i > 40 {
+            break;
+        }
+    }
+    let notes = scene.input.notes().join("\n");
+    assert!(notes.contains("frames were linked: ") && notes.contains(&format!("are {lived} tracks")), "{notes}");
+}
+
+#[test]
+fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
+    let workplace = Workplace::new();
+    for t in 0..9 {
+        let (mixed, order) = frame(500, t, |_| true);
+        let mut back = vec![0; 500];
+        order.iter().enumerate().for_each(|(at, &i)| back[i] = at as u32);
+        workplace.ply(&format!("mixed/{t}.ply"), &mixed);
+        workplace.ply(&format!("kept/{t}.ply"), &mixed.pick(&back));
+    }
+    let kind = |folder: &str, link| open(&workplace, folder, link).input.kind();
+    assert_eq!(kind("kept", Link::Auto), "PLY frames");
+    assert_eq!(kind("mixed", Link::Auto), "linked PLY frames");
+    assert_eq!(kind("mixed", Link::Never), "PLY frames");
+    assert_eq!(kind("kept", Link::Always), "linked PLY frames");
+    // By their first order, the same tracks are the same Gaussians.
+    let (kept, linked) = (open(&workplace, "kept", Link::Never), open(&workplace, "kept", Link::Always));
+    assert_eq!(state(kept.source(), 8), state(linked.source(), 8));
+    let said = workplace.done("compress mixed -o out --target-ratio 0.5 --no-refine --verbose --link always");
+    assert!(said.contains("frames were linked: as asked"), "{said}");
+    assert!(fs::read_to_string(workplace.path("out/recipe.toml")).unwrap().contains("link = \"always\""));
+    // What a work folder keeps of one opening is not taken for the other's.
+    let small = "compress mixed --target-ratio 0.5 --no-refine --work work --link";
+    workplace.done(&format!("{small} never -o never"));
+    workplace.done(&format!("{small} always -o again"));
+    let files = |name: &str| lasting_files(&workplace.path(name));
+    assert!(files("again") == files("out"));
+}
+
+#[test]
+fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
+    let workplace = Workplace::new();
+    write_frames(&workplace, "frames", 900);
+    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all");
+    let rows = |folder: &str, t: usize| PlyRows::read(&workplace.path(&format!("{folder}/f_{t}.ply"))).rows;
+    for t in 0..FRAMES {
+        let (mut given, mut left) = (rows("frames", t), rows("all", t));
+        given.sort();
+        left.sort();
+        assert!(given == left, "frame {t}: all rows, in another order");
+    }
+    // Half of the tracks, merged too: every frame has fewer rows, none that nobody sees.
+    workplace.done("compress frames -o half --target-ratio 0.5");
+    for t in 0..FRAMES {
+        let (given, left) = (rows("frames", t).len(), rows("half", t).len());
+        assert!(left > 0 && left < given, "frame {t}: {left} of {given}");
+        let ply = PlyRows::read(&workplace.path(&format!("half/f_{t}.ply")));
+        assert!((0..left).all(|i| ply.value(i, "opacity") > -30.0));
+    }
+    workplace.done("info half");
+}
+
+#[test]
+fn threads_and_memory_change_nothing() {
+    let workplace = Workplace::new();
+    write_frames(&workplace, "frames", 1500);
+    let run = |name: &str, more: &str| {
+        workplace.done(&format!("compress frames -o {name} --target-ratio 0.4 --refine-steps 20 {more}"));
+        lasting_files(&workplace.path(name))
+    };
+    let one = run("one", "--threads 1");
+    assert!(run("two", "--threads 2") == one);
+    assert!(run("three", "--threads 3 --memory 200MiB") == one);
+}
+
+#[test]
+fn a_cut_begins_new_tracks_and_is_told() {
+    let workplace = Workplace::new();
+    for t in 0..8 {
+        let (mut gaussians, _) = frame(300, t, |i| i % 7 != t % 7);
+        if t >= 5 {
+            gaussians.position.planes_mut().iter_mut().for_each(|x| *x += 50.0);
+        }
+        workplace.ply(&format!("frames/{t}.ply"), &gaussians);
+    }
+    let scene = open(&workplace, "frames", Link::Auto);
+    assert_eq!(scene.source().info().count, 600);
+    let notes = scene.input.notes().join("\n");
+    assert!(notes.contains("a cut: 5.ply"), "{notes}");
+}
+
+#[test]
+fn frames_that_cannot_be_linked_are_refused_by_name_and_leave_nothing() {
+    let workplace = Workplace::new();
+    let put = |name: &str, gaussians: &Gaussians| workplace.ply(&format!("frames/{name}"), gaussians);
+    for t in 0..4 {
+        put(&format!("{t}.ply"), &frame(60, t, |i| i % 5 != t).0);
+    }
+    let good = fs::read(workplace.path("frames/2.ply")).unwrap();
+    let refused = |parts: &[&str]| workplace.refused(1, "compress frames -o out", &[&["2.ply"], parts].concat());
+    let spoil = |bytes: &[u8]| fs::write(workplace.path("frames/2.ply"), bytes).unwrap();
+    spoil(&[]);
+    refused(&[]);
+    spoil(&good[..good.len() - 5]);
+    refused(&["cut short"]);
+    // Another degree; other columns.
+    put("2.ply", &Gaussians::zeros(60, 0));
+    refused(&["as in"]);
+    let text = String::from_utf8_lossy(&good[..600]).into_owned();
+    let other = text.find("property float nx").unwrap();
+    spoil(&[&good[..other], b"property float mx", &good[other + 17..]].concat());
+    refused(&["mx", "nx"]);
+    fs::remove_file(workplace.path("frames/2.ply")).unwrap();
+    refused(&["--allow-gaps"]);
+    let gaps = workplace.done("info frames --allow-gaps");
+    assert!(gaps.contains("3 frames") || gaps.contains('3'), "{gaps}");
+    // A frame of no Gaussians is one.
+    put("2.ply", &Gaussians::zeros(0, 1));
+    workplace.done("compress frames -o out --target-ratio 1 --no-refine");
+    assert_eq!(PlyRows::read(&workplace.path("out/2.ply")).rows.len(), 0);
+    // What has as many Gaussians in every frame, and is not to be linked, is as before.
+    workplace.refused(1, "compress frames -o other --link never", &["element vertex", "--link"]);
+    // A single frame has nothing to be linked to.
+    fs::create_dir(workplace.path("alone")).unwrap();
+    fs::write(workplace.path("alone/0.ply"), &good).unwrap();
+    workplace.done("info alone --link always");
+}
+
+/// Frames of a trained model, permuted, with positions off by 2% of the size: links found and wrong, as parts of all.
+fn links(name: &str) -> (f64, f64) {
+    let model = shared(name);
+    let options = InputOptions { path: model.clone(), cameras: Some(model), ..InputOptions::default() };
+    let scene = open_scene(&options).unwrap();
+    let (count, frames) = (scene.source().info().count, scene.source().info().times.len());
+    let mut linker = splatsieve::link::Linker::default();
+    let (mut last, mut right, mut wrong): (Option<Vec<u32>>, usize, usize) = (None, 0, 0);
+    for t in 0..frames {
+        let given = state(scene.source(), t);
+        let mut order: Vec<u32> = (0..count as u32).collect();
+        order.sort_by_key(|&i| hash_id(u64::from(i) << 20 | t as u64));
+        let mut mixed = given.pick(&order);
+        for (at, &i) in order.iter().enumerate() {
+            let squares = mixed.log_scale.row::<3>(at).map(|log| (2.0 * log).exp());
+            let size = (squares.iter().sum::<f32>() / 3.0).sqrt();
+            // Sums of three even ones, of variance 1.
+            let normal = |c: u64| {
+                let of = |k: u64| uniform((u64::from(i) << 20 | t as u64) << 8 | c << 4 | k) - 0.5;
+                2.0 * (of(0) + of(1) + of(2))
+            };
+            let moved: [f32; 3] = std::array::from_fn(|c| mixed.position.plane(c)[at] + 0.02 * size * normal(c as u64));
+            mixed.position.set_row(at, moved);
+        }
+        let tracks = linker.link(&mixed).tracks;
+        let mut of_gaussian = vec![0; count];
+        order.iter().zip(&tracks).for_each(|(&i, &track)| of_gaussian[i as usize] = track);
+        if let Some(last) = last.replace(of_gaussian.clone()) {
+            let mut before = last.clone();
+            before.sort_unstable();
+            for (before_i, now) in last.iter().zip(&of_gaussian) {
+                right += usize::from(before_i == now);
+                wrong += usize::from(before_i != now && before.binary_search(now).is_ok());
+            }
+        }
+    }
+    let all = (count * (frames - 1)) as f64;
+    println!("{name}: {:.3}% found, {:.3}% wrong", 100.0 * right as f64 / all, 100.0 * wrong as f64 / all);
+    (right as f64 / all, wrong as f64 / all)
+}
+
+#[test]
+#[ignore = "needs the trained models"]
+fn shuffled_frames_of_trained_models_are_linked_again() {
+    for name in ["deform2", "room2_dynerf"] {
+        let (right, wrong) = links(name);
+        assert!(right >= 0.98 && wrong <= 0.005, "{name}: {right} found, {wrong} wrong");
+    }
+}
