@@ -194,8 +194,8 @@ fn deltas_at_the_canonical_positions_lead_to_the_states() {
 fn times_that_do_not_increase_are_refused_with_their_frames() {
     let (_, model) = load("deform2");
     for (times, says) in [
-        (vec![0.0, 0.5, 0.5], "frame 1 is at 0.5, frame 2 at 0.5"),
-        (vec![0.5, 0.25], "frame 0 is at 0.5, frame 1 at 0.25"),
+        (vec![0.0, 0.5, 0.5], "frame 1 has 0.5, frame 2 has 0.5"),
+        (vec![0.5, 0.25], "frame 0 has 0.5, frame 1 has 0.25"),
         (vec![0.0, f64::NAN], "frame 1 has time NaN"),
     ] {
         let error = model.clone().with_times(times).expect_err("must be refused").to_string();
