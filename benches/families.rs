@@ -3,14 +3,22 @@
 //! `network`: what the network of Deformable-3D-Gaussians says, with a time network, of 1024 Gaussians prepared once; it makes
 //! 0.5 million multiplications. The rival is a bare product of the same matrices by `matrixmultiply`, without biases, ReLUs and
 //! sines. With trained models at hand, whole states of Deformable-3D-Gaussians (a covariance is decomposed beside), with
-//! screws, and of SC-GS, whose nodes' outputs are shared by all Gaussians of a time.
-//! Invert the throughput to get the time per Gaussian and frame.
+//! screws, and of SC-GS, with each Gaussian 64 times, as the network's outputs for nodes, made anew at every time, are shared by
+//! all Gaussians; of SpacetimeGaussians and FreeTimeGS,
+//! which are polynomials and a window; of native 4D Gaussians, which are slices of covariances, without colours and with.
+//! `open`: what a block of these takes once for all frames. `scripts/torch_speed.py` has the same figures of PyTorch.
+//! Time is that of a processor: what else the machine does does not count. Invert the throughput to get the time per Gaussian
+//! and frame.
 
 #[path = "../tests/models/mod.rs"]
 mod models;
 
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
+use cpu_time::ProcessTime;
+use criterion::measurement::{Measurement, ValueFormatter, WallTime};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Motion, Network, Tensor, Tensors};
 use splatsieve::families::{self, OpenOptions};
@@ -19,8 +27,43 @@ use splatsieve::source::Ids;
 
 const BLOCK: usize = 1024;
 const WIDTH: usize = 256;
+/// Copies of each Gaussian of SC-GS.
+const REPEATED: usize = 64;
 /// Values of a position and of a time.
 const INPUTS: usize = 63 + 30;
+
+/// Time that processors spend on this process.
+struct Processor;
+
+impl Measurement for Processor {
+    type Intermediate = ProcessTime;
+    type Value = Duration;
+
+    fn start(&self) -> ProcessTime {
+        ProcessTime::now()
+    }
+
+    fn end(&self, start: ProcessTime) -> Duration {
+        start.elapsed()
+    }
+
+    fn add(&self, a: &Duration, b: &Duration) -> Duration {
+        *a + *b
+    }
+
+    fn zero(&self) -> Duration {
+        Duration::ZERO
+    }
+
+    fn to_f64(&self, value: &Duration) -> f64 {
+        value.as_nanos() as f64
+    }
+
+    fn formatter(&self) -> &dyn ValueFormatter {
+        const WALL: &WallTime = &WallTime;
+        WALL.formatter()
+    }
+}
 
 /// Values in [−1, 1), the same on every run.
 fn noise(seed: &mut u64) -> f32 {
@@ -80,7 +123,7 @@ fn product([outputs, inputs]: [usize; 2], weight: &[f32], x: &[f32], y: &mut [f3
     }
 }
 
-fn networks(criterion: &mut Criterion) {
+fn networks(criterion: &mut Criterion<Processor>) {
     let mut group = criterion.benchmark_group("network");
     group.throughput(Throughput::Elements(BLOCK as u64));
     let (network, mut seed) = (network(), 2);
@@ -104,25 +147,67 @@ fn networks(criterion: &mut Criterion) {
     group.finish();
 }
 
-fn states(criterion: &mut Criterion) {
+/// A copy of the model at `path` in `to`, with each of its Gaussians so many times.
+fn repeated(path: &Path, to: &Path) -> PathBuf {
+    for file in ["cfg_args", "deform/iteration_80000/deform.pth", "point_cloud/iteration_80000/point_cloud.ply"] {
+        let mut bytes = fs::read(path.join(file)).expect("a trained model");
+        if file.ends_with("ply") {
+            let end = b"end_header\n";
+            let start = bytes.windows(end.len()).position(|part| part == end).expect("a header") + end.len();
+            let header = String::from_utf8_lossy(&bytes[..start]);
+            let header = header.replace("vertex 1500", &format!("vertex {}", REPEATED * 1500));
+            bytes = [header.as_bytes(), &bytes[start..].repeat(REPEATED)].concat();
+        }
+        fs::create_dir_all(to.join(file).parent().expect("a folder")).expect("a folder");
+        fs::write(to.join(file), bytes).expect("a copy");
+    }
+    to.to_owned()
+}
+
+fn states(criterion: &mut Criterion<Processor>) {
     let Some(folder) = models::found() else { return };
     let mut group = criterion.benchmark_group("state");
-    group.throughput(Throughput::Elements(BLOCK as u64));
-    let times: Vec<f64> = (0..60).map(|frame| f64::from(frame) / 59.0).collect();
-    for (name, model) in [("d3g", "deformable3d"), ("d3g_6dof", "deformable3d_6dof"), ("sc_gs", "scgs")] {
-        let opened = families::open(&folder.join("families").join(model), &OpenOptions::default());
+    // More than those of which outputs for nodes are kept.
+    let times: Vec<f64> = (0..1500).map(|frame| f64::from(frame) / 1499.0).collect();
+    let scratch = tempfile::tempdir().expect("a folder for temporary files");
+    let still = Columns::all().difference(Columns::SH);
+    for (name, model, want) in [
+        ("d3g", "deformable3d", still),
+        ("d3g_6dof", "deformable3d_6dof", still),
+        ("sc_gs", "scgs", still),
+        ("spacetime", "stg_lite", Columns::all()),
+        ("free_time", "ftgs", still),
+        ("native_4d", "yang4d", still),
+        ("native_4d_colours", "yang4d", Columns::all()),
+    ] {
+        let model = folder.join("families").join(model);
+        let (path, count) = match name {
+            "sc_gs" => (repeated(&model, scratch.path()), REPEATED * 1500),
+            _ => (model, BLOCK),
+        };
+        group.throughput(Throughput::Elements(count as u64));
+        let opened = families::open(&path, &OpenOptions::default());
         let family = opened.and_then(|family| family.with_times(times.clone())).expect("a trained model");
-        let mut reader = family.source().open(Ids::Range(0..BLOCK)).expect("a block");
+        let mut reader = family.source().open(Ids::Range(0..count)).expect("Gaussians");
         let (mut frame, mut out) = (0, Gaussians::zeros(0, family.source().info().sh_degree));
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
                 frame = (frame + 1) % times.len();
-                reader.read(frame, Columns::all().difference(Columns::SH), &mut out)
+                reader.read(frame, want, &mut out)
             });
         });
+        if name == "native_4d" {
+            group.bench_function("native_4d_open", |bencher| {
+                bencher.iter(|| family.source().open(Ids::Range(0..BLOCK)).map(drop));
+            });
+        }
     }
     group.finish();
 }
 
-criterion_group!(benches, networks, states);
+criterion_group! {
+    name = benches;
+    config = Criterion::default().with_measurement(Processor);
+    targets = networks, states
+}
 criterion_main!(benches);

@@ -2,6 +2,7 @@
 
 mod camera;
 mod covariance;
+pub(crate) mod functions;
 mod gaussians;
 mod gradients;
 mod jacobian;

@@ -11,6 +11,7 @@ use std::ops::Range;
 
 use super::colour::{self, Colours};
 use super::convention::{BLOCK, MIN_ALPHA, TILE};
+use crate::model::functions::exp;
 use crate::model::{Camera, Gaussians};
 
 /// Variance added to the diagonal of every 2-D covariance, pixels².
@@ -380,52 +381,9 @@ fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     ]
 }
 
-/// eˣ for |x| ≤ 700 to 1e-15 relative: a polynomial, so that loops over it run in vectors and give the
-/// same bits whatever the system's mathematics library.
-#[inline(always)]
-fn exp(x: f64) -> f64 {
-    /// 1.5 · 2⁵²: adding it rounds to an integer kept in the low bits.
-    const ROUND: f64 = 6_755_399_441_055_744.0;
-    /// ln 2 in two parts, the first with trailing zeros so that its products with n are exact.
-    const LN_2_HIGH: f64 = 0.693_147_180_369_123_8;
-    const LN_2_LOW: f64 = 1.908_214_929_270_587_7e-10;
-    let rounded = x * LOG2_E + ROUND;
-    let n = rounded - ROUND;
-    let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
-    // Taylor to r¹³ / 13!, 2e-17 of the sum at |r| = ln 2 / 2.
-    let mut sum = 1.0 / 6_227_020_800.0;
-    for inverse_factorial in [
-        1.0 / 479_001_600.0,
-        1.0 / 39_916_800.0,
-        1.0 / 3_628_800.0,
-        1.0 / 362_880.0,
-        1.0 / 40_320.0,
-        1.0 / 5_040.0,
-        1.0 / 720.0,
-        1.0 / 120.0,
-        1.0 / 24.0,
-        1.0 / 6.0,
-        0.5,
-        1.0,
-        1.0,
-    ] {
-        sum = sum * r + inverse_factorial;
-    }
-    f64::from_bits(sum.to_bits().wrapping_add(rounded.to_bits() << 52))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn exp_is_within_1e_15_of_the_truth() {
-        for step in -80_000..=80_000 {
-            let x = f64::from(step) * 1e-3 + 1e-4;
-            let error = (exp(x) / x.exp() - 1.0).abs();
-            assert!(error < 1e-15, "exp({x}) is off by {error:e}, expected below 1e-15");
-        }
-    }
 
     #[test]
     fn log2_bound_is_above_by_less_than_0_087() {
@@ -434,11 +392,6 @@ mod tests {
             let excess = log2_bound(x) - x.log2();
             assert!((0.0..0.087).contains(&excess), "log2 of {x} is exceeded by {excess}");
         }
-    }
-
-    #[test]
-    fn exp_of_nan_is_nan() {
-        assert!(exp(f64::NAN).is_nan());
     }
 
     #[test]

@@ -65,6 +65,7 @@ impl Law for FreeTime {
         Columns::all()
     }
 
+    #[inline(always)]
     fn state(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns, out: &mut Gaussians) -> Result<()> {
         copy_stored(raw, want.difference(self.varying()), out);
         let centres = raw.own.plane(TIME);
@@ -82,8 +83,7 @@ impl Law for FreeTime {
             let to = out.opacity_logit.plane_mut(0).iter_mut().zip(centres).zip(&windows.rates).zip(&windows.odds);
             to.for_each(|(((to, &centre), &rate), &odds)| {
                 let exponent = -rate * (time - f64::from(centre)).powi(2);
-                // An opacity is no larger than its window.
-                *to = if exponent < least { least } else { faded(odds, exponent).max(least) } as f32;
+                *to = faded(odds, exponent).max(least) as f32;
             });
         }
         Ok(())

@@ -34,7 +34,8 @@ pub(super) trait Law: Debug + Send + Sync {
     fn movable(&self) -> Columns;
 
     /// Writes the columns `want` of the states at `time` into `out`, which has room for them: at most [`BLOCK`] at once,
-    /// from many threads.
+    /// from many threads. Loops over planes are compiled for wider registers where this is always inlined; no operation is
+    /// fused, so the same bits.
     ///
     /// # Errors
     /// What cannot be evaluated.
@@ -205,6 +206,18 @@ impl<L: Law> Block<L> {
 
     fn state(&self, law: &L, time: f64, want: Columns, out: &mut Gaussians) -> Result<()> {
         out.columns_mut(want).for_each(|column| column.resize(self.raw.len()));
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the line above saw that this processor has AVX2.
+            return unsafe { self.state_avx2(law, time, want, out) };
+        }
+        law.state(time, &self.raw, &self.prepared, want, out)
+    }
+
+    /// [`Law::state`] compiled for AVX2.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn state_avx2(&self, law: &L, time: f64, want: Columns, out: &mut Gaussians) -> Result<()> {
         law.state(time, &self.raw, &self.prepared, want, out)
     }
 }

@@ -3,6 +3,8 @@
 //! α = σ(o)·m with m = exp(e), e ≤ 0: as a logit ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), in f64 without loss where α is
 //! near 0 or near 1.
 
+use crate::model::functions::{exp_m1, ln};
+
 /// Logits beyond it say no more.
 pub(in crate::families) const MOST: f64 = 40.0;
 
@@ -11,13 +13,14 @@ pub(in crate::families) fn odds(logit: f32) -> f64 {
     (-f64::from(logit)).exp()
 }
 
-/// The logit of σ(o)·exp(`exponent`), from [`odds`] of o, within ±[`MOST`].
+/// The logit of σ(o)·exp(`exponent`), from [`odds`] of o, within ±[`MOST`]. Without a branch, so that loops run in vectors.
+#[inline(always)]
 pub(in crate::families) fn faded(odds: f64, exponent: f64) -> f64 {
     // The opacity is no larger than m.
-    if exponent < -MOST {
-        return -MOST;
-    }
-    (exponent - (odds - exponent.exp_m1()).ln()).clamp(-MOST, MOST)
+    let exponent = if exponent < -MOST { -MOST } else { exponent };
+    let logit = exponent - ln(odds - exp_m1(exponent));
+    let logit = if logit > MOST { MOST } else { logit };
+    if logit < -MOST { -MOST } else { logit }
 }
 
 /// ∂ [`faded`] / ∂ o; 0 where it does not change.

@@ -46,12 +46,14 @@ pub(super) struct Native {
 /// What follows from raw parameters for all times.
 #[derive(Debug)]
 pub(super) struct Slices {
-    pub(super) velocity: Vec<[f64; 3]>,
+    /// A plane for each axis.
+    velocity: [Vec<f64>; 3],
     /// −1/(2 Σ_tt), with the prefilter.
     rates: Vec<f64>,
     odds: Vec<f64>,
-    rotation: Vec<[f32; 4]>,
-    log_scale: Vec<[f32; 3]>,
+    /// Of Σ, where it turns in four dimensions.
+    rotation: Column,
+    log_scale: Column,
 }
 
 /// Of one Gaussian.
@@ -94,8 +96,8 @@ impl Native {
 
     /// cos(2π(μ − t)/L) and its double.
     pub(super) fn waves(&self, time: f64, centre: f64) -> [f64; 2] {
-        let turn = TAU * (centre - time) / self.period;
-        [turn.cos(), (2.0 * turn).cos()]
+        let wave = (TAU * (centre - time) / self.period).cos();
+        [wave, 2.0 * wave * wave - 1.0]
     }
 }
 
@@ -103,21 +105,22 @@ impl Law for Native {
     type Prepared = Slices;
 
     fn prepare(&self, raw: &Raw) -> Slices {
+        let (count, turning) = (raw.len(), if self.turns { raw.len() } else { 0 });
         let mut slices = Slices {
-            velocity: Vec::with_capacity(raw.len()),
-            rates: Vec::with_capacity(raw.len()),
+            velocity: [0, 1, 2].map(|_| vec![0.0; count]),
+            rates: vec![0.0; count],
             odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect(),
-            rotation: Vec::with_capacity(raw.len()),
-            log_scale: Vec::with_capacity(raw.len()),
+            rotation: Column::zeros(4, turning),
+            log_scale: Column::zeros(3, turning),
         };
-        for i in 0..raw.len() {
+        for i in 0..count {
             let Slice { velocity, variance, covariance } = self.slice(raw, i);
-            slices.velocity.push(velocity);
-            slices.rates.push(self.rate(variance));
+            (0..3).for_each(|c| slices.velocity[c][i] = velocity[c]);
+            slices.rates[i] = self.rate(variance);
             if let Some(covariance) = covariance {
                 let (scales, rotation) = scale_rotation(covariance, raw.gaussians.rotation.row(i).map(f64::from));
-                slices.rotation.push(rotation.map(|q| q as f32));
-                slices.log_scale.push(scales.map(|scale| scale.ln() as f32));
+                slices.rotation.set_row(i, rotation.map(|q| q as f32));
+                slices.log_scale.set_row(i, scales.map(|scale| scale.ln() as f32));
             }
         }
         slices
@@ -134,21 +137,22 @@ impl Law for Native {
         Columns::all().difference(mixed)
     }
 
+    #[inline(always)]
     fn state(&self, time: f64, raw: &Raw, slices: &Slices, want: Columns, out: &mut Gaussians) -> Result<()> {
         let centres = raw.own.plane(TIME);
         let mixed = if self.turns { Columns::ROTATION | Columns::LOG_SCALE } else { Columns::empty() };
         copy_stored(raw, want.difference(Columns::POSITION | Columns::OPACITY | mixed), out);
         if (want & mixed).contains(Columns::ROTATION) {
-            slices.rotation.iter().enumerate().for_each(|(i, &rotation)| out.rotation.set_row(i, rotation));
+            out.rotation.planes_mut().copy_from_slice(slices.rotation.planes());
         }
         if (want & mixed).contains(Columns::LOG_SCALE) {
-            slices.log_scale.iter().enumerate().for_each(|(i, &scale)| out.log_scale.set_row(i, scale));
+            out.log_scale.planes_mut().copy_from_slice(slices.log_scale.planes());
         }
         if want.contains(Columns::POSITION) {
-            for c in 0..3 {
-                let from = raw.gaussians.position.plane(c).iter().zip(&slices.velocity).zip(centres);
-                out.position.plane_mut(c).iter_mut().zip(from).for_each(|(to, ((&x, velocity), &centre))| {
-                    *to = (f64::from(x) + velocity[c] * (time - f64::from(centre))) as f32;
+            for (c, velocity) in slices.velocity.iter().enumerate() {
+                let from = raw.gaussians.position.plane(c).iter().zip(velocity).zip(centres);
+                out.position.plane_mut(c).iter_mut().zip(from).for_each(|(to, ((&x, &velocity), &centre))| {
+                    *to = (f64::from(x) + velocity * (time - f64::from(centre))) as f32;
                 });
             }
         }
@@ -157,16 +161,19 @@ impl Law for Native {
             let from = centres.iter().zip(&slices.rates).zip(&slices.odds);
             out.opacity_logit.plane_mut(0).iter_mut().zip(from).for_each(|(to, ((&centre, &rate), &odds))| {
                 let exponent = rate * (time - f64::from(centre)).powi(2);
-                *to = if exponent > cut { faded(odds, exponent) } else { -MOST } as f32;
+                let drawn = faded(odds, exponent);
+                *to = if exponent > cut { drawn } else { -MOST } as f32;
             });
         }
         if want.contains(Columns::SH) && self.terms > 0 {
-            let waves: Vec<[f64; 2]> = centres.iter().map(|&centre| self.waves(time, f64::from(centre))).collect();
-            for c in 0..out.sh.width() {
-                for term in 0..self.terms {
-                    let by = raw.own.plane(TERMS + term * TERM + c).iter().zip(&waves);
-                    let to = out.sh.plane_mut(c).iter_mut().zip(by);
-                    to.for_each(|(to, (&by, waves))| *to += (waves[term] * f64::from(by)) as f32);
+            let waves = centres.iter().map(|&centre| self.waves(time, f64::from(centre)));
+            let waves: (Vec<f64>, Vec<f64>) = waves.map(|[first, second]| (first, second)).unzip();
+            for (term, waves) in [waves.0, waves.1].iter().enumerate().take(self.terms) {
+                for c in 0..out.sh.width() {
+                    let by = raw.own.plane(TERMS + term * TERM + c).iter().zip(waves);
+                    out.sh.plane_mut(c).iter_mut().zip(by).for_each(|(to, (&by, &wave))| {
+                        *to += (wave * f64::from(by)) as f32;
+                    });
                 }
             }
         }

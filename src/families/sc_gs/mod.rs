@@ -14,9 +14,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use super::deform_folder::{Arguments, Deforming, Folder, LEAST_SCALE, Parts, has_network, names_of_network};
 use super::family::Entry;
-use super::law::Law;
+use super::law::{Law, copy_stored};
 use crate::deform::{Encoded, Motion, Network};
 use crate::error::{Error, Result, quoted};
+use crate::model::functions::{exp, ln};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, logit, opacity};
 use nodes::Nodes;
 
@@ -37,6 +38,8 @@ pub(super) const ENTRY: Entry = Entry {
 
 /// Bytes of the outputs that are kept, each of all nodes at one time.
 const KEPT_BYTES: usize = 16 << 20;
+/// Largest logarithm of a scale, either way: what is beyond has no size to be drawn in.
+const MOST_LOG_SCALE: f64 = 600.0;
 /// Largest logit of an opacity that the network adds to.
 const MOST_LOGIT: f64 = 40.0;
 
@@ -235,16 +238,20 @@ impl Law for Control {
         Columns::all()
     }
 
+    #[inline(always)]
     fn state(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns, out: &mut Gaussians) -> Result<()> {
         let motion = self.motion(time, prepared, want)?;
+        copy_stored(raw, want, out);
         for column in want.iter() {
-            let (from, to) = (raw.gaussians.column(column), out.column_mut(column));
-            *to = from.clone();
+            let to = out.column_mut(column);
             match column {
                 Columns::POSITION => add(&motion.warp, to),
                 Columns::ROTATION => add(&motion.rotation, to),
                 Columns::LOG_SCALE => each(&motion.scaling, to, |log, by| {
-                    (f64::from(log).exp() + f64::from(by)).abs().max(LEAST_SCALE).ln() as f32
+                    let log = f64::from(log);
+                    let log = if log > MOST_LOG_SCALE { MOST_LOG_SCALE } else { log };
+                    let log = if log < -MOST_LOG_SCALE { -MOST_LOG_SCALE } else { log };
+                    ln((exp(log) + f64::from(by)).abs().max(LEAST_SCALE)) as f32
                 }),
                 Columns::OPACITY => each(&motion.opacity, to, |logit, by| added(logit, by) as f32),
                 _ => add(&motion.colour, to),
@@ -297,6 +304,7 @@ fn add(by: &Column, to: &mut Column) {
 }
 
 /// Applies `f` to the values of the planes that `by` has, and to those of `by`.
+#[inline(always)]
 fn each(by: &Column, to: &mut Column, f: impl Fn(f32, f32) -> f32) {
     for c in 0..by.width().min(to.width()) {
         to.plane_mut(c).iter_mut().zip(by.plane(c)).for_each(|(value, &by)| *value = f(*value, by));

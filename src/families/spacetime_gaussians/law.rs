@@ -72,11 +72,10 @@ pub(super) struct Prepared {
     odds: Vec<f64>,
 }
 
-impl Prepared {
-    /// Logarithm of the window of Gaussian `row` so long since its centre.
-    fn exponent(&self, dt: f64, row: usize) -> f64 {
-        -dt * dt * self.inverse_squared[row]
-    }
+/// Logarithm of a window so long since its centre.
+#[inline(always)]
+fn exponent(dt: f64, inverse_squared: f64) -> f64 {
+    -dt * dt * inverse_squared
 }
 
 impl Law for Spacetime {
@@ -98,32 +97,35 @@ impl Law for Spacetime {
         if self.is_full { Columns::all().difference(Columns::SH) } else { Columns::all() }
     }
 
+    #[inline(always)]
     fn state(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns, out: &mut Gaussians) -> Result<()> {
         let (stored, own, centres) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
-        let since = |row: usize| time - f64::from(centres[row]);
+        let since = |centre: &f32| time - f64::from(*centre);
         if want.contains(Columns::POSITION) {
             for c in 0..3 {
-                let start = stored.position.plane(c);
                 let [m1, m2, m3] = [0, 1, 2].map(|k| own.plane(MOTION + 3 * k + c));
-                for (row, to) in out.position.plane_mut(c).iter_mut().enumerate() {
-                    let dt = since(row);
-                    let [p0, m1, m2, m3] = [start[row], m1[row], m2[row], m3[row]].map(f64::from);
+                let terms = stored.position.plane(c).iter().zip(m1).zip(m2).zip(m3);
+                let to = out.position.plane_mut(c).iter_mut().zip(terms).zip(centres);
+                to.for_each(|((to, (((&p0, &m1), &m2), &m3)), centre)| {
+                    let (dt, [p0, m1, m2, m3]) = (since(centre), [p0, m1, m2, m3].map(f64::from));
                     *to = (p0 + dt * (m1 + dt * (m2 + dt * m3))) as f32;
-                }
+                });
             }
         }
         if want.contains(Columns::ROTATION) {
             for c in 0..4 {
-                let (start, omega) = (stored.rotation.plane(c), own.plane(OMEGA + c));
-                for (row, to) in out.rotation.plane_mut(c).iter_mut().enumerate() {
-                    *to = (f64::from(start[row]) + since(row) * f64::from(omega[row])) as f32;
-                }
+                let terms = stored.rotation.plane(c).iter().zip(own.plane(OMEGA + c));
+                let to = out.rotation.plane_mut(c).iter_mut().zip(terms).zip(centres);
+                to.for_each(|((to, (&start, &omega)), centre)| {
+                    *to = (f64::from(start) + since(centre) * f64::from(omega)) as f32;
+                });
             }
         }
         if want.contains(Columns::OPACITY) {
-            for (row, to) in out.opacity_logit.plane_mut(0).iter_mut().enumerate() {
-                *to = faded(prepared.odds[row], prepared.exponent(since(row), row)) as f32;
-            }
+            let of = centres.iter().zip(&prepared.inverse_squared).zip(&prepared.odds);
+            out.opacity_logit.plane_mut(0).iter_mut().zip(of).for_each(|(to, ((centre, &inverse_squared), &odds))| {
+                *to = faded(odds, exponent(since(centre), inverse_squared)) as f32;
+            });
         }
         copy_stored(raw, want.difference(self.varying()), out);
         Ok(())
@@ -135,7 +137,7 @@ impl Law for Spacetime {
             let centres = raw.own.plane(CENTRE);
             let of = |row: usize| {
                 let dt = time - f64::from(centres[row]);
-                slope(prepared.odds[row], prepared.exponent(dt, row)) as f32
+                slope(prepared.odds[row], exponent(dt, prepared.inverse_squared[row])) as f32
             };
             *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(of).collect());
         }
