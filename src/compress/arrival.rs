@@ -85,7 +85,8 @@ fn receive_measured<S: Stages>(
     plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
-    let loaded = load_cameras(options, options.cameras.as_deref(), options.times.clone(), cameras::Clock::Normalised)?;
+    let (path, times) = (options.cameras.as_deref(), options.times.clone());
+    let loaded = load_cameras(options, path, times, cameras::Clock::Normalised, None)?;
     let has_cameras = loaded.is_some();
     let stream = open_stream(options)?;
     let count = stream.header().count;

@@ -100,6 +100,11 @@ pub trait Family: Send + Sync {
         None
     }
 
+    /// Frames of that data it was trained on, where the input says how many: the last is one step before the end of its time.
+    fn data_frames(&self) -> Option<usize> {
+        None
+    }
+
     /// Colour behind the scene that it was trained with, where it names one.
     fn background(&self) -> Option<[f32; 3]> {
         None

@@ -74,11 +74,18 @@ pub struct Opened {
     pub notes: Vec<String>,
 }
 
-/// The cameras of a file, if there is one, with times as `times` and `clock` say.
+/// The cameras of a file, if there is one, with times as `times` and `clock` say; where the file does not count the frames,
+/// there are `trained`, else as many as `options` say.
 ///
 /// # Errors
 /// A file that is not there, or holds no cameras.
-pub fn load_cameras(options: &InputOptions, path: Option<&Path>, times: Times, clock: Clock) -> Result<Option<Rig>> {
-    let camera_options = CameraOptions { size: options.size, frames: options.frames, times, clock };
+pub fn load_cameras(
+    options: &InputOptions,
+    path: Option<&Path>,
+    times: Times,
+    clock: Clock,
+    trained: Option<usize>,
+) -> Result<Option<Rig>> {
+    let camera_options = CameraOptions { size: options.size, frames: trained.or(options.frames), times, clock };
     path.map(|path| cameras::load(path, &camera_options)).transpose()
 }

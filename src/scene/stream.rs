@@ -44,7 +44,7 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 /// # Errors
 /// What is wrong with the stream; a budget that does not hold the frames that are packed together.
 pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
-    let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalised)?;
+    let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalised, None)?;
     let stream = open_stream(options)?;
     let mut room = room_to_pack(options, stream.header())?;
     let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| room.admit(held.len()))?;

@@ -105,6 +105,8 @@ impl Files {
 struct Configuration {
     source_path: Option<String>,
     rgb_function: Option<String>,
+    /// Frames from 0 to 1.
+    duration: Option<usize>,
 }
 
 impl Configuration {
@@ -117,7 +119,14 @@ impl Configuration {
             Some(Literal::Str(text)) => Ok(Some(text.clone())),
             Some(other) => Err(Error::input(path, format!("key {name}"), "a string", other.to_string())),
         };
-        Ok(Configuration { source_path: text_of("source_path")?, rgb_function: text_of("rgbfunction")? })
+        let duration = match named("duration").map(|argument| &argument.value) {
+            None | Some(Literal::None) => None,
+            Some(Literal::Int(frames)) if (1..=i64::from(u32::MAX)).contains(frames) => Some(*frames as usize),
+            Some(other) => {
+                return Err(Error::input(path, "key duration", "a number of frames, at least 1", other.to_string()));
+            }
+        };
+        Ok(Configuration { source_path: text_of("source_path")?, rgb_function: text_of("rgbfunction")?, duration })
     }
 }
 
@@ -166,7 +175,8 @@ impl SpacetimeGaussians {
             notes.push(match decoder {
                 Some(_) => format!(
                     "what is scored, merged, refined and written as frames is by {cheap}; pictures of render, evaluate, report \
-                     and video are by all nine and the network that reads them"
+                     and video, those that choose between merging and pruning, and what is compared with photographs are by all \
+                     nine and the network that reads them"
                 ),
                 None => format!("pictures are by {cheap}: the network that reads all of them is not beside the PLY"),
             });
@@ -261,6 +271,10 @@ impl Family for SpacetimeGaussians {
 
     fn data_folder(&self) -> Option<&str> {
         self.configuration.source_path.as_deref()
+    }
+
+    fn data_frames(&self) -> Option<usize> {
+        self.configuration.duration
     }
 
     /// Whatever `white_background` of `cfg_args` says.

@@ -419,6 +419,7 @@ fn files_that_are_cut_or_wrong_are_refused_and_leave_nothing() {
     for (arguments, expected) in [
         ("Namespace(rgbfunction='rgbv1')", "sandwichnoactss"),
         ("Namespace(rgbfunction=3)", "a string"),
+        ("Namespace(duration=0)", "at least 1"),
         ("Namespace(rgbfunction='sand", "cfg_args"),
     ] {
         fs::write(root.path().join(CFG_ARGS), arguments).unwrap();

@@ -5,7 +5,7 @@
 //! its name below `images/` beside `sparse/`. The middle of the first pixel is at 0.5, as here. Cameras must be without
 //! distortion: SIMPLE_PINHOLE, PINHOLE, or another whose coefficients are all 0. `--size` scales focal lengths and principal
 //! point. Pictures in folders called `test` or `val` are held out, all others are for training. Times are at
-//! [`super::times`].
+//! [`super::times`], those of a folder for each frame at [`super::frames`].
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -15,7 +15,7 @@ use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
 use super::assemble::{Picture, assemble};
-use super::{CameraOptions, MAX_SIDE_PX, times};
+use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
 use crate::error::{Error, Result, quoted};
 use crate::ingest::text::read_text;
 use crate::model::{Camera, Rig, Split};
@@ -103,6 +103,18 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
         })
     };
     let mut pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
+    if let (Some(first), Times::Own) = (frames::of(&folder), &options.times) {
+        let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
+        if pictures.len().saturating_mul(frames) > MAX_PICTURES {
+            return Err(Error::usage(format!(
+                "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+                folder.display(),
+                pictures.len()
+            )));
+        }
+        let origin = format!("{} (each of {frames} frames)", folder.display());
+        return assemble(vec![(images, frames::repeated(&pictures, &first, frames))], None, origin);
+    }
     let names: Vec<String> = listed.into_iter().map(|image| image.name).collect();
     let said = times::give(&images, &mut pictures, &names, &options.times)?;
     let origin = folder.display().to_string();

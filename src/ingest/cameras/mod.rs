@@ -8,6 +8,7 @@
 //! | `poses_bounds.npy` (LLFF, DyNeRF; `llff.rs`) | i/n | camera 0 is test |
 //! | `dataset.json` with `camera/` (NeRFies, HyperNeRF; `nerfies.rs`) | `warp_id` by the largest | `val_ids` are test |
 //! | COLMAP's `cameras` and `images`, `.bin` or `.txt` (`colmap.rs`) | from names or a table (`times.rs`) | from folders in names |
+//! | the first of several `colmap_K` with such in `sparse/0`, a folder for each frame (SpacetimeGaussians) | i/n | the first is test |
 //!
 //! Everything leaves in OpenCV axes, world to camera, in f64, rotations checked to be rotations.
 //! Memory: the parsed file; one small record per picture.
@@ -16,6 +17,7 @@ mod assemble;
 mod cameras_json;
 mod colmap;
 mod fields;
+mod frames;
 mod llff;
 mod meta_json;
 mod nerfies;
@@ -67,7 +69,8 @@ pub struct CameraOptions {
     /// Picture (width, height) in pixels where the file names none and the picture is not there to
     /// be asked. For `poses_bounds.npy`: instead of half the recorded size.
     pub size: Option<(u32, u32)>,
-    /// Frames of a `poses_bounds.npy`, which does not count them: 300 if not given.
+    /// Frames of what does not count them, a `poses_bounds.npy` (300 if not given) and folders `colmap_K` (as many as follow
+    /// one another).
     pub frames: Option<usize>,
     /// Where the times of pictures come from whose file has none.
     pub times: Times,
@@ -157,7 +160,9 @@ fn locate(path: &Path) -> Option<PathBuf> {
         return Some(path.to_owned());
     }
     let json_or_npy = NAMES.iter().map(|name| path.join(name)).find(|file| file.is_file());
-    json_or_npy.or_else(|| COLMAP.iter().map(|name| path.join(name)).find(|found| found.exists()))
+    json_or_npy
+        .or_else(|| COLMAP.iter().map(|name| path.join(name)).find(|found| found.exists()))
+        .or_else(|| frames::first_in(path))
 }
 
 fn is_colmap(path: &Path) -> bool {

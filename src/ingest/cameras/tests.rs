@@ -227,6 +227,30 @@ fn colmap_text_and_binary_give_the_same_cameras_with_times_from_names() {
 }
 
 #[test]
+fn a_colmap_folder_for_each_frame_has_the_first_ones_cameras_at_all_of_them() {
+    let root = tempfile::tempdir().unwrap();
+    let first = root.path().join("colmap_3");
+    colmap(&first, "PINHOLE 80 60 70 71 39.5 31", true);
+    let load =
+        |path: &Path, frames: Option<usize>| load(path, &CameraOptions { frames, ..CameraOptions::default() }).unwrap();
+    // A single folder says nothing of times, least of all by the numbers of cameras in names.
+    assert!(load(&first, None).times().is_empty());
+    for k in 4..6 {
+        fs::create_dir(root.path().join(format!("colmap_{k}"))).unwrap();
+    }
+    let rig = load(&first, None);
+    assert_eq!(load(root.path(), None).shots, rig.shots);
+    assert_eq!(rig.times(), [0.0, 1.0 / 3.0, 2.0 / 3.0]);
+    assert_eq!((rig.shots.len(), rig.cameras.len()), (9, 3));
+    let shot = &rig.shots[4];
+    assert!(shot.image.as_ref().unwrap().ends_with("colmap_4/cam1/frame_0003.png"), "{shot:?}");
+    let splits: Vec<Split> = rig.shots[3..6].iter().map(|shot| shot.split).collect();
+    assert_eq!(splits, [Split::Test, Split::Train, Split::Test]);
+    // A model may have been trained on fewer frames, and its data may be elsewhere.
+    assert_eq!(load(&first, Some(50)).times()[49], 0.98);
+}
+
+#[test]
 fn times_of_colmap_come_from_a_table_or_are_none_if_asked() {
     let folder = tempfile::tempdir().unwrap();
     colmap(folder.path(), "SIMPLE_PINHOLE 80 60 70 40 30", false);
