@@ -10,9 +10,9 @@ use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::metrics::psnr;
-use crate::model::{Columns, Gaussians, Picture};
+use crate::model::{Columns, Picture};
 use crate::reduction::Reduction;
-use crate::render::{self, Image, render};
+use crate::render::{self, Image};
 use crate::scene::Scene;
 use crate::select::Ranking;
 use crate::stream::{Batch, Progress, Subject, VIEWS_AT_ONCE, View, show, spread};
@@ -115,12 +115,14 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Pict
     let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
     let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
-        let picture = |state: &Gaussians, view: &View<'_, 2>| render(state, view.camera, scene.background);
-        let [original, merged] = views[0].states;
-        let expected: Vec<Image> = views.iter().map(|view| picture(original, view)).collect();
-        for (state, sum) in [&original.pick(pruned), merged].into_iter().zip(&mut sums) {
-            let quality = |(view, expected): (&View<'_, 2>, &Image)| psnr(&picture(state, view), expected);
-            *sum += views.iter().zip(&expected).map(quality).sum::<f64>();
+        let picture = |subject: usize, view: &View<'_, 2>| view.render(subject, scene.background);
+        let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
+        // All of one frame.
+        let state = views[0].states[0].pick(pruned);
+        let features = views[0].features(0).map(|features| features.pick(pruned));
+        for (view, expected) in views.iter().zip(&expected) {
+            sums[0] += psnr(&view.render_as(0, &state, features.as_ref(), scene.background), expected);
+            sums[1] += psnr(&picture(1, view), expected);
         }
         progress.advance(views.len() as u64);
         Ok(())

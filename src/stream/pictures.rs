@@ -103,8 +103,26 @@ impl<const S: usize> View<'_, S> {
     /// The picture of the subject numbered `subject` before `background`, on all threads of the pool, as its own renderer
     /// makes it: of one with features these are blended and decoded, and there is no background.
     pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
-        let (state, camera) = (self.states[subject], self.camera);
-        let Some((decoder, features)) = self.decoded[subject] else { return render(state, camera, background) };
+        self.render_as(subject, self.states[subject], self.features(subject), background)
+    }
+
+    /// The features of the subject numbered `subject`, where its pictures are made of some.
+    pub fn features(&self, subject: usize) -> Option<&Column> {
+        self.decoded[subject].map(|(_, features)| features)
+    }
+
+    /// [`View::render`] of that subject in another `state`, of as many Gaussians as `features`.
+    pub fn render_as(
+        &self,
+        subject: usize,
+        state: &Gaussians,
+        features: Option<&Column>,
+        background: [f32; 3],
+    ) -> Image {
+        let camera = self.camera;
+        let Some(((decoder, _), features)) = self.decoded[subject].zip(features) else {
+            return render(state, camera, background);
+        };
         let mut image = Image { width: camera.width, height: camera.height, data: Vec::new() };
         let values = blend_features(state, features, camera);
         let (centre, to_world) = (camera.center().to_array().map(|x| x as f32), camera.rotation.transpose());

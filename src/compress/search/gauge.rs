@@ -62,12 +62,14 @@ impl<'a> Gauge<'a> {
         show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
             let of_view = |(place, view): (usize, &View<'_, 1>)| {
-                let picture = render(view.states[0], view.camera, background);
                 match &self.with {
                     With::Photographs(photographs) => {
+                        let picture = view.render(0, background);
                         Ok(psnr(&picture, &photographs.read(view.picture, view.camera, background)?))
                     }
                     With::Original(targets, numbers) => {
+                        // As the targets are made.
+                        let picture = render(view.states[0], view.camera, background);
                         Ok(decibels(mean_square(&picture, &targets.values(numbers[places[first + place]])?)))
                     }
                 }
