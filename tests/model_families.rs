@@ -7,7 +7,6 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use scene::{Workplace, arrays, shared, state};
-use splatsieve::families::Conventions;
 use splatsieve::model::{Gaussians, SH_C0, Split};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
@@ -321,18 +320,12 @@ fn spacetime_gaussians_go_through_every_verb() {
     }
 }
 
-/// Opens a model in whose files something is not said.
-fn open_lasting(model: &Path, cameras: &Path, time_duration: f64) -> Scene {
-    let conventions = Conventions { time_duration: Some(time_duration), ..Conventions::default() };
-    let (path, cameras) = (model.to_owned(), Some(cameras.to_owned()));
-    open_scene(&InputOptions { path, cameras, conventions, ..InputOptions::default() }).unwrap()
-}
-
 #[test]
 #[ignore = "needs the trained models"]
 fn states_of_native_4d_gaussians_are_those_of_its_own_code() {
     let model = family("yang4d");
-    let scene = open_lasting(&model, &model, 2.0);
+    // The length of its time is that of the configuration beside it.
+    let scene = open(&model, &model);
     let expected = arrays(&model.join("states.npz"));
     let count = scene.source().info().count;
     let mut off = [0.0f64; 4];

@@ -137,8 +137,8 @@ pub(super) struct Input {
 /// What a model's files do not say of how it was trained.
 #[derive(Debug, Args)]
 pub(super) struct Trained {
-    /// Length of a 4D Gaussian Splatting checkpoint's time_duration, or both its ends A,B [default: 10 where frames lie
-    /// beyond 1, else 1]
+    /// Length of a 4D Gaussian Splatting checkpoint's time_duration, or both its ends A,B [default: that in a YAML
+    /// beside it, else 10 where frames lie beyond 1, else 1]
     #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration)]
     pub(super) time_duration: Option<f64>,
     /// How its rotations of four dimensions are written: unflipped before 15 September 2024 [default: flipped]

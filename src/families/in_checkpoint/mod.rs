@@ -103,13 +103,8 @@ impl<L: Merging> InCheckpoint<L> {
     fn beside(&self) -> Vec<PathBuf> {
         const NAMES: [&str; 2] = ["cfg_args", "cameras.json"];
         let Some(root) = &self.about.root else { return Vec::new() };
-        let is_one = |path: &Path| {
-            let text = path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending));
-            let named = NAMES.iter().any(|name| path.file_name().is_some_and(|found| found == *name));
-            (text || named) && fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= SMALL)
-        };
-        let entries = fs::read_dir(root).into_iter().flatten().flatten();
-        let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(|path| is_one(path)).collect();
+        let named = NAMES.iter().map(|name| root.join(name)).filter(|path| is_small(path));
+        let mut found: Vec<PathBuf> = named.chain(texts_in(root)).collect();
         found.sort();
         found
     }
@@ -254,6 +249,21 @@ impl<L: Merging + 'static> Family for InCheckpoint<L> {
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
         }
     }
+}
+
+fn is_small(path: &Path) -> bool {
+    fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() <= SMALL)
+}
+
+/// Small YAML files of a folder, by name.
+pub(super) fn texts_in(root: &Path) -> Vec<PathBuf> {
+    let is_one = |path: &Path| {
+        path.extension().is_some_and(|found| ["yaml", "yml"].iter().any(|ending| found == *ending)) && is_small(path)
+    };
+    let entries = fs::read_dir(root).into_iter().flatten().flatten();
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(|path| is_one(path)).collect();
+    found.sort();
+    found
 }
 
 /// The files of a folder called `<prefix><number><suffix>`, by number.

@@ -1,14 +1,14 @@
 //! 4D Gaussian Splatting in its native form (fudan-zvg): Gaussians of four dimensions in a training checkpoint.
 //!
 //! In: a folder with `chkpnt<K>.pth` or `chkpnt_best.pth`, or such a file: `(capture, iteration)`, the capture a tuple of 19,
-//! or of 12 of a static model. Out: the same checkpoint with fewer rows, optimiser state included, and `cfg_args`. What the
-//! file does not say of how it was trained can be said: [`Conventions`].
+//! or of 12 of a static model. Out: the same checkpoint with fewer rows, optimiser state included, `cfg_args` and the training
+//! configuration if it is there. What they do not say of how it was trained can be said: [`Conventions`].
 
+mod configuration;
 mod law;
 mod proxies;
 mod rotation;
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
@@ -17,12 +17,12 @@ use super::family::{Conventions, Entry, Family, OpenOptions};
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{About, InCheckpoint, Merging, Plane, Reading, count_of, numbered};
 use super::law::Model;
-use super::python_literal::{Literal, parse_call};
 use crate::error::{Error, Result};
 use crate::ingest::checkpoint::{Checkpoint, Node, NodeId};
 use crate::model::{Columns, Raw, sh_coefficients};
 use crate::recipe::Merge;
 use crate::reduction::Cluster;
+use configuration::Configuration;
 use law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 
 /// Lengths of the tuple that a model captures: of four dimensions, and static.
@@ -96,35 +96,6 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
-/// What `cfg_args` says that matters.
-#[derive(Debug, Default)]
-struct Config {
-    source_path: Option<String>,
-    white_background: bool,
-    prefilter: f64,
-}
-
-impl Config {
-    fn read(root: &Path) -> Result<Config> {
-        let path = root.join("cfg_args");
-        let mut config = Config::default();
-        if !path.is_file() {
-            return Ok(config);
-        }
-        let text = fs::read_to_string(&path).map_err(Error::io("read", &path))?;
-        let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(&path, &text))?;
-        for argument in arguments {
-            match (argument.name.as_str(), argument.value) {
-                ("source_path", Literal::Str(path)) => config.source_path = Some(path),
-                ("white_background", Literal::Bool(is_white)) => config.white_background = is_white,
-                ("prefilter_var", Literal::Float(variance)) => config.prefilter = variance,
-                _ => (),
-            }
-        }
-        Ok(config)
-    }
-}
-
 fn open(about: About, conventions: Conventions) -> Result<Box<dyn Family>> {
     let checkpoint = Checkpoint::open(&about.file)?;
     let pickle = checkpoint.pickle();
@@ -139,7 +110,8 @@ fn open(about: About, conventions: Conventions) -> Result<Box<dyn Family>> {
             .hint("write its frames as PLY files or as a frame stream with its own renderer, and give those"));
     }
     let moves = parts.len() == MOVING;
-    let config = about.root.as_deref().or(about.file.parent()).map_or_else(|| Ok(Config::default()), Config::read)?;
+    let root = about.root.as_deref().or(about.file.parent());
+    let config = root.map_or_else(|| Ok(Configuration::default()), Configuration::read)?;
     let part = |i: usize, name: &str| (parts[i], format!("capture[{i}] ({name})"));
     let (xyz, place) = part(1, "xyz");
     let count = count_of(&checkpoint, xyz, &place)?;
@@ -167,13 +139,15 @@ fn open(about: About, conventions: Conventions) -> Result<Box<dyn Family>> {
                 return Err(checkpoint.wrong(&place, "True or False", checkpoint.describe(id)));
             };
             let active = usize::try_from(integer(18, "active_sh_degree_t")?).unwrap_or(0);
+            let configured = config.time_duration.as_ref().map(|(length, _)| *length);
+            let given = conventions.time_duration.or(configured);
             Some(Native {
                 turns,
                 flipped: !conventions.rot4d_unflipped,
                 prefilter: config.prefilter,
                 terms: active.min(stored),
-                given: conventions.time_duration,
-                period: conventions.time_duration.unwrap_or(1.0),
+                given,
+                period: given.unwrap_or(1.0),
             })
         }
         false => None,
@@ -181,6 +155,9 @@ fn open(about: About, conventions: Conventions) -> Result<Box<dyn Family>> {
     let mut notes = about.notes.clone();
     if moves && !matches!(pickle.node(parts[17]), Node::None) {
         notes.push("its environment map, the sky behind everything, is neither drawn nor compared".to_owned());
+    }
+    if let (Some((length, file)), None, true) = (&config.time_duration, conventions.time_duration, moves) {
+        notes.push(format!("{file} beside it says that its time_duration is {length}"));
     }
     let (optimizer, beside) = if moves { (11, 7..11) } else { (10, 7..10) };
     let mut of_training: Vec<NodeId> = parts[beside].to_vec();

@@ -1,3 +1,4 @@
+use std::fs;
 use std::path::Path;
 
 use glam::{DMat3, DMat4, DVec4};
