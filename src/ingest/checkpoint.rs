@@ -405,9 +405,14 @@ fn inside(name: &str) -> &str {
 /// All bytes of an entry, whose checksum is looked at.
 fn bytes_of(archive: &mut ZipArchive<Cursor<Mapped>>, index: usize) -> std::io::Result<Vec<u8>> {
     let mut file = archive.by_index(index)?;
-    let mut bytes = Vec::with_capacity(file.size() as usize);
+    let size = file.size();
+    let mut bytes = Vec::with_capacity(size as usize);
     file.read_to_end(&mut bytes)?;
-    Ok(bytes)
+    // The directory may say otherwise than what lies there.
+    match bytes.len() as u64 == size {
+        true => Ok(bytes),
+        false => Err(std::io::Error::other(format!("{} bytes of {size}", bytes.len()))),
+    }
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use std::error::Error;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use flate2::Crc;
 use splatsieve::families::{self, OpenOptions};
 use splatsieve::ingest::cameras::{self, CameraOptions};
 use splatsieve::ingest::container::Container;
@@ -77,7 +78,7 @@ const TILES: usize = 640 << 20;
 const CONTENT: usize = 256 << 20;
 
 /// Every way in.
-pub(crate) const ENTRIES: [Entry; 11] = [
+pub(crate) const ENTRIES: [Entry; 15] = [
     Entry { name: "archive", corpus: "archive", read: archive, mended: mended_archive, most_bytes: CONTENT },
     Entry {
         name: "archive_sections",
@@ -88,23 +89,33 @@ pub(crate) const ENTRIES: [Entry; 11] = [
     },
     Entry { name: "cameras", corpus: "cameras", read: cameras, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "cfg_args", corpus: "cfg_args", read: cfg_args, mended: |_| None, most_bytes: LITTLE },
+    Entry { name: "checkpoint", corpus: "checkpoint", read: checkpoint, mended: mended_zip, most_bytes: LITTLE },
     Entry { name: "colmap", corpus: "colmap", read: colmap, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "container", corpus: "container", read: container, mended: mended_container, most_bytes: TILES },
-    Entry { name: "pickle", corpus: "pickle", read: pickle, mended: |_| None, most_bytes: LITTLE },
+    Entry { name: "deform", corpus: "deform", read: deform, mended: mended_zip, most_bytes: LITTLE },
+    Entry { name: "params", corpus: "params", read: params, mended: mended_zip, most_bytes: LITTLE },
+    Entry { name: "pickle", corpus: "pickle", read: pickle, mended: mended_zip, most_bytes: LITTLE },
     Entry { name: "ply", corpus: "ply", read: ply, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "recipe", corpus: "recipe", read: recipe, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "recover", corpus: "container", read: recover, mended: mended_container, most_bytes: TILES },
+    Entry { name: "splatv", corpus: "splatv", read: splatv, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "stream", corpus: "stream", read: stream, mended: |_| None, most_bytes: LITTLE },
 ];
 
 /// A folder in memory, where there is one, with a small model in it.
 pub(crate) struct Place(tempfile::TempDir);
 
-/// The files of a model of six Gaussians, of which a target replaces one.
-const MODEL: [(&str, &[u8]); 3] = [
-    ("cfg_args", include_bytes!("cfg_args/whole")),
-    ("point_cloud/iteration_7/point_cloud.ply", include_bytes!("ply/whole")),
-    ("point_cloud/iteration_7/deformation.pth", include_bytes!("pickle/whole")),
+/// The files of models of six Gaussians, of which a target replaces one.
+const MODELS: [(&str, &[u8]); 8] = [
+    ("of_config/cfg_args", include_bytes!("cfg_args/whole")),
+    ("of_config/point_cloud/iteration_7/point_cloud.ply", include_bytes!("ply/whole")),
+    ("of_config/point_cloud/iteration_7/deformation.pth", include_bytes!("pickle/whole")),
+    ("of_field/cfg_args", include_bytes!("cfg_args/whole")),
+    ("of_field/point_cloud/iteration_7/point_cloud.ply", include_bytes!("ply/whole")),
+    // A network's tensors say which of two families it is of.
+    ("of_network/cfg_args", b"Namespace(sh_degree=1, source_path='data')"),
+    ("of_network/point_cloud/iteration_7/point_cloud.ply", include_bytes!("ply/whole")),
+    ("of_splats/cfg_args", b"Namespace(source_path='data', prefilter_var=-1.0)"),
 ];
 
 impl Place {
@@ -116,9 +127,7 @@ impl Place {
         let memory = Path::new("/dev/shm");
         let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
         let place = Place(folder.expect("a folder for temporary files"));
-        for model in ["of_config", "of_field"] {
-            MODEL.iter().for_each(|(name, bytes)| drop(place.put(&format!("{model}/{name}"), bytes)));
-        }
+        MODELS.iter().for_each(|(name, bytes)| drop(place.put(name, bytes)));
         place
     }
 
@@ -208,14 +217,39 @@ fn colmap(bytes: &[u8], place: &Place) -> Outcome {
     Ok(binary.or(text)?)
 }
 
-fn model(root: &Path) -> Outcome {
-    let model = families::open(root, &OpenOptions::default())?.with_times(vec![0.0, 0.5])?;
+/// A model of any family, at two times where its frames are still to be chosen.
+fn model(path: &Path) -> Outcome {
+    let mut model = families::open(path, &OpenOptions::default())?;
+    if model.source().info().times.is_empty() {
+        model = model.with_times(vec![0.0, 0.5])?;
+    }
     look(model.source())
+}
+
+/// As a file, by which it is told what it is of, and as that of a model's folder.
+fn checkpoint(bytes: &[u8], place: &Place) -> Outcome {
+    let alone = model(&place.put("a.pt", bytes));
+    place.put("of_splats/chkpnt7.pth", bytes);
+    let inside = model(&place.path("of_splats"));
+    alone.or(inside)
 }
 
 fn cfg_args(bytes: &[u8], place: &Place) -> Outcome {
     place.put("of_config/cfg_args", bytes);
     model(&place.path("of_config"))
+}
+
+fn deform(bytes: &[u8], place: &Place) -> Outcome {
+    place.put("of_network/deform/iteration_7/deform.pth", bytes);
+    model(&place.path("of_network"))
+}
+
+fn params(bytes: &[u8], place: &Place) -> Outcome {
+    model(&place.put("params.npz", bytes))
+}
+
+fn splatv(bytes: &[u8], place: &Place) -> Outcome {
+    model(&place.put("a.splatv", bytes))
 }
 
 fn pickle(bytes: &[u8], place: &Place) -> Outcome {
@@ -239,7 +273,7 @@ fn recover(bytes: &[u8], place: &Place) -> Outcome {
 }
 
 fn ply(bytes: &[u8], place: &Place) -> Outcome {
-    look(families::open(&place.put("a.ply", bytes), &OpenOptions::default())?.source())
+    model(&place.put("a.ply", bytes))
 }
 
 fn recipe(bytes: &[u8], _: &Place) -> Outcome {
@@ -265,6 +299,29 @@ fn sum(bytes: &mut [u8], of: std::ops::Range<usize>, at: usize) -> Option<()> {
     let checksum = xxh3_64(bytes.get(of)?);
     bytes.get_mut(at..at.checked_add(8)?)?.copy_from_slice(&checksum.to_le_bytes());
     Some(())
+}
+
+/// A zip archive: its directory says where each file begins and how long it is, and has its checksum, as the file has.
+fn mended_zip(bytes: &[u8]) -> Option<Vec<u8>> {
+    let mut bytes = bytes.to_vec();
+    let mut at = (0..bytes.len()).find(|&at| bytes[at..].starts_with(b"PK\x01\x02"))?;
+    while bytes[at..].starts_with(b"PK\x01\x02") {
+        let lengths = [28, 30, 32].map(|place| number::<2>(&bytes, at + place));
+        let next = lengths.into_iter().try_fold(at + 46, |next, length| Some(next + length? as usize))?;
+        let [size, file] = [20, 42].map(|place| number::<4>(&bytes, at + place));
+        let file = file? as usize;
+        let start = file + 30 + number::<2>(&bytes, file + 26)? as usize + number::<2>(&bytes, file + 28)? as usize;
+        // Of a compressed one the checksum is that of what it unpacks to.
+        if number::<2>(&bytes, at + 10)? == 0 && bytes.get(file..)?.starts_with(b"PK\x03\x04") {
+            let mut sum = Crc::new();
+            sum.update(bytes.get(start..start + size? as usize)?);
+            for place in [at + 16, file + 14] {
+                bytes.get_mut(place..place + 4)?.copy_from_slice(&sum.sum().to_le_bytes());
+            }
+        }
+        at = next.min(bytes.len());
+    }
+    Some(bytes)
 }
 
 /// format/ARCHIVE.md: four sections behind a head that has their lengths and checksums.

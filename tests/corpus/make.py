@@ -141,6 +141,7 @@ def named(module, name):
 
 
 FLOATS, REBUILD = named("torch", "FloatStorage"), named("torch._utils", "_rebuild_tensor_v2")
+PARAMETER = named("torch._utils", "_rebuild_parameter")
 
 
 class Tensor:
@@ -152,14 +153,24 @@ class Tensor:
         return Rebuilt(), (self.storage, self.offset, self.shape, self.strides, False, OrderedDict())
 
 
+class Parameter:
+    """What training optimises: a tensor in a wrapping of its own."""
+
+    def __init__(self, tensor):
+        self.tensor = tensor
+
+    def __reduce__(self):
+        return Rebuilt(PARAMETER), (self.tensor, True, OrderedDict())
+
+
 class Rebuilt:
     """Callable, so that `__reduce__` takes it, and pickled as the name of what PyTorch calls."""
 
+    def __init__(self, called=REBUILD):
+        self.called = called
+
     def __call__(self, *_):
         raise NotImplementedError
-
-    def __reduce__(self):
-        return "REBUILD"
 
 
 class Pickler(pickle._Pickler):
@@ -167,7 +178,7 @@ class Pickler(pickle._Pickler):
 
     def save(self, thing, **options):
         if isinstance(thing, Rebuilt):
-            thing = REBUILD
+            thing = thing.called
         return super().save(thing, **options)
 
     def persistent_id(self, thing):
@@ -182,11 +193,11 @@ def pickled(state):
     return out.getvalue()
 
 
-def zipped(entries, method=zipfile.ZIP_STORED):
+def zipped(entries, method=zipfile.ZIP_STORED, folder="archive/"):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", method) as archive:
         for name, data in entries.items():
-            archive.writestr(zipfile.ZipInfo(f"archive/{name}", (1980, 1, 1, 0, 0, 0)), data, method)
+            archive.writestr(zipfile.ZipInfo(folder + name, (1980, 1, 1, 0, 0, 0)), data, method)
     return out.getvalue()
 
 
@@ -562,6 +573,280 @@ def make_sections(archive):
             write("archive_sections", f"number_{k}_{name}", sections(json.dumps(changed, separators=(",", ":")).encode()))
 
 
+# --- models of other families ------------------------------------------------------------------------------------------
+
+
+def saved(make, change=lambda data: data):
+    """A file as torch.save writes whatever `make` gives; `make` calls what it is handed to get a tensor of shape and values."""
+    storages = []
+
+    def tensor(shape, values=None, **view):
+        values = normal(math.prod(shape), 0.3) if values is None else values
+        storages.append(Storage(str(len(storages)), values))
+        return Tensor(storages[-1], shape, **view)
+
+    thing = make(tensor)
+    data = {f"data/{storage.key}": floats(storage.values) for storage in storages}
+    return zipped({"data.pkl": change(pickled(thing)), "byteorder": b"little", **data, "version": b"3\n"})
+
+
+def moments(tensor, shape):
+    return {"step": tensor((), [7.0]), "exp_avg": tensor(shape, [0.0] * math.prod(shape)), "exp_avg_sq": tensor(shape)}
+
+
+SPLATS = {
+    "means": (COUNT, 3), "scales": (COUNT, 3), "quats": (COUNT, 4), "opacities": (COUNT,), "sh0": (COUNT, 1, 3),
+    "shN": (COUNT, 3, 3), "times": (COUNT, 1), "durations": (COUNT, 1), "velocities": (COUNT, 3),
+}
+
+
+def splats(**change):
+    """A gsplat checkpoint of Gaussians that move; `change` by name: a shape, or none to leave it out."""
+
+    def make(tensor):
+        shapes = {name: shape for name, shape in (SPLATS | change).items() if shape}
+        state = {name: {0: moments(tensor, SPLATS[name])} for name in ("means", "times")}
+        optimizers = {name: {"state": of, "param_groups": [{"lr": 0.1}]} for name, of in state.items()}
+        tensors = OrderedDict((name, tensor(shape)) for name, shape in shapes.items())
+        return {"step": 7, "splats": tensors, "optimizers": optimizers}
+
+    return make
+
+
+CAPTURE = {1: (COUNT, 3), 2: (COUNT, 1, 3), 3: (COUNT, 47, 3), 4: (COUNT, 3), 5: (COUNT, 4), 6: (COUNT, 1)}
+CAPTURE_4D = {13: (COUNT, 1), 14: (COUNT, 1), 15: (COUNT, 4)}
+
+
+def capture(change={}, length=19):
+    """What a Gaussian model of four dimensions captures, or of three with a length of 12; `change` by place."""
+
+    def make(tensor):
+        shapes = CAPTURE | CAPTURE_4D if length == 19 else CAPTURE | {3: (COUNT, 3, 3)}
+        parts = {at: Parameter(tensor(shape)) for at, shape in shapes.items()}
+        parts |= {0: 1, 7: tensor((COUNT,)), 8: tensor((COUNT, 1)), 9: tensor((COUNT, 1)), 10: {}, 11: 1.5}
+        if length == 19:
+            state = {"state": {0: moments(tensor, (COUNT, 3))}, "param_groups": [{"name": "xyz", "params": [0]}]}
+            parts |= {10: tensor((COUNT, 1)), 11: state, 12: 1.5, 16: True, 17: None, 18: 2}
+        parts |= {at: tensor(what) if isinstance(what, tuple) else what for at, what in change.items()}
+        return (tuple(parts[at] for at in range(length)), 7)
+
+    return make
+
+
+def make_checkpoints():
+    whole = saved(splats())
+    start = whole.index(b"\x80\x02")
+    damaged("checkpoint", whole, [0, 8, 26, start + 2, start + 60, len(whole) - 6, len(whole) - 12])
+    for name, make in {
+        "static": splats(times=None, durations=None, velocities=None),
+        "no_means": splats(means=None),
+        "no_durations": splats(durations=None),
+        "no_bands": splats(shN=(COUNT, 0, 3)),
+        "other_bands": splats(shN=(COUNT, 4, 3)),
+        "fewer": splats(velocities=(COUNT - 1, 3)),
+        "flat": splats(quats=(COUNT * 4,)),
+        "none": splats(**{name: (0, *shape[1:]) for name, shape in SPLATS.items()}),
+        "accels": splats(accels=(COUNT, 3)),
+        "features": splats(features=(COUNT, 32)),
+        "a_number": lambda tensor: {"step": 7, "splats": 3},
+        "a_list": lambda tensor: {"splats": [tensor((3,))]},
+        "native": capture(),
+        "native_static": capture(length=12),
+        "native_apart": capture({16: False}),
+        "native_sky": capture({17: (3, 2, 2)}),
+        "native_bands": capture({3: (COUNT, 30, 3)}),
+        "native_fewer": capture({13: (COUNT - 1, 1)}),
+        "native_flat": capture({15: (COUNT,)}),
+        "native_number": capture({4: 3}),
+        "native_terms": capture({18: 1 << 40}),
+        "native_negative": capture({18: -1}),
+        "native_optimizer": capture({11: {"state": [1, 2]}}),
+        "native_short": lambda tensor: (tuple([1] * 13), 7),
+        "pair": lambda tensor: (OrderedDict(a=tensor((2,))), OrderedDict(a=tensor((2,)))),
+    }.items():
+        write("checkpoint", name, saved(make))
+    for name, view in {
+        "strides": {"strides": (1, COUNT)},
+        "repeated": {"strides": (0, 0)},
+        "far": {"offset": 1 << 62},
+        "overflow": {"strides": (1 << 63, 1)},
+        "huge": {"shape": (1 << 32, 3)},
+    }.items():
+
+        def make(tensor, view=view):
+            thing = splats()(tensor)
+            thing["splats"]["means"] = tensor(**({"shape": (COUNT, 3), "values": normal(3 * COUNT)} | view))
+            return thing
+
+        write("checkpoint", name, saved(make))
+    filled = splats()
+    not_finite = saved(lambda tensor: filled(lambda shape, _=None: tensor(shape, [math.nan] * math.prod(shape))))
+    write("checkpoint", "not_finite", not_finite)
+    for name, data in {
+        "command": b"cposix\nsystem\n(S'true'\ntR.",
+        "itself": b"\x80\x02}q\x00(h\x00h\x00u.",
+        "deep": b"\x80\x02" + b"]" * 3000 + b"a" * 2999 + b".",
+    }.items():
+        write("checkpoint", f"pickle_{name}", saved(splats(), lambda _, data=data: data))
+
+
+def network(heads=("gaussian_warp", "gaussian_rotation", "gaussian_scaling"), prefix="", time=True, **change):
+    """A network of two layers, of which the second reads the encodings too."""
+    of_time = 5 if time else 13
+    layers = {"timenet.0": (WIDTH, 13), "timenet.2": (of_time, WIDTH)} if time else {}
+    layers |= {"linear.0": (WIDTH, 63 + of_time), "linear.1": (WIDTH, WIDTH + 63 + of_time)}
+    outputs = {"gaussian_warp": 3, "gaussian_rotation": 4, "gaussian_scaling": 3, "gaussian_opacity": 1}
+    outputs |= {"branch_w": 3, "branch_v": 3}
+    layers |= {head: (outputs[head], WIDTH) for head in heads}
+    shapes = {}
+    for name, shape in layers.items():
+        shapes |= {f"{prefix}{name}.weight": shape, f"{prefix}{name}.bias": shape[:1]}
+    return {name: shape for name, shape in (shapes | change).items() if shape}
+
+
+NODES = {"nodes": (5, 3), "_node_radius": (5,), "_node_weight": (5, 1)}
+
+
+def make_networks():
+    def state(shapes):
+        return saved(lambda tensor: OrderedDict((name, tensor(shape)) for name, shape in shapes.items()))
+
+    whole = state(network())
+    start = whole.index(b"\x80\x02")
+    damaged("deform", whole, [0, 8, 26, start + 2, start + 60, len(whole) - 6, len(whole) - 12])
+    screws = ("branch_w", "branch_v", "gaussian_rotation", "gaussian_scaling")
+    of_nodes = network(("gaussian_warp", "gaussian_rotation", "gaussian_scaling", "gaussian_opacity"), "network.") | NODES
+    for name, shapes in {
+        "no_time": network(time=False),
+        "screws": network(screws),
+        "nodes": of_nodes,
+        "no_nodes": of_nodes | {"nodes": (0, 3)},
+        "flat_nodes": of_nodes | {"nodes": (5, 2)},
+        "one_node": of_nodes | {"nodes": (1, 3), "_node_radius": (1,), "_node_weight": (1, 1)},
+        "features": of_nodes | {"nodes": (5, 5)},
+        "fewer_weights": of_nodes | {"_node_weight": (4, 1)},
+        "no_layers": {"gaussian_warp.weight": (3, WIDTH)},
+        "no_head": network(("gaussian_warp",)),
+        "half_a_screw": network(("branch_w", "gaussian_rotation", "gaussian_scaling")),
+        "even_time": network(**{"timenet.0.weight": (WIDTH, 12)}),
+        "no_time_left": network(time=False, **{"linear.0.weight": (WIDTH, 63)}),
+        "narrow": network(**{"linear.1.weight": (WIDTH, WIDTH)}),
+        "no_outputs": network(**{"linear.1.weight": (0, WIDTH), "linear.1.bias": (0,)}),
+        "no_bias": network(**{"linear.0.bias": None}),
+        "a_vector": network(**{"linear.0.weight": (WIDTH,)}),
+    }.items():
+        write("deform", name, state(shapes))
+    write("deform", "pair", saved(lambda tensor: (OrderedDict(a=tensor((2,))), OrderedDict(a=tensor((2,))))))
+    infinite = {name: (shape, [math.inf] * math.prod(shape)) for name, shape in network().items()}
+    write("deform", "not_finite", checkpoint(infinite))
+
+
+def make_params():
+    def array(shape, kind="<f4", values=None, order=False):
+        text = f"{{'descr': '{kind}', 'fortran_order': {order}, 'shape': {shape}, }}"
+        text += " " * (-(len(text) + 11) % 64) + "\n"
+        values = floats(normal(math.prod(shape), 0.3)) if values is None else values
+        return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + values
+
+    def params(method=zipfile.ZIP_STORED, **change):
+        frames = 3
+        shapes = {
+            "means3D": (frames, COUNT, 3), "rgb_colors": (frames, COUNT, 3), "unnorm_rotations": (frames, COUNT, 4),
+            "seg_colors": (COUNT, 3), "logit_opacities": (COUNT, 1), "log_scales": (COUNT, 3), "cam_m": (2, 3), "cam_c": (2, 3),
+        }
+        arrays = {name: array(shape) for name, shape in shapes.items()} | change
+        return zipped({f"{name}.npy": data for name, data in arrays.items() if data}, method, "")
+
+    whole = params()
+    start = whole.index(b"\x93NUMPY")
+    damaged("params", whole, [0, 8, 26, start + 6, start + 8, start + 60, len(whole) - 6, len(whole) - 12])
+    means = (3, COUNT, 3)
+    for name, data in {
+        "deflated": params(zipfile.ZIP_DEFLATED),
+        "halves": params(means3D=array(means, "<f2", bytes(2 * math.prod(means)))),
+        "doubles": params(means3D=array(means, "<f8", bytes(8 * math.prod(means)))),
+        "objects": params(means3D=array(means, "|O")),
+        "columns": params(means3D=array(means, order=True)),
+        "no_means": params(means3D=None),
+        "no_scales": params(log_scales=None),
+        "fewer": params(rgb_colors=array((3, COUNT - 1, 3))),
+        "frames": params(unnorm_rotations=array((2, COUNT, 4))),
+        "no_frames": params(means3D=array((0, COUNT, 3))),
+        "static": params(means3D=array((COUNT, 3)), cam_unnorm_rots=array((1, 4))),
+        "many": params(means3D=array((1 << 40, 1 << 40, 3), values=b"")),
+        "short": params(means3D=array(means, values=bytes(8))),
+        "nan": params(means3D=array(means, values=floats([math.nan] * math.prod(means)))),
+    }.items():
+        write("params", name, data)
+
+
+def make_splatv():
+    def row():
+        words = struct.pack("<3f", *normal(3, 0.5))
+        words += struct.pack("<8e", *normal(4), 0.1, 0.1, 0.1, 0) + bytes([200, 100, 50, 255])
+        return words + struct.pack("<16e", *normal(9, 0.1), 0, *normal(4, 0.1), DICE.random(), 0.5)
+
+    def file(text, texture):
+        text = text if isinstance(text, bytes) else json.dumps(text, separators=(",", ":")).encode()
+        return struct.pack("<II", 0x674B, len(text)) + text + texture
+
+    camera = {"id": 0, "img_name": "a", "width": 32, "height": 24, "position": [0, 0, 4], "fy": 40, "fx": 40}
+    camera["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    # A viewer's texture is 4096 texels wide; the sizes are the file's own to say.
+    texture = b"".join(row() for _ in range(COUNT)) + bytes(64 * 2)
+    entry = {"type": "splat", "size": len(texture), "texwidth": 8, "texheight": len(texture) // 128, "cameras": [camera]}
+    whole = file([entry], texture)
+    start = whole.index(texture)
+    damaged("splatv", whole, [0, 4, 6, 8, start - 1, start, start + 14, start + 60])
+    for name, change in {
+        "size": {"size": 64},
+        "huge": {"size": 1 << 36, "texwidth": 1 << 16, "texheight": 1 << 16},
+        "negative": {"texwidth": -8},
+        "wide": {"texwidth": 1 << 63},
+        "text": {"texheight": "4"},
+        "part": {"texheight": 0.5},
+        "type": {"type": "other"},
+        "no_cameras": {"cameras": None},
+        "camera_number": {"cameras": 3},
+        "part_of_a_gaussian": {"size": 16, "texwidth": 1, "texheight": 1},
+    }.items():
+        write("splatv", name, file([entry | change], texture))
+    write("splatv", "none", file([entry | {"size": 0, "texheight": 0}], b""))
+    write("splatv", "second", file([{"type": "other"}, entry], texture))
+    write("splatv", "two", file([entry, entry], texture))
+    write("splatv", "no_list", file(entry, texture))
+    write("splatv", "no_json", file(b"[{]", texture))
+    write("splatv", "nested", file(b"[" * 5000, texture))
+    write("splatv", "long_text", struct.pack("<II", 0x674B, 0xFFFFFFFF) + whole[8:])
+    write("splatv", "nan", file([entry], b"\xff" * len(texture)))
+    write("splatv", "zeros_only", file([entry], bytes(len(texture))))
+
+
+def make_spacetime():
+    """Clouds of SpacetimeGaussians, whose properties a loader counts by how their names begin."""
+    lite = ["x", "y", "z", "trbf_center", "trbf_scale", "nx", "ny", "nz", *(f"motion_{k}" for k in range(9))]
+    rest = ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), *(f"omega_{k}" for k in range(4))]
+    of_lite = [*lite, *(f"f_dc_{k}" for k in range(3)), *rest]
+    of_full = [*lite, *(f"f_dc_{k}" for k in range(6)), *rest, *(f"f_t_{k}" for k in range(3))]
+    for name, names in {
+        "spacetime": of_lite, "spacetime_full": of_full, "spacetime_no_omega": of_lite[:-1], "spacetime_features": of_full[:-1],
+        "spacetime_rest": [*of_lite, "f_rest_0"], "spacetime_no_scale": [name for name in of_lite if name != "trbf_scale"],
+    }.items():
+        write("ply", name, header(names=names) + floats(normal(len(names) * COUNT, 0.3)))
+    write("ply", "spacetime_nan", header(names=of_lite) + floats([math.nan] * len(of_lite) * COUNT))
+    write("ply", "spacetime_largest", header(names=of_lite) + floats([3.4e38] * len(of_lite) * COUNT))
+
+
+def make_families():
+    # What comes before changes nothing here.
+    DICE.seed(16)
+    make_checkpoints()
+    make_networks()
+    make_params()
+    make_splatv()
+    make_spacetime()
+
+
 def main():
     if len(sys.argv) != 2:
         sys.exit(__doc__)
@@ -573,6 +858,7 @@ def main():
     make_cameras()
     make_colmap()
     make_frames(program, ply)
+    make_families()
 
 
 if __name__ == "__main__":
