@@ -100,7 +100,7 @@ impl Reading {
                 Plane::Own(plane) => self.raw.own.plane_mut(plane),
                 Plane::Unread => continue,
             };
-            to.iter_mut().zip(values[c..].iter().step_by(width)).for_each(|(to, from)| *to = *from);
+            to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
         }
         self.table.params.push(Param { name: name.to_owned(), tensor, planes });
         Ok(())
