@@ -489,3 +489,22 @@ fn reader_that_has_seen_enough_is_no_failure() {
         assert!(output.status.success() && message.is_empty(), "{arguments:?}: {message}");
     }
 }
+
+#[test]
+fn a_stage_is_told_of_once_and_what_is_undone_as_left_out() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 1500 --frames 4 -o demo");
+    let compress = |ratio: f64| {
+        let request =
+            format!("compress demo/scene.gseq --cameras demo/cameras.json --target-ratio {ratio} --no-refine");
+        let run = workplace.run(&format!("{request} -o {ratio}.gseq"));
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        let stages: Vec<String> =
+            run.stderr.lines().filter(|line| line.starts_with('[')).map(|line| line[..5].to_owned()).collect();
+        let mut told = stages.clone();
+        told.dedup();
+        assert!(stages == told, "{}", run.stderr);
+        run.stderr.lines().any(|line| line.starts_with("merging  left out: at the same "))
+    };
+    assert_eq!([0.4, 0.7].map(compress), [false, true]);
+}

@@ -95,12 +95,11 @@ impl Choose {
         if with > without {
             return Ok(merged);
         }
-        journal.leave_out(
-            "merging",
-            format!(
-                "at the same {count} Gaussians scoring pictures keep {without:.2} dB without it, {with:.2} with it"
-            ),
+        let why = format!(
+            "at the same {count} Gaussians scoring pictures keep {without:.2} dB without it, {with:.2} with it"
         );
+        Progress::undone("merging", &why);
+        journal.leave_out("merging", why);
         let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
         Ok(Outcome { reduction: Reduction::pruned(kept, &reduction.rule), summary: None })
     }

@@ -30,7 +30,7 @@ use crate::scene::Scene;
 use crate::select::Ranking;
 use crate::source::FrameSource;
 use crate::stream::motion::{self, PairMeter};
-use crate::stream::{BLOCK, gather};
+use crate::stream::{BLOCK, Progress, gather};
 use crate::work::Work;
 
 /// What the stage is called.
@@ -206,6 +206,8 @@ struct Trial<'a> {
     pairs_together: usize,
     /// How pairs of the pool move: it does not depend on who else survives.
     known: KnownPairs,
+    /// Sets of survivors that were tried.
+    progress: Progress,
 }
 
 impl<'a> Trial<'a> {
@@ -232,8 +234,8 @@ impl<'a> Trial<'a> {
         };
         let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
         let importance = scored.importance()?;
-        let work = &scene.work;
-        Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known })
+        let (work, progress) = (&scene.work, Progress::counting(NAME, "sets of survivors"));
+        Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 
     /// Merges `survivors` to exactly `target`.
@@ -250,7 +252,8 @@ impl<'a> Trial<'a> {
 
     /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
     fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
-        let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known } = self;
+        let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
+            self;
         let [coverage, visibility] = &*importance;
         let survivors = Survivors {
             states,
@@ -272,6 +275,7 @@ impl<'a> Trial<'a> {
             known.add(found, most);
             Ok::<_, Error>(answer)
         })?;
+        progress.advance(1);
         Ok(outcome(&survivors, &merged, scored.reference.frame, merge))
     }
 }

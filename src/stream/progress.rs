@@ -1,12 +1,13 @@
 //! Progress on stderr. On a terminal a bar with rate and time left, a line each for what goes on within another;
-//! elsewhere, for logs, a line when a stage ends and at most one a minute within it; nothing when quiet.
+//! elsewhere, for logs, a line when a stage ends and at most one a minute within it, none where what goes on within another
+//! ends; nothing when quiet.
 //!
 //! A line that is longer than the terminal is wide would leave its end behind when it is drawn anew: so lines are put
 //! together here, of what there is room for.
 
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write as _};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -26,6 +27,8 @@ static BARS: LazyLock<MultiProgress> =
     LazyLock::new(|| MultiProgress::with_draw_target(ProgressDrawTarget::stderr_with_hz(10)));
 /// A library says nothing unasked.
 static QUIET: AtomicBool = AtomicBool::new(true);
+/// Of those that are told of line by line, how many go on.
+static LOGS: AtomicUsize = AtomicUsize::new(0);
 static RUN: Mutex<Option<Run>> = Mutex::new(None);
 
 /// What this process shows of its progress.
@@ -164,6 +167,19 @@ impl Progress {
         Progress(Shown::Bar(bar))
     }
 
+    /// Tells that what the stage `what` did is undone, and `why`: nobody is to take it for progress.
+    pub fn undone(what: &str, why: &str) {
+        if QUIET.load(Ordering::Relaxed) {
+            return;
+        }
+        let line = format!("{what}  left out: {why}");
+        match io::stderr().is_terminal() {
+            // A terminal that cannot be written to shows nothing of the rest either.
+            true => drop(BARS.println(line)),
+            false => tell(&line),
+        }
+    }
+
     /// Marks `units` as done.
     pub fn advance(&self, units: u64) {
         match &self.0 {
@@ -264,12 +280,15 @@ struct Log {
     done: AtomicU64,
     /// Seconds from the start to the next line.
     next: AtomicU64,
+    /// Whether it goes on within another.
+    is_within: bool,
 }
 
 impl Log {
     fn new(name: String, unit: &str, total: Option<u64>) -> Log {
         let (done, next) = (AtomicU64::new(0), AtomicU64::new(LINE_EVERY));
-        Log { name, unit: unit.to_owned(), total, start: Instant::now(), done, next }
+        let is_within = LOGS.fetch_add(1, Ordering::Relaxed) > 0;
+        Log { name, unit: unit.to_owned(), total, start: Instant::now(), done, next, is_within }
     }
 
     fn advance(&self, units: u64) {
@@ -283,8 +302,9 @@ impl Log {
     }
 
     fn end(&self) {
+        LOGS.fetch_sub(1, Ordering::Relaxed);
         // What failed before its first step has nothing to tell.
-        if self.done.load(Ordering::Relaxed) > 0 {
+        if self.done.load(Ordering::Relaxed) > 0 && !self.is_within {
             tell(&self.line(self.start.elapsed(), true));
         }
     }
