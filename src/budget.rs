@@ -148,7 +148,7 @@ impl Workload {
         let timeless = rig.shots.len() - times.len();
         let views = (together + timeless) as u64;
         let pairs = if frames > 0 { timeless as u64 * frames + times.len() as u64 } else { 0 };
-        let StreamHeader { count, sh_degree, varying } = *header;
+        let StreamHeader { count, sh_degree, varying, .. } = *header;
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
         let work = Workload { frames, ..Workload::new(&info, Residence::of_tiles(frame_block as u64)) };
         work.seen_by(rig, views, pairs)

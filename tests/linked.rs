@@ -4,6 +4,8 @@ mod scene;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Write;
+use std::process::{Command, Output, Stdio};
 
 use scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
 use splatsieve::families::Link;
@@ -261,5 +263,90 @@ fn shuffled_frames_of_trained_models_are_linked_again() {
     for name in ["deform2", "room2_dynerf"] {
         let (right, wrong) = links(name);
         assert!(right >= 0.98 && wrong <= 0.005, "{name}: {right} found, {wrong} wrong");
+    }
+}
+
+/// A stream of version 2 (format/STREAM.md) with frames at even times.
+fn stream(frames: &[Gaussians]) -> Vec<u8> {
+    let mut bytes = b"\x89GSTR\r\n\x1a".to_vec();
+    for field in [2, 1, 0, 0, 31, 0] {
+        bytes.extend(u32::to_le_bytes(field));
+    }
+    for (number, frame) in (0u32..).zip(frames) {
+        let columns = [&frame.position, &frame.rotation, &frame.log_scale, &frame.opacity_logit, &frame.sh];
+        let values: Vec<u8> =
+            columns.iter().flat_map(|column| column.planes()).flat_map(|value| value.to_le_bytes()).collect();
+        bytes.extend(b"FRAM");
+        bytes.extend(number.to_le_bytes());
+        bytes.extend((f64::from(number) / frames.len() as f64).to_le_bytes());
+        bytes.extend((values.len() as u64).to_le_bytes());
+        bytes.extend(values);
+    }
+    bytes.extend(b"DONE");
+    bytes.extend((frames.len() as u32).to_le_bytes());
+    bytes.extend([0; 16]);
+    bytes
+}
+
+fn piped(workplace: &Workplace, arguments: &str, stdin: &[u8]) -> Output {
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));
+    command.current_dir(workplace.path("")).args(arguments.split_whitespace());
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut pipe = child.stdin.take().unwrap();
+    let bytes = stdin.to_owned();
+    // It may stop reading early: then the rest has nowhere to go.
+    let writer = std::thread::spawn(move || drop(pipe.write_all(&bytes)));
+    let output = child.wait_with_output().unwrap();
+    writer.join().unwrap();
+    output
+}
+
+#[test]
+fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
+    let workplace = Workplace::new();
+    let frames: Vec<Gaussians> = (0..FRAMES).map(|t| frame(900, t, |i| lives(i, t)).0).collect();
+    for (t, frame) in frames.iter().enumerate() {
+        workplace.ply(&format!("frames/frame_{t:05}.ply"), frame);
+    }
+    let bytes = stream(&frames);
+    let run = |arguments: &str| {
+        let output = piped(&workplace, arguments, &bytes);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let same = |a: &str, b: &str| fs::read(workplace.path(a)).unwrap() == fs::read(workplace.path(b)).unwrap();
+    workplace.done("pack frames -o files.gseq");
+    run("pack - -o stream.gseq");
+    assert!(same("files.gseq", "stream.gseq"));
+    workplace.done("compress frames -o small_files.gseq --target-ratio 0.4 --no-refine");
+    let said = run("compress - -o small_stream.gseq --target-ratio 0.4 --no-refine --verbose");
+    assert!(said.contains("linked frame stream") && said.contains("does not say which"), "{said}");
+    assert!(same("small_files.gseq", "small_stream.gseq"));
+    // And as frames of what lives in them.
+    run("compress - -o half --as ply-sequence --target-ratio 0.5 --no-refine");
+    let rows = |t: usize| PlyRows::read(&workplace.path(&format!("half/frame_{t:05}.ply"))).rows.len();
+    assert!((0..FRAMES).all(|t| (1..frames[t].len()).contains(&rows(t))));
+}
+
+#[test]
+fn a_stream_that_breaks_off_or_has_no_frame_leaves_nothing() {
+    let workplace = Workplace::new();
+    let frames: Vec<Gaussians> = (0..3).map(|t| frame(50, t, |_| true).0).collect();
+    let whole = stream(&frames);
+    let mut odd = whole.clone();
+    odd[32 + 16..][..8].copy_from_slice(&(4u64 * 24 + 1).to_le_bytes());
+    for (bytes, part) in [
+        (&whole[..whole.len() - 30], "the rest of frame 2 (column sh)"),
+        (&whole[..whole.len() - 24], "after 3 complete frames"),
+        (&stream(&[])[..], "at least one frame"),
+        (&odd[..], "frame 0, byte 48"),
+    ] {
+        for verb in ["pack - -o out.gseq --scratch-dir .", "compress - -o out.gseq --scratch-dir . --target-ratio 0.5"]
+        {
+            let output = piped(&workplace, verb, bytes);
+            let said = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(output.status.code() == Some(1) && said.contains(part), "{part}: {said}");
+            assert!(lasting_files(&workplace.path("")).is_empty(), "{part}");
+        }
     }
 }

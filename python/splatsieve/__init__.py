@@ -51,7 +51,7 @@ def read_gseq(path: str) -> Gseq:
 
 def stream(
     output: str,
-    count: int,
+    count: int | None,
     sh_degree: int,
     constant: Mapping[str, ArrayLike] | None = None,
     *,
@@ -61,7 +61,8 @@ def stream(
 ) -> Stream:
     """Starts the program on a frame stream: a context manager to whose `frame` each frame is given.
 
-    `count` Gaussians with spherical harmonics of `sh_degree`; `constant` has the columns that hold for every frame, by
+    `count` Gaussians with spherical harmonics of `sh_degree`; none: any number in each frame, all columns with it, and
+    the program finds which is which. `constant` has the columns that hold for every frame, by
     name, the others come with every frame: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural logs;
     opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Where the block ends the program goes on to the end of its work, and
     `summary` of `compress` is there; where the block raises, the program is told that the stream broke off, and writes

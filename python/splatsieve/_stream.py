@@ -2,7 +2,7 @@
 
 Columns are arrays [N, ...], in stored encoding: position [N, 3]; rotation [N, 4], wxyz; log_scale [N, 3], natural
 logs; opacity_logit [N] or [N, 1]; sh [N, (d+1)^2, 3]. Those that hold for every frame are given once, the others with
-every frame. Needs numpy.
+every frame. Frames of any number of Gaussians, which nothing numbers, have no `count` and all columns. Needs numpy.
 """
 
 from __future__ import annotations
@@ -32,13 +32,16 @@ class StreamWriter:
     """
 
     def __init__(
-        self, out: IO[bytes], count: int, sh_degree: int, constant: Mapping[str, ArrayLike] | None = None
+        self, out: IO[bytes], count: int | None, sh_degree: int, constant: Mapping[str, ArrayLike] | None = None
     ) -> None:
         self.out, self.frames = out, 0
         constant = dict(constant or {})
+        if count is None and constant:
+            raise ValueError("frames of any number of Gaussians have no columns that hold for every frame")
         self.varying = [name for name in COLUMNS if name not in constant]
         bits = sum(1 << COLUMNS.index(name) for name in self.varying)
-        out.write(struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", 1, sh_degree, count, bits, 0))
+        version = 2 if count is None else 1
+        out.write(struct.pack("<8sIIQII", b"\x89GSTR\r\n\x1a", version, sh_degree, count or 0, bits, 0))
         out.writelines(planes(constant[name]) for name in COLUMNS if name in constant)
 
     def frame(self, time: float, columns: Mapping[str, ArrayLike]) -> None:
@@ -75,7 +78,7 @@ class Stream:
     def __init__(
         self,
         output: str,
-        count: int,
+        count: int | None,
         sh_degree: int,
         constant: Mapping[str, ArrayLike] | None = None,
         *,

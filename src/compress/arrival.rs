@@ -8,6 +8,7 @@
 //! measured instead: the result is the same either way.
 
 use std::cell::OnceCell;
+use std::io::Stdin;
 
 use glam::DVec3;
 
@@ -19,9 +20,12 @@ use crate::error::Result;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
 use crate::ingest::cameras;
+use crate::ingest::frame_stream::FrameStream;
 use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::recipe;
-use crate::scene::{InputOptions, Opened, Room, Scene, load_cameras, open_scene, open_stream, receiving, scene_of};
+use crate::scene::{
+    InputOptions, Opened, Room, Scene, link_stream, load_cameras, open_scene, open_stream, receiving, scene_of,
+};
 use crate::source::{FrameSource, Reads};
 use crate::stats::{RobustBox, ScanPlan};
 use crate::stream::{HeldFrames, RunningContribution, RunningScan, Sampler};
@@ -37,12 +41,19 @@ pub fn open_to_measure<S: Stages>(
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
     let start = Clock::start();
-    if options.is_stream() {
-        let found = receive_measured(options, plan, journal)?;
-        journal.opened("receive", start, found.0.source().info().count, Reads::default());
-        return Ok(found);
-    }
-    let mut scene = open_scene(options)?;
+    let mut scene = if options.is_stream() {
+        let normalised = cameras::Clock::Normalised;
+        let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalised, None)?;
+        let stream = open_stream(options)?;
+        if !stream.header().is_unlinked {
+            let found = receive_measured(stream, rig, options, plan, journal)?;
+            journal.opened("receive", start, found.0.source().info().count, Reads::default());
+            return Ok(found);
+        }
+        scene_of(link_stream(stream, options, rig)?, options)?
+    } else {
+        open_scene(options)?
+    };
     let stages = plan(Outlook::of(&scene), &scene.workload())?;
     let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
     scene.follow(&plan);
@@ -78,17 +89,16 @@ fn foretell(
     Ok(())
 }
 
-/// Packs a stream into a scratch container and measures it meanwhile, if there is memory for that beside the frames
+/// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that beside the frames
 /// held. Gives the statistics if what was assumed held.
 fn receive_measured<S: Stages>(
+    stream: FrameStream<Stdin>,
+    loaded: Option<Rig>,
     options: &InputOptions,
     plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
-    let (path, times) = (options.cameras.as_deref(), options.times.clone());
-    let loaded = load_cameras(options, path, times, cameras::Clock::Normalised, None)?;
     let has_cameras = loaded.is_some();
-    let stream = open_stream(options)?;
     let count = stream.header().count;
     let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
     let block = frame_block(stream.header());

@@ -134,7 +134,9 @@ impl Merge {
         ));
         let run = |journal: &mut Journal| {
             journal.stage(NAME, survivors, scene.source(), |_| {
-                let mut trial = Trial::new(scene, scored, self, ranking.take(survivors))?;
+                // Proxies belong to it, too.
+                let progress = Progress::counting(NAME, "sets of survivors");
+                let mut trial = Trial::new(scene, scored, self, ranking.take(survivors), &progress)?;
                 let mut merged = match self.target {
                     None => trial.merge(&ranking.take(survivors), None)?,
                     Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
@@ -207,11 +209,17 @@ struct Trial<'a> {
     /// How pairs of the pool move: it does not depend on who else survives.
     known: KnownPairs,
     /// Sets of survivors that were tried.
-    progress: Progress,
+    progress: &'a Progress,
 }
 
 impl<'a> Trial<'a> {
-    fn new(scene: &'a Scene, scored: &'a Scored, stage: &'a Merge, pool: Vec<u32>) -> Result<Self> {
+    fn new(
+        scene: &'a Scene,
+        scored: &'a Scored,
+        stage: &'a Merge,
+        pool: Vec<u32>,
+        progress: &'a Progress,
+    ) -> Result<Self> {
         let source = scene.source();
         let (states, finite) = states_of(source, &pool, scored.reference.frame)?;
         let class = |(&id, is_finite): (&u32, bool)| is_finite.then(|| scene.input.class(id));
@@ -234,7 +242,7 @@ impl<'a> Trial<'a> {
         };
         let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
         let importance = scored.importance()?;
-        let (work, progress) = (&scene.work, Progress::counting(NAME, "sets of survivors"));
+        let work = &scene.work;
         Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
     }
 

@@ -33,6 +33,7 @@ use std::path::Path;
 
 pub use family::{ColumnInfo, Conventions, Family, Link, OpenOptions, Residence, Timing};
 pub use four_d_gaussians::ModelFolder;
+pub use linked::Linked;
 pub use size::Size;
 
 use crate::error::{Error, Result};

@@ -101,7 +101,7 @@ pub fn pack_stream(
     packing: impl Into<Packing>,
     mut take: impl FnMut(&HeldFrames) -> Result<()>,
 ) -> Result<u64> {
-    let StreamHeader { count, sh_degree, varying } = *stream.header();
+    let StreamHeader { count, sh_degree, varying, .. } = *stream.header();
     let block = frame_block(stream.header());
     let mut writer = ContainerWriter::create(path, count, sh_degree, block, packing, BTreeMap::new())?;
     let mut held = HeldFrames::new(count, sh_degree, varying, stream.take_constant());

@@ -8,6 +8,7 @@ use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
+use crate::families::{Family, Linked};
 use crate::ingest::cameras::Clock;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
@@ -46,9 +47,22 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
     let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalised, None)?;
     let stream = open_stream(options)?;
+    if stream.header().is_unlinked {
+        return link_stream(stream, options, rig);
+    }
     let mut room = room_to_pack(options, stream.header())?;
     let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| room.admit(held.len()))?;
     Ok(Opened { input: Box::new(streamed), rig, notes: Vec::new() })
+}
+
+/// Receives and links a stream of frames that do not know one another.
+///
+/// # Errors
+/// What is wrong with the stream.
+pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
+    let input = Linked::receive(stream, Path::new(STANDARD_INPUT), &options.scratch_folder())?;
+    let notes = input.notes();
+    Ok(Opened { input: Box::new(input), rig, notes })
 }
 
 /// The memory there is to pack a stream.

@@ -167,6 +167,22 @@ impl Progress {
         Progress(Shown::Bar(bar))
     }
 
+    /// Begins anew, with `total` units.
+    pub fn restart(&mut self, total: u64) {
+        match &mut self.0 {
+            Shown::Nothing => (),
+            Shown::Bar(bar) => {
+                bar.set_length(total);
+                bar.reset();
+            }
+            Shown::Lines(log) => {
+                log.sum_up();
+                (log.total, log.start, log.done) = (Some(total), Instant::now(), AtomicU64::new(0));
+                log.next = AtomicU64::new(LINE_EVERY);
+            }
+        }
+    }
+
     /// Tells that what the stage `what` did is undone, and `why`: nobody is to take it for progress.
     pub fn undone(what: &str, why: &str) {
         if QUIET.load(Ordering::Relaxed) {
@@ -303,6 +319,10 @@ impl Log {
 
     fn end(&self) {
         LOGS.fetch_sub(1, Ordering::Relaxed);
+        self.sum_up();
+    }
+
+    fn sum_up(&self) {
         // What failed before its first step has nothing to tell.
         if self.done.load(Ordering::Relaxed) > 0 && !self.is_within {
             tell(&self.line(self.start.elapsed(), true));

@@ -28,7 +28,7 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::Limits;
 use crate::model::Columns;
-use crate::scene::{InputOptions, Opened, first_box, kept_work, open_input, open_stream, room_to_pack};
+use crate::scene::{InputOptions, Opened, first_box, kept_work, link_stream, open_input, open_stream, room_to_pack};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
 use crate::work::Spilling;
@@ -78,14 +78,18 @@ impl Storing {
 pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
     check_container_name(output, "pack")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
-    if input.is_stream() {
+    let stream = input.is_stream().then(|| open_stream(input)).transpose()?;
+    let (numbered, unlinked) = match stream {
+        Some(stream) if stream.header().is_unlinked => (None, Some(stream)),
+        other => (other, None),
+    };
+    if let Some(stream) = numbered {
         let packing = storing.packing(|| {
             let message =
                 "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
             Err(Error::usage(message))
         })?;
         let staged = StagedFile::new(output, overwrite)?;
-        let stream = open_stream(input)?;
         let mut room = room_to_pack(input, stream.header())?;
         let received = pack_stream(stream, staged.path(), packing, |held| room.admit(held.len()))?;
         let container = Container::open(staged.path())?;
@@ -95,7 +99,10 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
         let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
         return Ok(Packed { gaussians, frames, bytes, larger, notes: Vec::new() });
     }
-    let opened = open_input(input)?;
+    let opened = match unlinked {
+        Some(stream) => link_stream(stream, input, None)?,
+        None => open_input(input)?,
+    };
     let source = opened.input.source();
     Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?.tell_time(input.memory.tell);
     let (work, digest) = kept_work(input, &*opened.input)?;
@@ -135,7 +142,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let opened = open_input(input)?;
     let source = opened.input.source();
     let info = source.info();
-    let header = StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying };
+    let header =
+        StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
     let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
     plan.tell_time(input.memory.tell);
     let held = plan.limits.frames_held;

@@ -123,7 +123,7 @@ struct Sequence {
 impl Sequence {
     /// `frames` frames of `count` balls, of which `varying` may be set anew in each.
     fn new(count: usize, frames: usize, varying: Columns) -> Sequence {
-        let header = StreamHeader { count, sh_degree: 0, varying };
+        let header = StreamHeader { count, sh_degree: 0, varying, is_unlinked: false };
         Sequence { frames, header, state: balls(count), cameras: None, time: |t| t as f64 }
     }
 

@@ -366,7 +366,7 @@ impl<'a> Walk<'a> {
 
     /// Shows how far it is of so many steps.
     fn expect(&mut self, steps: usize) {
-        self.progress = Progress::new(self.stage, "steps", steps as u64);
+        self.progress.restart(steps as u64);
     }
 
     /// What moves of `reduction`, which `result` shows.

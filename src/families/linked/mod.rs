@@ -7,6 +7,7 @@
 //! 12 per Gaussian of a block of frames, and a tile of every column and thread. On the disk, in a file without a name,
 //! 4 bytes per Gaussian and frame, beside the container.
 
+mod arrival;
 mod tracks;
 mod write;
 
@@ -18,7 +19,7 @@ use self::tracks::Tracks;
 use super::family::{Family, Residence, Timing};
 use super::size::bytes_of;
 use super::trajectories::write_trajectories;
-use crate::emit::atomic::ScratchFile;
+use crate::emit::atomic::{ScratchFile, ScratchFolder};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
 use crate::ingest::container::Container;
@@ -29,7 +30,7 @@ use crate::reduction::Reduction;
 use crate::source::{Ahead, BlockReader, FrameSource, Ids, Reads, Wanted};
 
 /// Linked frames.
-pub(super) struct Linked {
+pub struct Linked {
     tracks: Tracks,
     /// The tracks at every frame.
     container: Container,
@@ -38,6 +39,8 @@ pub(super) struct Linked {
     notes: Vec<String>,
     /// Keeps the container's file until nobody reads it any more.
     _scratch: ScratchFile,
+    /// The folder of frames that came by a stream.
+    arrived: Option<ScratchFolder>,
 }
 
 impl Linked {
@@ -53,7 +56,7 @@ impl Linked {
         let info = container.info().clone();
         let mut notes = vec![format!("frames were linked: {why}")];
         notes.extend(found.notes(tracks.frames()));
-        Ok(Linked { tracks, container, info, notes, _scratch: packed })
+        Ok(Linked { tracks, container, info, notes, _scratch: packed, arrived: None })
     }
 }
 
@@ -81,7 +84,10 @@ impl FrameSource for Linked {
 
 impl Family for Linked {
     fn kind(&self) -> &'static str {
-        "linked PLY frames"
+        match self.arrived {
+            None => "linked PLY frames",
+            Some(_) => "linked frame stream",
+        }
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -111,7 +117,10 @@ impl Family for Linked {
     }
 
     fn timing(&self) -> Timing {
-        Timing::Numbered
+        match self.arrived {
+            None => Timing::Numbered,
+            Some(_) => Timing::Stamped,
+        }
     }
 
     fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {

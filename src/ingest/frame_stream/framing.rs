@@ -3,19 +3,22 @@
 use crate::error::quoted;
 use crate::model::{Columns, sh_coefficients};
 
-const VERSION: u32 = 1;
+/// Every frame has the same Gaussians; or says itself how many it has.
+const VERSIONS: [u32; 2] = [1, 2];
 const FRAME: [u8; 4] = *b"FRAM";
 const END: [u8; 4] = *b"DONE";
 
 /// What a stream says of itself before its first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StreamHeader {
-    /// N, Gaussians in every frame; below 2³².
+    /// N, Gaussians in every frame; below 2³²; 0 of frames that do not know one another.
     pub count: usize,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: usize,
     /// Columns that come with every frame; the others come once.
     pub varying: Columns,
+    /// Whether every frame says itself how many Gaussians it has, and nothing which is which (version 2).
+    pub is_unlinked: bool,
 }
 
 /// What stands before the columns of a frame, or ends the stream.
@@ -44,15 +47,20 @@ impl StreamHeader {
     /// First bytes of every stream, chosen like the container's.
     pub(crate) const MAGIC: [u8; 8] = *b"\x89GSTR\r\n\x1a";
 
-    /// Bytes of the columns of one frame.
+    /// Bytes of the columns of one frame, where all have the same Gaussians.
     pub fn frame_bytes(&self) -> u64 {
-        4 * self.varying.width(self.sh_degree) as u64 * self.count as u64
+        self.gaussian_bytes() * self.count as u64
+    }
+
+    /// Bytes of what comes of a Gaussian with every frame.
+    pub(crate) fn gaussian_bytes(&self) -> u64 {
+        4 * self.varying.width(self.sh_degree) as u64
     }
 
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let mut bytes = [0; Self::BYTES];
         bytes[..8].copy_from_slice(&Self::MAGIC);
-        bytes[8..12].copy_from_slice(&VERSION.to_le_bytes());
+        bytes[8..12].copy_from_slice(&VERSIONS[usize::from(self.is_unlinked)].to_le_bytes());
         bytes[12..16].copy_from_slice(&(self.sh_degree as u32).to_le_bytes());
         bytes[16..24].copy_from_slice(&(self.count as u64).to_le_bytes());
         bytes[24..28].copy_from_slice(&self.varying.bits().to_le_bytes());
@@ -67,9 +75,10 @@ impl StreamHeader {
             return illegal(0, "a frame stream (format/STREAM.md)", quoted(&shown(&bytes[..8])), FOREIGN);
         }
         let version = u32_at(bytes, 8);
-        if version != VERSION {
-            return illegal(8, "version 1", format!("version {version}"), "a newer splatsieve may read it");
+        if !VERSIONS.contains(&version) {
+            return illegal(8, "version 1 or 2", format!("version {version}"), "a newer splatsieve may read it");
         }
+        let is_unlinked = version == VERSIONS[1];
         let degree = u32_at(bytes, 12);
         if degree > 3 {
             return illegal(12, "a degree of spherical harmonics from 0 to 3", degree.to_string(), "");
@@ -81,10 +90,17 @@ impl StreamHeader {
         let Some(varying) = Columns::from_bits(u32_at(bytes, 24)) else {
             return illegal(24, "a set of the five columns", format!("bits {:#x}", u32_at(bytes, 24)), "");
         };
+        if is_unlinked && count != 0 {
+            return illegal(16, "0 Gaussians in a header of version 2: frames say how many", count.to_string(), "");
+        }
+        if is_unlinked && varying != Columns::all() {
+            let found = format!("bits {:#x}", varying.bits());
+            return illegal(24, "all five columns with every frame of version 2", found, "");
+        }
         if u32_at(bytes, 28) != 0 {
             return illegal(28, "a reserved field of 0", u32_at(bytes, 28).to_string(), "");
         }
-        Ok(StreamHeader { count, sh_degree: degree as usize, varying })
+        Ok(StreamHeader { count, sh_degree: degree as usize, varying, is_unlinked })
     }
 }
 
@@ -143,7 +159,14 @@ impl Mark {
                     let expected = format!("a time stamp above {before}, that of frame {}", frames - 1);
                     return illegal(8, expected, time.to_string(), "frames come in the order of their times");
                 }
-                if length != header.frame_bytes() {
+                if header.is_unlinked {
+                    let fits = length.is_multiple_of(header.gaussian_bytes())
+                        && length / header.gaussian_bytes() <= u64::from(u32::MAX);
+                    if !fits {
+                        let expected = format!("bytes of fewer than 2^32 Gaussians, {} each", header.gaussian_bytes());
+                        return illegal(16, expected, format!("{length} bytes"), FOREIGN);
+                    }
+                } else if length != header.frame_bytes() {
                     return illegal(16, expected_length(header), found_length(header, length), SAME_IN_EVERY_FRAME);
                 }
                 Ok(Mark::Frame { index, time, bytes: length })

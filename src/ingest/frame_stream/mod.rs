@@ -98,12 +98,16 @@ impl<R: Read> FrameStream<R> {
         }
         let mark = Mark::from_bytes(&mark, &self.header, frame, self.last_time)
             .map_err(|illegal| self.bytes.error(start, Some(frame), illegal))?;
-        let Mark::Frame { time, .. } = mark else {
+        let Mark::Frame { time, bytes, .. } = mark else {
             self.ended = true;
             return self.expect_nothing().map(|()| None);
         };
+        let count = match self.header.is_unlinked {
+            true => (bytes / self.header.gaussian_bytes()) as usize,
+            false => self.header.count,
+        };
         for column in self.header.varying.iter() {
-            if !self.bytes.column(self.header.count, out.column_mut(column))? {
+            if !self.bytes.column(count, out.column_mut(column))? {
                 let expected = format!("the rest of frame {frame} (column {})", column.name());
                 return Err(self.bytes.ended(&expected, Some(frame)));
             }

@@ -10,7 +10,7 @@ const T: usize = 4;
 fn written() -> (Scene, Vec<u8>, Vec<usize>) {
     let scene = Scene::new(N, T);
     let info = scene.info();
-    let header = StreamHeader { count: N, sh_degree: info.sh_degree, varying: info.varying };
+    let header = StreamHeader { count: N, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
     let states = states(&scene);
     let mut bytes = Vec::new();
     let mut stream = StreamWriter::new(&mut bytes, Path::new("test"), header, &states[0]).unwrap();
@@ -81,7 +81,7 @@ fn odd_bits_and_columns_that_all_vary_or_none_survive() {
         for (i, bits) in [0x7fc0_1234, 0x8000_0000, 0xff80_0000, 1].into_iter().enumerate() {
             state.rotation.plane_mut(i)[1] = f32::from_bits(bits);
         }
-        let header = StreamHeader { count: 2, sh_degree: 0, varying };
+        let header = StreamHeader { count: 2, sh_degree: 0, varying, is_unlinked: false };
         let mut bytes = Vec::new();
         let mut stream = StreamWriter::new(&mut bytes, Path::new("test"), header, &state).unwrap();
         stream.frame(-1.5, &state).unwrap();
@@ -95,7 +95,7 @@ fn odd_bits_and_columns_that_all_vary_or_none_survive() {
 
 #[test]
 fn no_gaussians_and_no_frames_are_a_stream() {
-    let header = StreamHeader { count: 0, sh_degree: 3, varying: Columns::POSITION };
+    let header = StreamHeader { count: 0, sh_degree: 3, varying: Columns::POSITION, is_unlinked: false };
     for frames in [0, 2] {
         let state = Gaussians::zeros(0, 3);
         let mut bytes = Vec::new();
@@ -140,9 +140,10 @@ fn every_illegal_field_is_named_with_its_frame_and_byte() {
         changed
     };
     let at = |frame: usize, offset: usize| format!("frame {frame}, byte {}", starts[frame] + offset);
-    let cases: [(Vec<u8>, String, &str); 16] = [
+    let cases: [(Vec<u8>, String, &str); 17] = [
         (header(0, b"Loading "), "byte 0".into(), "Loading "),
-        (header(8, &[2]), "byte 8".into(), "version 2"),
+        (header(8, &[3]), "byte 8".into(), "version 3"),
+        (header(8, &[2]), "byte 16".into(), "frames say how many"),
         (header(12, &[4]), "byte 12".into(), "found 4"),
         (header(20, &[1]), "byte 16".into(), "fewer than 2^32"),
         (header(24, &[32]), "byte 24".into(), "0x20"),
@@ -195,14 +196,15 @@ fn text_printed_into_a_frame_or_after_the_end_is_found() {
 #[test]
 fn a_header_that_promises_too_much_costs_no_memory() {
     // 2³² − 1 Gaussians of which nothing comes: 240 GiB if they were believed.
-    let header = StreamHeader { count: u32::MAX as usize, sh_degree: 3, varying: Columns::POSITION };
+    let header =
+        StreamHeader { count: u32::MAX as usize, sh_degree: 3, varying: Columns::POSITION, is_unlinked: false };
     let message = refusal(&[&header.to_bytes()[..], &[0; 5000]].concat());
     assert!(message.contains("constant column rotation"), "{message}");
 }
 
 #[test]
 fn the_writer_refuses_what_a_reader_would() {
-    let header = StreamHeader { count: 3, sh_degree: 0, varying: Columns::POSITION };
+    let header = StreamHeader { count: 3, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
     let state = Gaussians::zeros(3, 0);
     let mut stream = StreamWriter::new(Vec::new(), Path::new("test"), header, &state).unwrap();
     stream.frame(1.0, &state).unwrap();
