@@ -29,7 +29,8 @@ struct Walk {
 impl Walk {
     /// Writes it as a stream; whoever reads may stop early.
     fn write(self, to: impl Write) {
-        let header = StreamHeader { count: self.gaussians, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
+        let header =
+            StreamHeader { count: self.gaussians, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
         let mut state = Gaussians::zeros(self.gaussians, 0);
         let value = |i: usize, k: f32| (i as f32 * k).fract();
         for c in 0..3 {

@@ -16,10 +16,17 @@
 //!    A = (ln s_b/s_a / ln √2)² + ‖Ŝ_b − Ŝ_a‖² / ¼² + (α_b − α_a)² / ½² + |c_b − c_a|² / 0.1².
 //!    It goes on with it only if that is at most 1. Each track names the four Gaussians that cost least, ties by their
 //!    number; those are taken by cost, then track, then Gaussian, each track and each Gaussian once, which is the same
-//!    as to take those that are best for one another until none are left.
+//!    as to take those that are best for one another until none are left. Then two tracks that would cost less together
+//!    exchange their Gaussians, in the order of the tracks and of what they named, four times over.
 //! 3. First with r = ¼ and q = 4, tracks of the frame before alone; of what is left with r = 1 and q = 1, all tracks; then
 //!    with r = 4 and q = 4.
-//! 4. Where less than a quarter goes on, of at least 16, everything has moved at once: a cut, at which all tracks end.
+//! 4. A link is wrong with the larger chance of two. By rivals: R⁵ / (1 + R⁵), where R is what it and a rival cost, over
+//!    what they would cost the other way round, the largest of all that its track named instead and all that named its
+//!    Gaussian; ½ where that makes no difference, and about what is found in trained models whose links are known. By
+//!    strangers: ¼·k·C^{3/2}, at most ½, for a cost C where tracks name k Gaussians too many in the mean of the round: of
+//!    strangers that lie evenly so many cost as little. The least likely links are given up, and begin new tracks, until of
+//!    those left no more than one in two hundred is expected to be wrong ([`Linked::doubtful`]).
+//! 5. Where less than a quarter goes on, of at least 16, everything has moved at once: a cut, at which all tracks end.
 //!
 //! Tracks are numbered by their births, those of one frame by its order. What is not a number is never compared: it goes on
 //! if it is repeated only. Colours are compared without harmonics, which turn with the Gaussian.
@@ -30,7 +37,10 @@
 mod grid;
 mod identity;
 mod linker;
+mod links;
 mod look;
+mod track;
+mod trust;
 
 pub use identity::{Identity, identity};
 pub use linker::{GAP, Linked, Linker};

@@ -128,34 +128,89 @@ impl SlowTrack {
 }
 
 impl Slow {
+    /// Of every track that a round has linked the chance that it is wrong.
+    fn chances(
+        by_track: &[(f64, usize, usize)],
+        of_track: &BTreeMap<usize, usize>,
+        taken: &BTreeMap<usize, usize>,
+        cost: impl Fn(usize, usize) -> f64,
+    ) -> Vec<(f64, usize)> {
+        let linked: BTreeMap<usize, usize> =
+            by_track.iter().filter_map(|&(_, a, _)| of_track.get(&a).map(|&b| (a, b))).collect();
+        let rivals: Vec<_> = by_track.iter().filter(|(_, a, b)| of_track.get(a) != Some(b)).collect();
+        let strangers = rivals.iter().filter(|(_, a, _)| linked.contains_key(a)).count();
+        let crowd = strangers as f64 / linked.len().max(1) as f64;
+        let chance = |(&a, &b): (&usize, &usize)| {
+            let mut most = 0f64;
+            for &&(named, c, d) in rivals.iter().filter(|(_, c, d)| *c == a || *d == b) {
+                let (now, swapped) = match (linked.get(&c), taken.get(&d)) {
+                    (Some(&own), Some(&other)) => (cost(c, own) + cost(other, d), named + cost(other, own).min(1.0)),
+                    (Some(&own), None) => (cost(c, own), named),
+                    (None, Some(&other)) => (cost(other, d), named),
+                    (None, None) => continue,
+                };
+                most = most.max((now + 1e-6) / (swapped + 1e-6));
+            }
+            let by_rivals = most.powi(5) / (1.0 + most.powi(5));
+            ((0.25 * crowd * cost(a, b).powf(1.5)).min(0.5).max(by_rivals), a)
+        };
+        linked.iter().map(chance).collect()
+    }
+
     fn link(&mut self, state: &Gaussians) -> Vec<u32> {
         let all: Vec<Seen> = (0..state.len()).map(|i| seen(state, i)).collect();
         let mut of_track: BTreeMap<usize, usize> = BTreeMap::new();
-        let mut taken: BTreeSet<usize> = BTreeSet::new();
+        let mut taken: BTreeMap<usize, usize> = BTreeMap::new();
         for (a, track) in self.tracks.iter().enumerate() {
-            if let Some(b) = (0..all.len()).find(|b| !taken.contains(b) && all[*b].bits == track.seen.bits) {
+            let free = |b: &usize| !taken.contains_key(b) && all[*b].bits == track.seen.bits;
+            if let Some(b) = (0..all.len()).find(free) {
                 of_track.insert(a, b);
-                taken.insert(b);
+                taken.insert(b, a);
             }
         }
+        let mut chances: Vec<(f64, usize)> = Vec::new();
         for (r, q, missing) in [(0.25, 4.0, false), (1.0, 1.0, true), (4.0, 4.0, true)] {
+            let cost = |a: usize, b: usize| self.tracks[a].cost(&all[b], r, q);
             let mut offers: Vec<(f64, usize, usize)> = Vec::new();
             for (a, track) in self.tracks.iter().enumerate() {
                 if of_track.contains_key(&a) || !(missing || track.ago == 1.0) {
                     continue;
                 }
-                let free = (0..all.len()).filter(|b| !taken.contains(b));
-                let mut own: Vec<(f64, usize, usize)> = free.map(|b| (track.cost(&all[b], r, q), a, b)).collect();
+                let free = (0..all.len()).filter(|b| !taken.contains_key(b));
+                let mut own: Vec<(f64, usize, usize)> = free.map(|b| (cost(a, b), a, b)).collect();
                 own.retain(|offer| offer.0 <= 1.0);
                 own.sort_by(|x, y| x.partial_cmp(y).unwrap());
                 offers.extend(own.into_iter().take(4));
             }
+            let by_track = offers.clone();
             offers.sort_by(|x, y| x.partial_cmp(y).unwrap());
             for (_, a, b) in offers {
-                if !of_track.contains_key(&a) && taken.insert(b) {
+                if !of_track.contains_key(&a) && !taken.contains_key(&b) {
                     of_track.insert(a, b);
+                    taken.insert(b, a);
                 }
             }
+            for _ in 0..4 {
+                for &(named, a, b) in &by_track {
+                    let (Some(&own), Some(&other)) = (of_track.get(&a), taken.get(&b)) else { continue };
+                    let theirs = cost(other, own);
+                    if other != a && theirs <= 1.0 && named + theirs < cost(a, own) + cost(other, b) {
+                        of_track.extend([(a, b), (other, own)]);
+                        taken.extend([(b, a), (own, other)]);
+                    }
+                }
+            }
+            chances.extend(Self::chances(&by_track, &of_track, &taken, cost));
+        }
+        // Until no more than one in two hundred is expected to be wrong.
+        chances.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
+        let mut wrong: f64 = chances.iter().map(|(chance, _)| chance).sum();
+        for (chance, a) in chances {
+            if wrong <= 0.005 * of_track.len() as f64 {
+                break;
+            }
+            of_track.remove(&a);
+            wrong -= chance;
         }
         let mut numbers = vec![u32::MAX; all.len()];
         for (a, track) in self.tracks.iter_mut().enumerate() {
@@ -188,11 +243,21 @@ fn shuffled(cloud: &Gaussians, dice: &mut Dice, lives: impl Fn(u32) -> bool) -> 
 
 #[test]
 fn tracks_are_those_of_every_pair_compared() {
-    for (seed, crowd) in [(1, 0.5), (2, 4.0), (3, 30.0)] {
+    for (seed, crowd, alike) in [(1, 0.5, false), (2, 4.0, false), (3, 30.0, false), (4, 4.0, true)] {
         let mut dice = Dice(seed * 1_000_000);
-        let cloud = cloud(250, crowd, &mut dice);
+        let mut cloud = cloud(250, crowd, &mut dice);
+        // Of those that look nearly alike, some could be any.
+        if alike {
+            for i in 0..250 {
+                let size = cloud.log_scale.plane(0)[0];
+                cloud.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+                cloud.log_scale.set_row(i, [0; 3].map(|_| dice.around(size, 0.05)));
+                cloud.opacity_logit.set_row(i, [0.0]);
+                cloud.sh.set_row(i, [0.0; 3]);
+            }
+        }
         let (mut linker, mut slow) = (Linker::default(), Slow::default());
-        let mut linked = 0;
+        let (mut linked, mut doubtful) = (0, 0);
         for t in 0..8 {
             let state = later(&cloud, t, 0.3, &mut dice);
             // Every Gaussian is away for some frames of its own; a sixth does not move at all.
@@ -204,8 +269,9 @@ fn tracks_are_those_of_every_pair_compared() {
             assert_eq!(found.tracks, slow.link(&state), "frame {t}, crowd {crowd}");
             assert_eq!(linker.tracks(), slow.born);
             linked += found.linked;
+            doubtful += found.doubtful;
         }
-        assert!(linked > 600, "{linked} links hold nothing against one another");
+        assert!(linked > 300 && (doubtful > 0) == alike, "crowd {crowd}: {linked} links, {doubtful} in doubt");
     }
 }
 

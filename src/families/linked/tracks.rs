@@ -48,6 +48,8 @@ pub(super) struct Found {
     states: u64,
     /// Frames that begin something new.
     cuts: Vec<usize>,
+    /// Links that nobody can tell.
+    doubtful: usize,
     /// Frames that tracks are there, in the median.
     median_length: u32,
 }
@@ -62,6 +64,12 @@ impl Found {
             self.count,
             self.median_length
         )];
+        if self.doubtful > 0 {
+            notes.push(format!(
+                "{} links could not be told from others: what they would have led to begins a new track",
+                self.doubtful
+            ));
+        }
         if let Some(&first) = self.cuts.first() {
             let name = frames.paths()[first].file_name().unwrap_or_default().display();
             notes.push(match self.cuts.len() {
@@ -78,6 +86,7 @@ impl Tracks {
     pub(super) fn link(frames: PlyFrames, scratch: &Path) -> Result<(Tracks, Vec<At>, Found)> {
         let mut linker = Linker::default();
         let (mut births, mut lengths, mut cuts) = (Vec::new(), Vec::<u32>::new(), Vec::new());
+        let mut doubtful = 0;
         let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
         let progress = Progress::new("link", "frames", frames.paths().len() as u64);
@@ -88,6 +97,7 @@ impl Tracks {
             if linked.is_cut {
                 cuts.push(frame);
             }
+            doubtful += linked.doubtful;
             for (row, &track) in linked.tracks.iter().enumerate() {
                 // Those that begin here are numbered in the order of their rows.
                 if track as usize == births.len() {
@@ -103,7 +113,7 @@ impl Tracks {
         }
         let middle = lengths.len() / 2;
         let median_length = if lengths.is_empty() { 0 } else { *lengths.select_nth_unstable(middle).1 };
-        let found = Found { count: linker.tracks(), states: end, cuts, median_length };
+        let found = Found { count: linker.tracks(), states: end, cuts, doubtful, median_length };
         let tracks = Tracks { count: births.len(), frames, of_rows: spilling.finish()?, starts };
         Ok((tracks, births, found))
     }
