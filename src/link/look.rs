@@ -11,6 +11,9 @@ const SIZE_UNIT: f32 = std::f32::consts::LN_2 / 2.0;
 const SHAPE_UNIT: f32 = 0.25;
 const OPACITY_UNIT: f32 = 0.5;
 const COLOUR_UNIT: f32 = 0.1;
+/// r and q of the [module](super) for twins.
+const TWIN_REACH: f32 = 0.25;
+const TWIN_STRICTNESS: f32 = 4.0;
 
 /// What is compared of a Gaussian at a frame.
 #[derive(Debug, Clone, Copy)]
@@ -63,14 +66,27 @@ impl Look {
 
     /// A of the [module](super), symmetric.
     pub(super) fn unlike(&self, other: &Look) -> f32 {
-        let squared = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
-        let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
+        self.unlike_but_opacity(other) + opacity * opacity
+    }
+
+    /// Whether both are one to the eye, but for their opacity: in the same place by what the first round calls it.
+    pub(super) fn is_twin(&self, other: &Look) -> bool {
+        let reach = TWIN_REACH * self.size.min(other.size);
+        let apart = squared(&self.position, &other.position) / (reach * reach);
+        apart + TWIN_STRICTNESS * self.unlike_but_opacity(other) <= 1.0
+    }
+
+    fn unlike_but_opacity(&self, other: &Look) -> f32 {
+        let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
-            + opacity * opacity
             + squared(&self.shape, &other.shape) / (SHAPE_UNIT * SHAPE_UNIT)
             + squared(&self.colour, &other.colour) / (COLOUR_UNIT * COLOUR_UNIT)
     }
+}
+
+fn squared(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
 /// A bijection whose every bit follows from all below it and, by the shift, from those above

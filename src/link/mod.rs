@@ -22,7 +22,9 @@
 //!    with r = 4 and q = 4.
 //! 4. A link is wrong with the larger chance of two. By rivals: R⁵ / (1 + R⁵), where R is what it and a rival cost, over
 //!    what they would cost the other way round, the largest of all that its track named instead and all that named its
-//!    Gaussian; ½ where that makes no difference, and about what is found in trained models whose links are known. By
+//!    Gaussian; ½ where that makes no difference, and about what is found in trained models whose links are known. Twins
+//!    are no rivals: |x_b − x_a|² / (¼·min(s_a, s_b))² + 4·A ≤ 1, opacities aside. Which of them is which nobody sees, and
+//!    where one fades out while the other fades in they are one. By
 //!    strangers: ¼·k·C^{3/2}, at most ½, for a cost C where tracks name k Gaussians too many in the mean of the round: of
 //!    strangers that lie evenly so many cost as little. The least likely links are given up, and begin new tracks, until of
 //!    those left no more than one in two hundred is expected to be wrong ([`Linked::doubtful`]).

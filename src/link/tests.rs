@@ -110,20 +110,26 @@ fn seen(state: &Gaussians, i: usize) -> Seen {
     }
 }
 
+/// How different both look, opacities aside.
+fn unlike(a: &Seen, b: &Seen) -> f64 {
+    let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
+    let colour: f64 = (0..3).map(|c| (b.colour[c] - a.colour[c]).powi(2)).sum();
+    let size = (b.size / a.size).ln() / 2f64.sqrt().ln();
+    size * size + shape / 0.25f64.powi(2) + colour / 0.1f64.powi(2)
+}
+
+fn is_twin(a: &Seen, b: &Seen) -> bool {
+    let distance: f64 = (0..3).map(|c| (b.at[c] - a.at[c]).powi(2)).sum();
+    distance / (0.25 * a.size.min(b.size)).powi(2) + 4.0 * unlike(a, b) <= 1.0
+}
+
 impl SlowTrack {
     fn cost(&self, b: &Seen, r: f64, q: f64) -> f64 {
         let v = self.velocity.unwrap_or_default();
         let speed = v.iter().map(|v| v * v).sum::<f64>().sqrt();
         let u = self.seen.size + (0.5 * self.ago * speed).min(3.0 * self.seen.size);
         let distance: f64 = (0..3).map(|c| (b.at[c] - self.seen.at[c] - self.ago * v[c]).powi(2)).sum();
-        let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - self.seen.shape[k / 3][k % 3]).powi(2)).sum();
-        let colour: f64 = (0..3).map(|c| (b.colour[c] - self.seen.colour[c]).powi(2)).sum();
-        let size = (b.size / self.seen.size).ln() / 2f64.sqrt().ln();
-        let unlike = size * size
-            + shape / 0.25f64.powi(2)
-            + ((b.opacity - self.seen.opacity) / 0.5).powi(2)
-            + colour / 0.1f64.powi(2);
-        distance / (r * u).powi(2) + q * unlike
+        distance / (r * u).powi(2) + q * (unlike(&self.seen, b) + ((b.opacity - self.seen.opacity) / 0.5).powi(2))
     }
 }
 
@@ -134,6 +140,7 @@ impl Slow {
         of_track: &BTreeMap<usize, usize>,
         taken: &BTreeMap<usize, usize>,
         cost: impl Fn(usize, usize) -> f64,
+        are_twins: impl Fn(usize, usize, Option<usize>, Option<usize>) -> bool,
     ) -> Vec<(f64, usize)> {
         let linked: BTreeMap<usize, usize> =
             by_track.iter().filter_map(|&(_, a, _)| of_track.get(&a).map(|&b| (a, b))).collect();
@@ -143,6 +150,9 @@ impl Slow {
         let chance = |(&a, &b): (&usize, &usize)| {
             let mut most = 0f64;
             for &&(named, c, d) in rivals.iter().filter(|(_, c, d)| *c == a || *d == b) {
+                if are_twins(c, d, linked.get(&c).copied(), taken.get(&d).copied()) {
+                    continue;
+                }
                 let (now, swapped) = match (linked.get(&c), taken.get(&d)) {
                     (Some(&own), Some(&other)) => (cost(c, own) + cost(other, d), named + cost(other, own).min(1.0)),
                     (Some(&own), None) => (cost(c, own), named),
@@ -200,7 +210,11 @@ impl Slow {
                     }
                 }
             }
-            chances.extend(Self::chances(&by_track, &of_track, &taken, cost));
+            let twins = |a: usize, b: usize| is_twin(&self.tracks[a].seen, &self.tracks[b].seen);
+            let are_twins = |c, d, own: Option<usize>, other: Option<usize>| {
+                other.is_some_and(|e| twins(c, e)) || own.is_some_and(|b: usize| is_twin(&all[b], &all[d]))
+            };
+            chances.extend(Self::chances(&by_track, &of_track, &taken, cost, are_twins));
         }
         // Until no more than one in two hundred is expected to be wrong.
         chances.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));

@@ -46,6 +46,11 @@ impl Trust {
             }
             for offer in others {
                 let other = links.of_point[offer.point as usize];
+                let of_tracks = |a: u32, b: u32| tracks[a as usize].look.is_twin(&tracks[b as usize].look);
+                let of_points = |a: u32, b: u32| looks[a as usize].is_twin(&looks[b as usize]);
+                if (other != NONE && of_tracks(*track, other)) || (own != NONE && of_points(own, offer.point)) {
+                    continue;
+                }
                 let now = own_cost + if other == NONE { 0.0 } else { cost(other, offer.point) };
                 let swapped = offer.cost + if own == NONE || other == NONE { 0.0 } else { cost(other, own) };
                 let ratio = (now + SAME) / (swapped + SAME);
