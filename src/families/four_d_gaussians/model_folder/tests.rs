@@ -196,7 +196,7 @@ fn times_that_do_not_increase_are_refused_with_their_frames() {
     for (times, says) in [
         (vec![0.0, 0.5, 0.5], "frame 1 has 0.5, frame 2 has 0.5"),
         (vec![0.5, 0.25], "frame 0 has 0.5, frame 1 has 0.25"),
-        (vec![0.0, f64::NAN], "frame 1 has time NaN"),
+        (vec![0.0, f64::NAN], "the time of frame 1 is NaN"),
     ] {
         let error = model.clone().with_times(times).expect_err("must be refused").to_string();
         assert!(error.contains(says), "{error}");
