@@ -1,4 +1,5 @@
-//! How many Gaussians of a frame are linked to the frame before in a second, on one thread and on all?
+//! How many Gaussians of a frame are linked to the frame before, and looked at for lives that are one, in a second, on one
+//! thread and on all?
 //!
 //! `still` repeats every Gaussian to the bit, `moving` moves each on its circle, `noisy` adds 2% of its size to that,
 //! `lives` lets a seventh of them be away in each frame, and `crowded` has fifty lie within the size of each. Frames come in
@@ -11,7 +12,7 @@ use std::collections::HashMap;
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use splatsieve::link::Linker;
+use splatsieve::link::{Joiner, Linker};
 use splatsieve::model::Gaussians;
 use splatsieve::select::hash_id;
 
@@ -47,8 +48,13 @@ fn frames(crowd: f32, motion: f32, noise: f32, lives: bool) -> Vec<Gaussians> {
 }
 
 fn linked(frames: &[Gaussians]) -> usize {
-    let mut linker = Linker::default();
-    frames.iter().map(|frame| linker.link(frame).linked).sum()
+    let (mut linker, mut joiner) = (Linker::default(), Joiner::default());
+    let link = |frame| {
+        let linked = linker.link(frame).linked;
+        joiner.see(&linker);
+        linked
+    };
+    frames.iter().map(link).sum()
 }
 
 fn nearest(before: &Gaussians, after: &Gaussians) -> usize {

@@ -68,7 +68,7 @@ fn frames_of_other_numbers_become_tracks_that_hold_every_row_to_the_bit() {
     let workplace = Workplace::new();
     // Several blocks of Gaussians, so that some are not there yet for a while, and others no longer.
     let orders = write_frames(&workplace, "frames", 4000);
-    let scene = open(&workplace, "frames", Link::Auto);
+    let scene = open(&workplace, "frames", Link::Apart);
     let count = scene.source().info().count;
     let lived = (0..4000).filter(|&i| (0..FRAMES).any(|t| lives(i, t))).count();
     assert_eq!(count, lived, "one track per Gaussian, across gaps of two frames");
@@ -132,7 +132,7 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
 fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
     let workplace = Workplace::new();
     write_frames(&workplace, "frames", 900);
-    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all");
+    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all --link apart");
     let rows = |folder: &str, t: usize| PlyRows::read(&workplace.path(&format!("{folder}/f_{t}.ply"))).rows;
     for t in 0..FRAMES {
         let (mut given, mut left) = (rows("frames", t), rows("all", t));
@@ -151,10 +151,71 @@ fn what_is_kept_is_written_as_frames_of_what_lives_in_them() {
     workplace.done("info half");
 }
 
+/// Frame `t` of Gaussians whose lives begin anew every seven frames, for two of which the old fades out while the new fades
+/// in: both together as opaque as `row` says.
+fn fading(count: usize, t: usize) -> Gaussians {
+    let parts = |i: usize| match (t + (hash_id(i as u64) % 7) as usize) % 7 {
+        phase @ (0 | 1) if t > phase => vec![(phase + 1) as f64 / 3.0, (2 - phase) as f64 / 3.0],
+        _ => vec![1.0],
+    };
+    let mut rows: Vec<(usize, usize, f64)> = Vec::new();
+    (0..count).for_each(|i| rows.extend(parts(i).into_iter().enumerate().map(|(k, part)| (i, k, part))));
+    rows.sort_by_key(|&(i, k, _)| hash_id((i as u64) << 20 | (k as u64) << 40 | t as u64));
+    let mut out = Gaussians::zeros(rows.len(), 1);
+    for (at, (i, _, part)) in rows.into_iter().enumerate() {
+        row(i, t, &mut out, at);
+        let alpha = 1.0 - (1.0 + f64::from(out.opacity_logit.plane(0)[at]).exp()).powf(-part);
+        out.opacity_logit.set_row(at, [(alpha / (1.0 - alpha)).ln() as f32]);
+    }
+    out
+}
+
+#[test]
+fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
+    let workplace = Workplace::new();
+    let (count, frames) = (600, 21);
+    for t in 0..frames {
+        workplace.ply(&format!("frames/{t}.ply"), &fading(count, t));
+    }
+    let (apart, joined) = (open(&workplace, "frames", Link::Apart), open(&workplace, "frames", Link::Auto));
+    let [apart_count, joined_count] = [&apart, &joined].map(|scene| scene.source().info().count);
+    assert!(apart_count > 2 * count && joined_count <= count + count / 20, "{apart_count}, {joined_count}");
+    let notes = joined.input.notes().join("\n");
+    assert!(notes.contains(&format!("{apart_count} lives of ")) && notes.contains("pictures stay within"), "{notes}");
+    assert!(!apart.input.notes().join("\n").contains("were joined"));
+    // As opaque as both were, in one row.
+    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all");
+    let mut one_row = 0;
+    for t in 0..frames {
+        let (mut whole, ply) = (Gaussians::zeros(count, 1), PlyRows::read(&workplace.path(&format!("all/{t}.ply"))));
+        (0..count).for_each(|i| row(i, t, &mut whole, i));
+        let there = joined.source();
+        let found = state(there, t);
+        let living: Vec<usize> = (0..found.len()).filter(|&i| found.opacity_logit.plane(0)[i] > -30.0).collect();
+        assert_eq!(living.len(), ply.rows.len(), "frame {t}");
+        for i in 0..count {
+            let is_it = |&&track: &&usize| {
+                let apart = |c: usize| (found.position.plane(c)[track] - whole.position.plane(c)[i]).abs();
+                let logit = found.opacity_logit.plane(0)[track] - whole.opacity_logit.plane(0)[i];
+                (0..3).all(|c| apart(c) < 1e-5) && logit.abs() < 1e-3
+            };
+            one_row += usize::from(living.iter().filter(is_it).count() == 1);
+        }
+    }
+    assert!(one_row * 100 >= 97 * count * frames, "{one_row} of {} are in one row", count * frames);
+    // Held apart where that is asked for, and so recorded.
+    workplace.done("compress frames -o apart --target-ratio 1 --no-refine --prune-only --bands all --link apart");
+    let rows = |folder: &str| PlyRows::read(&workplace.path(&format!("{folder}/8.ply"))).rows.len();
+    assert!(rows("apart") == rows("frames") && rows("all") < rows("apart"), "{} {}", rows("all"), rows("apart"));
+    assert!(fs::read_to_string(workplace.path("apart/recipe.toml")).unwrap().contains("link = \"apart\""));
+}
+
 #[test]
 fn threads_and_memory_change_nothing() {
     let workplace = Workplace::new();
-    write_frames(&workplace, "frames", 1500);
+    for t in 0..20 {
+        workplace.ply(&format!("frames/{t}.ply"), &fading(1500, t));
+    }
     let run = |name: &str, more: &str| {
         workplace.done(&format!("compress frames -o {name} --target-ratio 0.4 --refine-steps 20 {more}"));
         lasting_files(&workplace.path(name))
@@ -174,7 +235,7 @@ fn a_cut_begins_new_tracks_and_is_told() {
         }
         workplace.ply(&format!("frames/{t}.ply"), &gaussians);
     }
-    let scene = open(&workplace, "frames", Link::Auto);
+    let scene = open(&workplace, "frames", Link::Apart);
     assert_eq!(scene.source().info().count, 600);
     let notes = scene.input.notes().join("\n");
     assert!(notes.contains("a cut: 5.ply"), "{notes}");

@@ -123,7 +123,7 @@ pub(super) struct Input {
     #[arg(long, hide_short_help = true)]
     pub(super) allow_gaps: bool,
     /// Whether to find out which Gaussian of a folder's frames is which: where they differ in number, or their order does
-    /// not tell, `always`, or `never` [default: auto]
+    /// not tell, `always`, or `never`; `apart`: always, and lives that seem to be one are not joined [default: auto]
     #[arg(long, hide_short_help = true)]
     pub(super) link: Option<LinkArg>,
     /// Folder for scratch files while the run lasts: the packed frames of a stream or of linked frames, what does not fit
@@ -253,6 +253,8 @@ pub(super) enum LinkArg {
     Auto,
     /// Whatever their order tells
     Always,
+    /// Whatever their order tells, and lives that seem to be one stay apart
+    Apart,
     /// The same place means the same Gaussian
     Never,
 }
@@ -262,6 +264,7 @@ impl From<LinkArg> for Link {
         match given {
             LinkArg::Auto => Link::Auto,
             LinkArg::Always => Link::Always,
+            LinkArg::Apart => Link::Apart,
             LinkArg::Never => Link::Never,
         }
     }

@@ -353,6 +353,8 @@ pub enum Link {
     Auto,
     /// Whatever their order tells.
     Always,
+    /// Whatever their order tells, and lives that seem to be one stay apart.
+    Apart,
     /// The same place means the same Gaussian.
     Never,
 }

@@ -49,14 +49,14 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
     let why = match options.link {
         _ if frames.paths().len() == 1 => None,
         Link::Never => None,
-        Link::Always => Some("as asked".to_owned()),
+        Link::Always | Link::Apart => Some("as asked".to_owned()),
         Link::Auto => why_linked(&frames)?,
     };
     match why {
         None => Ok(Box::new(PlySequence::new(frames)?)),
         Some(why) => {
             let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
-            Ok(Box::new(Linked::open(frames, &why, &scratch)?))
+            Ok(Box::new(Linked::open(frames, &why, options.link != Link::Apart, &scratch)?))
         }
     }
 }

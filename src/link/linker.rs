@@ -43,6 +43,11 @@ impl Linker {
     pub const BYTES_PER_TRACK: usize =
         size_of::<Track>() + 2 * size_of::<u32>() + NAMED * size_of::<Offer>() + size_of::<f32>();
 
+    /// Those that may go on, by their numbers.
+    pub(super) fn living(&self) -> &[Track] {
+        &self.tracks
+    }
+
     /// How many tracks there are so far.
     pub fn tracks(&self) -> u32 {
         self.born
@@ -66,15 +71,16 @@ impl Linker {
             self.tracks.clear();
             links = Links { of_track: Vec::new(), of_point: vec![NONE; looks.len()] };
         }
-        let doubtful = if is_cut { 0 } else { trust.give_up(&mut links) };
+        let doubtful = if is_cut { Vec::new() } else { trust.give_up(&mut links) };
         let linked = links.count();
-        let tracks = self.go_on(&links, &looks);
-        Linked { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful, is_cut }
+        let tracks = self.go_on(&links, &looks, &doubtful);
+        Linked { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
-    /// Moves the tracks on by a frame; gives that of every Gaussian.
-    fn go_on(&mut self, links: &Links, looks: &[Look]) -> Vec<u32> {
+    /// Moves the tracks on by a frame; gives that of every Gaussian. Of those `in_doubt` tracks begin.
+    fn go_on(&mut self, links: &Links, looks: &[Look], in_doubt: &[u32]) -> Vec<u32> {
         let mut of_points = vec![NONE; looks.len()];
+        let born = self.born;
         for (track, &point) in self.tracks.iter_mut().zip(&links.of_track) {
             if point == NONE {
                 track.ago += 1;
@@ -86,8 +92,13 @@ impl Linker {
         self.tracks.retain(|track| track.ago <= GAP + 1);
         for (point, of_point) in of_points.iter_mut().enumerate().filter(|(_, track)| **track == NONE) {
             *of_point = self.born;
-            self.tracks.push(Track { number: self.born, ago: 1, velocity: None, look: looks[point] });
+            let look = looks[point];
+            self.tracks.push(Track { number: self.born, ago: 1, velocity: None, look, is_in_doubt: false });
             self.born += 1;
+        }
+        let first = self.tracks.partition_point(|track| track.number < born);
+        for &point in in_doubt {
+            self.tracks[first + (of_points[point as usize] - born) as usize].is_in_doubt = true;
         }
         of_points
     }

@@ -25,10 +25,11 @@ impl Links {
         (self.of_track[track as usize], self.of_point[point as usize]) = (point, track);
     }
 
-    /// Undoes what a track is linked to.
-    pub(super) fn undo(&mut self, track: u32) {
+    /// Undoes what a track is linked to, which is given.
+    pub(super) fn undo(&mut self, track: u32) -> u32 {
         let point = std::mem::replace(&mut self.of_track[track as usize], NONE);
         self.of_point[point as usize] = NONE;
+        point
     }
 
     fn is_free(&self, track: u32, point: u32) -> bool {

@@ -59,6 +59,11 @@ impl Look {
         }
     }
 
+    /// The same elsewhere.
+    pub(super) fn at(self, position: [f32; 3]) -> Look {
+        Look { position, ..self }
+    }
+
     /// What tells those of a crowded cell apart.
     pub(super) fn brightness(&self) -> f32 {
         self.colour.iter().sum()
@@ -77,7 +82,8 @@ impl Look {
         apart + TWIN_STRICTNESS * self.unlike_but_opacity(other) <= 1.0
     }
 
-    fn unlike_but_opacity(&self, other: &Look) -> f32 {
+    /// A without opacities.
+    pub(super) fn unlike_but_opacity(&self, other: &Look) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
             + squared(&self.shape, &other.shape) / (SHAPE_UNIT * SHAPE_UNIT)

@@ -453,3 +453,234 @@ fn order_is_believed_where_it_holds_and_not_where_it_was_shuffled() {
     assert!(identity(&cloud.pick(&few), &mixed.pick(&few)).holds);
     assert!(identity(&Gaussians::zeros(0, 0), &Gaussians::zeros(0, 0)).holds);
 }
+
+/// Where each track was, frame by frame.
+type History = Vec<BTreeMap<usize, Seen>>;
+
+/// Where a track is, seen or not, at a frame after its first.
+fn place(track: &BTreeMap<usize, Seen>, frame: usize) -> ([f64; 3], usize) {
+    let seen: Vec<(&usize, &Seen)> = track.range(..=frame).collect();
+    let mut velocity: Option<[f64; 3]> = None;
+    for pair in seen.windows(2) {
+        let step: [f64; 3] =
+            std::array::from_fn(|c| (pair[1].1.at[c] - pair[0].1.at[c]) / (pair[1].0 - pair[0].0) as f64);
+        velocity = Some(velocity.map_or(step, |v| std::array::from_fn(|c| 0.5 * (v[c] + step[c]))));
+    }
+    let (&last, at) = seen[seen.len() - 1];
+    let v = velocity.unwrap_or_default();
+    (std::array::from_fn(|c| at.at[c] + (frame - last) as f64 * v[c]), frame - last)
+}
+
+/// What the documentation of the module says of lives, pair by pair, in f64.
+fn slow_lives(tracks: &History, in_doubt: &BTreeSet<u32>, frames: usize, (r, q): (f64, f64)) -> Vec<u32> {
+    let cost = |a: &Seen, at: [f64; 3], b: &Seen, (r, q): (f64, f64)| {
+        let distance: f64 = (0..3).map(|c| (at[c] - b.at[c]).powi(2)).sum();
+        let is_of_its_size = a.size.max(b.size) <= 2f64.sqrt() * a.size.min(b.size);
+        let cost = distance / (r * a.size.min(b.size)).powi(2) + q * unlike(a, b);
+        if is_of_its_size { cost } else { f64::INFINITY }
+    };
+    let first = |track: usize| *tracks[track].keys().next().unwrap();
+    let is_gone = |track: usize, frame: usize| frame > tracks[track].keys().last().unwrap() + GAP as usize;
+    let looked = |track: usize, frame: usize| tracks[track].range(..=frame).last().unwrap().1;
+    let mut from: Vec<Option<usize>> = vec![None; tracks.len()];
+    let mut goes_on = vec![false; tracks.len()];
+    // By track and cost: the other, frames together, whether they are twins, whether the other has ended.
+    let mut pairs: BTreeMap<(usize, u64), (usize, usize, bool, bool)> = BTreeMap::new();
+    let settle = |pairs: &mut BTreeMap<(usize, u64), (usize, usize, bool, bool)>,
+                  from: &mut Vec<Option<usize>>,
+                  goes_on: &mut Vec<bool>| loop {
+        let mut firsts: BTreeMap<usize, (u64, usize, bool)> = BTreeMap::new();
+        for (&(b, cost), &(a, _, _, ended)) in pairs.iter() {
+            firsts.entry(b).or_insert((cost, a, ended));
+        }
+        let mut ended: Vec<(u64, usize, usize)> =
+            firsts.into_iter().filter(|(_, (_, _, ended))| *ended).map(|(b, (cost, a, _))| (cost, b, a)).collect();
+        ended.sort_unstable();
+        for &(_, b, a) in &ended {
+            if !goes_on[a] {
+                (from[b], goes_on[a]) = (Some(a), true);
+            }
+        }
+        pairs.retain(|&(b, _), (a, _, _, has_ended)| from[b].is_none() && !(*has_ended && goes_on[*a]));
+        if ended.is_empty() {
+            return;
+        }
+    };
+    for frame in 0..frames {
+        let mut within = Vec::new();
+        pairs.retain(|&(b, _), (a, together, twins, ended)| {
+            if is_gone(*a, frame) {
+                *ended = true;
+                return true;
+            }
+            if is_gone(b, frame) {
+                if *twins {
+                    within.push((b, *a));
+                }
+                return false;
+            }
+            let (Some(seen_a), Some(seen_b)) = (tracks[*a].get(&frame), tracks[b].get(&frame)) else { return true };
+            *together += 1;
+            *twins &= cost(seen_a, seen_a.at, seen_b, (1.0, 1.0)) <= 1.0;
+            *together <= 4 && cost(seen_a, seen_a.at, seen_b, (r, q)) <= 1.0
+        });
+        for (b, a) in within {
+            from[b] = from[b].or(Some(a));
+        }
+        pairs.retain(|&(b, _), _| from[b].is_none());
+        settle(&mut pairs, &mut from, &mut goes_on);
+        for b in (0..tracks.len()).filter(|&b| first(b) == frame && !in_doubt.contains(&(b as u32))) {
+            let own = &tracks[b][&frame];
+            let mut named = Vec::new();
+            for a in (0..tracks.len()).filter(|&a| first(a) < frame) {
+                let (at, missing) = place(&tracks[a], frame);
+                let look = looked(a, frame);
+                let all = cost(look, at, own, (r, q));
+                if missing <= GAP as usize && all <= 1.0 {
+                    let twins = cost(look, at, own, (1.0, 1.0)) <= 1.0;
+                    named.push((all.to_bits(), (a, usize::from(missing == 0), twins, false)));
+                }
+            }
+            named.sort_unstable();
+            pairs.extend(named.into_iter().take(4).map(|(cost, pair)| ((b, cost), pair)));
+        }
+    }
+    pairs.retain(|_, (a, _, twins, ended)| {
+        *ended = *twins || is_gone(*a, frames - 1) || !tracks[*a].contains_key(&(frames - 1));
+        *ended
+    });
+    settle(&mut pairs, &mut from, &mut goes_on);
+    let (mut lives, mut count) = (Vec::<u32>::new(), 0);
+    for from in from {
+        lives.push(from.map_or(count, |a| lives[a]));
+        count += u32::from(from.is_none());
+    }
+    lives
+}
+
+/// Frames of a cloud whose Gaussians live for 6 to 10 frames at a time, and fade over `overlap` of them; every life has
+/// colours of its own, and there is a seventh that nothing follows on.
+fn fading(cloud: &Gaussians, frames: usize, overlap: usize, tint: f32, dice: &mut Dice) -> Vec<(Gaussians, Vec<u32>)> {
+    let mut rows: Vec<Vec<(u32, f32, [f32; 3])>> = vec![Vec::new(); frames];
+    for i in 0..cloud.len() as u32 {
+        let mut begins = 0;
+        while begins < frames {
+            let (length, tint) = (6 + (5.0 * dice.roll()) as usize, [0; 3].map(|_| dice.around(0.0, tint)));
+            for age in 0..length + overlap {
+                let frame = begins + age;
+                let fades_in = if begins == 0 { 1.0 } else { (age + 1) as f32 / (overlap + 1) as f32 };
+                let fades_out = (length + overlap - age) as f32 / (overlap + 1) as f32;
+                if frame < frames {
+                    rows[frame].push((i, fades_in.min(fades_out).min(1.0), tint));
+                }
+            }
+            begins += if dice.roll() < 1.0 / 7.0 { 3 * length } else { length };
+        }
+    }
+    let of_frame = |(t, rows): (usize, Vec<(u32, f32, [f32; 3])>)| {
+        let ids: Vec<u32> = rows.iter().map(|row| row.0).collect();
+        let mut state = later(cloud, t, 0.02, dice).pick(&ids);
+        for (at, (_, part, tint)) in rows.into_iter().enumerate() {
+            let alpha = 1.0 - (1.0 - opacity(state.opacity_logit.plane(0)[at])).powf(f64::from(part));
+            state.opacity_logit.set_row(at, [(alpha / (1.0 - alpha)).ln() as f32]);
+            let [r, g, b] = state.sh.row::<3>(at);
+            state.sh.set_row(at, [r + tint[0], g + tint[1], b + tint[2]]);
+        }
+        let order = dice.order(ids.len());
+        (state.pick(&order), order.iter().map(|&at| ids[at as usize]).collect())
+    };
+    rows.into_iter().enumerate().map(of_frame).collect()
+}
+
+#[test]
+fn lives_are_those_of_every_pair_compared() {
+    for (seed, overlap, tint) in [(21, 2, 0.05), (22, 0, 0.8), (23, 3, 0.5), (24, 5, 0.05)] {
+        let mut dice = Dice(seed * 1_000_000);
+        // Sparse: in a crowd not all are looked at.
+        let cloud = cloud(120, 0.03, &mut dice);
+        let frames = fading(&cloud, 24, overlap, tint, &mut dice);
+        let (mut linker, mut joiner) = (Linker::default(), Joiner::default());
+        let (mut history, mut in_doubt) = (History::new(), BTreeSet::new());
+        for (t, (state, _)) in frames.iter().enumerate() {
+            let linked = linker.link(state);
+            joiner.see(&linker);
+            let doubted = linker.living().iter().filter(|track| track.is_in_doubt);
+            in_doubt.extend(doubted.map(|track| track.number));
+            history.resize(linker.tracks() as usize, BTreeMap::new());
+            for (at, &track) in linked.tracks.iter().enumerate() {
+                history[track as usize].insert(t, seen(state, at));
+            }
+        }
+        let [alike, twins] = joiner.finish(&linker);
+        for ((lives, count), rule) in [(&alike, (4.0, 0.0625)), (&twins, (1.0, 1.0))] {
+            assert!(*lives == slow_lives(&history, &in_doubt, frames.len(), rule), "overlap {overlap}, {rule:?}");
+            assert_eq!(*count, 1 + *lives.iter().max().unwrap() as usize);
+        }
+        let joined = history.len() - alike.1;
+        assert!(overlap > 4 || joined > 100, "overlap {overlap}: {joined} joined");
+    }
+}
+
+#[test]
+fn lives_that_fade_into_one_another_are_one_and_strangers_stay_apart() {
+    let mut dice = Dice(31);
+    let cloud = cloud(200, 1.0, &mut dice);
+    let frames = fading(&cloud, 30, 2, 0.05, &mut dice);
+    let (mut linker, mut joiner) = (Linker::default(), Joiner::default());
+    let mut whose: Vec<BTreeSet<u32>> = Vec::new();
+    for (state, ids) in &frames {
+        let linked = linker.link(state);
+        joiner.see(&linker);
+        whose.resize(linker.tracks() as usize, BTreeSet::new());
+        for (&track, &i) in linked.tracks.iter().zip(ids) {
+            whose[track as usize].insert(i);
+        }
+    }
+    let [(lives, count), _] = joiner.finish(&linker);
+    let mut of_lives = vec![BTreeSet::<u32>::new(); count];
+    lives.iter().zip(&whose).for_each(|(&life, who)| of_lives[life as usize].extend(who));
+    let mixed = of_lives.iter().filter(|who| who.len() > 1).count();
+    assert!(whose.len() > 2 * count && count < 420, "{} tracks are {count} lives", whose.len());
+    assert!(mixed * 20 < count, "{mixed} of {count} lives are of several Gaussians");
+}
+
+#[test]
+fn what_is_together_is_blended_as_its_formula_says() {
+    let mut dice = Dice(41);
+    let state = cloud(6, 1.0, &mut dice);
+    let rows = [4, 1, 3];
+    let mut blended = state.clone();
+    blend(&mut blended, &rows);
+    let alphas = rows.map(|i| opacity(state.opacity_logit.plane(0)[i]));
+    let near = |found: f32, expected: f64| assert!((f64::from(found) - expected).abs() < 1e-5, "{found}, {expected}");
+    near(opacity(blended.opacity_logit.plane(0)[4]) as f32, 1.0 - alphas.iter().map(|a| 1.0 - a).product::<f64>());
+    let mean = |values: [f64; 3]| (0..3).map(|k| alphas[k] * values[k]).sum::<f64>() / alphas.iter().sum::<f64>();
+    for c in 0..3 {
+        near(blended.position.plane(c)[4], mean(rows.map(|i| f64::from(state.position.plane(c)[i]))));
+        near(blended.log_scale.plane(c)[4], mean(rows.map(|i| f64::from(state.log_scale.plane(c)[i]))));
+    }
+    let turned = |i: usize| {
+        let (own, other) = (state.rotation.row::<4>(4), state.rotation.row::<4>(i));
+        let dot: f32 = (0..4).map(|c| own[c] * other[c]).sum();
+        other.map(|x| f64::from(x * dot.signum()))
+    };
+    let rotations = rows.map(turned);
+    (0..4).for_each(|c| near(blended.rotation.plane(c)[4], mean([0, 1, 2].map(|k| rotations[k][c]))));
+    for c in 0..state.sh.width() {
+        near(blended.sh.plane(c)[4], mean(rows.map(|i| f64::from(state.sh.plane(c)[i]))));
+    }
+    let others: Vec<u32> = vec![0, 1, 2, 3, 5];
+    assert!(blended.pick(&others) == state.pick(&others));
+    // Nearly opaque, nearly clear, and nothing at all.
+    for (logits, expected) in [([30.0, 30.0], 60.0), ([-30.0, -30.0], -30.0 + 2f32.ln()), ([50.0, -50.0], 50.0)] {
+        let mut pair = state.pick(&[0, 1]);
+        logits.iter().enumerate().for_each(|(i, &logit)| pair.opacity_logit.set_row(i, [logit]));
+        blend(&mut pair, &[0, 1]);
+        near(pair.opacity_logit.plane(0)[0], f64::from(expected));
+    }
+    let mut gone = state.pick(&[0, 1]);
+    (0..2).for_each(|i| gone.opacity_logit.set_row(i, [f32::NEG_INFINITY]));
+    let before = gone.clone();
+    blend(&mut gone, &[0, 1]);
+    assert!(gone == before, "what nobody sees stays as it is");
+}

@@ -33,6 +33,8 @@ pub(super) struct Track {
     /// Scene units per frame; none before its first step.
     pub(super) velocity: Option<[f32; 3]>,
     pub(super) look: Look,
+    /// Whether it has begun as nobody could tell which track goes on as it.
+    pub(super) is_in_doubt: bool,
 }
 
 /// What going on as a Gaussian costs.
@@ -55,11 +57,22 @@ impl Track {
         self.look.size + (0.5 * self.ago as f32 * speed).min(MOST_FROM_SPEED * self.look.size)
     }
 
-    /// What going on as `look` costs.
+    /// What going on as `look` costs; more than 1 where that is too much, whatever it is.
     pub(super) fn cost(&self, look: &Look, round: &Round) -> f32 {
-        let (expected, unit) = (self.expected(), round.reach * self.unit());
+        self.cost_at(look, self.expected(), round.reach * self.unit(), round.strictness)
+    }
+
+    fn cost_at(&self, look: &Look, expected: [f32; 3], unit: f32, strictness: f32) -> f32 {
         let distance: f32 = (0..3).map(|c| (look.position[c] - expected[c]).powi(2)).sum();
-        distance / (unit * unit) + round.strictness * self.look.unlike(look)
+        let apart = distance / (unit * unit);
+        // Most of those in its cells are too far away.
+        if apart > 1.0 { apart } else { apart + strictness * self.look.unlike(look) }
+    }
+
+    /// Where it is, seen or not, in the frame that was linked last.
+    pub(super) fn now(&self) -> [f32; 3] {
+        let velocity = self.velocity.unwrap_or_default();
+        std::array::from_fn(|c| self.look.position[c] + (self.ago - 1) as f32 * velocity[c])
     }
 
     pub(super) fn see(&mut self, look: Look) {
@@ -73,12 +86,10 @@ impl Track {
 
     /// The Gaussians it may go on as.
     pub(super) fn offers(&self, grid: &Grid, round: &Round) -> Offers {
-        let mut offers = Offers { best: [Offer { cost: f32::INFINITY, point: NONE }; NAMED] };
-        grid.near(&self.look, self.expected(), round.reach * self.unit(), |point, look| {
-            let cost = self.cost(look, round);
-            if cost <= 1.0 {
-                offers.add(Offer { cost, point });
-            }
+        let mut offers = Offers::default();
+        let (expected, unit) = (self.expected(), round.reach * self.unit());
+        grid.near(&self.look, expected, unit, |point, look| {
+            offers.add_within(self.cost_at(look, expected, unit, round.strictness), point);
         });
         offers
     }
@@ -89,7 +100,20 @@ pub(super) struct Offers {
     best: [Offer; NAMED],
 }
 
+impl Default for Offers {
+    fn default() -> Offers {
+        Offers { best: [Offer { cost: f32::INFINITY, point: NONE }; NAMED] }
+    }
+}
+
 impl Offers {
+    /// Takes in what costs 1 at most.
+    pub(super) fn add_within(&mut self, cost: f32, point: u32) {
+        if cost <= 1.0 {
+            self.add(Offer { cost, point });
+        }
+    }
+
     fn add(&mut self, offer: Offer) {
         let comes_before = |other: &Offer| (other.cost, other.point) < (offer.cost, offer.point);
         let place = self.best.iter().take_while(|other| comes_before(other)).count();

@@ -74,18 +74,17 @@ impl Trust {
         }
     }
 
-    /// Undoes the least likely links until of those left no more are expected to be wrong; gives how many.
-    pub(super) fn give_up(mut self, links: &mut Links) -> usize {
+    /// Undoes the least likely links until of those left no more are expected to be wrong; gives their Gaussians.
+    pub(super) fn give_up(mut self, links: &mut Links) -> Vec<u32> {
         self.doubted.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         let count = links.count();
-        let mut given_up = 0;
+        let mut given_up = Vec::new();
         for (chance, track) in self.doubted {
-            if self.wrong <= MOST_WRONG * (count - given_up) as f64 {
+            if self.wrong <= MOST_WRONG * (count - given_up.len()) as f64 {
                 break;
             }
-            links.undo(track);
+            given_up.push(links.undo(track));
             self.wrong -= f64::from(chance);
-            given_up += 1;
         }
         given_up
     }

@@ -8,7 +8,7 @@ use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
-use crate::families::{Family, Linked};
+use crate::families::{Family, Link, Linked};
 use crate::ingest::cameras::Clock;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
@@ -60,7 +60,8 @@ pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
 /// # Errors
 /// What is wrong with the stream.
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
-    let input = Linked::receive(stream, Path::new(STANDARD_INPUT), &options.scratch_folder())?;
+    let joins = options.link != Link::Apart;
+    let input = Linked::receive(stream, Path::new(STANDARD_INPUT), joins, &options.scratch_folder())?;
     let notes = input.notes();
     Ok(Opened { input: Box::new(input), rig, notes })
 }

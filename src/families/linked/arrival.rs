@@ -15,11 +15,12 @@ use crate::model::Gaussians;
 use crate::stream::Progress;
 
 impl Linked {
-    /// Receives all of a stream, called `name`, and links it, with scratch files in `scratch`.
+    /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`, with scratch files in
+    /// `scratch`.
     ///
     /// # Errors
     /// What is wrong with the stream; none but the end of it; a failed write.
-    pub fn receive(mut stream: FrameStream<impl Read>, name: &Path, scratch: &Path) -> Result<Linked> {
+    pub fn receive(mut stream: FrameStream<impl Read>, name: &Path, joins: bool, scratch: &Path) -> Result<Linked> {
         let folder = ScratchFolder::new(scratch)?;
         let (mut state, mut times) = (Gaussians::zeros(0, stream.header().sh_degree), Vec::new());
         let progress = Progress::counting("receive", "frames");
@@ -33,7 +34,7 @@ impl Linked {
             return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
         }
         let frames = PlyFrames::open(folder.path())?;
-        let linked = Linked::open(frames, "the stream does not say which Gaussian is which", scratch)?;
+        let linked = Linked::open(frames, "the stream does not say which Gaussian is which", joins, scratch)?;
         Ok(Linked { info: linked.info.with_times(times)?, arrived: Some(folder), ..linked })
     }
 }

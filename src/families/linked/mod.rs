@@ -1,13 +1,17 @@
 //! PLY frames that do not know one another: linked, packed into a container, and read from that.
 //!
-//! Every frame is read twice: to link it, then to pack its tracks. A track that is not there in a frame is held as it was,
-//! or as it will be first, with an opacity of nothing, so that it is seen nowhere and costs next to nothing.
+//! Every frame is read twice: to link it, then to pack its tracks. Lives that are one become one track, where pictures with
+//! them stay within 40 dB of those without: of twins alone where that is not so of all that are alike. A track that is not
+//! there in a frame is held as it was, or as it will be first, with an opacity of nothing, so that it is seen nowhere and
+//! costs next to nothing.
 //!
-//! Memory of opening: two frames and what [`Linker`](crate::link::Linker) keeps; then, while packing, 8 bytes per track,
-//! 12 per Gaussian of a block of frames, and a tile of every column and thread. On the disk, in a file without a name,
+//! Memory of opening: two frames and what [`Linker`](crate::link::Linker) keeps, 18 bytes for each track and four times 20
+//! for each that began in the last few frames; 12 more per track to join lives, and a few pictures; then, while packing, 8
+//! bytes per track, 12 per Gaussian of a block of frames, and a tile of every column and thread. On the disk, in a file without a name,
 //! 4 bytes per Gaussian and frame, beside the container.
 
 mod arrival;
+mod lives;
 mod tracks;
 mod write;
 
@@ -25,6 +29,7 @@ use crate::error::Result;
 use crate::ingest::container::Container;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::limits::Limits;
+use crate::link::Joiner;
 use crate::model::SequenceInfo;
 use crate::reduction::Reduction;
 use crate::source::{Ahead, BlockReader, FrameSource, Ids, Reads, Wanted};
@@ -44,18 +49,22 @@ pub struct Linked {
 }
 
 impl Linked {
-    /// Links `frames`, which the notes say `why` of, with scratch files in `scratch`.
+    /// Links `frames`, which the notes say `why` of, and lives that are one if `joins`, with scratch files in `scratch`.
     ///
     /// # Errors
     /// A frame that cannot be read or has changed meanwhile; a failed write.
-    pub(super) fn open(frames: PlyFrames, why: &str, scratch: &Path) -> Result<Linked> {
-        let (tracks, births, found) = Tracks::link(frames, scratch)?;
+    pub(super) fn open(frames: PlyFrames, why: &str, joins: bool, scratch: &Path) -> Result<Linked> {
+        let mut joiner = joins.then(Joiner::default);
+        let (mut tracks, found, linker) = Tracks::link(frames, joiner.as_mut(), scratch)?;
+        let joined = joiner.map(|joiner| lives::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
+        drop(linker);
         let packed = ScratchFile::new(scratch)?;
-        tracks.pack(births, packed.path())?;
+        tracks.pack(packed.path())?;
         let container = Container::open(packed.path())?;
         let info = container.info().clone();
         let mut notes = vec![format!("frames were linked: {why}")];
-        notes.extend(found.notes(tracks.frames()));
+        notes.extend(found.notes(&tracks)?);
+        notes.extend(joined);
         Ok(Linked { tracks, container, info, notes, _scratch: packed, arrived: None })
     }
 }

@@ -10,7 +10,7 @@ use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, Lives
 use crate::error::Result;
 use crate::ingest::ply::Ply;
 use crate::ingest::ply_frames::PlyFrames;
-use crate::link::Linker;
+use crate::link::{Joiner, Linker, blend};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::stream::Progress;
@@ -33,36 +33,56 @@ pub(super) struct At {
     row: u32,
 }
 
-/// Frames, and the track of every row of them.
+/// Frames, and the track of every row of them. Where lives are joined, several rows of a frame may be of one track.
 pub(super) struct Tracks {
     frames: PlyFrames,
     count: usize,
+    /// Of every track of `of_rows` the one it is part of, if lives are joined.
+    lives: Option<Vec<u32>>,
+    /// Where each track is first.
+    births: Vec<At>,
     /// Tracks of the rows of all frames, one after the other, and where those of each frame begin.
     of_rows: Spill,
     starts: Vec<u64>,
 }
 
+/// For how long tracks are there.
+pub(super) struct Lengths {
+    /// Frames of each.
+    of_tracks: Vec<u32>,
+    /// Frames in which several rows are of one.
+    pub(super) blended: Vec<u32>,
+}
+
+impl Lengths {
+    /// Frames that tracks are there, in the median.
+    pub(super) fn median(mut self) -> u32 {
+        let middle = self.of_tracks.len() / 2;
+        if self.of_tracks.is_empty() { 0 } else { *self.of_tracks.select_nth_unstable(middle).1 }
+    }
+}
+
 /// What linking found.
 pub(super) struct Found {
-    count: u32,
     states: u64,
     /// Frames that begin something new.
     cuts: Vec<usize>,
     /// Links that nobody can tell.
     doubtful: usize,
-    /// Frames that tracks are there, in the median.
-    median_length: u32,
 }
 
 impl Found {
-    /// Things a person should know.
-    pub(super) fn notes(&self, frames: &PlyFrames) -> Vec<String> {
+    /// Things a person should know, of the `tracks` that were made of it.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn notes(&self, tracks: &Tracks) -> Result<Vec<String>> {
         let mut notes = vec![format!(
             "{} Gaussians of {} frames are {} tracks, of {} frames in the median",
             self.states,
-            frames.paths().len(),
-            self.count,
-            self.median_length
+            tracks.frames.paths().len(),
+            tracks.count,
+            tracks.lengths()?.median()
         )];
         if self.doubtful > 0 {
             notes.push(format!(
@@ -71,22 +91,25 @@ impl Found {
             ));
         }
         if let Some(&first) = self.cuts.first() {
-            let name = frames.paths()[first].file_name().unwrap_or_default().display();
+            let name = tracks.frames.paths()[first].file_name().unwrap_or_default().display();
             notes.push(match self.cuts.len() {
                 1 => format!("a cut: {name} shows nothing of the frame before, all tracks end there"),
                 cuts => format!("{cuts} cuts, the first at {name}: such a frame shows nothing of the one before, all tracks end there"),
             });
         }
-        notes
+        Ok(notes)
     }
 }
 
 impl Tracks {
-    /// Links `frames`; gives where each track is first, too. Scratch files are in `scratch`.
-    pub(super) fn link(frames: PlyFrames, scratch: &Path) -> Result<(Tracks, Vec<At>, Found)> {
+    /// Links `frames`, which `joiner` looks at too. Scratch files are in `scratch`.
+    pub(super) fn link(
+        frames: PlyFrames,
+        mut joiner: Option<&mut Joiner>,
+        scratch: &Path,
+    ) -> Result<(Tracks, Found, Linker)> {
         let mut linker = Linker::default();
-        let (mut births, mut lengths, mut cuts) = (Vec::new(), Vec::<u32>::new(), Vec::new());
-        let mut doubtful = 0;
+        let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
         let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
         let progress = Progress::new("link", "frames", frames.paths().len() as u64);
@@ -94,6 +117,9 @@ impl Tracks {
             let ply = frames.frame(frame)?;
             ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
             let linked = linker.link(&state);
+            if let Some(joiner) = &mut joiner {
+                joiner.see(&linker);
+            }
             if linked.is_cut {
                 cuts.push(frame);
             }
@@ -102,20 +128,73 @@ impl Tracks {
                 // Those that begin here are numbered in the order of their rows.
                 if track as usize == births.len() {
                     births.push(At { frame: frame as u32, row: row as u32 });
-                    lengths.push(0);
                 }
-                lengths[track as usize] += 1;
             }
             spilling.write(bytemuck::cast_slice(&linked.tracks))?;
             end += linked.tracks.len() as u64;
             starts.push(end);
             progress.advance(1);
         }
-        let middle = lengths.len() / 2;
-        let median_length = if lengths.is_empty() { 0 } else { *lengths.select_nth_unstable(middle).1 };
-        let found = Found { count: linker.tracks(), states: end, cuts, doubtful, median_length };
-        let tracks = Tracks { count: births.len(), frames, of_rows: spilling.finish()?, starts };
-        Ok((tracks, births, found))
+        let tracks = Tracks { count: births.len(), frames, lives: None, births, of_rows: spilling.finish()?, starts };
+        Ok((tracks, Found { states: end, cuts, doubtful }, linker))
+    }
+
+    /// Makes `count` tracks of what is there, of each the one that `of_tracks` says.
+    pub(super) fn join(&mut self, of_tracks: Vec<u32>, count: usize) {
+        (self.lives, self.count) = (Some(of_tracks), count);
+    }
+
+    /// Takes back what was joined.
+    pub(super) fn part(&mut self) {
+        (self.lives, self.count) = (None, self.births.len());
+    }
+
+    /// For how long tracks are there.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn lengths(&self) -> Result<Lengths> {
+        let mut lengths = Lengths { of_tracks: vec![0; self.count], blended: Vec::new() };
+        let mut last = vec![u32::MAX; self.count];
+        for frame in 0..self.frames.paths().len() {
+            let mut is_blended = false;
+            for track in self.of_frame(frame)? {
+                let before = std::mem::replace(&mut last[track as usize], frame as u32);
+                is_blended |= before == frame as u32;
+                lengths.of_tracks[track as usize] += u32::from(before != frame as u32);
+            }
+            if is_blended {
+                lengths.blended.push(frame as u32);
+            }
+        }
+        Ok(lengths)
+    }
+
+    /// The tracks of the rows of a frame.
+    fn of_frame(&self, frame: usize) -> Result<Vec<u32>> {
+        let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
+        self.of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
+        if let Some(lives) = &self.lives {
+            tracks.iter_mut().for_each(|track| *track = lives[*track as usize]);
+        }
+        Ok(tracks)
+    }
+
+    /// Where each track is first.
+    fn first(&self) -> Vec<At> {
+        match &self.lives {
+            None => self.births.clone(),
+            // Lives are numbered by their beginnings.
+            Some(lives) => {
+                let mut first = Vec::with_capacity(self.count);
+                for (&life, &birth) in lives.iter().zip(&self.births) {
+                    if life as usize == first.len() {
+                        first.push(birth);
+                    }
+                }
+                first
+            }
+        }
     }
 
     /// The files.
@@ -130,9 +209,7 @@ impl Tracks {
 
     /// The rows of a frame by their tracks.
     pub(super) fn rows(&self, frame: usize) -> Result<Vec<Row>> {
-        let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
-        self.of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
-        let rows = tracks.into_iter().enumerate();
+        let rows = self.of_frame(frame)?.into_iter().enumerate();
         let mut rows: Vec<Row> = rows.map(|(row, track)| Row { track, row: row as u32 }).collect();
         rows.sort_unstable();
         Ok(rows)
@@ -140,7 +217,8 @@ impl Tracks {
 
     /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbours, so that where a
     /// block of them is not there yet, or no longer, nothing is written.
-    pub(super) fn pack(&self, mut held: Vec<At>, path: &Path) -> Result<()> {
+    pub(super) fn pack(&self, path: &Path) -> Result<()> {
+        let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
         let compression = Compression::Zstd(1);
         let mut writer = ContainerWriter::create(path, self.count, degree, FRAME_BLOCK, compression, BTreeMap::new())?;
@@ -220,7 +298,7 @@ impl FrameBlock<'_> {
                 }
             };
             ply.gather(&Ids::List(&rows), Columns::all(), &mut part)?;
-            scatter(&part, of_frame.iter().map(|&(_, i)| i), state);
+            scatter(&part, of_frame.iter().map(|&(_, i)| i).enumerate(), state);
         }
         Ok(())
     }
@@ -248,9 +326,9 @@ impl BlockReader for Reader<'_> {
             let rows = &rows[first..];
             let rows = &rows[..rows.partition_point(|row| (row.track as usize) < self.range.end)];
             self.state.opacity_logit.planes_mut().fill(NOT_THERE);
-            let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
-            self.block.files[self.next].gather(&Ids::List(&of_file), Columns::all(), &mut self.part)?;
-            scatter(&self.part, rows.iter().map(|row| row.track as usize - self.range.start), &mut self.state);
+            let firsts = read_rows(&self.block.files[self.next], rows, &mut self.part)?;
+            let places = firsts.iter().map(|&first| (first, rows[first].track as usize - self.range.start));
+            scatter(&self.part, places, &mut self.state);
             self.next += 1;
         }
         for column in want.iter() {
@@ -260,13 +338,31 @@ impl BlockReader for Reader<'_> {
     }
 }
 
-/// Writes the rows of `part` to the `places` of `state`.
-fn scatter(part: &Gaussians, places: impl Iterator<Item = usize> + Clone, state: &mut Gaussians) {
+/// Reads `rows`, which are by track, into `part`, those of one track blended in the place of the first; gives the first of
+/// each.
+pub(super) fn read_rows(ply: &Ply, rows: &[Row], part: &mut Gaussians) -> Result<Vec<usize>> {
+    let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
+    ply.gather(&Ids::List(&of_file), Columns::all(), part)?;
+    let mut firsts = Vec::with_capacity(rows.len());
+    let mut at = 0;
+    for of_track in rows.chunk_by(|a, b| a.track == b.track) {
+        let together: Vec<usize> = (at..at + of_track.len()).collect();
+        if together.len() > 1 {
+            blend(part, &together);
+        }
+        firsts.push(at);
+        at += of_track.len();
+    }
+    Ok(firsts)
+}
+
+/// Writes rows of `part` to `state`, of each pair of `places` the first to the second.
+fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
     for column in Columns::all().iter() {
         let (from, to) = (part.column(column), state.column_mut(column));
         for c in 0..to.width() {
-            let to = to.plane_mut(c);
-            places.clone().zip(from.plane(c)).for_each(|(place, &value)| to[place] = value);
+            let (from, to) = (from.plane(c), to.plane_mut(c));
+            places.clone().for_each(|(row, place)| to[place] = from[row]);
         }
     }
 }

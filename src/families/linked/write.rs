@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use hashbrown::HashSet;
 use rayon::prelude::*;
 
 use super::Linked;
@@ -19,25 +20,32 @@ const NONE: u32 = u32::MAX;
 
 impl Linked {
     /// Writes every frame's file into `folder`. A merged Gaussian is there where one of its members is, in the row of the
-    /// first of them.
+    /// first of them; of several rows of a track there is one, in the place of the first.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
     pub(super) fn write_files(&self, reduction: &Reduction, folder: &Path) -> Result<()> {
         let (frames, result) = (self.tracks.frames(), merged(self, reduction));
-        let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
         let all = out_rows(reduction);
         let progress = Progress::new("emit", "frames", frames.paths().len() as u64);
         let write = |&frame: &usize| {
+            let of_frame = self.tracks.rows(frame)?;
             let mut row_of = vec![NONE; self.tracks.count()];
-            self.tracks.rows(frame)?.iter().for_each(|row| row_of[row.track as usize] = row.row);
-            let (mut rows, mut written) = (Vec::new(), Vec::new());
+            // Of several rows of a track the first.
+            of_frame.iter().rev().for_each(|row| row_of[row.track as usize] = row.row);
+            let several = of_frame.chunk_by(|a, b| a.track == b.track).filter(|of_track| of_track.len() > 1);
+            let blended: HashSet<u32> = several.map(|of_track| of_track[0].track).collect();
+            let (mut rows, mut written, mut places) = (Vec::new(), Vec::new(), Vec::new());
             for (place, row) in all.iter().enumerate() {
                 let members = row.proxy.map_or(&[][..], |proxy| &reduction.clusters[proxy as usize].members[..]);
                 let tracks = [row.source].into_iter().chain(members.iter().map(|member| member.0));
                 if let Some(source) = tracks.map(|track| row_of[track as usize]).find(|&row| row != NONE) {
-                    rows.push(OutRow { source, proxy: row.proxy });
+                    let is_made = row.proxy.is_some() || blended.contains(&row.source);
+                    rows.push(OutRow { source, proxy: is_made.then_some(places.len() as u32) });
                     written.push(place as u32);
+                    if is_made {
+                        places.push(place as u32);
+                    }
                 }
             }
             let mut proxies = Gaussians::zeros(0, self.info.sh_degree);
