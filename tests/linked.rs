@@ -4,9 +4,7 @@ mod scene;
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Write;
 use std::path::PathBuf;
-use std::process::{Command, Output, Stdio};
 
 use scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
 use splatsieve::families::Link;
@@ -353,19 +351,6 @@ fn stream(frames: &[Gaussians]) -> Vec<u8> {
     bytes
 }
 
-fn piped(workplace: &Workplace, arguments: &str, stdin: &[u8]) -> Output {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));
-    command.current_dir(workplace.path("")).args(arguments.split_whitespace());
-    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    let mut pipe = child.stdin.take().unwrap();
-    let bytes = stdin.to_owned();
-    // It may stop reading early: then the rest has nowhere to go.
-    let writer = std::thread::spawn(move || drop(pipe.write_all(&bytes)));
-    let output = child.wait_with_output().unwrap();
-    writer.join().unwrap();
-    output
-}
-
 #[test]
 fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
     let workplace = Workplace::new();
@@ -375,7 +360,7 @@ fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
     }
     let bytes = stream(&frames);
     let run = |arguments: &str| {
-        let output = piped(&workplace, arguments, &bytes);
+        let output = workplace.piped(arguments, &bytes);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         String::from_utf8(output.stdout).unwrap()
     };
@@ -408,7 +393,7 @@ fn a_stream_that_breaks_off_or_has_no_frame_leaves_nothing() {
     ] {
         for verb in ["pack - -o out.gseq --scratch-dir .", "compress - -o out.gseq --scratch-dir . --target-ratio 0.5"]
         {
-            let output = piped(&workplace, verb, bytes);
+            let output = workplace.piped(verb, bytes);
             let said = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(output.status.code() == Some(1) && said.contains(part), "{part}: {said}");
             assert!(lasting_files(&workplace.path("")).is_empty(), "{part}");

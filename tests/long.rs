@@ -8,7 +8,7 @@ mod scene;
 use std::fs;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Output};
 
 use scene::Workplace;
 use splatsieve::emit::frame_stream::StreamWriter;
@@ -62,12 +62,7 @@ fn piped(workplace: &Workplace, arguments: &str, walk: Walk) -> Output {
     let program = std::env::var_os("SPLATSIEVE_PROGRAM");
     let mut command = Command::new(program.map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from));
     command.current_dir(workplace.path("")).args(arguments.split_whitespace());
-    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    let pipe = child.stdin.take().unwrap();
-    let writer = std::thread::spawn(move || walk.write(pipe));
-    let output = child.wait_with_output().unwrap();
-    writer.join().unwrap();
-    output
+    scene::piped(&mut command, move |pipe| walk.write(pipe))
 }
 
 /// Runs the program without an input.

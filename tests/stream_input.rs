@@ -10,30 +10,14 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use gseq::{Reader, TileId};
-use scene::{Workplace, files, lasting_files, state, tiny};
+use scene::{Workplace, files, lasting_files, state};
 use splatsieve::ingest::container::Container;
 use splatsieve::source::FrameSource;
 
 fn splatsieve(workplace: &Workplace, arguments: &str) -> Command {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));
-    let tiny = tiny().display().to_string();
-    command
-        .current_dir(workplace.path(""))
-        .args(arguments.split_whitespace().map(|word| word.replace("{tiny}", &tiny)));
+    let mut command = workplace.command(arguments);
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     command
-}
-
-/// Runs the program with `stdin` on its standard input.
-fn piped(workplace: &Workplace, arguments: &str, stdin: &[u8]) -> Output {
-    let mut child = splatsieve(workplace, arguments).spawn().unwrap();
-    let mut pipe = child.stdin.take().unwrap();
-    let bytes = stdin.to_owned();
-    // It may stop reading early: then the rest has nowhere to go.
-    let writer = std::thread::spawn(move || drop(pipe.write_all(&bytes)));
-    let output = child.wait_with_output().unwrap();
-    writer.join().unwrap();
-    output
 }
 
 fn done(output: Output) -> Vec<u8> {
@@ -43,7 +27,7 @@ fn done(output: Output) -> Vec<u8> {
 
 /// The tiny model as a stream.
 fn streamed(workplace: &Workplace) -> Vec<u8> {
-    done(piped(workplace, "unpack {tiny} --stream", b""))
+    done(workplace.piped("unpack {tiny} --stream", b""))
 }
 
 /// Names of everything in a folder that is no result: hidden ones, and those of scratch files.
@@ -55,7 +39,7 @@ fn left_over(folder: &Path) -> Vec<PathBuf> {
 fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
-    done(piped(&workplace, "pack - -o packed.gseq", &stream));
+    done(workplace.piped("pack - -o packed.gseq", &stream));
     // The frames are scanned once, as they arrive, and all pictures are looked at then; only the end tells which a
     // hundred are spread evenly.
     let (as_it_arrives, at_the_end): (&[&str], &[&str]) = (&["receive", "score"], &["receive", "visible", "score"]);
@@ -78,7 +62,7 @@ fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
         for threads in [1, 3] {
             let arguments = format!("compress - -o {name}{threads}.gseq {rest} --threads {threads} --json");
             let summary: serde_json::Value =
-                serde_json::from_slice(&done(piped(&workplace, &arguments, &stream))).unwrap();
+                serde_json::from_slice(&done(workplace.piped(&arguments, &stream))).unwrap();
             for (ending, expected) in [".gseq", ".gseq.recipe.toml", ".gseq.index_map.npy"].iter().zip(&expected) {
                 let found = fs::read(workplace.path(&format!("{name}{threads}{ending}"))).unwrap();
                 assert!(found == *expected, "{name}{ending} on {threads} threads");
@@ -96,7 +80,7 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
     let bounds = "--max-error position=2e-3,sh=1e-2";
-    done(piped(&workplace, &format!("pack - -o stream.gseq {bounds}"), &stream));
+    done(workplace.piped(&format!("pack - -o stream.gseq {bounds}"), &stream));
     workplace.done(&format!("pack {{tiny}} -o file.gseq {bounds}"));
     let [stream_of, file] =
         ["stream", "file"].map(|name| Reader::open(workplace.path(&format!("{name}.gseq"))).unwrap());
@@ -105,9 +89,9 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
         assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
     }
     // Raw tiles and what says where they lie.
-    let larger = String::from_utf8(done(piped(&workplace, "pack - -o raw.gseq --raw", &stream))).unwrap();
+    let larger = String::from_utf8(done(workplace.piped("pack - -o raw.gseq --raw", &stream))).unwrap();
     assert!(larger.contains(&format!("bytes of {}: the input holds its values in fewer", stream.len())), "{larger}");
-    let refused = piped(&workplace, "pack - -o x.gseq --max-error position=1%", &stream);
+    let refused = workplace.piped("pack - -o x.gseq --max-error position=1%", &stream);
     let message = String::from_utf8_lossy(&refused.stderr);
     assert!(refused.status.code() == Some(2) && message.contains("expected scene units"), "{message}");
     assert!(!workplace.path("x.gseq").exists());
@@ -117,9 +101,9 @@ fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger
 fn rows_of_a_stream_are_those_of_the_packed_frames() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
-    done(piped(&workplace, "pack - -o packed.gseq", &stream));
+    done(workplace.piped("pack - -o packed.gseq", &stream));
     workplace.done("score packed.gseq --cameras {tiny} -o expected.npz");
-    done(piped(&workplace, "score - --cameras {tiny} -o found.npz", &stream));
+    done(workplace.piped("score - --cameras {tiny} -o found.npz", &stream));
     assert!(fs::read(workplace.path("expected.npz")).unwrap() == fs::read(workplace.path("found.npz")).unwrap());
 }
 
@@ -143,9 +127,9 @@ fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
 fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
     let workplace = Workplace::new();
     let stream = retimed(&streamed(&workplace), |frame| (frame * frame) as f64);
-    done(piped(&workplace, "pack - -o packed.gseq", &stream));
+    done(workplace.piped("pack - -o packed.gseq", &stream));
     workplace.done("compress packed.gseq -o expected");
-    let output = done(piped(&workplace, "compress - -o found", &stream));
+    let output = done(workplace.piped("compress - -o found", &stream));
     assert!(String::from_utf8_lossy(&output).contains("not evenly spaced"), "{}", String::from_utf8_lossy(&output));
     assert!(lasting_files(&workplace.path("expected")) == lasting_files(&workplace.path("found")));
 }
@@ -154,13 +138,13 @@ fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
 fn what_is_unpacked_as_a_stream_packs_to_the_same_frames_and_chains() {
     let workplace = Workplace::new();
     workplace.done("pack {tiny} -o a.gseq");
-    let stream = done(piped(&workplace, "unpack a.gseq --stream", b""));
-    done(piped(&workplace, "pack - -o b.gseq", &stream));
+    let stream = done(workplace.piped("unpack a.gseq --stream", b""));
+    done(workplace.piped("pack - -o b.gseq", &stream));
     let [a, b] = ["a.gseq", "b.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
     assert_eq!(a.info(), b.info());
     assert!((0..10).all(|frame| state(&a, frame) == state(&b, frame)));
-    assert!(done(piped(&workplace, "unpack - --stream", &stream)) == stream, "a stream of a stream is that stream");
-    done(piped(&workplace, "unpack - -o frames", &stream));
+    assert!(done(workplace.piped("unpack - --stream", &stream)) == stream, "a stream of a stream is that stream");
+    done(workplace.piped("unpack - -o frames", &stream));
     workplace.done("unpack a.gseq -o expected");
     assert!(lasting_files(&workplace.path("frames")) == lasting_files(&workplace.path("expected")));
 
@@ -174,7 +158,7 @@ fn what_is_unpacked_as_a_stream_packs_to_the_same_frames_and_chains() {
     workplace.done("compress a.gseq -o d.gseq --cameras {tiny}");
     // Recipes differ in the digest of their inputs.
     assert!(fs::read(workplace.path("c.gseq")).unwrap() == fs::read(workplace.path("d.gseq")).unwrap());
-    let info = String::from_utf8(done(piped(&workplace, "info -", &stream))).unwrap();
+    let info = String::from_utf8(done(workplace.piped("info -", &stream))).unwrap();
     assert!(info.contains("frame stream") && info.contains("10 frames"), "{info}");
 }
 
@@ -184,7 +168,7 @@ fn broken_streams_end_in_an_error_and_leave_nothing() {
     let stream = streamed(&workplace);
     let refused = |arguments: &str, stdin: &[u8], code: i32, part: &str| {
         let before = files(&workplace.path(""));
-        let output = piped(&workplace, arguments, stdin);
+        let output = workplace.piped(arguments, stdin);
         let message = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(code), "{arguments}: {message}");
         assert!(message.contains(part), "{arguments}: {part:?} is not in {message:?}");
@@ -242,7 +226,7 @@ fn what_a_killed_run_leaves_is_gone_after_the_next_one() {
         child.wait().unwrap();
         assert!(!workplace.path("out").exists());
         assert!(!left_over(&folder).is_empty(), "a kill leaves the scratch file");
-        done(piped(&workplace, &format!("{next}{flag}"), &stream));
+        done(workplace.piped(&format!("{next}{flag}"), &stream));
         assert!(left_over(&folder).is_empty());
     }
 }

@@ -89,8 +89,8 @@ fn foretell(
     Ok(())
 }
 
-/// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that beside the frames
-/// held. Gives the statistics if what was assumed held.
+/// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that
+/// beside the frames held. Gives the statistics if what was assumed held.
 fn receive_measured<S: Stages>(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,

@@ -10,7 +10,7 @@ use crate::model::{Column, Gaussians};
 
 /// r and q of lives that may be one, and of those that are one to the eye.
 const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, missing: true };
-const TWINS: Round = Round { reach: 1.0, strictness: 1.0, missing: true };
+const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, missing: true };
 /// How much larger one may be, as a natural log: no other is looked for in the grid.
 const MOST_LARGER: f32 = std::f32::consts::LN_2 / 2.0;
 /// Frames that both lives may be there together: one fades out while the other fades in.
@@ -18,7 +18,7 @@ const TOGETHER: u8 = 4;
 
 /// How alike lives must be to be one: so that they may be, and so that they are to the eye. What the second takes the first
 /// does too.
-const RULES: [&Round; 2] = [&ALIKE, &TWINS];
+const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 
 /// Watches a [`Linker`] for lives that are one.
 pub struct Joiner([Lives; 2]);
@@ -43,7 +43,7 @@ struct Pair {
     /// Frames that both were there.
     together: u8,
     /// Whether they were one to the eye in all of these.
-    are_twins: bool,
+    are_close: bool,
     /// Whether the other has ended.
     has_ended: bool,
 }
@@ -97,9 +97,9 @@ impl Joiner {
             for (lives, offers) in self.0.iter_mut().zip(offers) {
                 lives.pairs.extend(offers.iter().map(|offer| {
                     let other = &old[offer.point as usize];
-                    let are_twins = cost(&looks[offer.point as usize], look, &TWINS) <= 1.0;
+                    let are_close = cost(&looks[offer.point as usize], look, &CLOSE) <= 1.0;
                     let together = u8::from(other.ago == 1);
-                    Pair { track: *track, other: other.number, cost: offer.cost, together, are_twins, has_ended: false }
+                    Pair { track: *track, other: other.number, cost: offer.cost, together, are_close, has_ended: false }
                 }));
             }
         }
@@ -124,14 +124,14 @@ impl Lives {
                 true
             }
             (Some(_), None) => {
-                if pair.are_twins {
+                if pair.are_close {
                     within.push(*pair);
                 }
                 false
             }
             (Some(a), Some(b)) if a.ago == 1 && b.ago == 1 => {
                 pair.together += 1;
-                pair.are_twins &= cost(&a.look, &b.look, &TWINS) <= 1.0;
+                pair.are_close &= cost(&a.look, &b.look, &CLOSE) <= 1.0;
                 pair.together <= TOGETHER && cost(&a.look, &b.look, rule) <= 1.0
             }
             _ => true,
@@ -172,7 +172,7 @@ impl Lives {
         let living = linker.living();
         self.pairs.retain_mut(|pair| {
             let other = living.binary_search_by_key(&pair.other, |track| track.number);
-            pair.has_ended = pair.are_twins || other.is_err() || other.is_ok_and(|at| living[at].ago > 1);
+            pair.has_ended = pair.are_close || other.is_err() || other.is_ok_and(|at| living[at].ago > 1);
             pair.has_ended
         });
         self.settle();
@@ -196,11 +196,7 @@ fn cost(a: &Look, b: &Look, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MOST_LARGER {
         return f32::INFINITY;
     }
-    let unit = rule.reach * a.size.min(b.size);
-    let distance: f32 = (0..3).map(|c| (a.position[c] - b.position[c]).powi(2)).sum();
-    let apart = distance / (unit * unit);
-    // Most of those in its cells are too far away.
-    if apart > 1.0 { f32::INFINITY } else { apart + rule.strictness * a.unlike_but_opacity(b) }
+    a.apart(b, rule.reach, rule.strictness)
 }
 
 /// Writes to row `rows[0]` of `state` what all of `rows` are together: opacity 1 − Π(1 − αᵢ), all else the mean of what they

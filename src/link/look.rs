@@ -77,13 +77,20 @@ impl Look {
 
     /// Whether both are one to the eye, but for their opacity: in the same place by what the first round calls it.
     pub(super) fn is_twin(&self, other: &Look) -> bool {
-        let reach = TWIN_REACH * self.size.min(other.size);
-        let apart = squared(&self.position, &other.position) / (reach * reach);
-        apart + TWIN_STRICTNESS * self.unlike_but_opacity(other) <= 1.0
+        self.apart(other, TWIN_REACH, TWIN_STRICTNESS) <= 1.0
+    }
+
+    /// |x_b − x_a|² / (r·min(s_a, s_b))² + q·A of the [module](super), opacities aside, with r the `reach` and q the
+    /// `strictness`; more than 1 where that is too much, whatever it is.
+    pub(super) fn apart(&self, other: &Look, reach: f32, strictness: f32) -> f32 {
+        let unit = reach * self.size.min(other.size);
+        let apart = squared(&self.position, &other.position) / (unit * unit);
+        // Most of those in the cells of a grid are too far away.
+        if apart > 1.0 { apart } else { apart + strictness * self.unlike_but_opacity(other) }
     }
 
     /// A without opacities.
-    pub(super) fn unlike_but_opacity(&self, other: &Look) -> f32 {
+    fn unlike_but_opacity(&self, other: &Look) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
             + squared(&self.shape, &other.shape) / (SHAPE_UNIT * SHAPE_UNIT)

@@ -24,18 +24,17 @@
 //!    what they would cost the other way round, the largest of all that its track named instead and all that named its
 //!    Gaussian; ½ where that makes no difference, and about what is found in trained models whose links are known. Twins
 //!    are no rivals: |x_b − x_a|² / (¼·min(s_a, s_b))² + 4·A ≤ 1, opacities aside. Which of them is which nobody sees, and
-//!    where one fades out while the other fades in they are one. By
-//!    strangers: ¼·k·C^{3/2}, at most ½, for a cost C where tracks name k Gaussians too many in the mean of the round: of
+//!    where one fades out while the other fades in they are one.
+//!    By strangers: ¼·k·C^{3/2}, at most ½, for a cost C where tracks name k Gaussians too many in the mean of the round: of
 //!    strangers that lie evenly so many cost as little. The least likely links are given up, and begin new tracks, until of
 //!    those left no more than one in two hundred is expected to be wrong ([`Linked::doubtful`]).
 //! 5. Where less than a quarter goes on, of at least 16, everything has moved at once: a cut, at which all tracks end.
-//!
 //! 6. Lives that are one ([`Joiner`]). A track that begins where another is, or would be, names the four that cost least by
 //!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A without opacities, at most 1, with r = 4 and q = 1/16 (alike) or r = q = 1
-//!    (twins), and sizes within a factor of √2. Both may be there together for four frames, in each of which that holds: one fades out while the other fades
-//!    in. When the cheapest that is left has ended, the track goes on from it, by cost, each end and each beginning once. A
-//!    track that ends within these frames while the other goes on was part of it, if they were twins. Where several tracks
-//!    of a life are there together they are [blended](blend).
+//!    (close), and sizes within a factor of √2. Both may be there together for four frames, in each of which that holds: one
+//!    fades out while the other fades in. When the cheapest that is left has ended, the track goes on from it, by cost, each
+//!    end and each beginning once. A track that ends within these frames while the other goes on was part of it, if they
+//!    were close. Where several tracks of a life are there together they are [blended](blend).
 //!
 //! Tracks are numbered by their births, those of one frame by its order. What is not a number is never compared: it goes on
 //! if it is repeated only. Colours are compared without harmonics, which turn with the Gaussian.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Write;
+use std::io::{Stdin, Write};
 use std::ops::Range;
 use std::path::Path;
 
@@ -25,7 +25,7 @@ use crate::families::stream::pack_stream;
 use crate::families::trajectories::write_sequence;
 use crate::families::{self, ColumnInfo, Family, Size, Timing};
 use crate::ingest::container::Container;
-use crate::ingest::frame_stream::StreamHeader;
+use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::model::Columns;
 use crate::scene::{InputOptions, Opened, first_box, kept_work, link_stream, open_input, open_stream, room_to_pack};
@@ -78,29 +78,9 @@ impl Storing {
 pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
     check_container_name(output, "pack")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
-    let stream = input.is_stream().then(|| open_stream(input)).transpose()?;
-    let (numbered, unlinked) = match stream {
-        Some(stream) if stream.header().is_unlinked => (None, Some(stream)),
-        other => (other, None),
-    };
-    if let Some(stream) = numbered {
-        let packing = storing.packing(|| {
-            let message =
-                "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
-            Err(Error::usage(message))
-        })?;
-        let staged = StagedFile::new(output, overwrite)?;
-        let mut room = room_to_pack(input, stream.header())?;
-        let received = pack_stream(stream, staged.path(), packing, |held| room.admit(held.len()))?;
-        let container = Container::open(staged.path())?;
-        let (gaussians, frames) = (container.info().count, container.info().times.len());
-        let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
-        staged.commit()?;
-        let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
-        return Ok(Packed { gaussians, frames, bytes, larger, notes: Vec::new() });
-    }
-    let opened = match unlinked {
-        Some(stream) => link_stream(stream, input, None)?,
+    let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
+        Some(stream) if stream.header().is_unlinked => link_stream(stream, input, None)?,
+        Some(stream) => return pack_arriving(stream, input, output, storing, overwrite),
         None => open_input(input)?,
     };
     let source = opened.input.source();
@@ -133,6 +113,29 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
     let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
     let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
     Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, larger, notes })
+}
+
+/// Packs a stream of numbered Gaussians as it arrives.
+fn pack_arriving(
+    stream: FrameStream<Stdin>,
+    input: &InputOptions,
+    output: &Path,
+    storing: &Storing,
+    overwrite: Replace,
+) -> Result<Packed> {
+    let packing = storing.packing(|| {
+        let message = "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
+        Err(Error::usage(message))
+    })?;
+    let staged = StagedFile::new(output, overwrite)?;
+    let mut room = room_to_pack(input, stream.header())?;
+    let received = pack_stream(stream, staged.path(), packing, |held| room.admit(held.len()))?;
+    let container = Container::open(staged.path())?;
+    let (gaussians, frames) = (container.info().count, container.info().times.len());
+    let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+    staged.commit()?;
+    let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
+    Ok(Packed { gaussians, frames, bytes, larger, notes: Vec::new() })
 }
 
 /// Writes any input as a frame stream; gives the input.

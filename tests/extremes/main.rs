@@ -62,7 +62,7 @@ use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::io::{BufWriter, Write};
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::Output;
 
 use scene::Workplace;
 use splatsieve::emit::frame_stream::StreamWriter;
@@ -100,14 +100,7 @@ type Rows = BTreeMap<String, Vec<f64>>;
 
 /// Runs the program with `stdin` on its standard input, written while it runs: it may stop reading early.
 fn piped(workplace: &Workplace, arguments: &str, write: impl FnOnce(&mut dyn Write) + Send + 'static) -> Output {
-    let mut command = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));
-    command.current_dir(workplace.path("")).args(arguments.split_whitespace());
-    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    let pipe = child.stdin.take().unwrap();
-    let writer = std::thread::spawn(move || write(&mut BufWriter::new(pipe)));
-    let output = child.wait_with_output().unwrap();
-    writer.join().unwrap();
-    output
+    scene::piped(&mut workplace.command(arguments), move |pipe| write(&mut BufWriter::new(pipe)))
 }
 
 /// A sequence made frame by frame, for the program to read as a stream.

@@ -6,7 +6,10 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::{self, ChildStdin, Output, Stdio};
+use std::thread;
 
 use assert_cmd::Command;
 use splatsieve::model::{Columns, Gaussians};
@@ -20,11 +23,21 @@ pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
+/// Runs `command`, to whose standard input `write` writes meanwhile.
+pub(crate) fn piped(command: &mut process::Command, write: impl FnOnce(ChildStdin) + Send + 'static) -> Output {
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let pipe = child.stdin.take().unwrap();
+    let writer = thread::spawn(move || write(pipe));
+    let output = child.wait_with_output().unwrap();
+    writer.join().unwrap();
+    output
+}
+
 /// Runs `check_model_folder.py`; gives whether it accepts, and what it printed. `PYTHON` names another than python3.
 pub(crate) fn check_model_folder(original: &Path, compressed: &Path) -> (bool, String) {
     let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/check_model_folder.py");
-    let output = std::process::Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
+    let output = process::Command::new(&python).arg(script).args([original, compressed]).output().unwrap();
     let [complaints, text] = [&output.stderr, &output.stdout].map(|bytes| String::from_utf8_lossy(bytes));
     (output.status.success(), format!("{complaints}{text}"))
 }
@@ -109,6 +122,21 @@ impl Workplace {
             stdout: String::from_utf8(output.stdout).unwrap(),
             stderr: String::from_utf8(output.stderr).unwrap(),
         }
+    }
+
+    /// The program with these arguments, to be run here.
+    pub(crate) fn command(&self, arguments: &str) -> process::Command {
+        let mut command = process::Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));
+        let tiny = tiny().display().to_string();
+        command.current_dir(self.0.path()).args(arguments.split_whitespace().map(|word| word.replace("{tiny}", &tiny)));
+        command
+    }
+
+    /// Runs the program with `stdin` on its standard input.
+    pub(crate) fn piped(&self, arguments: &str, stdin: &[u8]) -> Output {
+        let bytes = stdin.to_owned();
+        // It may stop reading early: then the rest has nowhere to go.
+        piped(&mut self.command(arguments), move |mut pipe| drop(pipe.write_all(&bytes)))
     }
 
     /// Runs the program, which must succeed; gives its stdout.

@@ -1,14 +1,14 @@
 //! PLY frames that do not know one another: linked, packed into a container, and read from that.
 //!
 //! Every frame is read twice: to link it, then to pack its tracks. Lives that are one become one track, where pictures with
-//! them stay within 40 dB of those without: of twins alone where that is not so of all that are alike. A track that is not
-//! there in a frame is held as it was, or as it will be first, with an opacity of nothing, so that it is seen nowhere and
-//! costs next to nothing.
+//! them stay within 40 dB of those without: of the close ones alone where that is not so of all that are alike. A track
+//! that is not there in a frame is held as it was, or as it will be first, with an opacity of nothing, so that it is seen
+//! nowhere and costs next to nothing.
 //!
 //! Memory of opening: two frames and what [`Linker`](crate::link::Linker) keeps, 18 bytes for each track and four times 20
 //! for each that began in the last few frames; 12 more per track to join lives, and a few pictures; then, while packing, 8
-//! bytes per track, 12 per Gaussian of a block of frames, and a tile of every column and thread. On the disk, in a file without a name,
-//! 4 bytes per Gaussian and frame, beside the container.
+//! bytes per track, 12 per Gaussian of a block of frames, and a tile of every column and thread. On the disk, in a file
+//! without a name, 4 bytes per Gaussian and frame, beside the container.
 
 mod arrival;
 mod lives;

@@ -346,9 +346,8 @@ pub(super) fn read_rows(ply: &Ply, rows: &[Row], part: &mut Gaussians) -> Result
     let mut firsts = Vec::with_capacity(rows.len());
     let mut at = 0;
     for of_track in rows.chunk_by(|a, b| a.track == b.track) {
-        let together: Vec<usize> = (at..at + of_track.len()).collect();
-        if together.len() > 1 {
-            blend(part, &together);
+        if of_track.len() > 1 {
+            blend(part, &Vec::from_iter(at..at + of_track.len()));
         }
         firsts.push(at);
         at += of_track.len();
