@@ -60,6 +60,21 @@ impl Gradients {
         self.sums.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
     }
 
+    /// Makes the sums of the Gaussians `rows` those of `of`, in that order.
+    ///
+    /// # Panics
+    /// If `of` has other columns or another number of Gaussians, or there is no such row.
+    pub fn set_rows(&mut self, rows: &[u32], of: &Gradients) {
+        for column in self.columns.iter() {
+            let (from, to) = (of.column(column), self.sums.column_mut(column));
+            for c in 0..to.width() {
+                let (from, to) = (from.plane(c), to.plane_mut(c));
+                assert_eq!(from.len(), rows.len(), "a row for each");
+                rows.iter().zip(from).for_each(|(&row, sum)| to[row as usize] = *sum);
+            }
+        }
+    }
+
     /// The sums of `len` consecutive Gaussians each, the last fewer: for threads to add to.
     ///
     /// # Panics

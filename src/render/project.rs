@@ -20,6 +20,8 @@ const DILATION: f64 = 0.3;
 const FIELD_MARGIN: f64 = 1.3;
 /// Logarithms of scales and logits are cut to ± this: squares of squares of scales stay finite in f64.
 pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
+/// Below this logit an opacity, .0025, is less than [`MIN_ALPHA`].
+const LEAST_LOGIT: f32 = -6.0;
 /// Slack of the alpha bound in powers of two: thousands of times the rounding of the blend's exponent.
 const REACH_SLACK: f64 = 1e-3;
 
@@ -142,6 +144,10 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloure
     let mut colours: Colours = [[0.0; BLOCK]; 3];
     for start in ids.clone().step_by(BLOCK) {
         let block = start..(start + BLOCK).min(ids.end);
+        let logits = &gaussians.opacity_logit.plane(0)[block.clone()];
+        if logits.iter().all(|&logit| logit < LEAST_LOGIT) {
+            continue;
+        }
         let before = out.splats.len();
         footprints.fill(gaussians, block.clone(), view);
         for i in 0..block.len() {

@@ -64,6 +64,14 @@ impl RemovalError {
         self.sum.iter_mut().zip(&other.sum).for_each(|(sum, other)| *sum = sum.saturating_add(*other));
     }
 
+    /// Adds what `other` found of the Gaussians `rows` alone, in that order.
+    pub fn merge_rows(&mut self, rows: &[u32], other: &RemovalError) {
+        for (&row, other) in rows.iter().zip(&other.sum) {
+            let sum = &mut self.sum[row as usize];
+            *sum = sum.saturating_add(*other);
+        }
+    }
+
     /// Adds one tile's error of Gaussian `i`.
     pub(super) fn add(&mut self, i: usize, error: f32) {
         let units = (f64::from(error) * (1.0 / Self::UNIT) + 0.5) as u64;

@@ -31,8 +31,6 @@ pub struct ScanPlan {
     pub(super) steps: Vec<f64>,
     pub(super) frames: usize,
     pub(super) pairs: u32,
-    /// Whether there is any camera to project to.
-    pub(super) projects: bool,
     pub(super) coverage_exponent: i32,
 }
 
@@ -91,7 +89,6 @@ impl ScanPlan {
             steps: Vec::new(),
             frames: 0,
             pairs: 0,
-            projects: !cameras.is_empty(),
             coverage_exponent: coverage_exponent(image_px),
         }
     }

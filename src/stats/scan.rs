@@ -6,7 +6,7 @@ use super::life::Life;
 use super::motion::Motion;
 use super::plan::{PAIRS_PER_CARRY, ScanPlan};
 use super::projection::{Footprints, Scale, Sums, project};
-use super::state::State;
+use super::state::{CHUNK, State};
 use crate::model::{Camera, Columns, Flags, Gaussians, Rows};
 
 /// Resident bytes of a [`BlockScan`] per Gaussian, whatever the number of frames.
@@ -16,9 +16,8 @@ pub const BYTES_PER_GAUSSIAN: usize = State::BYTES_PER_GAUSSIAN
     + size_of::<u64>()
     + 2 * size_of::<u32>();
 
-/// Gaussians projected at a time: about 108 bytes each, so that every view of a frame but the first
-/// finds them in the first-level cache.
-const CHUNK: usize = 256;
+/// Opacities below this, 2⁻⁵³, add nothing to a coverage sum, as a picture has fewer than 2⁵² units.
+const NOTHING: f64 = 0.5 * f64::EPSILON;
 
 /// Bits of a coverage sum that stay when it is carried: 2³² pairs of at most 2⁵¹ leave 2³¹ above them.
 const CARRY_BITS: u32 = 52;
@@ -138,7 +137,7 @@ impl<'a> BlockScan<'a> {
     /// State, life and motion; inlined, with the loops it calls, into each instruction set's copy.
     #[inline(always)]
     fn advance_plainly(&mut self, t: usize, gaussians: &Gaussians, changed: Columns) {
-        self.state.update(gaussians, changed, self.plan.projects);
+        self.state.update(gaussians, changed);
         let alpha_min = self.plan.alpha_min;
         // The first frame is what the others may be like; named or not, its opacities are new.
         self.steady &= t == 0 || !changed.contains(Columns::OPACITY);
@@ -155,6 +154,11 @@ impl<'a> BlockScan<'a> {
         let len = self.coverage.len();
         for start in (0..len).step_by(CHUNK) {
             let range = start..len.min(start + CHUNK);
+            let opacity = &self.state.opacity[range.clone()];
+            if opacity.iter().all(|&opacity| opacity < scale.alpha_min.min(NOTHING)) {
+                continue;
+            }
+            self.state.turn(gaussians, range.clone());
             let from = Footprints {
                 position: std::array::from_fn(|axis| &gaussians.position.plane(axis)[range.clone()]),
                 axes: std::array::from_fn(|plane| &self.state.axes[plane][range.clone()]),

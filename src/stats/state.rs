@@ -2,6 +2,7 @@
 //! only columns that changed are decoded again.
 
 use std::mem::size_of;
+use std::ops::Range;
 
 use crate::model::{self, Column, Columns, Flags, Gaussians};
 
@@ -9,12 +10,18 @@ use crate::model::{self, Column, Columns, Flags, Gaussians};
 /// already covers every picture whole.
 const MAX_LOG_SCALE: f64 = 100.0;
 
+/// Gaussians projected at a time: about 108 bytes each, so that every view of a frame but the first
+/// finds them in the first-level cache.
+pub(super) const CHUNK: usize = 256;
+
 /// Decoded state of a block at the current frame.
 pub(super) struct State {
     /// Opacity in [0, 1].
     pub(super) opacity: Vec<f64>,
-    /// R·S, plane 3·row + axis.
+    /// R·S, plane 3·row + axis; of a chunk when it was last turned.
     pub(super) axes: [Vec<f64>; 9],
+    /// Whether R or S of a chunk have changed since.
+    turned: Vec<bool>,
     pub(super) flags: Vec<Flags>,
     /// Largest finite |coordinate| so far.
     pub(super) largest_coordinate: f32,
@@ -27,15 +34,16 @@ impl State {
         State {
             opacity: vec![0.0; len],
             axes: std::array::from_fn(|_| vec![0.0; len]),
+            turned: vec![false; len.div_ceil(CHUNK)],
             flags: vec![Flags::empty(); len],
             largest_coordinate: 0.0,
         }
     }
 
-    /// Takes over the columns `changed`, and flags what is odd in them. The axes are for projections only: without
-    /// `projected` they are left alone.
+    /// Takes over the columns `changed`, and flags what is odd in them. The axes are for projections only: they wait for
+    /// [`State::turn`].
     #[inline(always)]
-    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns, projected: bool) {
+    pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns) {
         for column in changed.iter() {
             let values = gaussians.column(column);
             let largest = largest_magnitude(values.planes());
@@ -55,8 +63,8 @@ impl State {
         if changed.contains(Columns::ROTATION) {
             self.flag_zero_rotation(&gaussians.rotation);
         }
-        if projected && changed.intersects(Columns::ROTATION | Columns::LOG_SCALE) {
-            self.update_axes(gaussians);
+        if changed.intersects(Columns::ROTATION | Columns::LOG_SCALE) {
+            self.turned.fill(true);
         }
     }
 
@@ -78,8 +86,12 @@ impl State {
         }
     }
 
-    fn update_axes(&mut self, gaussians: &Gaussians) {
-        for i in 0..self.flags.len() {
+    /// Brings the axes of a chunk up to the state of `gaussians`.
+    pub(super) fn turn(&mut self, gaussians: &Gaussians, chunk: Range<usize>) {
+        if !std::mem::take(&mut self.turned[chunk.start / CHUNK]) {
+            return;
+        }
+        for i in chunk {
             let mut quaternion = gaussians.rotation.row::<4>(i).map(f64::from);
             if quaternion == [0.0; 4] {
                 quaternion = [1.0, 0.0, 0.0, 0.0];
@@ -94,7 +106,7 @@ impl State {
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let State { opacity, axes, flags, largest_coordinate: _ } = self;
+        let State { opacity, axes, turned: _, flags, largest_coordinate: _ } = self;
         size_of_val(&opacity[..])
             + axes.iter().map(|plane| size_of_val(&plane[..])).sum::<usize>()
             + size_of_val(&flags[..])

@@ -581,11 +581,15 @@ mod tests {
     use super::*;
     use crate::compress::score::UserOverrides;
     use crate::compress::tests::{scene, score_scene};
+    use crate::demo;
+    use crate::emit::container::write_container;
+    use crate::ingest::container::Container;
     use crate::metrics::psnr;
-    use crate::model::{Rig, Split};
+    use crate::model::{Gaussians, Rig, SequenceInfo, Split};
     use crate::recipe::Recipe;
     use crate::render::render;
     use crate::scene::{InputOptions, open_scene};
+    use crate::source::{BlockReader, Ids};
     use crate::stream::gather_all;
     use crate::work::Asked;
 
@@ -710,6 +714,54 @@ mod tests {
             assert!(cuts > 1, "it was cut short {cuts} times");
             assert!(found == expected.change && !found.is_empty(), "field: {field}, cut short {cuts} times");
         }
+    }
+
+    /// A scene of which a third is there in any frame, and the others with that logit.
+    struct ShortLives(demo::Scene, SequenceInfo, f32);
+
+    struct Reader<'a>(Box<dyn BlockReader + 'a>, Vec<usize>, f32);
+
+    impl FrameSource for ShortLives {
+        fn info(&self) -> &SequenceInfo {
+            &self.1
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            let numbers = ids.iter().collect();
+            Ok(Box::new(Reader(self.0.open(ids)?, numbers, self.2)))
+        }
+    }
+
+    impl BlockReader for Reader<'_> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            self.0.read(frame, want, out)?;
+            if want.contains(Columns::OPACITY) {
+                let logits = out.opacity_logit.plane_mut(0).iter_mut().zip(&self.1);
+                logits.filter(|(_, id)| (*id + frame) % 3 > 0).for_each(|(logit, _)| *logit = self.2);
+            }
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn those_that_are_not_there_are_left_out_and_what_comes_out_is_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let [away, unseen] = [-40.0, -25.0].map(|logit| {
+            let made = demo::Scene::new(900, 6);
+            let (rig, info) = (made.rig(), SequenceInfo { varying: Columns::all(), ..made.info().clone() });
+            let path = folder.path().join("scene.gseq");
+            let source = ShortLives(made, info, logit);
+            write_container(&source, &path, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+            let input = Box::new(Container::open(&path).unwrap());
+            let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
+            let recipe = Recipe::preset("default").unwrap();
+            let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+            let reduction = Reduction::pruned(scored.ranked().take(600), &recipe.merge);
+            let few = Refine { steps: 100, cut_steps: 40, ..Refine::of(&recipe, None, true).unwrap() };
+            few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
+        });
+        assert!(!away.change.is_empty() && away.change == unseen.change);
+        assert_eq!(away.kept, unseen.kept);
     }
 
     #[test]

@@ -35,7 +35,8 @@ pub(super) const FOUND_EVERY: usize = 200;
 /// their Jacobians in between: a field and its derivative at every step take a third of the time and gain nothing
 /// (method.md, section 6.2).
 ///
-/// Memory: six states, [`Descent`], and a differentiated picture; on a scratch file a state for every frame shown.
+/// Memory: six states, [`Descent`], and a differentiated picture; on a scratch file a state for every frame shown, of those
+/// that are there if they are few.
 pub(super) struct Moving<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
@@ -114,7 +115,7 @@ impl<'a> Moving<'a> {
             let mut states = States::open(result, &wanted)?;
             let mut locals = Keeping::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
-                locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::none(of_state) })?;
+                locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::default() })?;
             }
             moving.locals = locals.finish()?;
         }
@@ -152,6 +153,7 @@ impl<'a> Moving<'a> {
         let mut locals = Keeping::new(&self.scene.scratch, self.varying)?;
         for &frame in &self.frames {
             let want = if locals.is_empty() { Columns::all() } else { self.varying };
+            self.now.there = None;
             deformation.state(frame, &self.stored, want, &mut self.now.state)?;
             self.now.jacobian = deformation.jacobian(frame, &self.stored, self.manner.columns)?;
             locals.push(&mut self.now)?;
@@ -229,7 +231,11 @@ impl<'a> Moving<'a> {
     /// Makes `now` what is at the frame in place `k` by now.
     fn show(&self, k: usize, now: &mut Local) -> Result<()> {
         self.locals.read(k, now)?;
-        now.jacobian.add_to(&self.descent.change().0, &mut now.state);
+        let change = self.descent.change();
+        match &now.there {
+            None => now.jacobian.add_to(&change.0, &mut now.state),
+            Some(there) => now.jacobian.add_to(&change.pick(there).0, &mut now.state),
+        }
         Ok(())
     }
 
@@ -251,10 +257,15 @@ impl<'a> Moving<'a> {
         let mut now = std::mem::take(&mut self.now);
         self.show(self.place(k), &mut now)?;
         self.gradients.clear();
-        let pull = |picture: &_| (0.0, self.manner.loss.slope(picture, &target));
-        let camera = self.targets.camera(k);
-        self.renderer.gradient(&now.state, camera, self.scene.background, pull, &mut self.gradients);
-        now.jacobian.pull_back(&mut self.gradients);
+        let Manner { columns, sh_degree, loss } = self.manner;
+        let mut of_those = now.there.as_ref().map(|there| Gradients::new(there.len(), columns, sh_degree));
+        let gradients = of_those.as_mut().unwrap_or(&mut self.gradients);
+        let pull = |picture: &_| (0.0, loss.slope(picture, &target));
+        self.renderer.gradient(&now.state, self.targets.camera(k), self.scene.background, pull, gradients);
+        now.jacobian.pull_back(gradients);
+        if let Some((there, gradients)) = now.there.as_ref().zip(of_those) {
+            self.gradients.set_rows(there, &gradients);
+        }
         self.descent.step(&self.gradients, schedule);
         self.now = now;
         Ok(())
@@ -282,7 +293,12 @@ impl<'a> Moving<'a> {
         let none = || (self.worker(), RemovalError::new(self.fixed.len(), contrast_floor));
         let of_picture = |((mut renderer, mut now), mut errors): ((Renderer, Local), RemovalError), &k: &usize| {
             self.show(self.place(k), &mut now)?;
-            renderer.removal_error(&now.state, self.targets.camera(k), self.scene.background, &mut errors);
+            let mut of_those = now.there.as_ref().map(|there| RemovalError::new(there.len(), contrast_floor));
+            let found = of_those.as_mut().unwrap_or(&mut errors);
+            renderer.removal_error(&now.state, self.targets.camera(k), self.scene.background, found);
+            if let Some((there, found)) = now.there.as_ref().zip(of_those) {
+                errors.merge_rows(there, &found);
+            }
             Ok::<_, Error>(((renderer, now), errors))
         };
         // Sums of integers: the order does not show.

@@ -1,0 +1,94 @@
+#!/usr/bin/env python3
+"""What a long sequence of short lives takes: frames of any order, linked and compressed within a budget of memory.
+
+    cargo build --release
+    python3 scripts/many_lives.py target/release/splatsieve [--frames 300] [--living 60000] [--life 9] [--memory 2GiB] [--folder DIR] [--with="--no-refine"]
+
+Makes PLY frames of so many Gaussians each, that live for so many frames in the mean, move, end, and begin elsewhere, in another
+order in every frame; the same for every run. Prints how many lives there are, how many tracks were found, the time and the
+largest resident set of the run, and whether that is within the budget. The frames are left in DIR if it is given, and taken
+from there if they are there. Needs numpy.
+"""
+
+import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+PROPERTIES += [f"scale_{c}" for c in range(3)] + [f"rot_{c}" for c in range(4)]
+
+
+def born(count, rng):
+    """Rows of new Gaussians, on and near a sphere, and how they move in a frame."""
+    rows = np.zeros((count, len(PROPERTIES)), np.float32)
+    towards = rng.standard_normal((count, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    rows[:, :3] = towards * rng.uniform(0.7, 1, (count, 1))
+    rows[:, 6:9] = rng.uniform(-1.5, 1.5, (count, 3))
+    rows[:, 9] = rng.uniform(-2, 4, count)
+    rows[:, 10:13] = rng.uniform(-6, -4.3, (count, 1)) + rng.uniform(-0.5, 0.5, (count, 3))
+    rows[:, 13:] = rng.standard_normal((count, 4))
+    return rows, rng.standard_normal((count, 3)).astype(np.float32) * 0.002
+
+
+def make(folder, frames, living, life):
+    """Writes the frames; gives the number of lives."""
+    rng = np.random.default_rng(2)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {living}\n"
+    header += "".join(f"property float {name}\n" for name in PROPERTIES) + "end_header\n"
+    rows, speed = born(living, rng)
+    left = rng.integers(1, 2 * life, living)
+    lives = living
+    for frame in range(frames):
+        (folder / f"frame_{frame:05}.ply").write_bytes(header.encode() + rows[rng.permutation(living)].tobytes())
+        left -= 1
+        ended = np.flatnonzero(left == 0)
+        rows[:, :3] += speed
+        rows[ended], speed[ended] = born(len(ended), rng)
+        left[ended] = rng.integers(1, 2 * life, len(ended))
+        lives += len(ended)
+    return lives
+
+
+def main():
+    parser = argparse.ArgumentParser(usage=plainly.usage(__doc__).strip())
+    parser.add_argument("binary", type=Path)
+    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--living", type=int, default=60_000)
+    parser.add_argument("--life", type=int, default=9)
+    parser.add_argument("--memory", default="2GiB")
+    parser.add_argument("--folder", type=Path)
+    parser.add_argument("--with", dest="extra", type=shlex.split, default=[])
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=args.folder and args.folder.parent) as scratch:
+        folder = args.folder or Path(scratch) / "frames"
+        if not folder.exists():
+            folder.mkdir()
+            print(f"{make(folder, args.frames, args.living, args.life):,} lives", flush=True)
+        out = Path(scratch) / "small"
+        command = [args.binary, "compress", folder, "-o", out, "--memory", args.memory, "--json", *args.extra]
+        start = time.monotonic()
+        process = subprocess.Popen([str(part) for part in command], stdout=subprocess.PIPE)
+        summary = process.stdout.read()
+        _, code, usage = os.wait4(process.pid, 0)
+        if code != 0:
+            raise SystemExit(f"splatsieve ended with {os.waitstatus_to_exitcode(code)}")
+        summary = json.loads(summary)
+        print(f"{summary['input']['gaussians']:,} tracks, {summary['gaussians']:,} of them kept")
+        print(f"{time.monotonic() - start:.0f} s, {usage.ru_utime + usage.ru_stime:.0f} s of processor")
+        print(f"{usage.ru_maxrss / 1024:.0f} MiB at most, {args.memory} allowed")
+        for note in summary.get("notes", []):
+            print(f"note: {note}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
