@@ -68,6 +68,11 @@ impl Change {
         picked
     }
 
+    /// Makes it so many times as much.
+    pub fn scale(&mut self, by: f32) {
+        self.0.columns_mut(Columns::all()).flat_map(Column::planes_mut).for_each(|x| *x *= by);
+    }
+
     /// This change and then `more`, whose harmonics are of no lower degree where both have some.
     pub fn and(self, mut more: Change) -> Change {
         for column in self.columns().iter() {
@@ -84,7 +89,7 @@ impl Change {
     /// What leads from `before` here.
     pub fn since(&self, before: &Change) -> Change {
         let mut back = before.clone();
-        back.0.columns_mut(Columns::all()).flat_map(Column::planes_mut).for_each(|x| *x = -*x);
+        back.scale(-1.0);
         back.and(self.clone())
     }
 
@@ -97,6 +102,57 @@ impl Change {
                     *value = if by == 0.0 { *value } else { *value + by };
                 }
             }
+        }
+    }
+}
+
+/// What is added beside a [`Change`], another amount at every time: these at times that lie evenly from the first frame to
+/// the last, and in between what lies on the straight line; none: nothing. All have the same columns.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Course(pub Vec<Change>);
+
+impl Course {
+    /// Which of `knots`, 2 or more, make up what is added at `frame` of `frames`, and with which weights.
+    pub fn weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
+        let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
+        let first = (along as usize).min(knots - 2);
+        let part = (along - first as f64) as f32;
+        [(first, 1.0 - part), (first + 1, part)]
+    }
+
+    /// Whether nothing is added.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// The columns that change.
+    pub fn columns(&self) -> Columns {
+        self.0.first().map_or(Columns::empty(), Change::columns)
+    }
+
+    /// What is added at `frame` of `frames`.
+    pub fn at(&self, frame: usize, frames: usize) -> Change {
+        if self.is_empty() {
+            return Change::default();
+        }
+        let [(first, before), (second, after)] = Course::weights(self.0.len(), frame, frames);
+        let [mut change, mut more] = [first, second].map(|knot| self.0[knot].clone());
+        change.scale(before);
+        more.scale(after);
+        change.and(more)
+    }
+
+    /// The course of the Gaussians at `places`, in that order.
+    pub fn pick(&self, places: &[u32]) -> Course {
+        Course(self.0.iter().map(|knot| knot.pick(places)).collect())
+    }
+
+    /// This course and then `more`, of as many knots if both have any.
+    pub fn and(self, more: Course) -> Course {
+        match (self.is_empty(), more.is_empty()) {
+            (_, true) => self,
+            (true, _) => more,
+            _ => Course(self.0.into_iter().zip(more.0).map(|(knot, more)| knot.and(more)).collect()),
         }
     }
 }
@@ -114,6 +170,8 @@ pub struct Reduction {
     pub proxies: Proxies,
     /// What is added to their parameters.
     pub change: Change,
+    /// And beside that along time, where their state stands in every frame and there are no proxies.
+    pub course: Course,
     /// How the field that deforms them is written, where there is one.
     pub field: Precision,
     /// Degree of the harmonics that stay of them; those above go, if there are any.
@@ -124,13 +182,13 @@ impl Reduction {
     /// The Gaussians `kept` (increasing) as they are, with their field and all of their harmonics. Nothing is merged, so
     /// that nothing goes by `rule`.
     pub fn pruned(kept: Vec<u32>, rule: &Merge) -> Self {
-        let (clusters, proxies, change) = (Vec::new(), Proxies::default(), Change::default());
         Reduction {
             kept,
-            clusters,
+            clusters: Vec::new(),
             rule: rule.clone(),
-            proxies,
-            change,
+            proxies: Proxies::default(),
+            change: Change::default(),
+            course: Course::default(),
             field: Precision::Exact,
             sh_degree: ALL_HARMONICS,
         }
@@ -171,8 +229,15 @@ impl Reduction {
     pub fn pick(&self, places: &[u32]) -> Reduction {
         assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
         let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
-        let (change, field, sh_degree) = (self.change.pick(places), self.field, self.sh_degree);
-        Reduction { change, field, sh_degree, ..Reduction::pruned(kept, &self.rule) }
+        let (change, course) = (self.change.pick(places), self.course.pick(places));
+        let (field, sh_degree) = (self.field, self.sh_degree);
+        Reduction { change, course, field, sh_degree, ..Reduction::pruned(kept, &self.rule) }
+    }
+
+    /// All that is added at `frame` of `frames`.
+    pub fn change_at(&self, frame: usize, frames: usize) -> Change {
+        // The course has no higher bands.
+        self.course.at(frame, frames).and(self.change.clone())
     }
 
     /// For every Gaussian of an input of `count` its place in the output, if it has one.
@@ -214,6 +279,32 @@ mod tests {
         change.pick(&[1, 0]).add_to(&mut state, Columns::all());
         assert_eq!((state.position.row(0), state.sh.row(1)), ([1.0, 0.0, -2.0], [0.5, 0.0, 0.25]));
         assert!(Change::default().is_empty() && !change.is_empty());
+    }
+
+    #[test]
+    fn a_course_goes_through_its_knots_and_straight_in_between() {
+        let knot = |x: f32, logit: f32| {
+            let mut by = Gaussians::zeros(0, 0);
+            by.position = Column::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
+            by.opacity_logit = Column::from_planes(1, vec![logit, 1.0]);
+            Change(by)
+        };
+        let course = Course(vec![knot(1.0, 0.0), knot(3.0, 4.0), knot(-1.0, 4.0)]);
+        assert_eq!(course.columns(), Columns::POSITION | Columns::OPACITY);
+        for (frame, x, logit) in [(0, 1.0, 0.0), (1, 1.5, 1.0), (4, 3.0, 4.0), (7, 0.0, 4.0), (8, -1.0, 4.0)] {
+            assert_eq!(course.at(frame, 9), knot(x, logit), "frame {frame}");
+            assert_eq!(course.pick(&[1, 0, 1]).at(frame, 9), knot(x, logit).pick(&[1, 0, 1]));
+            assert_eq!(course.clone().and(course.clone()).at(frame, 9), knot(x, logit).and(knot(x, logit)));
+        }
+        assert_eq!(course.at(0, 1), knot(1.0, 0.0));
+        assert!(Course::default().at(3, 9).is_empty() && Course::default().and(course.clone()) == course);
+        let mut of_all = Gaussians::zeros(2, 1);
+        of_all.sh.planes_mut().fill(0.5);
+        let mut reduction = Reduction::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
+        (reduction.change, reduction.course) = (Change(of_all), course);
+        let both = reduction.change_at(4, 9);
+        assert_eq!((both.0.position.row(0), both.0.sh.row::<12>(1)), ([3.0, 6.0, 0.0], [0.5; 12]));
+        assert_eq!(reduction.pick(&[1]).change_at(4, 9), both.pick(&[1]));
     }
 
     #[test]

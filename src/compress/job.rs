@@ -66,7 +66,12 @@ enum Spared {
     /// Nothing.
     #[default]
     Nothing,
-    /// That colours change with direction.
+    /// That things change along time.
+    Course {
+        /// Bytes that it would take.
+        least: u64,
+    },
+    /// And that colours change with direction.
     Bands {
         /// Bytes that it would take.
         least: u64,
@@ -93,8 +98,8 @@ impl Job {
         Job::down_to(request, outlook, target, spared)
     }
 
-    /// [`Job::new`] within the request's budget of memory: harmonics above the first stay as they are, else nothing is
-    /// refined, where it does not reach for more. If it does not reach for that either, what is asked for stays, to be
+    /// [`Job::new`] within the request's budget of memory: all times change alike, else harmonics above the first stay as they
+    /// are too, else nothing is refined, where it does not reach for more. If it does not reach for that either, what is asked for stays, to be
     /// refused.
     ///
     /// # Errors
@@ -107,7 +112,11 @@ impl Job {
             return Ok(asked);
         }
         let least = |job: &Job| Plan::closest(*work, 1, |work, limits| job.needs(work, limits)).peak();
-        let bands = of(Spared::Bands { least: least(&asked) })?;
+        let alike = of(Spared::Course { least: least(&asked) })?;
+        if least(&alike) < least(&asked) && Plan::fits(*work, budget, |work, limits| alike.needs(work, limits)) {
+            return Ok(alike);
+        }
+        let bands = of(Spared::Bands { least: least(&alike) })?;
         if work.sh_degree > 0 && Plan::fits(*work, budget, |work, limits| bands.needs(work, limits)) {
             return Ok(bands);
         }
@@ -134,7 +143,10 @@ impl Job {
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
         let refine = match spared {
             Spared::Nothing => Refine::of(recipe, part, looks && prunes),
-            Spared::Bands { .. } => Refine::of(recipe, part, looks && prunes).map(Refine::without_bands),
+            Spared::Course { .. } => Refine::of(recipe, part, looks && prunes).map(Refine::without_course),
+            Spared::Bands { .. } => {
+                Refine::of(recipe, part, looks && prunes).map(|refine| refine.without_course().without_bands())
+            }
             Spared::Refining { .. } => None,
         };
         if request.kind.is_none() {
@@ -274,7 +286,11 @@ impl Job {
         let takes = |least: u64| format!("memory: expected at least {}MiB for it (--memory)", least.div_ceil(1 << 20));
         match self.spared {
             Spared::Nothing => (),
-            Spared::Bands { least } => journal.leave_out("refining of harmonics above the first", takes(least)),
+            Spared::Course { least } => journal.leave_out("refining along time", takes(least)),
+            Spared::Bands { least } => {
+                journal.leave_out("refining along time", takes(least));
+                journal.leave_out("refining of harmonics above the first", takes(least));
+            }
             Spared::Refining { least } => journal.leave_out("refinement", takes(least)),
         }
         if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
@@ -325,6 +341,7 @@ mod tests {
     use super::*;
     use crate::budget::Budget;
     use crate::compress::tests::work;
+    use crate::model::ALL_HARMONICS;
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
@@ -361,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_budget_leaves_out_bands_then_refining_and_names_what_there_would_have_to_be() {
+    fn a_small_budget_leaves_out_time_then_bands_then_refining_and_names_what_there_would_have_to_be() {
         let mut request = request(Recipe::preset("default").unwrap());
         let work = work(200_000);
         let mut within = |bytes: u64| {
@@ -371,15 +388,24 @@ mod tests {
             job.write_down(&request, &work, &Limits::NONE, &mut journal);
             let left_out =
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
-            let [bands, all] = [left_out("refining of harmonics above the first"), left_out("refinement")];
-            (job.spared, job.refine.map(|refine| refine.sh_degree), bands, all)
+            let whats = ["refining along time", "refining of harmonics above the first", "refinement"];
+            let [time, bands, all] = whats.map(left_out);
+            assert_eq!(job.refine.as_ref().is_some_and(|refine| refine.knots > 0), job.spared == Spared::Nothing);
+            (job.spared, job.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)
         };
         let least = |spared: Spared| match spared {
-            Spared::Bands { least } | Spared::Refining { least } => least,
+            Spared::Course { least } | Spared::Bands { least } | Spared::Refining { least } => least,
             Spared::Nothing => 0,
         };
-        let all = Plan::closest(work, 1, everything("default")).peak();
-        assert_eq!(within(all).0, Spared::Nothing);
+        let whole = Plan::closest(work, 1, everything("default")).peak();
+        assert_eq!(within(whole).0, Spared::Nothing);
+        let (spared, degree, named, none) = within(whole - 1);
+        assert_eq!((spared, degree, none), (Spared::Course { least: whole }, Some(ALL_HARMONICS), None));
+        assert!(named.unwrap().contains(&format!("{}MiB", whole.div_ceil(1 << 20))));
+        let (spared, ..) = (1..).map(|k| within(whole - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
+        let all = least(spared);
+        assert!(matches!(spared, Spared::Bands { .. }) && all < whole, "{spared:?}");
+        assert!(matches!(within(all).0, Spared::Course { .. }));
         let (spared, degree, named, none) = within(all - 1);
         assert_eq!((spared, degree, none), (Spared::Bands { least: all }, Some(0), None));
         assert!(named.unwrap().contains(&format!("{}MiB", all.div_ceil(1 << 20))));

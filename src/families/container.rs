@@ -36,6 +36,10 @@ impl Family for Container {
         bytes_of([self.path()])
     }
 
+    fn stands_in_frames(&self) -> bool {
+        true
+    }
+
     fn residence(&self) -> Residence {
         let layout = self.reader().layout();
         // The tiles decide what is decoded together.

@@ -183,6 +183,11 @@ pub trait Family: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
+    /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`Reduction::course`]).
+    fn stands_in_frames(&self) -> bool {
+        false
+    }
+
     /// The frames of what `reduction` leaves, as they will be once it is written.
     ///
     /// # Errors

@@ -109,6 +109,10 @@ impl Family for PlySequence {
         bytes_of(self.paths().iter().map(PathBuf::as_path))
     }
 
+    fn stands_in_frames(&self) -> bool {
+        true
+    }
+
     fn residence(&self) -> Residence {
         Residence {
             per_gaussian: 0,
@@ -178,7 +182,8 @@ fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, 
             (OutputKind::PlySequence, Some(name)) => path.join(name),
             _ => path.to_owned(),
         };
-        write_like(&template, &rows, &proxies, &reduction.change, reduction.sh_degree, &target)?;
+        let change = reduction.change_at(frame, sequence.paths().len());
+        write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &target)?;
         progress.advance(1);
         Ok(())
     };

@@ -76,6 +76,10 @@ impl Family for Streamed {
         self.container.bytes()
     }
 
+    fn stands_in_frames(&self) -> bool {
+        true
+    }
+
     fn residence(&self) -> Residence {
         self.container.residence()
     }

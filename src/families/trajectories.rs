@@ -16,7 +16,7 @@ use crate::emit::spz::write_spz;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::reduction::Reduction;
+use crate::reduction::{Course, Reduction};
 use crate::source::{FrameSource, Wanted};
 use crate::stream::{Changed, HeldFrames, MergedSequence, Progress, States, gather_all};
 
@@ -46,7 +46,8 @@ pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
     reduction: &'a Reduction,
 ) -> Box<dyn FrameSource + 'a> {
-    Box::new(Changed::new(Box::new(merged(source, reduction)), &reduction.change, reduction.sh_degree))
+    let Reduction { change, course, sh_degree, .. } = reduction;
+    Box::new(Changed::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
 /// Confirms that a sequence of so many frames can be written as `kind`.
@@ -106,7 +107,9 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
             drop(frames);
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
             let change = reduction.change.pick(&places);
-            let held = Changed::new(Box::new(held), &change, reduction.sh_degree);
+            // Where there are proxies there is no course.
+            let course = Course::default();
+            let held = Changed::new(Box::new(held), &change, &course, reduction.sh_degree);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
     }

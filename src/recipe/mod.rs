@@ -201,6 +201,7 @@ pub struct Refine {
     pub refine_cut_steps: u32,
     pub refine_pictures: usize,
     pub refine_ssim: f64,
+    pub refine_knots: usize,
 }
 
 /// Parameters of the deformation field that is written.
@@ -481,6 +482,7 @@ impl Recipe {
                 (16..=1_000_000).contains(&self.refine.refine_pictures),
                 "16 to 1000000",
             ),
+            ("refine.refine_knots", self.refine.refine_knots as f64, self.refine.refine_knots <= 1000, "0 to 1000"),
             ("refine.refine_ssim", self.refine.refine_ssim, in_unit(self.refine.refine_ssim), "0 to 1"),
             ("select.contrast_floor", self.select.contrast_floor, in_unit(self.select.contrast_floor), "0 to 1"),
             ("merge.max_scale_ratio", max_scale_ratio, max_scale_ratio >= 1.0, "1 or more"),

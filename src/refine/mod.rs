@@ -116,11 +116,11 @@ impl Descent {
         (self.change, self.means, self.done) = (change, means, done);
     }
 
-    /// One step against `gradients`, at rates of `schedule`.
+    /// One step against `weight` times `gradients`, at rates of `schedule`.
     ///
     /// # Panics
-    /// If they are of other Gaussians or columns.
-    pub fn step(&mut self, gradients: &Gradients, schedule: &Schedule) {
+    /// If they are of other Gaussians or fewer columns.
+    pub fn step(&mut self, gradients: &Gradients, weight: f32, schedule: &Schedule) {
         let factor = schedule.at(self.done);
         self.done += 1;
         // Of means that began at 0.
@@ -141,6 +141,7 @@ impl Descent {
         planes.into_par_iter().for_each(|(rate, reach, (((mean, square), value), slope))| {
             let own = mean.iter_mut().zip(square).zip(value).zip(slope).zip(reach);
             for ((((mean, square), value), &slope), &reach) in own {
+                let slope = weight * slope;
                 *mean += (1.0 - BETAS[0]) * (slope - *mean);
                 *square += (1.0 - BETAS[1]) * (slope * slope - *square);
                 let root = (*square * unbiased[1]).sqrt() + EPSILON;
@@ -184,7 +185,7 @@ mod tests {
         for _ in 0..2000 {
             let mut now = start.clone();
             descent.change().add_to(&mut now, Columns::all());
-            descent.step(&slopes(&now, 0.25), &Schedule::new(2000, 0.05, 1.0));
+            descent.step(&slopes(&now, 0.25), 1.0, &Schedule::new(2000, 0.05, 1.0));
         }
         let mut end = start.clone();
         descent.change().add_to(&mut end, Columns::all());
@@ -207,7 +208,7 @@ mod tests {
             let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
             let slope = (k as f64 * 0.7).sin() + 0.3;
             gradients.column_mut(Columns::OPACITY).set_row(0, [slope as f32]);
-            descent.step(&gradients, &Schedule::new(steps, 0.05, error));
+            descent.step(&gradients, 1.0, &Schedule::new(steps, 0.05, error));
             mean = 0.9 * mean + 0.1 * slope;
             square = 0.999 * square + 0.001 * slope * slope;
             let t = k as i32 + 1;
@@ -227,7 +228,7 @@ mod tests {
             for column in Columns::all().iter() {
                 gradients.column_mut(column).planes_mut().fill(slope);
             }
-            descent.step(&gradients, &Schedule::new(10, 0.05, 1.0));
+            descent.step(&gradients, 1.0, &Schedule::new(10, 0.05, 1.0));
         }
         let change = descent.change();
         assert!(Columns::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));

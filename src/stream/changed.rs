@@ -2,27 +2,38 @@
 
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::reduction::Change;
+use crate::reduction::{Change, Course};
 use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
 
-/// A source whose parameters are changed, the same at every frame.
+/// A source whose parameters are changed, the same at every frame and along a course.
 pub struct Changed<'a> {
     source: Box<dyn FrameSource + 'a>,
     change: &'a Change,
+    course: &'a Course,
     info: SequenceInfo,
 }
 
 impl<'a> Changed<'a> {
-    /// `source` with `change` added to its Gaussians, and of their harmonics those up to `sh_degree`; nothing to add and
-    /// none above: the source as it is.
-    pub fn new(source: Box<dyn FrameSource + 'a>, change: &'a Change, sh_degree: usize) -> Self {
+    /// `source` with `change` and `course` added to its Gaussians, and of their harmonics those up to `sh_degree`; nothing
+    /// to add and none above: the source as it is.
+    pub fn new(
+        source: Box<dyn FrameSource + 'a>,
+        change: &'a Change,
+        course: &'a Course,
+        sh_degree: usize,
+    ) -> Changed<'a> {
         let mut info = source.info().clone();
         info.sh_degree = info.sh_degree.min(sh_degree);
-        Changed { source, change, info }
+        info.varying |= course.columns();
+        Changed { source, change, course, info }
     }
 
     fn is_plain(&self) -> bool {
-        self.change.is_empty() && self.drops().is_none()
+        self.change.is_empty() && self.course.is_empty() && self.drops().is_none()
+    }
+
+    fn reader<'b>(&self, reader: Box<dyn BlockReader + 'b>, change: Change, course: Course) -> ChangedReader<'b> {
+        ChangedReader { reader, change, course, frames: self.info.times.len(), all_sh: self.drops() }
     }
 
     /// Room for all harmonics, where some of them go.
@@ -42,8 +53,7 @@ impl FrameSource for Changed<'_> {
             return self.source.open(ids);
         }
         let places: Vec<u32> = ids.iter().map(|id| id as u32).collect();
-        let change = self.change.pick(&places);
-        Ok(Box::new(ChangedReader { reader: self.source.open(ids)?, change, all_sh: self.drops() }))
+        Ok(Box::new(self.reader(self.source.open(ids)?, self.change.pick(&places), self.course.pick(&places))))
     }
 
     fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
@@ -52,7 +62,7 @@ impl FrameSource for Changed<'_> {
             return Some(opened);
         }
         let changed = |reader| -> Box<dyn BlockReader + '_> {
-            Box::new(ChangedReader { reader, change: self.change.clone(), all_sh: self.drops() })
+            Box::new(self.reader(reader, self.change.clone(), self.course.clone()))
         };
         Some(opened.map(changed))
     }
@@ -65,6 +75,9 @@ impl FrameSource for Changed<'_> {
 struct ChangedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
     change: Change,
+    course: Course,
+    /// How many there are.
+    frames: usize,
     /// Where harmonics are read into, of which some go.
     all_sh: Option<Column>,
 }
@@ -83,7 +96,11 @@ impl BlockReader for ChangedReader<'_> {
                 out.sh.planes_mut().copy_from_slice(&all.planes()[..left]);
             }
         }
-        self.change.add_to(out, want);
+        match self.course.is_empty() {
+            true => self.change.add_to(out, want),
+            // The course has no higher bands.
+            false => self.course.at(frame, self.frames).and(self.change.clone()).add_to(out, want),
+        }
         Ok(())
     }
 
@@ -109,7 +126,8 @@ mod tests {
             by.sh.set_row(i, [0.125 * i as f32; 3]);
         }
         let change = Change(by);
-        let changed = Changed::new(Box::new(Scene::new(40, 3)), &change, ALL_HARMONICS);
+        let straight = Course::default();
+        let changed = Changed::new(Box::new(Scene::new(40, 3)), &change, &straight, ALL_HARMONICS);
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
                 let mut state = Gaussians::zeros(ids.len(), plain.info().sh_degree);
@@ -127,7 +145,7 @@ mod tests {
         }
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(0..40)] {
             // Without the first band too, whose changes go with it.
-            let fewer = Changed::new(Box::new(Scene::new(40, 3)), &change, 0);
+            let fewer = Changed::new(Box::new(Scene::new(40, 3)), &change, &straight, 0);
             assert_eq!((fewer.info().sh_degree, plain.info().sh_degree), (0, 1));
             let mut expected = Gaussians::zeros(ids.len(), 1);
             changed.open(ids.clone()).unwrap().read(1, Columns::all(), &mut expected).unwrap();
@@ -138,10 +156,34 @@ mod tests {
         }
         let none = Change::default();
         let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
-        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, ALL_HARMONICS);
+        let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, &straight, ALL_HARMONICS);
         unchanged.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut untouched).unwrap();
         let mut expected = untouched.clone();
         plain.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut expected).unwrap();
         assert!(untouched == expected);
+    }
+
+    #[test]
+    fn what_changes_along_a_course_varies_and_is_read_at_every_frame() {
+        let plain = Scene::new(30, 5);
+        let knot = |scale: f32| {
+            let mut by = Gaussians::zeros(0, 0);
+            by.log_scale = Column::from_planes(3, (0..90).map(|k| scale * k as f32).collect());
+            Change(by)
+        };
+        let (change, course) = (knot(0.5), Course(vec![knot(0.0), knot(1.0), knot(-1.0)]));
+        assert!(!plain.info().varying.contains(Columns::LOG_SCALE));
+        let changed = Changed::new(Box::new(Scene::new(30, 5)), &change, &course, ALL_HARMONICS);
+        assert_eq!(changed.info().varying, plain.info().varying | Columns::LOG_SCALE);
+        let ids = [4, 29, 0];
+        let mut reader = changed.open(Ids::List(&ids)).unwrap();
+        for (frame, scale) in [(0, 0.5), (1, 1.0), (2, 1.5), (3, 0.5), (4, -0.5)] {
+            let mut expected = Gaussians::zeros(3, plain.info().sh_degree);
+            plain.open(Ids::List(&ids)).unwrap().read(frame, Columns::all(), &mut expected).unwrap();
+            knot(scale).pick(&ids).add_to(&mut expected, Columns::all());
+            let mut got = Gaussians::zeros(3, plain.info().sh_degree);
+            reader.read(frame, Columns::all(), &mut got).unwrap();
+            assert!(got == expected, "frame {frame}");
+        }
     }
 }

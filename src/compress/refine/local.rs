@@ -95,6 +95,11 @@ impl Keeping {
         self.first.is_none()
     }
 
+    /// The first frame's, if there is one.
+    pub(super) fn first(&self) -> Option<&Local> {
+        self.first.as_ref()
+    }
+
     fn write(&mut self, bytes: &[u8]) -> Result<()> {
         self.end += bytes.len() as u64;
         self.file.write(bytes)

@@ -26,7 +26,7 @@ use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{ALL_HARMONICS, Columns};
 use crate::recipe;
-use crate::reduction::{Change, Reduction};
+use crate::reduction::{Change, Course, Reduction};
 use crate::refine::{self, Schedule};
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 use crate::scene::Scene;
@@ -35,7 +35,7 @@ use crate::source::FrameSource;
 use crate::stream::Progress;
 use crate::work::Key;
 use loss::{Closeness, Loss};
-use moving::{Manner, Moving};
+use moving::{Manner, Moving, knots};
 use targets::{Parted, Targets};
 
 /// What the stage is called.
@@ -84,6 +84,8 @@ pub struct Refine {
     pub cuts: bool,
     /// Contrast that every Gaussian is taken to have at least with what it hides, for a cut.
     pub contrast_floor: f64,
+    /// Times between which what is added changes along time, at most, where states stand in every frame; 0: never.
+    pub knots: usize,
     /// Part of the Gaussians that is asked for.
     pub target: Option<f64>,
 }
@@ -91,7 +93,8 @@ pub struct Refine {
 impl Refine {
     /// The stage, unless `recipe` lets nothing move. Of a run that ranks by pictures (`cuts`), down to the part `target`.
     pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<Refine> {
-        let recipe::Refine { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim } = recipe.refine;
+        let recipe::Refine { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
+            recipe.refine;
         let refine = Refine {
             columns: refine.0,
             sh_degree: ALL_HARMONICS,
@@ -101,6 +104,7 @@ impl Refine {
             pictures: refine_pictures,
             cuts,
             contrast_floor: recipe.select.contrast_floor,
+            knots: refine_knots,
             target,
         };
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
@@ -111,15 +115,20 @@ impl Refine {
         Refine { sh_degree: 0, ..self }
     }
 
-    /// The same in a `part` of the steps.
+    /// The same, but that all times change alike.
+    pub fn without_course(self) -> Refine {
+        Refine { knots: 0, ..self }
+    }
+
+    /// The same in a `part` of the steps, and all times alike.
     pub fn in_part(&self, part: f64) -> Refine {
         let of = |steps: usize| (part * steps as f64).ceil() as usize;
-        Refine { steps: of(self.steps), cut_steps: of(self.cut_steps), ..self.clone() }
+        Refine { steps: of(self.steps), cut_steps: of(self.cut_steps), ..self.clone() }.without_course()
     }
 
     /// What it does follows from this, and what it is done to.
     pub(super) fn key(&self) -> Key {
-        let of_steps = (self.steps, self.cut_steps, self.pictures, self.cuts);
+        let of_steps = (self.steps, self.cut_steps, self.pictures, self.cuts, self.knots);
         Key::of(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, of_steps))
     }
 
@@ -131,6 +140,16 @@ impl Refine {
     fn last_steps(&self, kept: f64) -> usize {
         let part = ((1.0 - kept) / (1.0 - CUTS_FROM)).clamp(0.0, 1.0);
         (part * self.steps as f64).ceil() as usize
+    }
+
+    /// Knots of the course of such an input.
+    fn knots_of(&self, work: &Workload) -> usize {
+        match (work.input.jacobian, work.frames) {
+            // Nobody knows how many frames a stream will have.
+            (0, 0) => self.knots,
+            (0, frames) => knots(self.knots, frames as usize),
+            _ => 0,
+        }
     }
 
     /// Steps before a cut of what is `left`, if `wanted` are to stay: fewer where a step takes longer and more of what it
@@ -157,16 +176,24 @@ impl Refine {
             ("result", work.input.reduced),
             ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
         ];
-        // First the original is looked at, then only what is left, of which there are fewer.
-        let part = self.target.map_or(1.0, |target| target.max(CUTS_FROM)).min(1.0);
-        let left: Vec<Part> = read.into_iter().chain(left).map(|(name, bytes)| (name, of_left(part, bytes))).collect();
-        let bytes = |parts: &[Part]| parts.iter().map(|part| part.1).sum::<u64>();
-        let per_gaussian = if bytes(&left) > bytes(&original) { left } else { original };
+        // First the original is looked at, then only what is left, of which there are fewer; at the end along time.
+        let of = |part: f64, more: Option<Part>| -> Vec<Part> {
+            let parts = read.into_iter().chain(left).chain(more);
+            parts.map(|(name, bytes)| (name, of_left(part, bytes))).collect()
+        };
+        let (wanted, knots) = (self.target.unwrap_or(1.0).min(1.0), self.knots_of(work));
+        // And the best so far.
+        let course =
+            refine::bytes_per_gaussian(self.columns, 0) as u64 + work.state(self.columns.difference(Columns::SH)) + 12;
+        let along = (knots > 0).then(|| of(wanted, Some(("course", knots as u64 * course))));
+        let bytes = |parts: &Vec<Part>| parts.iter().map(|part| part.1).sum::<u64>();
+        let stages = [Some(original), Some(of(wanted.max(CUTS_FROM), None)), along];
+        let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
         let [own, between] = targets::numbers(self.pictures, work.pixels);
         let (pictures, frames) = ((own + between) as f64, (own as u64).min(work.frames.max(1)));
         let wanted = self.target.unwrap_or(0.5);
         let sizes = sizes(self.first((wanted * 1e6) as usize, 1_000_000), (wanted * 1e6) as usize);
-        let steps = self.last_steps(wanted);
+        let steps = self.last_steps(wanted) + if knots > 0 { along_time(self.last_steps(wanted)) } else { 0 };
         let judged = pictures / targets::APART_EVERY as f64 * 4.0;
         let seconds = |(k, &size): (usize, &usize)| {
             let (of, left) = (size as f64 / 1e6 * work.count(), (wanted * 1e6) as usize);
@@ -250,6 +277,11 @@ impl Refine {
         let all = || Ok(walk.all(reduction, wanted, steps, &mut Journal::default())?.1);
         scene.work.known(&format!("{stage}-size"), key, all)
     }
+}
+
+/// Steps along time behind `steps` steps of all times together.
+fn along_time(steps: usize) -> usize {
+    2 * steps / 3
 }
 
 /// How many Gaussians there are from `first` to `last`, cut by cut.
@@ -342,6 +374,8 @@ struct End<Best> {
     kept: Best,
     /// Of the rates.
     part: f32,
+    /// And along time; none before all steps are done.
+    course: Course,
 }
 
 /// Steps of a leg that are done, their rates, and what the last leg knows beside.
@@ -401,15 +435,15 @@ impl<'a> Walk<'a> {
         let mut moving = self.begin(reduction, &*result)?;
         let sizes = sizes(reduction.len(), wanted);
         let of_cuts: usize = sizes.windows(2).map(|pair| self.refine.steps_before(pair[0], wanted)).sum();
-        self.expect(of_cuts + steps);
+        self.expect(of_cuts + steps + self.steps_along(steps));
         let mut left = reduction.clone();
         for pair in sizes.windows(2) {
             let steps = self.refine.steps_before(pair[0], wanted);
             left = left.pick(&self.cut(&mut moving, &mut trail, steps, pair[1])?);
         }
-        let (change, psnr) = self.finish(&mut moving, &mut trail, steps, journal)?;
-        left.change = left.change.and(change);
-        Ok((left, psnr))
+        let End { kept, course, best, .. } = self.finish(&mut moving, &mut trail, steps, journal)?;
+        (left.change, left.course) = (left.change.and(kept), left.course.and(course));
+        Ok((left, best.psnr))
     }
 
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
@@ -433,17 +467,30 @@ impl<'a> Walk<'a> {
     pub(super) fn best_of(&mut self, mut reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
         let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.count().max(1) as f64);
         let (key, work) = (self.key(&reduction, reduction.len(), reduction.len()), &self.scene.work);
-        let (change, taken) = journal.kept(work, &format!("{}-best", self.stage), key, |journal| {
-            self.expect(steps);
+        let (change, course, taken) = journal.kept(work, &format!("{}-best", self.stage), key, |journal| {
+            self.expect(steps + self.steps_along(steps));
             let mut trail = self.trail(key);
             let result = self.scene.input.reduced(&reduction)?;
             let mut moving = self.begin(&reduction, &*result)?;
-            let change = self.finish(&mut moving, &mut trail, steps, journal)?.0;
-            Ok((change, self.turns.taken))
+            let End { kept, course, .. } = self.finish(&mut moving, &mut trail, steps, journal)?;
+            Ok((kept, course, self.turns.taken))
         })?;
         self.turns.skip_to(taken);
-        reduction.change = reduction.change.and(change);
+        (reduction.change, reduction.course) = (reduction.change.and(change), reduction.course.and(course));
         Ok(reduction)
+    }
+
+    /// Knots of the course of what is refined.
+    fn knots(&self) -> usize {
+        match self.scene.input.stands_in_frames() {
+            true => knots(self.refine.knots, self.scene.source().info().times.len()),
+            false => 0,
+        }
+    }
+
+    /// Steps along time behind `steps` steps.
+    fn steps_along(&self, steps: usize) -> usize {
+        if self.knots() > 0 { along_time(steps) } else { 0 }
     }
 
     fn step(&mut self, moving: &mut Moving<'_>, schedule: &Schedule) -> Result<()> {
@@ -524,15 +571,15 @@ impl<'a> Walk<'a> {
         Ok(left)
     }
 
-    /// Takes `steps` steps; gives what is to be added to what is stored for the state that the pictures kept apart like
-    /// best, and how close they are then, dB.
+    /// Takes `steps` steps, and some along time; gives what is to be added to what is stored for the state that the pictures
+    /// kept apart like best, and how close they are then.
     fn finish(
         &mut self,
         moving: &mut Moving<'_>,
         trail: &mut Trail,
         steps: usize,
         journal: &mut Journal,
-    ) -> Result<(Change, f64)> {
+    ) -> Result<End<Change>> {
         let count = self.apart.len();
         let (done, mut schedule, mut end) = match self.go_on(moving, trail)? {
             Some((done, schedule, Some(end))) => (done, schedule, end),
@@ -542,10 +589,9 @@ impl<'a> Walk<'a> {
                 if before.psnr >= CLOSE_ENOUGH {
                     let why = format!("{count} pictures kept apart keep {:.2} dB without", before.psnr);
                     journal.leave_out("refinement", why);
-                    return Ok((moving.change(), before.psnr));
+                    return Ok(End::new(before, moving.change()));
                 }
-                let schedule = Schedule::new(steps, LAST_RATE[1], before.error);
-                (0, schedule, End { before, best: before, kept: moving.change(), part: 1.0 })
+                (0, Schedule::new(steps, LAST_RATE[1], before.error), End::new(before, moving.change()))
             }
         };
         let judge_every = steps.div_ceil(3).clamp(JUDGE_EVERY[0], JUDGE_EVERY[1]);
@@ -562,9 +608,12 @@ impl<'a> Walk<'a> {
                     schedule = Schedule::new(steps - step, LAST_RATE[1], end.best.error).times(end.part);
                 }
             }
-            let End { before, best, ref kept, part } = end;
-            self.keep(moving, trail, (step, schedule), Some(End { before, best, kept, part }))?;
+            let End { before, best, ref kept, part, .. } = end;
+            let course = Course::default();
+            self.keep(moving, trail, (step, schedule), Some(End { before, best, kept, part, course }))?;
         }
+        let of_all = end.best;
+        self.follow_time(moving, &mut end, self.steps_along(steps))?;
         let [start, best] = [end.before.psnr, end.best.psnr];
         if self.refine.loss.is_closer(&end.best, &end.before) {
             journal.notes.push(format!("refined: {count} pictures kept apart keep {best:.2} dB, not {start:.2}"));
@@ -572,7 +621,48 @@ impl<'a> Walk<'a> {
         } else {
             journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
         }
-        Ok((end.kept, best))
+        match end.course.is_empty() {
+            true if self.steps_along(steps) == 0 => (),
+            true => journal
+                .leave_out("changes along time", format!("pictures kept apart never kept more than {best:.2} dB")),
+            false => {
+                journal.notes.push(format!("refined along time: {:.2} dB of these are due to that", best - of_all.psnr))
+            }
+        }
+        Ok(end)
+    }
+
+    /// Takes so many steps along time from what was best of all times alike, as far as the pictures kept apart like it.
+    fn follow_time(&mut self, moving: &mut Moving<'_>, end: &mut End<Change>, steps: usize) -> Result<()> {
+        if steps == 0 || end.best.psnr >= CLOSE_ENOUGH {
+            return Ok(());
+        }
+        moving.turn_back(&end.kept)?;
+        let knots = self.knots();
+        if !moving.bend(knots) {
+            return Ok(());
+        }
+        // Each picture is a step of two knots.
+        let schedule = Schedule::new(2 * steps / knots, LAST_RATE[1], end.best.error);
+        let judge_every = steps.div_ceil(3).max(1);
+        for step in 1..=steps {
+            moving.step_along(self.turns.next(), &schedule)?;
+            self.progress.advance(1);
+            if step % judge_every == 0 || step == steps {
+                let now = moving.closeness(&self.apart)?;
+                if self.refine.loss.is_closer(&now, &end.best) {
+                    (end.best, end.course) = (now, moving.course());
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl<Best> End<Best> {
+    /// Nothing gained yet.
+    fn new(before: Closeness, kept: Best) -> End<Best> {
+        End { before, best: before, kept, part: 1.0, course: Course::default() }
     }
 }
 
@@ -583,6 +673,9 @@ mod tests {
     use crate::compress::tests::{scene, score_scene};
     use crate::demo;
     use crate::emit::container::write_container;
+    use crate::emit::kind::OutputKind;
+    use crate::families::trajectories::write_sequence;
+    use crate::families::{Link, OpenOptions};
     use crate::ingest::container::Container;
     use crate::metrics::psnr;
     use crate::model::{Gaussians, Rig, SequenceInfo, Split};
@@ -762,6 +855,47 @@ mod tests {
         });
         assert!(!away.change.is_empty() && away.change == unseen.change);
         assert_eq!(away.kept, unseen.kept);
+    }
+
+    #[test]
+    fn what_stands_in_frames_comes_closer_along_time_and_every_kind_of_it_is_written_so() {
+        let folder = tempfile::tempdir().unwrap();
+        let made = demo::Scene::new(900, 16);
+        let [packed, files] = ["scene.gseq", "frames"].map(|name| folder.path().join(name));
+        write_container(&made, &packed, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        std::fs::create_dir(&files).unwrap();
+        write_sequence(&made, OutputKind::PlySequence, &files, 1).unwrap();
+        let read = |source: &dyn FrameSource| -> Vec<Gaussians> {
+            (0..16).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+        };
+        for (name, path, link) in
+            [("packed", &packed, Link::Never), ("files", &files, Link::Never), ("linked", &files, Link::Apart)]
+        {
+            let input = crate::families::open(path, &OpenOptions { link, ..OpenOptions::default() }).unwrap();
+            let scene = Scene::new(path.clone(), input, made.rig(), Some(Split::Train)).unwrap();
+            let recipe = Recipe::preset("default").unwrap();
+            let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+            let [alike, along] = [0, 4].map(|knots| {
+                let reduction = Reduction::pruned(scored.ranked().take(200), &recipe.merge);
+                let few = Refine { steps: 300, knots, ..Refine::of(&recipe, None, false).unwrap() };
+                few.run(&scene, &scored, reduction, 200, &mut Journal::default()).unwrap()
+            });
+            assert_eq!((alike.course.0.len(), along.course.0.len()), (0, 4));
+            assert!(along.change == alike.change && !along.course.columns().contains(Columns::SH), "{name}");
+            let [before, after] = [&alike, &along].map(|reduction| held_out(&scene, &made.rig(), reduction));
+            assert!(after > before + 0.1, "{name}: {before:.2} dB of all times alike, {after:.2} along time");
+            let expected = read(&*scene.input.reduced(&along).unwrap());
+            for (kind, out) in [(OutputKind::Gseq, "out.gseq"), (OutputKind::PlySequence, "out")] {
+                let out = folder.path().join(format!("{name}_{out}"));
+                if kind == OutputKind::PlySequence {
+                    std::fs::create_dir(&out).unwrap();
+                }
+                scene.input.write(&along, kind, &out, &Limits::NONE).unwrap();
+                let options = OpenOptions { link: Link::Never, ..OpenOptions::default() };
+                let written = crate::families::open(&out, &options).unwrap();
+                assert!(read(written.source()) == expected, "{name} as {kind:?}");
+            }
+        }
     }
 
     #[test]

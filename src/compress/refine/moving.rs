@@ -8,7 +8,7 @@ use super::loss::{Closeness, Loss};
 use super::targets::Targets;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, Gradients, Raw, SequenceInfo};
-use crate::reduction::Change;
+use crate::reduction::{Change, Course};
 use crate::refine::{Descent, Schedule};
 use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
@@ -24,6 +24,15 @@ pub(super) struct Manner {
     pub(super) sh_degree: usize,
     /// What is made small.
     pub(super) loss: Loss,
+}
+
+/// A knot of a [`Course`] for every so many frames, at most.
+const FRAMES_PER_KNOT: usize = 4;
+
+/// How many knots the course of a sequence of `frames` frames has, of at most `most`; none where there would be one.
+pub(super) fn knots(most: usize, frames: usize) -> usize {
+    let knots = most.min(frames / FRAMES_PER_KNOT);
+    if knots > 1 { knots } else { 0 }
 }
 
 /// Steps after which states are found anew, where they follow from what is stored by more than a sum.
@@ -54,6 +63,10 @@ pub(super) struct Moving<'a> {
     /// Of what the states have.
     manner: Manner,
     descent: Descent,
+    /// The knots of the course along time, if there is one.
+    course: Vec<Descent>,
+    /// Columns of states that are not the same at all frames, where they do not follow from anything.
+    changing: Columns,
     gradients: Gradients,
     /// What the picture in the making shows.
     now: Local,
@@ -98,6 +111,8 @@ impl<'a> Moving<'a> {
             stored: deformation.map_or_else(|| nothing.clone().into(), |deformation| deformation.stored().clone()),
             before: Change::default(),
             descent: Descent::new(&nothing, columns, sh_degree, &[]),
+            course: Vec::new(),
+            changing: Columns::empty(),
             gradients: Gradients::new(0, columns, sh_degree),
             now: Local::none(of_state),
             renderer: Renderer::on_all_threads(),
@@ -115,7 +130,12 @@ impl<'a> Moving<'a> {
             let mut states = States::open(result, &wanted)?;
             let mut locals = Keeping::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
-                locals.push(&mut Local { state: states.at(frame)?.clone(), ..Local::default() })?;
+                let state = states.at(frame)?.clone();
+                if let Some(Local { state: first, .. }) = locals.first() {
+                    let differs = |&column: &Columns| state.column(column) != first.column(column);
+                    moving.changing |= varying.difference(moving.changing).iter().filter(differs).collect();
+                }
+                locals.push(&mut Local { state, ..Local::default() })?;
             }
             moving.locals = locals.finish()?;
         }
@@ -130,6 +150,25 @@ impl<'a> Moving<'a> {
         let Manner { columns, sh_degree, .. } = self.manner;
         self.descent = Descent::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
+    }
+
+    /// Begins to move along time too, from nothing, at so many knots: in columns that change with time anyway, as others are
+    /// stored once, and of harmonics the first. Gives whether anything can.
+    pub(super) fn bend(&mut self, knots: usize) -> bool {
+        let columns = self.manner.columns & self.changing;
+        let Some(Local { state, .. }) = self.locals.first().filter(|_| !columns.is_empty()) else { return false };
+        self.course = (0..knots).map(|_| Descent::new(state, columns, 0, &self.fixed)).collect();
+        true
+    }
+
+    /// What is to be added along time.
+    pub(super) fn course(&self) -> Course {
+        Course(self.course.iter().map(|knot| knot.change().clone()).collect())
+    }
+
+    /// The knots that tell of the frame in place `k`, with their weights.
+    fn around(&self, k: usize) -> [(usize, f32); 2] {
+        Course::weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
     /// Which Gaussians stay as they are.
@@ -236,6 +275,15 @@ impl<'a> Moving<'a> {
             None => now.jacobian.add_to(&change.0, &mut now.state),
             Some(there) => now.jacobian.add_to(&change.pick(there).0, &mut now.state),
         }
+        if !self.course.is_empty() {
+            let knots = self.around(k).map(|(knot, weight)| {
+                let change = self.course[knot].change();
+                let mut change = now.there.as_ref().map_or_else(|| change.clone(), |there| change.pick(there));
+                change.scale(weight);
+                change
+            });
+            knots.iter().for_each(|change| change.add_to(&mut now.state, Columns::all()));
+        }
         Ok(())
     }
 
@@ -253,6 +301,25 @@ impl<'a> Moving<'a> {
             self.find()?;
         }
         self.steps += 1;
+        self.differentiate(k)?;
+        self.descent.step(&self.gradients, 1.0, schedule);
+        Ok(())
+    }
+
+    /// One step of the course along picture `k`, at rates `schedule`.
+    ///
+    /// # Errors
+    /// A scratch file that cannot be read.
+    pub(super) fn step_along(&mut self, k: usize, schedule: &Schedule) -> Result<()> {
+        self.differentiate(k)?;
+        for (knot, weight) in self.around(self.place(k)) {
+            self.course[knot].step(&self.gradients, weight, schedule);
+        }
+        Ok(())
+    }
+
+    /// Makes the gradients those of picture `k`.
+    fn differentiate(&mut self, k: usize) -> Result<()> {
         let target = self.targets.values(k)?;
         let mut now = std::mem::take(&mut self.now);
         self.show(self.place(k), &mut now)?;
@@ -266,7 +333,6 @@ impl<'a> Moving<'a> {
         if let Some((there, gradients)) = now.there.as_ref().zip(of_those) {
             self.gradients.set_rows(there, &gradients);
         }
-        self.descent.step(&self.gradients, schedule);
         self.now = now;
         Ok(())
     }

@@ -48,7 +48,12 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &Merge) -> Res
 
 /// The frames of what `reduction` leaves of `params`.
 pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a Reduction) -> Box<dyn FrameSource + 'a> {
-    Box::new(Changed::new(Box::new(Settled::new(params, reduction)), &reduction.change, reduction.sh_degree))
+    Box::new(Changed::new(
+        Box::new(Settled::new(params, reduction)),
+        &reduction.change,
+        &reduction.course,
+        reduction.sh_degree,
+    ))
 }
 
 /// A merged sequence whose proxies have the sizes and opacities that were solved for.

@@ -117,6 +117,10 @@ impl Family for Linked {
         self.container.bytes()
     }
 
+    fn stands_in_frames(&self) -> bool {
+        true
+    }
+
     fn residence(&self) -> Residence {
         self.container.residence()
     }

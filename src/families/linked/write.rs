@@ -50,7 +50,8 @@ impl Linked {
             }
             let mut proxies = Gaussians::zeros(0, self.info.sh_degree);
             result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut proxies)?;
-            let (template, change) = (frames.frame(frame)?, reduction.change.pick(&written));
+            let change = reduction.change_at(frame, frames.paths().len()).pick(&written);
+            let template = frames.frame(frame)?;
             let name = template.path().file_name().unwrap_or_default();
             write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &folder.join(name))?;
             progress.advance(1);
