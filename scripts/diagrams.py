@@ -15,7 +15,12 @@ import re
 import sys
 from pathlib import Path
 
-STYLE = (Path(__file__).parent.parent / "src/report/chart.css").read_text().split("@media")[0]
+# As on paper: what depends on the screen goes.
+STYLE = re.sub(
+    r"@media[^{]*\{(?:[^{}]*\{[^{}]*\})*[^{}]*\}\n?",
+    "",
+    (Path(__file__).parent.parent / "src/report/chart.css").read_text(),
+)
 
 
 def main():
