@@ -5,6 +5,8 @@ mod scene;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::PathBuf;
+use std::process::Stdio;
+use std::time::Instant;
 
 use scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
 use splatsieve::families::Link;
@@ -118,6 +120,8 @@ fn frames_are_linked_where_their_order_does_not_tell_or_where_asked() {
     let said = workplace.done("compress mixed -o out --target-ratio 0.5 --no-refine --verbose --link always");
     assert!(said.contains("frames were linked: as asked"), "{said}");
     assert!(fs::read_to_string(workplace.path("out/recipe.toml")).unwrap().contains("link = \"always\""));
+    let said = workplace.done("compress kept -o in_order --target-ratio 0.5 --no-refine --verbose");
+    assert!(said.contains("frames are in one order: those of the same place are nearer than strangers"), "{said}");
     // What a work folder keeps of one opening is not taken for the other's.
     let small = "compress mixed --target-ratio 0.5 --no-refine --work work --link";
     workplace.done(&format!("{small} never -o never"));
@@ -221,6 +225,42 @@ fn threads_and_memory_change_nothing() {
     let one = run("one", "--threads 1");
     assert!(run("two", "--threads 2") == one);
     assert!(run("three", "--threads 3 --memory 200MiB") == one);
+}
+
+#[test]
+fn a_run_killed_at_any_moment_leaves_nothing_under_the_final_name() {
+    let workplace = Workplace::new();
+    for t in 0..12 {
+        workplace.ply(&format!("frames/{t}.ply"), &fading(800, t));
+    }
+    let arguments = "compress frames -o small --target-ratio 0.4 --refine-steps 20";
+    let start = Instant::now();
+    workplace.done(arguments);
+    let whole = start.elapsed();
+    let expected = lasting_files(&workplace.path("small"));
+    fs::remove_dir_all(workplace.path("small")).unwrap();
+    let mut early = 0;
+    for kill in 1..=5 {
+        let mut child = workplace.command(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        std::thread::sleep(whole * kill / 6);
+        child.kill().unwrap();
+        child.wait().unwrap();
+        if workplace.path("small").exists() {
+            assert!(
+                lasting_files(&workplace.path("small")) == expected,
+                "kill {kill}: it has its name, and is not whole"
+            );
+            fs::remove_dir_all(workplace.path("small")).unwrap();
+        } else {
+            early += 1;
+        }
+    }
+    assert!(early > 0, "every kill came too late");
+    workplace.done(arguments);
+    assert!(lasting_files(&workplace.path("small")) == expected);
+    let mut left: Vec<_> = fs::read_dir(workplace.path("")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["frames", "small"], "what killed runs left is still there");
 }
 
 #[test]

@@ -499,6 +499,9 @@ pub(super) struct SideBySide {
     /// Take folders of PLY frames with a gap in their numbers as they are
     #[arg(long)]
     pub(super) allow_gaps: bool,
+    /// Whether to find out which Gaussian of a folder's frames is which, as `compress` does [default: auto]
+    #[arg(long)]
+    pub(super) link: Option<LinkArg>,
     #[command(flatten)]
     pub(super) memory: Memory,
     #[command(flatten)]

@@ -432,6 +432,7 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
 fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
+    original.link = args.link.map_or(Link::Auto, Link::from);
     original.conventions = conventions(&args.trained);
     original.use_cameras(args.cameras);
     original.memory = budget_of(args.memory);

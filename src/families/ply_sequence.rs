@@ -20,7 +20,7 @@ use crate::error::Result;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::limits::Limits;
-use crate::link::identity;
+use crate::link::{Identity, identity};
 use crate::model::{Columns, Gaussians};
 use crate::reduction::Reduction;
 use crate::source::{FrameSource, Ids};
@@ -46,15 +46,16 @@ pub(super) const FILE: Entry = Entry {
 /// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
 fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
     options.refuse_for(path)?;
-    let why = match options.link {
-        _ if frames.paths().len() == 1 => None,
-        Link::Never => None,
-        Link::Always | Link::Apart => Some("as asked".to_owned()),
-        Link::Auto => why_linked(&frames)?,
+    let order = match options.link {
+        _ if frames.paths().len() == 1 => Order::Believed,
+        Link::Never => Order::Believed,
+        Link::Always | Link::Apart => Order::Lost("as asked".to_owned()),
+        Link::Auto => order(&frames)?,
     };
-    match why {
-        None => Ok(Box::new(PlySequence::new(frames)?)),
-        Some(why) => {
+    match order {
+        Order::Believed => Ok(Box::new(PlySequence::new(frames)?)),
+        Order::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
+        Order::Lost(why) => {
             let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
             Ok(Box::new(Linked::open(frames, &why, options.link != Link::Apart, &scratch)?))
         }
@@ -64,12 +65,22 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
 /// Pairs of frames whose order is measured.
 const MEASURED: usize = 5;
 
-/// Why order does not tell which Gaussian is which, if it does not: it does where it holds in most pairs of neighbouring
-/// frames, of five that are evenly spread.
-fn why_linked(frames: &PlyFrames) -> Result<Option<String>> {
+/// Whether the order of frames tells which Gaussian is which.
+enum Order {
+    /// Nobody looked.
+    Believed,
+    /// It does, as the note says.
+    Kept(String),
+    /// It does not, and why.
+    Lost(String),
+}
+
+/// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighbouring frames, of five that
+/// are evenly spread.
+fn order(frames: &PlyFrames) -> Result<Order> {
     if let Some(other) = frames.other_count() {
         let (counts, path) = (frames.counts(), &frames.paths()[other]);
-        return Ok(Some(format!("{} has {} Gaussians, the first {}", path.display(), counts[other], counts[0])));
+        return Ok(Order::Lost(format!("{} has {} Gaussians, the first {}", path.display(), counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;
     let mut found = Vec::new();
@@ -82,14 +93,22 @@ fn why_linked(frames: &PlyFrames) -> Result<Option<String>> {
         };
         found.push(identity(&state(first)?, &state(first + 1)?));
     }
-    let lost: Vec<_> = found.iter().filter(|identity| !identity.holds).collect();
-    Ok((2 * lost.len() > found.len()).then(|| {
-        let worst = lost[0];
-        format!(
-            "those of the same place are as far apart as strangers ({:.1} sizes, {:.1}) or look as different ({:.2}, {:.2})",
-            worst.moved, worst.apart, worst.unlike, worst.strangers
-        )
-    }))
+    let lost = found.iter().filter(|identity| !identity.holds).count();
+    let is_lost = 2 * lost > found.len();
+    let Some(Identity { moved, apart, unlike, strangers, .. }) = found.iter().find(|found| found.holds != is_lost)
+    else {
+        return Ok(Order::Believed);
+    };
+    let apart = format!("({moved:.1} sizes, {apart:.1})");
+    Ok(match is_lost {
+        true => Order::Lost(format!(
+            "those of the same place are as far apart as strangers {apart} or look as different ({unlike:.2}, {strangers:.2})"
+        )),
+        false => Order::Kept(format!(
+            "frames are in one order: those of the same place are nearer than strangers {apart} and look more alike \
+             ({unlike:.2}, {strangers:.2})"
+        )),
+    })
 }
 
 impl Family for PlySequence {
@@ -103,6 +122,10 @@ impl Family for PlySequence {
 
     fn digest(&self) -> Result<String> {
         PlySequence::digest(self)
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.note().map(str::to_owned).into_iter().collect()
     }
 
     fn bytes(&self) -> Result<u64> {

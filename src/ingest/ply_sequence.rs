@@ -17,6 +17,7 @@ use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 pub struct PlySequence {
     frames: PlyFrames,
     info: SequenceInfo,
+    note: Option<String>,
     bytes: Count,
     states: Count,
 }
@@ -57,7 +58,17 @@ impl PlySequence {
             varying: if frames.paths().len() == 1 { Columns::empty() } else { Columns::all() },
         };
         let (bytes, states) = (Count::default(), Count::default());
-        Ok(PlySequence { frames, info, bytes, states })
+        Ok(PlySequence { frames, info, note: None, bytes, states })
+    }
+
+    /// The same, with something that a person should know of them.
+    pub fn with_note(self, note: String) -> PlySequence {
+        PlySequence { note: Some(note), ..self }
+    }
+
+    /// What a person should know of them, if anything.
+    pub fn note(&self) -> Option<&str> {
+        self.note.as_deref()
     }
 
     /// The same frames at other times, one per frame.

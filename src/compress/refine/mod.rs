@@ -830,7 +830,7 @@ mod tests {
             self.0.read(frame, want, out)?;
             if want.contains(Columns::OPACITY) {
                 let logits = out.opacity_logit.plane_mut(0).iter_mut().zip(&self.1);
-                logits.filter(|(_, id)| (*id + frame) % 3 > 0).for_each(|(logit, _)| *logit = self.2);
+                logits.filter(|(_, id)| !(*id + frame).is_multiple_of(3)).for_each(|(logit, _)| *logit = self.2);
             }
             Ok(())
         }
