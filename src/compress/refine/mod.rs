@@ -52,6 +52,8 @@ const KEEP_AFTER: u32 = 40;
 const KEEP_EVERY: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(30)];
 /// Decibels beyond which nothing is to be gained: less than a quarter of a step of 8 bits.
 pub(super) const CLOSE_ENOUGH: f64 = 60.0;
+/// Decibels that changes along time gain at least, or they are not worth their bytes.
+const LEAST_GAIN: f64 = 0.01;
 /// Part of the rates to go on with, where they led away from the pictures kept apart.
 const TOO_FAST: f32 = 0.3;
 /// Part of the Gaussians that ranking alone leaves, before the first steps of a stronger reduction.
@@ -650,7 +652,8 @@ impl<'a> Walk<'a> {
             self.progress.advance(1);
             if step % judge_every == 0 || step == steps {
                 let now = moving.closeness(&self.apart)?;
-                if self.refine.loss.is_closer(&now, &end.best) {
+                let gains = self.refine.loss.ssim > 0.0 || now.psnr >= end.best.psnr + LEAST_GAIN;
+                if gains && self.refine.loss.is_closer(&now, &end.best) {
                     (end.best, end.course) = (now, moving.course());
                 }
             }
