@@ -99,8 +99,8 @@ impl Job {
     }
 
     /// [`Job::new`] within the request's budget of memory: all times change alike, else harmonics above the first stay as they
-    /// are too, else nothing is refined, where it does not reach for more. If it does not reach for that either, what is asked for stays, to be
-    /// refused.
+    /// are too, else nothing is refined, where it does not reach for more. If it does not reach for that either, what is
+    /// asked for stays, to be refused.
     ///
     /// # Errors
     /// Those of [`Job::new`].

@@ -369,19 +369,21 @@ struct Kept<Standing, End> {
 
 /// What the last leg knows beside where it is.
 #[derive(Clone, Serialize, Deserialize)]
-struct End<Best> {
+struct End<Best, Along> {
     before: Closeness,
     best: Closeness,
+    /// The best of all times alike.
+    alike: Closeness,
     /// What is to be added for the best.
     kept: Best,
     /// Of the rates.
     part: f32,
-    /// And along time; none before all steps are done.
-    course: Course,
+    /// What is to be added along time for the best.
+    course: Along,
 }
 
 /// Steps of a leg that are done, their rates, and what the last leg knows beside.
-type Reached = (usize, Schedule, Option<End<Change>>);
+type Reached = (usize, Schedule, Option<End<Change, Course>>);
 
 impl<'a> Walk<'a> {
     /// Of `stage`, along the pictures of `parts`.
@@ -508,7 +510,7 @@ impl<'a> Walk<'a> {
 
     /// Goes to where the leg was when it was kept last, if it was.
     fn go_on(&mut self, moving: &mut Moving<'_>, trail: &Trail) -> Result<Option<Reached>> {
-        let kept: Option<Kept<moving::Kept, End<Change>>> = self.scene.work.find(&self.name(), trail.key)?;
+        let kept: Option<Kept<moving::Kept, End<Change, Course>>> = self.scene.work.find(&self.name(), trail.key)?;
         let Some(kept) = kept.filter(|kept| kept.leg == trail.leg) else { return Ok(None) };
         moving.go_on(kept.standing)?;
         self.turns.skip_to(kept.taken);
@@ -522,7 +524,7 @@ impl<'a> Walk<'a> {
         moving: &Moving<'_>,
         trail: &mut Trail,
         (steps, schedule): (usize, Schedule),
-        end: Option<End<&Change>>,
+        end: Option<End<&Change, &Course>>,
     ) -> Result<()> {
         if !self.scene.work.keeps() || trail.kept.elapsed() < trail.every {
             return Ok(());
@@ -581,7 +583,7 @@ impl<'a> Walk<'a> {
         trail: &mut Trail,
         steps: usize,
         journal: &mut Journal,
-    ) -> Result<End<Change>> {
+    ) -> Result<End<Change, Course>> {
         let count = self.apart.len();
         let (done, mut schedule, mut end) = match self.go_on(moving, trail)? {
             Some((done, schedule, Some(end))) => (done, schedule, end),
@@ -610,12 +612,10 @@ impl<'a> Walk<'a> {
                     schedule = Schedule::new(steps - step, LAST_RATE[1], end.best.error).times(end.part);
                 }
             }
-            let End { before, best, ref kept, part, .. } = end;
-            let course = Course::default();
-            self.keep(moving, trail, (step, schedule), Some(End { before, best, kept, part, course }))?;
+            end.alike = end.best;
+            self.keep(moving, trail, (step, schedule), Some(end.standing()))?;
         }
-        let of_all = end.best;
-        self.follow_time(moving, &mut end, self.steps_along(steps))?;
+        let is_along = self.follow_time(moving, trail, (done, schedule), &mut end, steps)?;
         let [start, best] = [end.before.psnr, end.best.psnr];
         if self.refine.loss.is_closer(&end.best, &end.before) {
             journal.notes.push(format!("refined: {count} pictures kept apart keep {best:.2} dB, not {start:.2}"));
@@ -623,49 +623,66 @@ impl<'a> Walk<'a> {
         } else {
             journal.leave_out("refinement", format!("{count} pictures kept apart never kept more than {start:.2} dB"));
         }
-        match end.course.is_empty() {
-            true if self.steps_along(steps) == 0 => (),
-            true => journal
-                .leave_out("changes along time", format!("pictures kept apart never kept more than {best:.2} dB")),
-            false => {
-                journal.notes.push(format!("refined along time: {:.2} dB of these are due to that", best - of_all.psnr))
-            }
+        if !end.course.is_empty() {
+            let gain = best - end.alike.psnr;
+            journal.notes.push(format!("refined along time: {gain:.2} dB of these are due to that"));
+        } else if is_along {
+            let why = format!("pictures kept apart never kept more than {best:.2} dB");
+            journal.leave_out("changes along time", why);
         }
         Ok(end)
     }
 
-    /// Takes so many steps along time from what was best of all times alike, as far as the pictures kept apart like it.
-    fn follow_time(&mut self, moving: &mut Moving<'_>, end: &mut End<Change>, steps: usize) -> Result<()> {
-        if steps == 0 || end.best.psnr >= CLOSE_ENOUGH {
-            return Ok(());
+    /// Takes steps along time behind `steps` steps, from what is best of all times alike or where it was `done` before, as far
+    /// as the pictures kept apart like them; gives whether any are.
+    fn follow_time(
+        &mut self,
+        moving: &mut Moving<'_>,
+        trail: &mut Trail,
+        (done, mut schedule): (usize, Schedule),
+        end: &mut End<Change, Course>,
+        steps: usize,
+    ) -> Result<bool> {
+        let along = self.steps_along(steps);
+        if along == 0 || end.alike.psnr >= CLOSE_ENOUGH {
+            return Ok(false);
         }
-        moving.turn_back(&end.kept)?;
-        let knots = self.knots();
-        if !moving.bend(knots) {
-            return Ok(());
+        if done <= steps {
+            let knots = self.knots();
+            moving.turn_back(&end.kept)?;
+            if !moving.bend(knots) {
+                return Ok(false);
+            }
+            // Each picture is a step of two knots.
+            schedule = Schedule::new(2 * along / knots, LAST_RATE[1], end.alike.error);
         }
-        // Each picture is a step of two knots.
-        let schedule = Schedule::new(2 * steps / knots, LAST_RATE[1], end.best.error);
-        let judge_every = steps.div_ceil(3).max(1);
-        for step in 1..=steps {
+        let judge_every = along.div_ceil(3);
+        for step in done.saturating_sub(steps) + 1..=along {
             moving.step_along(self.turns.next(), &schedule)?;
             self.progress.advance(1);
-            if step % judge_every == 0 || step == steps {
+            if step % judge_every == 0 || step == along {
                 let now = moving.closeness(&self.apart)?;
                 let gains = self.refine.loss.ssim > 0.0 || now.psnr >= end.best.psnr + LEAST_GAIN;
                 if gains && self.refine.loss.is_closer(&now, &end.best) {
                     (end.best, end.course) = (now, moving.course());
                 }
             }
+            self.keep(moving, trail, (steps + step, schedule), Some(end.standing()))?;
         }
-        Ok(())
+        Ok(true)
     }
 }
 
-impl<Best> End<Best> {
+impl End<Change, Course> {
     /// Nothing gained yet.
-    fn new(before: Closeness, kept: Best) -> End<Best> {
-        End { before, best: before, kept, part: 1.0, course: Course::default() }
+    fn new(before: Closeness, kept: Change) -> Self {
+        End { before, best: before, alike: before, kept, part: 1.0, course: Course::default() }
+    }
+
+    /// To be kept.
+    fn standing(&self) -> End<&Change, &Course> {
+        let End { before, best, alike, ref kept, part, ref course } = *self;
+        End { before, best, alike, kept, part, course }
     }
 }
 
@@ -755,20 +772,19 @@ mod tests {
     fn a_way_that_is_cut_short_anywhere_goes_on_and_ends_where_it_would_have() {
         let folder = tempfile::tempdir().unwrap();
         let model = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model");
-        // States that follow from what is stored by a sum, and by a field.
-        for (number, field) in [(0, false), (1, true)] {
+        let long = folder.path().join("long.gseq");
+        write_container(&demo::Scene::new(400, 12), &long, gseq::Compression::Raw, Default::default(), |_| ()).unwrap();
+        let short = folder.path().join("scene.gseq");
+        drop(scene(folder.path()));
+        // States that follow from what is stored by a sum, by a field, and along time.
+        for (number, field, path) in [(0, false, short), (1, true, model), (2, false, long)] {
             let open = |work: Option<Asked>| {
-                let options = match field {
-                    true => {
-                        InputOptions { path: model.clone(), cameras: Some(model.clone()), work, ..Default::default() }
-                    }
-                    false => InputOptions { path: folder.path().join("scene.gseq"), work, ..Default::default() },
-                };
+                let cameras = field.then(|| path.clone());
+                let options = InputOptions { path: path.clone(), cameras, work, ..Default::default() };
                 let mut opened = open_scene(&options).unwrap();
                 opened.has_cameras = true;
                 opened
             };
-            drop(scene(folder.path()));
             let run = |scene: &Scene| -> Result<Reduction> {
                 let recipe = Recipe::preset("default").unwrap();
                 let scored = crate::compress::score_scene(scene, &recipe, &UserOverrides::default())?;
@@ -806,9 +822,10 @@ mod tests {
                     }
                 }
             }
-            let found = found.expect("it ends").change;
+            let found = found.expect("it ends");
             assert!(cuts > 1, "it was cut short {cuts} times");
-            assert!(found == expected.change && !found.is_empty(), "field: {field}, cut short {cuts} times");
+            assert!(found.change == expected.change && !found.change.is_empty(), "{number}, cut short {cuts} times");
+            assert!(found.course == expected.course && found.course.is_empty() == (number < 2), "{number}: along time");
         }
     }
 

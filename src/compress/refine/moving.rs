@@ -78,8 +78,10 @@ pub(super) struct Moving<'a> {
 }
 
 /// What states follow from: what was stored when they were found last and what had been added by then, none as long as
-/// that is what a leg began with; what the descent added, with its means and steps; and the steps since states were found.
-type Standing<Stored, Added, Means> = (Option<(Stored, Added)>, (Added, Means, usize), usize);
+/// that is what a leg began with; what the descent added, with its means and steps; the steps since states were found; and
+/// what each knot of the course added.
+type Standing<Stored, Added, Means> =
+    (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
 /// A [`Standing`] that was kept.
 pub(super) type Kept = Standing<Raw, Change, [Gaussians; 2]>;
@@ -205,7 +207,8 @@ impl<'a> Moving<'a> {
     /// What is needed to go on from here, for [`Moving::go_on`].
     pub(super) fn standing(&self) -> impl Serialize + '_ {
         let found = self.found.then_some((&self.stored, &self.before));
-        let standing: Standing<&Raw, &Change, &[Gaussians; 2]> = (found, self.descent.standing(), self.steps);
+        let course = self.course.iter().map(Descent::standing).collect();
+        let standing: Standing<&Raw, &Change, &[Gaussians; 2]> = (found, self.descent.standing(), self.steps, course);
         standing
     }
 
@@ -213,7 +216,7 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be written.
-    pub(super) fn go_on(&mut self, (found, descent, steps): Kept) -> Result<()> {
+    pub(super) fn go_on(&mut self, (found, descent, steps, course): Kept) -> Result<()> {
         if let Some((stored, before)) = found {
             self.descent.take();
             (self.stored, self.before) = (stored, before);
@@ -221,6 +224,10 @@ impl<'a> Moving<'a> {
         }
         self.descent.go_on(descent);
         self.steps = steps;
+        if !course.is_empty() {
+            self.bend(course.len());
+            self.course.iter_mut().zip(course).for_each(|(knot, standing)| knot.go_on(standing));
+        }
         Ok(())
     }
 
