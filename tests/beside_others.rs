@@ -7,15 +7,11 @@ mod scene;
 
 use std::fs;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use scene::{Workplace, files, lasting_files, tiny};
-
-fn program() -> PathBuf {
-    assert_cmd::cargo::cargo_bin("splatsieve")
-}
+use scene::{Workplace, files, lasting_files, program, tiny};
 
 /// The tiny model as a frame stream.
 fn stream(workplace: &Workplace) -> Vec<u8> {

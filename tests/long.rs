@@ -7,8 +7,8 @@ mod scene;
 
 use std::fs;
 use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
+use std::process::Output;
 
 use scene::Workplace;
 use splatsieve::emit::frame_stream::StreamWriter;
@@ -59,10 +59,7 @@ impl Walk {
 
 /// Runs the program on `walk` as it arrives.
 fn piped(workplace: &Workplace, arguments: &str, walk: Walk) -> Output {
-    let program = std::env::var_os("SPLATSIEVE_PROGRAM");
-    let mut command = Command::new(program.map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from));
-    command.current_dir(workplace.path("")).args(arguments.split_whitespace());
-    scene::piped(&mut command, move |pipe| walk.write(pipe))
+    scene::piped(&mut workplace.command(arguments), move |pipe| walk.write(pipe))
 }
 
 /// Runs the program without an input.

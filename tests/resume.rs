@@ -7,24 +7,19 @@ mod scene;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime};
 
-use scene::Workplace;
+use scene::{Workplace, program};
 
 /// A scene of many Gaussians for its size on the disk, and a run of all that can be kept.
 const RUN: &str =
     "compress scene/scene.gseq --cameras scene/cameras.json --quiet --target-ratio 0.2 --refine-steps 150";
 
-fn program() -> Command {
-    let program = std::env::var_os("SPLATSIEVE_PROGRAM");
-    Command::new(program.map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from))
-}
-
 fn command(workplace: &Workplace, arguments: &str) -> Command {
-    let mut command = program();
+    let mut command = Command::new(program());
     command.current_dir(workplace.path("")).args(arguments.split_whitespace());
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     command
@@ -212,10 +207,9 @@ fn a_full_disk_under_the_work_folder_is_named_and_more_room_goes_on() {
     let workplace = made(700);
     fs::create_dir(workplace.path("disk")).unwrap();
     let run = format!("{RUN} -o full.gseq --work disk/work");
-    let program = program();
     let script = format!(
         "mount -t tmpfs -o size=300k none disk && ({0} {run}; echo \"code $?\" >&2; mount -o remount,size=300m disk && {0} {run})",
-        program.get_program().to_str().unwrap()
+        program().display()
     );
     let shell = |arguments: &[&str]| {
         Command::new("unshare")

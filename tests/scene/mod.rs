@@ -23,6 +23,11 @@ pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
+/// The program: the one that was built with this test, or another one that `SPLATSIEVE_PROGRAM` names, an optimised one.
+pub(crate) fn program() -> PathBuf {
+    std::env::var_os("SPLATSIEVE_PROGRAM").map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from)
+}
+
 /// Runs `command`, to whose standard input `write` writes meanwhile.
 pub(crate) fn piped(command: &mut process::Command, write: impl FnOnce(ChildStdin) + Send + 'static) -> Output {
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -116,7 +121,7 @@ impl Workplace {
 
     /// Runs the program with these arguments, which may hold blanks.
     pub(crate) fn run_words(&self, words: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Run {
-        let output = Command::cargo_bin("splatsieve").unwrap().current_dir(self.0.path()).args(words).output().unwrap();
+        let output = Command::new(program()).current_dir(self.0.path()).args(words).output().unwrap();
         Run {
             code: output.status.code().unwrap(),
             stdout: String::from_utf8(output.stdout).unwrap(),
@@ -126,7 +131,7 @@ impl Workplace {
 
     /// The program with these arguments, to be run here.
     pub(crate) fn command(&self, arguments: &str) -> process::Command {
-        let mut command = process::Command::new(assert_cmd::cargo::cargo_bin("splatsieve"));
+        let mut command = process::Command::new(program());
         let tiny = tiny().display().to_string();
         command.current_dir(self.0.path()).args(arguments.split_whitespace().map(|word| word.replace("{tiny}", &tiny)));
         command
