@@ -13,15 +13,14 @@ from there if they are there. Needs numpy.
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
 import argparse
 import json
-import os
 import shlex
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
+
+from scaling import measured
 
 PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
 PROPERTIES += [f"scale_{c}" for c in range(3)] + [f"rot_{c}" for c in range(4)]
@@ -76,16 +75,11 @@ def main():
             print(f"{make(folder, args.frames, args.living, args.life):,} lives", flush=True)
         out = Path(scratch) / "small"
         command = [args.binary, "compress", folder, "-o", out, "--memory", args.memory, "--json", *args.extra]
-        start = time.monotonic()
-        process = subprocess.Popen([str(part) for part in command], stdout=subprocess.PIPE)
-        summary = process.stdout.read()
-        _, code, usage = os.wait4(process.pid, 0)
-        if code != 0:
-            raise SystemExit(f"splatsieve ended with {os.waitstatus_to_exitcode(code)}")
-        summary = json.loads(summary)
+        printed, cost = measured(command)
+        summary = json.loads(printed)
         print(f"{summary['input']['gaussians']:,} tracks, {summary['gaussians']:,} of them kept")
-        print(f"{time.monotonic() - start:.0f} s, {usage.ru_utime + usage.ru_stime:.0f} s of processor")
-        print(f"{usage.ru_maxrss / 1024:.0f} MiB at most, {args.memory} allowed")
+        print(f"{cost['wall']:.0f} s, {cost['processor']:.0f} s of processor")
+        print(f"{cost['peak'] / (1 << 20):.0f} MiB at most, {args.memory} allowed")
         for note in summary.get("notes", []):
             print(f"note: {note}")
 
