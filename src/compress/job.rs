@@ -112,11 +112,13 @@ impl Job {
             return Ok(asked);
         }
         let least = |job: &Job| Plan::closest(*work, 1, |work, limits| job.needs(work, limits)).peak();
-        let alike = of(Spared::Course { least: least(&asked) })?;
-        if least(&alike) < least(&asked) && Plan::fits(*work, budget, |work, limits| alike.needs(work, limits)) {
+        let of_all = least(&asked);
+        let alike = of(Spared::Course { least: of_all })?;
+        let of_alike = least(&alike);
+        if of_alike < of_all && Plan::fits(*work, budget, |work, limits| alike.needs(work, limits)) {
             return Ok(alike);
         }
-        let bands = of(Spared::Bands { least: least(&alike) })?;
+        let bands = of(Spared::Bands { least: of_alike })?;
         if work.sh_degree > 0 && Plan::fits(*work, budget, |work, limits| bands.needs(work, limits)) {
             return Ok(bands);
         }
@@ -141,14 +143,12 @@ impl Job {
         let looks = measure.visible.is_some();
         let prunes = *only != Only::Merge;
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
-        let refine = match spared {
-            Spared::Nothing => Refine::of(recipe, part, looks && prunes),
-            Spared::Course { .. } => Refine::of(recipe, part, looks && prunes).map(Refine::without_course),
-            Spared::Bands { .. } => {
-                Refine::of(recipe, part, looks && prunes).map(|refine| refine.without_course().without_bands())
-            }
+        let refine = Refine::of(recipe, part, looks && prunes).and_then(|refine| match spared {
+            Spared::Nothing => Some(refine),
+            Spared::Course { .. } => Some(refine.without_course()),
+            Spared::Bands { .. } => Some(refine.without_course().without_bands()),
             Spared::Refining { .. } => None,
-        };
+        });
         if request.kind.is_none() {
             OutputKind::check_name(&request.output)?;
         }
