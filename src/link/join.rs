@@ -13,7 +13,7 @@ const ALIKE: Round = Round { reach: 4.0, strictness: 1.0 / 16.0, missing: true }
 const CLOSE: Round = Round { reach: 1.0, strictness: 1.0, missing: true };
 /// How much larger one may be, as a natural log: no other is looked for in the grid.
 const MOST_LARGER: f32 = std::f32::consts::LN_2 / 2.0;
-/// Frames that both lives may be there together: one fades out while the other fades in.
+/// Frames that both lives may be there together, beyond those that one is there alone: one fades out while the other fades in.
 const TOGETHER: u8 = 4;
 
 /// How alike lives must be to be one: so that they may be, and so that they are to the eye. What the second takes the first
@@ -40,7 +40,7 @@ struct Pair {
     track: u32,
     other: u32,
     cost: f32,
-    /// Frames that both were there.
+    /// Frames that both were there, less those after them that one was there alone.
     together: u8,
     /// Whether they were one to the eye in all of these.
     are_close: bool,
@@ -134,7 +134,11 @@ impl Lives {
                 pair.are_close &= cost(&a.look, &b.look, &CLOSE) <= 1.0;
                 pair.together <= TOGETHER && cost(&a.look, &b.look, rule) <= 1.0
             }
-            _ => true,
+            // Where lives are short, one that fades out is linked with what the one after the next fades in as.
+            _ => {
+                pair.together = pair.together.saturating_sub(1);
+                true
+            }
         });
         // What has come and gone beside another was part of it: pairs are in the order of cost.
         for pair in within {

@@ -32,7 +32,7 @@
 //! 6. Lives that are one ([`Joiner`]). A track that begins where another is, or would be, names the four that cost least by
 //!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A without opacities, at most 1, with r = 4 and q = 1/16 (alike) or r = q = 1
 //!    (close), and sizes within a factor of √2. Both may be there together for four frames, in each of which that holds: one
-//!    fades out while the other fades in. When the cheapest that is left has ended, the track goes on from it, by cost, each
+//!    fades out while the other fades in; and for as many more as one was away of them before. When the cheapest that is left has ended, the track goes on from it, by cost, each
 //!    end and each beginning once. A track that ends within these frames while the other goes on was part of it, if they
 //!    were close. Where several tracks of a life are there together they are [blended](blend).
 //!
