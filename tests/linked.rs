@@ -3,6 +3,7 @@
 mod scene;
 
 use std::collections::BTreeMap;
+use std::f64::consts::PI;
 use std::fs;
 use std::path::PathBuf;
 use std::process::Stdio;
@@ -210,6 +211,140 @@ fn lives_that_fade_into_one_another_are_one_track_and_one_row() {
     let rows = |folder: &str| PlyRows::read(&workplace.path(&format!("{folder}/8.ply"))).rows.len();
     assert!(rows("apart") == rows("frames") && rows("all") < rows("apart"), "{} {}", rows("all"), rows("apart"));
     assert!(fs::read_to_string(workplace.path("apart/recipe.toml")).unwrap().contains("link = \"apart\""));
+}
+
+/// Frame `t` of Gaussians that change along time by parts of their own, so that of every column some are steady and some are
+/// not.
+fn trembling(count: usize, t: usize) -> Gaussians {
+    let mut out = Gaussians::zeros(count, 1);
+    for i in 0..count {
+        row(i, t, &mut out, i);
+        let tremble = |k: u64, most: f32| {
+            let part = |of: u64| uniform(hash_id((i as u64) << 20 | k << 12 | of));
+            2.0 * most * part(4000) * (part(t as u64) - 0.5) * 3f32.sqrt()
+        };
+        for (c, value) in (0..).zip(out.sh.row::<12>(i)) {
+            out.sh.plane_mut(c as usize)[i] = value + tremble(c, 0.06 * 3.5 / 2.0);
+        }
+        let [scales, turn] = [(20, 0.03), (30, 0.01)].map(|(k, most)| [0, 1, 2].map(|c| tremble(k + c, most)));
+        (0..3).for_each(|c| out.log_scale.plane_mut(c)[i] += scales[c]);
+        let [w, x, y, z] = out.rotation.row(i);
+        // Half of them with the other sign.
+        let sign = if uniform((i as u64) << 20 | t as u64) < 0.5 { -1.0 } else { 1.0 };
+        out.rotation.set_row(i, [w + turn[0], x + turn[1], y + turn[2], z].map(|q| sign * q));
+        out.opacity_logit.set_row(i, [out.opacity_logit.plane(0)[i] + tremble(40, 0.25)]);
+    }
+    let mut order: Vec<u32> = (0..count as u32).collect();
+    order.sort_by_key(|&i| hash_id(u64::from(i) << 20 | t as u64));
+    out.pick(&order)
+}
+
+/// What the documentation of `steady` says of one track, in f64: the means of rotation, scales, opacity logit and colours, and
+/// by how much each changes, over its bound.
+fn steadiness(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
+    let values = |column: &dyn Fn(&Gaussians) -> Vec<f32>| -> Vec<Vec<f64>> {
+        frames.iter().map(|frame| column(frame).into_iter().map(f64::from).collect()).collect()
+    };
+    let alphas: Vec<f64> =
+        frames.iter().map(|frame| 1.0 / (1.0 + (-f64::from(frame.opacity_logit.plane(0)[track])).exp())).collect();
+    let weight: f64 = alphas.iter().sum();
+    let mean = |rows: &[Vec<f64>]| -> Vec<f64> {
+        (0..rows[0].len()).map(|c| rows.iter().zip(&alphas).map(|(row, a)| a * row[c]).sum::<f64>() / weight).collect()
+    };
+    let rms = |rows: &[Vec<f64>], of: &dyn Fn(Vec<f64>) -> f64| {
+        let mean = mean(rows);
+        let differ = |row: &Vec<f64>| row.iter().zip(&mean).map(|(a, b)| a - b).collect();
+        (rows.iter().zip(&alphas).map(|(row, a)| a * of(differ(row))).sum::<f64>() / weight).sqrt()
+    };
+    let mut turns = values(&|frame| frame.rotation.row::<4>(track).to_vec());
+    let first = turns[0].clone();
+    for turn in &mut turns {
+        let along: f64 = turn.iter().zip(&first).map(|(a, b)| a * b).sum();
+        turn.iter_mut().for_each(|q| *q *= along.signum());
+    }
+    let length = |turn: &Vec<f64>| turn.iter().map(|q| q * q).sum::<f64>().sqrt();
+    let units: Vec<Vec<f64>> = turns.iter().map(|turn| turn.iter().map(|q| q / length(turn)).collect()).collect();
+    let scales = values(&|frame| frame.log_scale.row::<3>(track).to_vec());
+    let colours = values(&|frame| frame.sh.row::<12>(track).to_vec());
+    let logits = values(&|frame| vec![frame.opacity_logit.plane(0)[track]]);
+    let mean_alpha = weight / frames.len() as f64;
+    let of_alpha = alphas.iter().map(|a| (a - mean_alpha).powi(2)).sum::<f64>() / frames.len() as f64;
+    let most = |parts: [f64; 3]| parts.into_iter().fold(0.0, f64::max);
+    let of_scales = most([0, 1, 2].map(|c| rms(&scales, &|by| by[c] * by[c])));
+    let of_colours = most([0, 1, 2].map(|channel| {
+        rms(&colours, &|by| by.iter().skip(channel).step_by(3).map(|v| v * v).sum::<f64>() / (4.0 * PI))
+    }));
+    let of_turns = 2.0 * rms(&units, &|by| by.iter().map(|q| q * q).sum());
+    [
+        (mean(&turns), of_turns / 0.02),
+        (mean(&scales), of_scales / 0.02),
+        (mean(&logits), of_alpha.sqrt() / 0.02),
+        (mean(&colours), of_colours / 0.04),
+    ]
+}
+
+#[test]
+fn what_hardly_changes_along_a_track_is_held_at_its_mean() {
+    let workplace = Workplace::new();
+    let (count, frames) = (400, 12);
+    for t in 0..frames {
+        workplace.ply(&format!("frames/{t}.ply"), &trembling(count, t));
+    }
+    let (apart, held) = (open(&workplace, "frames", Link::Apart), open(&workplace, "frames", Link::Always));
+    let [given, found] = [&apart, &held].map(|scene| {
+        let states: Vec<Gaussians> = (0..frames).map(|t| state(scene.source(), t)).collect();
+        states
+    });
+    let mut parts = [[0, 0]; 4];
+    // Tracks that are there in all frames, and are so of one life.
+    let whole = |states: &[Gaussians], track: usize| {
+        let is_there = states.iter().all(|frame| frame.opacity_logit.plane(0)[track] > -39.0);
+        is_there.then(|| {
+            states.iter().flat_map(|frame| frame.position.row::<3>(track).map(f32::to_bits)).collect::<Vec<u32>>()
+        })
+    };
+    let places: BTreeMap<Vec<u32>, usize> =
+        (0..found[0].len()).filter_map(|track| Some((whole(&found, track)?, track))).collect();
+    for given_as in 0..given[0].len() {
+        let Some(&found_as) = whole(&given, given_as).and_then(|place| places.get(&place)) else { continue };
+        for (kind, (mean, change)) in steadiness(&given, given_as).into_iter().enumerate() {
+            let columns = |frame: &Gaussians, track: usize| match kind {
+                0 => frame.rotation.row::<4>(track).to_vec(),
+                1 => frame.log_scale.row::<3>(track).to_vec(),
+                2 => frame.opacity_logit.row::<1>(track).to_vec(),
+                _ => frame.sh.row::<12>(track).to_vec(),
+            };
+            assert!((change - 1.0).abs() > 1e-6, "nothing is at the bound");
+            parts[kind][usize::from(change < 1.0)] += 1;
+            for (given, found) in given.iter().zip(&found) {
+                let (given, found) = (columns(given, given_as), columns(found, found_as));
+                if change > 1.0 {
+                    assert_eq!(given, found, "track {found_as}, column {kind}: {change}");
+                } else {
+                    let near = |(a, b): (&f32, &f64)| (f64::from(*a) - b).abs() <= 1e-6 * b.abs().max(1.0);
+                    assert!(found.iter().zip(&mean).all(near), "track {found_as}, column {kind}: {change}");
+                }
+            }
+        }
+    }
+    assert!(parts.iter().flatten().all(|&part| part > 20), "{parts:?}");
+    let notes = held.input.notes().join("\n");
+    assert!(notes.contains("% of the colours (within 0.04)") && notes.contains("pictures stay within"), "{notes}");
+    // Files say the same, to the bit.
+    workplace.done("compress frames -o all --target-ratio 1 --no-refine --prune-only --bands all");
+    for (t, found) in found.iter().enumerate() {
+        let ply = PlyRows::read(&workplace.path(&format!("all/{t}.ply")));
+        let rows: BTreeMap<u32, usize> = (0..ply.rows.len()).map(|i| (ply.value(i, "x").to_bits(), i)).collect();
+        let living: Vec<usize> = (0..found.len()).filter(|&i| found.opacity_logit.plane(0)[i] > -39.0).collect();
+        assert_eq!(living.len(), ply.rows.len());
+        for track in living {
+            let at = rows[&found.position.plane(0)[track].to_bits()];
+            let all = [("rot_0", &found.rotation), ("scale_0", &found.log_scale), ("f_dc_0", &found.sh)];
+            for (name, column) in all.into_iter().chain([("opacity", &found.opacity_logit)]) {
+                assert_eq!(ply.value(at, name).to_bits(), column.plane(0)[track].to_bits(), "{name} at frame {t}");
+            }
+        }
+    }
 }
 
 #[test]

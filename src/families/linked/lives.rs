@@ -1,6 +1,9 @@
-//! Which lives are made one, and what that costs in pictures.
+//! Which lives are made one and what is held along them, and what that costs in pictures.
 
-use super::tracks::{Tracks, read_rows};
+use std::path::Path;
+
+use super::steady::{Bound, Steady};
+use super::tracks::Tracks;
 use crate::error::Result;
 use crate::ingest::cameras::virtual_rig;
 use crate::link::{Joiner, Linker};
@@ -9,11 +12,13 @@ use crate::model::{Columns, Gaussians};
 use crate::render::Renderer;
 use crate::stats::RobustBox;
 
-/// Pictures with joined lives are at least as near to those of lives apart, dB.
+/// Pictures with joined lives are at least as near to those of lives apart, and those with what is held to those without, dB.
 const LEAST_DB: f64 = 40.0;
 /// Frames that are looked at, and views of each.
 const FRAMES: usize = 3;
 const VIEWS: usize = 3;
+/// What may change along a track and be held: no more than trainers leave between lives, or half of that.
+const BOUNDS: [Bound; 2] = [Bound { colour: 0.04, other: 0.02 }, Bound { colour: 0.02, other: 0.01 }];
 
 /// Joins the lives of `tracks` that `joiner` has seen as loosely as pictures allow, if any may be; gives what a person should
 /// know of that.
@@ -30,8 +35,7 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut Tracks) -> Resu
         tracks.join(of_tracks, count);
         let psnr = cost(tracks)?;
         if psnr.is_none_or(|psnr| psnr >= LEAST_DB) {
-            let cost =
-                psnr.map_or("no picture changes".to_owned(), |psnr| format!("pictures stay within {psnr:.1} dB"));
+            let cost = within(psnr.unwrap_or(f64::INFINITY));
             let lives = format!("{before} lives of {median_length} frames in the median");
             return Ok(Some(format!("{lives} were joined to these tracks: {cost}")));
         }
@@ -43,31 +47,80 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut Tracks) -> Resu
     Ok(note)
 }
 
-/// PSNR of pictures of joined lives against those of lives apart, where any are blended: the mean of some views around the
-/// scene at frames, evenly spread, in which some are.
+/// Holds what hardly changes along `tracks` at its mean, within the largest of [`BOUNDS`] that pictures allow, if any; gives
+/// what a person should know of that.
+///
+/// # Errors
+/// A frame that cannot be read; a failed write to `scratch`.
+pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>> {
+    for bound in BOUNDS {
+        let steady = Steady::of(tracks, bound, scratch)?;
+        let parts = steady.parts();
+        if parts == [0.0; 4] {
+            return Ok(None);
+        }
+        let frames: Vec<u32> = (0..tracks.frames().paths().len() as u32).collect();
+        let states = |tracks: &Tracks, frame: usize| {
+            tracks.states(&tracks.frames().frame(frame)?, &tracks.rows(frame, 0..tracks.count())?)
+        };
+        let before = looked_at(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
+        tracks.hold(Some(steady));
+        let after = looked_at(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
+        let psnr = likeness(&before, &after);
+        if psnr >= LEAST_DB {
+            let [colours, scales, rotations, opacities] = parts.map(|part| format!("{:.0}%", 100.0 * part));
+            let Bound { colour, other } = bound;
+            return Ok(Some(format!(
+                "what hardly changes along a track is held: {colours} of the colours (within {colour}), {scales} of the \
+                 scales, {rotations} of the rotations and {opacities} of the opacities (within {other}): {}",
+                within(psnr)
+            )));
+        }
+        tracks.hold(None);
+    }
+    Ok(None)
+}
+
+/// PSNR of pictures of joined lives against those of lives apart, where any are blended.
 fn cost(tracks: &Tracks) -> Result<Option<f64>> {
     let frames = tracks.lengths()?.blended;
     if frames.is_empty() {
         return Ok(None);
     }
-    let looked_at = frames.len().min(FRAMES);
-    let mut renderer = Renderer::on_all_threads();
-    let (mut apart, mut part) = [(); 2].map(|()| Gaussians::zeros(0, tracks.frames().sh_degree())).into();
-    let mut found = Vec::new();
-    for k in 0..looked_at {
-        let frame = frames[(2 * k + 1) * frames.len() / (2 * looked_at)] as usize;
+    let (mut apart, mut joined) = (Vec::new(), Vec::new());
+    for frame in looked_at(&frames) {
         let ply = tracks.frames().frame(frame)?;
-        ply.gaussians(0..ply.count(), Columns::all(), &mut apart)?;
-        let firsts: Vec<u32> =
-            read_rows(&ply, &tracks.rows(frame)?, &mut part)?.into_iter().map(|first| first as u32).collect();
-        let joined = part.pick(&firsts);
-        let around = RobustBox::of(&apart.position);
+        let mut all = Gaussians::zeros(0, tracks.frames().sh_degree());
+        ply.gaussians(0..ply.count(), Columns::all(), &mut all)?;
+        apart.push(all);
+        joined.push(tracks.states(&ply, &tracks.rows(frame, 0..tracks.count())?)?);
+    }
+    Ok(Some(likeness(&apart, &joined)))
+}
+
+/// Some of `frames`, evenly spread.
+fn looked_at(frames: &[u32]) -> impl Iterator<Item = usize> {
+    let count = frames.len().min(FRAMES);
+    (0..count).map(move |k| frames[(2 * k + 1) * frames.len() / (2 * count)] as usize)
+}
+
+/// PSNR of pictures of `b` against those of `a`, frame by frame: the mean of some views around the scene.
+fn likeness(a: &[Gaussians], b: &[Gaussians]) -> f64 {
+    let mut renderer = Renderer::on_all_threads();
+    let mut found = Vec::new();
+    for (a, b) in a.iter().zip(b) {
+        let around = RobustBox::of(&a.position);
         let rig = virtual_rig(around.middle, around.extent());
         for view in 0..VIEWS {
             let camera = &rig.cameras[view * rig.cameras.len() / VIEWS];
-            let [a, b] = [&apart, &joined].map(|state| renderer.render(state, camera, [0.0; 3]));
+            let [a, b] = [a, b].map(|state| renderer.render(state, camera, [0.0; 3]));
             found.push(psnr(&a, &b));
         }
     }
-    Ok(Some(found.iter().sum::<f64>() / found.len() as f64))
+    found.iter().sum::<f64>() / found.len() as f64
+}
+
+/// `psnr` in words.
+fn within(psnr: f64) -> String {
+    if psnr.is_finite() { format!("pictures stay within {psnr:.1} dB") } else { "no picture changes".to_owned() }
 }

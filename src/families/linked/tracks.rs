@@ -6,6 +6,7 @@ use std::path::Path;
 
 use gseq::Compression;
 
+use super::steady::{Means, Steady};
 use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, Lives};
 use crate::error::Result;
 use crate::ingest::ply::Ply;
@@ -29,7 +30,7 @@ pub(super) struct Row {
 /// A frame in which a track is, and the row there.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct At {
-    frame: u32,
+    pub(super) frame: u32,
     row: u32,
 }
 
@@ -39,6 +40,8 @@ pub(super) struct Tracks {
     count: usize,
     /// Of every track of `of_rows` the one it is part of, if lives are joined.
     lives: Option<Vec<u32>>,
+    /// What is held along tracks, if anything is.
+    steady: Option<Steady>,
     /// Where each track is first.
     births: Vec<At>,
     /// Tracks of the rows of all frames, one after the other, and where those of each frame begin.
@@ -135,13 +138,31 @@ impl Tracks {
             starts.push(end);
             progress.advance(1);
         }
-        let tracks = Tracks { count: births.len(), frames, lives: None, births, of_rows: spilling.finish()?, starts };
+        let tracks = Tracks {
+            count: births.len(),
+            frames,
+            lives: None,
+            steady: None,
+            births,
+            of_rows: spilling.finish()?,
+            starts,
+        };
         Ok((tracks, Found { states: end, cuts, doubtful }, linker))
     }
 
     /// Makes `count` tracks of what is there, of each the one that `of_tracks` says.
     pub(super) fn join(&mut self, of_tracks: Vec<u32>, count: usize) {
         (self.lives, self.count) = (Some(of_tracks), count);
+    }
+
+    /// Holds along tracks what `steady` says, or nothing.
+    pub(super) fn hold(&mut self, steady: Option<Steady>) {
+        self.steady = steady;
+    }
+
+    /// What is held along tracks, if anything is.
+    pub(super) fn steady(&self) -> Option<&Steady> {
+        self.steady.as_ref()
     }
 
     /// Takes back what was joined.
@@ -180,8 +201,8 @@ impl Tracks {
         Ok(tracks)
     }
 
-    /// Where each track is first.
-    fn first(&self) -> Vec<At> {
+    /// Where each track is first, in the order of frames.
+    pub(super) fn first(&self) -> Vec<At> {
         match &self.lives {
             None => self.births.clone(),
             // Lives are numbered by their beginnings.
@@ -207,12 +228,49 @@ impl Tracks {
         self.count
     }
 
-    /// The rows of a frame by their tracks.
-    pub(super) fn rows(&self, frame: usize) -> Result<Vec<Row>> {
+    /// The rows of a frame that are of `tracks`, by their tracks.
+    pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<Row>> {
         let rows = self.of_frame(frame)?.into_iter().enumerate();
-        let mut rows: Vec<Row> = rows.map(|(row, track)| Row { track, row: row as u32 }).collect();
+        let rows = rows.map(|(row, track)| Row { track, row: row as u32 });
+        let mut rows: Vec<Row> = rows.filter(|row| tracks.contains(&(row.track as usize))).collect();
         rows.sort_unstable();
         Ok(rows)
+    }
+
+    /// Reads `rows`, which are by track, of a frame's `file` into `state`, those of one track blended in the place of the
+    /// first; gives the first of each.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn blended(&self, file: &Ply, rows: &[Row], state: &mut Gaussians) -> Result<Vec<usize>> {
+        let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
+        file.gather(&Ids::List(&of_file), Columns::all(), state)?;
+        let mut firsts = Vec::with_capacity(rows.len());
+        let mut at = 0;
+        for of_track in rows.chunk_by(|a, b| a.track == b.track) {
+            if of_track.len() > 1 {
+                blend(state, &Vec::from_iter(at..at + of_track.len()));
+            }
+            firsts.push(at);
+            at += of_track.len();
+        }
+        Ok(firsts)
+    }
+
+    /// The tracks of `rows`, which are by track, in the states they have in the frame of `file`: blended, and held where they
+    /// are steady.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn states(&self, file: &Ply, rows: &[Row]) -> Result<Gaussians> {
+        let mut state = Gaussians::zeros(0, self.frames.sh_degree());
+        let firsts = self.blended(file, rows, &mut state)?;
+        let mut states = state.pick(&firsts.iter().map(|&first| first as u32).collect::<Vec<u32>>());
+        if let Some(steady) = &self.steady {
+            let tracks: Vec<u32> = firsts.iter().map(|&first| rows[first].track).collect();
+            steady.means(&tracks)?.hold((0..tracks.len()).map(|at| (at, at)), &mut states);
+        }
+        Ok(states)
     }
 
     /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbours, so that where a
@@ -227,7 +285,8 @@ impl Tracks {
         for start in (0..times.len()).step_by(FRAME_BLOCK) {
             let of_block = start..times.len().min(start + FRAME_BLOCK);
             let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
-            let rows: Vec<Vec<Row>> = of_block.clone().map(|frame| self.rows(frame)).collect::<Result<_>>()?;
+            let rows: Vec<Vec<Row>> =
+                of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;
             let mut lives: Vec<Lives> =
                 was_still.iter().map(|&still| if still { Lives::Repeating } else { Lives::Still }).collect();
             for row in rows.iter().flatten() {
@@ -274,9 +333,12 @@ impl FrameSource for FrameBlock<'_> {
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         let ids: Vec<usize> = ids.iter().collect();
         let range = ids.first().map_or(0..0, |&first| first..first + ids.len());
-        let mut state = Gaussians::zeros(range.len(), self.info.sh_degree);
-        self.hold(range.clone(), &mut state)?;
-        Ok(Box::new(Reader { block: self, range, next: 0, state, part: Gaussians::zeros(0, self.info.sh_degree) }))
+        let tracks: Vec<u32> = range.clone().map(|track| track as u32).collect();
+        let means = self.tracks.steady.as_ref().map(|steady| steady.means(&tracks)).transpose()?;
+        let [state, part] = [range.len(), 0].map(|len| Gaussians::zeros(len, self.info.sh_degree));
+        let mut reader = Reader { block: self, range, next: 0, means, state, part };
+        reader.begin()?;
+        Ok(Box::new(reader))
     }
 }
 
@@ -310,15 +372,28 @@ struct Reader<'a> {
     range: Range<usize>,
     /// The frame that `state` is to become.
     next: usize,
+    /// What is held of `range`.
+    means: Option<Means>,
     state: Gaussians,
     part: Gaussians,
+}
+
+impl Reader<'_> {
+    /// Goes to what is before the first of the frames.
+    fn begin(&mut self) -> Result<()> {
+        self.block.hold(self.range.clone(), &mut self.state)?;
+        if let Some(means) = &self.means {
+            means.hold((0..self.range.len()).map(|at| (at, at)), &mut self.state);
+        }
+        self.next = 0;
+        Ok(())
+    }
 }
 
 impl BlockReader for Reader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         if frame + 1 < self.next {
-            self.block.hold(self.range.clone(), &mut self.state)?;
-            self.next = 0;
+            self.begin()?;
         }
         while self.next <= frame {
             let rows = &self.block.rows[self.next];
@@ -326,9 +401,12 @@ impl BlockReader for Reader<'_> {
             let rows = &rows[first..];
             let rows = &rows[..rows.partition_point(|row| (row.track as usize) < self.range.end)];
             self.state.opacity_logit.planes_mut().fill(NOT_THERE);
-            let firsts = read_rows(&self.block.files[self.next], rows, &mut self.part)?;
-            let places = firsts.iter().map(|&first| (first, rows[first].track as usize - self.range.start));
-            scatter(&self.part, places, &mut self.state);
+            let firsts = self.block.tracks.blended(&self.block.files[self.next], rows, &mut self.part)?;
+            let place = |first: usize| rows[first].track as usize - self.range.start;
+            scatter(&self.part, firsts.iter().map(|&first| (first, place(first))), &mut self.state);
+            if let Some(means) = &self.means {
+                means.hold(firsts.iter().map(|&first| (place(first), place(first))), &mut self.state);
+            }
             self.next += 1;
         }
         for column in want.iter() {
@@ -336,23 +414,6 @@ impl BlockReader for Reader<'_> {
         }
         Ok(())
     }
-}
-
-/// Reads `rows`, which are by track, into `part`, those of one track blended in the place of the first; gives the first of
-/// each.
-pub(super) fn read_rows(ply: &Ply, rows: &[Row], part: &mut Gaussians) -> Result<Vec<usize>> {
-    let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
-    ply.gather(&Ids::List(&of_file), Columns::all(), part)?;
-    let mut firsts = Vec::with_capacity(rows.len());
-    let mut at = 0;
-    for of_track in rows.chunk_by(|a, b| a.track == b.track) {
-        if of_track.len() > 1 {
-            blend(part, &Vec::from_iter(at..at + of_track.len()));
-        }
-        firsts.push(at);
-        at += of_track.len();
-    }
-    Ok(firsts)
 }
 
 /// Writes rows of `part` to `state`, of each pair of `places` the first to the second.
