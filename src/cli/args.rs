@@ -123,7 +123,8 @@ pub(super) struct Input {
     #[arg(long, hide_short_help = true)]
     pub(super) allow_gaps: bool,
     /// Whether to find out which Gaussian of a folder's frames is which: where they differ in number, or their order does
-    /// not tell, `always`, or `never`; `apart`: always, and lives that seem to be one are not joined [default: auto]
+    /// not tell, `always`, or `never`; `apart`: always, and neither are lives joined that seem to be one, nor is held what
+    /// hardly changes along them [default: auto]
     #[arg(long, hide_short_help = true)]
     pub(super) link: Option<LinkArg>,
     /// Folder for scratch files while the run lasts: the packed frames of a stream or of linked frames, what does not fit
@@ -253,7 +254,7 @@ pub(super) enum LinkArg {
     Auto,
     /// Whatever their order tells
     Always,
-    /// Whatever their order tells, and lives that seem to be one stay apart
+    /// Whatever their order tells; lives that seem to be one stay apart, and what hardly changes is not held
     Apart,
     /// The same place means the same Gaussian
     Never,

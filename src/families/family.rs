@@ -358,7 +358,7 @@ pub enum Link {
     Auto,
     /// Whatever their order tells.
     Always,
-    /// Whatever their order tells, and lives that seem to be one stay apart.
+    /// Whatever their order tells; lives that seem to be one stay apart, and what hardly changes along them is not held.
     Apart,
     /// The same place means the same Gaussian.
     Never,

@@ -909,6 +909,21 @@ mod tests {
             let [before, after] = [&alike, &along].map(|reduction| held_out(&scene, &made.rig(), reduction));
             assert!(after > before + 0.1, "{name}: {before:.2} dB of all times alike, {after:.2} along time");
             let expected = read(&*scene.input.reduced(&along).unwrap());
+            let given = read(scene.source());
+            // What does not change with time does not begin to, Gaussian by Gaussian.
+            let is_still = |states: &[Gaussians], column: Columns, row: usize| {
+                let values = |frame: &Gaussians| frame.column(column).pick(&[row as u32]);
+                states.iter().all(|frame| values(frame) == values(&states[0]))
+            };
+            let mut still = [0, 0];
+            for (place, &id) in along.kept.iter().enumerate() {
+                for column in Columns::all().iter() {
+                    let was_still = is_still(&given, column, id as usize);
+                    assert!(!was_still || is_still(&expected, column, place), "{name}: {id}, {}", column.name());
+                    still[usize::from(was_still && column == Columns::POSITION)] += 1;
+                }
+            }
+            assert!(still.iter().all(|&count| count > 20), "{name}: {still:?}");
             for (kind, out) in [(OutputKind::Gseq, "out.gseq"), (OutputKind::PlySequence, "out")] {
                 let out = folder.path().join(format!("{name}_{out}"));
                 if kind == OutputKind::PlySequence {

@@ -65,8 +65,8 @@ pub(super) struct Moving<'a> {
     descent: Descent,
     /// The knots of the course along time, if there is one.
     course: Vec<Descent>,
-    /// Columns of states that are not the same at all frames, where they do not follow from anything.
-    changing: Columns,
+    /// Columns of each Gaussian that are not the same at all frames, where they do not follow from anything.
+    changing: Vec<Columns>,
     gradients: Gradients,
     /// What the picture in the making shows.
     now: Local,
@@ -114,7 +114,7 @@ impl<'a> Moving<'a> {
             before: Change::default(),
             descent: Descent::new(&nothing, columns, sh_degree, &[]),
             course: Vec::new(),
-            changing: Columns::empty(),
+            changing: vec![Columns::empty(); fixed.len()],
             gradients: Gradients::new(0, columns, sh_degree),
             now: Local::none(of_state),
             renderer: Renderer::on_all_threads(),
@@ -134,8 +134,15 @@ impl<'a> Moving<'a> {
             for &frame in &moving.frames {
                 let state = states.at(frame)?.clone();
                 if let Some(Local { state: first, .. }) = locals.first() {
-                    let differs = |&column: &Columns| state.column(column) != first.column(column);
-                    moving.changing |= varying.difference(moving.changing).iter().filter(differs).collect();
+                    for column in varying.iter() {
+                        let (first, now) = (first.column(column), state.column(column));
+                        for c in 0..now.width() {
+                            let values = first.plane(c).iter().zip(now.plane(c));
+                            for (changing, (first, now)) in moving.changing.iter_mut().zip(values) {
+                                changing.set(column, changing.contains(column) || first != now);
+                            }
+                        }
+                    }
                 }
                 locals.push(&mut Local { state, ..Local::default() })?;
             }
@@ -154,10 +161,10 @@ impl<'a> Moving<'a> {
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
 
-    /// Begins to move along time too, from nothing, at so many knots: in columns that change with time anyway, as others are
-    /// stored once, and of harmonics the first. Gives whether anything can.
+    /// Begins to move along time too, from nothing, at so many knots: each Gaussian in columns that change with time anyway, as
+    /// others are stored once, and of harmonics the first. Gives whether anything can.
     pub(super) fn bend(&mut self, knots: usize) -> bool {
-        let columns = self.manner.columns & self.changing;
+        let columns = self.manner.columns & self.changing.iter().copied().collect();
         let Some(Local { state, .. }) = self.locals.first().filter(|_| !columns.is_empty()) else { return false };
         self.course = (0..knots).map(|_| Descent::new(state, columns, 0, &self.fixed)).collect();
         true
@@ -269,6 +276,7 @@ impl<'a> Moving<'a> {
             self.stored = self.stored.pick(places);
         }
         self.before = self.before.pick(places);
+        self.changing = places.iter().map(|&place| self.changing[place as usize]).collect();
         self.fixed = places.iter().map(|&place| self.fixed[place as usize]).collect();
         self.begin();
         Ok(())
@@ -319,6 +327,15 @@ impl<'a> Moving<'a> {
     /// A scratch file that cannot be read.
     pub(super) fn step_along(&mut self, k: usize, schedule: &Schedule) -> Result<()> {
         self.differentiate(k)?;
+        // What does not change with time goes nowhere.
+        for column in self.manner.columns.iter() {
+            let slopes = self.gradients.column_mut(column);
+            for c in 0..slopes.width() {
+                for (slope, changing) in slopes.plane_mut(c).iter_mut().zip(&self.changing) {
+                    *slope = if changing.contains(column) { *slope } else { 0.0 };
+                }
+            }
+        }
         for (knot, weight) in self.around(self.place(k)) {
             self.course[knot].step(&self.gradients, weight, schedule);
         }
