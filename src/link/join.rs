@@ -76,9 +76,10 @@ impl Joiner {
             return;
         }
         let looks: Vec<Look> = old.iter().map(|track| track.look.at(track.now())).collect();
-        let numbers: Vec<u32> = (0..old.len() as u32).collect();
+        // Who has been succeeded is not again by what begins later.
+        let numbers: Vec<u32> = (0..old.len() as u32).filter(|&at| !old[at as usize].is_succeeded).collect();
         let grid = Grid::new(&looks, &numbers, ALIKE.reach);
-        let offers = |track: &Track| {
+        let named = new.par_iter().with_min_len(256).map(|track| {
             let mut offers = RULES.map(|_| Offers::default());
             grid.near(&track.look, track.look.position, ALIKE.reach * track.look.size, |at, look| {
                 for (rule, offers) in RULES.iter().zip(&mut offers) {
@@ -89,17 +90,20 @@ impl Joiner {
                     offers.add_within(cost, at);
                 }
             });
-            (track.number, track.look, offers)
-        };
-        let named: Vec<(u32, Look, [Offers; 2])> =
-            new.par_iter().with_min_len(256).filter(|track| !track.is_in_doubt).map(offers).collect();
-        for (track, look, offers) in &named {
+            (track, offers)
+        });
+        let named: Vec<(&Track, [Offers; 2])> = named.collect();
+        for (track, offers) in &named {
+            // Which of two that nobody can tell apart goes on does not matter where they are one to the eye.
+            let is_in_doubt = track.is_in_doubt;
             for (lives, offers) in self.0.iter_mut().zip(offers) {
-                lives.pairs.extend(offers.iter().map(|offer| {
+                lives.pairs.extend(offers.iter().filter_map(|offer| {
                     let other = &old[offer.point as usize];
-                    let are_close = cost(&looks[offer.point as usize], look, &CLOSE) <= 1.0;
+                    let are_close = cost(&looks[offer.point as usize], &track.look, &CLOSE) <= 1.0;
                     let together = u8::from(other.ago == 1);
-                    Pair { track: *track, other: other.number, cost: offer.cost, together, are_close, has_ended: false }
+                    let (track, other, cost) = (track.number, other.number, offer.cost);
+                    let pair = Pair { track, other, cost, together, are_close, has_ended: false };
+                    (are_close || !is_in_doubt).then_some(pair)
                 }));
             }
         }

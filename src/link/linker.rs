@@ -2,6 +2,9 @@
 
 use std::mem::size_of;
 
+use rayon::prelude::*;
+
+use super::grid::Grid;
 use super::links::Links;
 use super::look::Look;
 use super::track::{NAMED, NONE, Offer, ROUNDS, Track};
@@ -10,6 +13,8 @@ use crate::model::Gaussians;
 
 /// Frames that a track may be missing from before it ends.
 pub const GAP: u32 = 3;
+/// r and q of the [module](super) of what a track that is missed was succeeded by.
+const BESIDE: (f32, f32) = (0.25, 1.0);
 /// Of fewer, those that go on tell nothing of a cut.
 const FEWEST: usize = 16;
 
@@ -81,6 +86,9 @@ impl Linker {
     fn go_on(&mut self, links: &Links, looks: &[Look], in_doubt: &[u32]) -> Vec<u32> {
         let mut of_points = vec![NONE; looks.len()];
         let born = self.born;
+        for track in self.succeeded(links, looks) {
+            self.tracks[track as usize].is_succeeded = true;
+        }
         for (track, &point) in self.tracks.iter_mut().zip(&links.of_track) {
             if point == NONE {
                 track.ago += 1;
@@ -92,8 +100,7 @@ impl Linker {
         self.tracks.retain(|track| track.ago <= GAP + 1);
         for (point, of_point) in of_points.iter_mut().enumerate().filter(|(_, track)| **track == NONE) {
             *of_point = self.born;
-            let look = looks[point];
-            self.tracks.push(Track { number: self.born, ago: 1, velocity: None, look, is_in_doubt: false });
+            self.tracks.push(Track::begin(self.born, looks[point]));
             self.born += 1;
         }
         let first = self.tracks.partition_point(|track| track.number < born);
@@ -101,5 +108,26 @@ impl Linker {
             self.tracks[first + (of_points[point as usize] - born) as usize].is_in_doubt = true;
         }
         of_points
+    }
+
+    /// Those that are missed for the first time while another is where they are expected and looks like them.
+    fn succeeded(&self, links: &Links, looks: &[Look]) -> Vec<u32> {
+        let is_missed = |&i: &u32| links.of_track[i as usize] == NONE && self.tracks[i as usize].ago == 1;
+        let missed: Vec<u32> = (0..links.of_track.len() as u32).filter(is_missed).collect();
+        if missed.is_empty() || looks.is_empty() {
+            return Vec::new();
+        }
+        let (reach, strictness) = BESIDE;
+        let grid = Grid::new(looks, &Vec::from_iter(0..looks.len() as u32), reach);
+        let is_succeeded = |i: &u32| {
+            let track = &self.tracks[*i as usize];
+            let look = track.look.at(track.expected());
+            let mut found = false;
+            grid.near(&look, look.position, reach * look.size, |_, other| {
+                found |= look.apart(other, reach, strictness) <= 1.0;
+            });
+            found
+        };
+        missed.into_par_iter().with_min_len(1024).filter(is_succeeded).collect()
     }
 }

@@ -68,7 +68,7 @@ impl Links {
 
     /// Links what a round does, of what is left; gives what each track may have gone on as.
     pub(super) fn take(&mut self, tracks: &[Track], looks: &[Look], round: &Round) -> Vec<(u32, Offers)> {
-        let takes_part = |track: &Track| round.missing || track.ago == 1;
+        let takes_part = |track: &Track| track.ago == 1 || (round.missing && !track.is_succeeded);
         let free =
             |links: &[u32]| -> Vec<u32> { (0..links.len() as u32).filter(|&i| links[i as usize] == NONE).collect() };
         let (points, mut left) = (free(&self.of_point), free(&self.of_track));

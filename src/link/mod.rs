@@ -19,7 +19,9 @@
 //!    as to take those that are best for one another until none are left. Then two tracks that would cost less together
 //!    exchange their Gaussians, in the order of the tracks and of what they named, four times over.
 //! 3. First with r = ¼ and q = 4, tracks of the frame before alone; of what is left with r = 1 and q = 1, all tracks; then
-//!    with r = 4 and q = 4.
+//!    with r = 4 and q = 4. A track of the frame before that is missed while a Gaussian is where it is expected and looks
+//!    like it, |x_b − p_a|² / (¼·min(s_a, s_b))² + A ≤ 1 without opacities, was succeeded by that: from then on it goes on by
+//!    rule 1 alone, and not as a neighbour that begins anew in these frames.
 //! 4. A link is wrong with the larger chance of two. By rivals: R⁵ / (1 + R⁵), where R is what it and a rival cost, over
 //!    what they would cost the other way round, the largest of all that its track named instead and all that named its
 //!    Gaussian; ½ where that makes no difference, and about what is found in trained models whose links are known. Twins
@@ -29,12 +31,14 @@
 //!    strangers that lie evenly so many cost as little. The least likely links are given up, and begin new tracks, until of
 //!    those left no more than one in two hundred is expected to be wrong ([`Linked::doubtful`]).
 //! 5. Where less than a quarter goes on, of at least 16, everything has moved at once: a cut, at which all tracks end.
-//! 6. Lives that are one ([`Joiner`]). A track that begins where another is, or would be, names the four that cost least by
-//!    |x_b − x_a|² / (r·min(s_a, s_b))² + q·A without opacities, at most 1, with r = 4 and q = 1/16 (alike) or r = q = 1
-//!    (close), and sizes within a factor of √2. Both may be there together for four frames, in each of which that holds: one
-//!    fades out while the other fades in; and for as many more as one was away of them before. When the cheapest that is left has ended, the track goes on from it, by cost, each
-//!    end and each beginning once. A track that ends within these frames while the other goes on was part of it, if they
-//!    were close. Where several tracks of a life are there together they are [blended](blend).
+//! 6. Lives that are one ([`Joiner`]). A track that begins where another is, or would be, that was not succeeded names the
+//!    four that cost least by |x_b − x_a|² / (r·min(s_a, s_b))² + q·A without opacities, at most 1, with r = 4 and q = 1/16
+//!    (alike) or r = q = 1 (close), and sizes within a factor of √2; one that began as nobody could tell which goes on as it
+//!    only such as are close. Both may be there together for four frames, in each of which that holds: one fades out while
+//!    the other fades in; and for as many more as one was away of them before. When the cheapest that is left has ended, the
+//!    track goes on from it, by cost, each end and each beginning once. A track that ends within these frames while the
+//!    other goes on was part of it, if they were close. Where several tracks of a life are there together they are
+//!    [blended](blend).
 //!
 //! Tracks are numbered by their births, those of one frame by its order. What is not a number is never compared: it goes on
 //! if it is repeated only. Colours are compared without harmonics, which turn with the Gaussian.

@@ -35,6 +35,8 @@ pub(super) struct Track {
     pub(super) look: Look,
     /// Whether it has begun as nobody could tell which track goes on as it.
     pub(super) is_in_doubt: bool,
+    /// Whether another was where it was expected when it was missed first: only as what it was to the bit it goes on.
+    pub(super) is_succeeded: bool,
 }
 
 /// What going on as a Gaussian costs.
@@ -45,8 +47,13 @@ pub(super) struct Offer {
 }
 
 impl Track {
+    /// One that begins.
+    pub(super) fn begin(number: u32, look: Look) -> Track {
+        Track { number, ago: 1, velocity: None, look, is_in_doubt: false, is_succeeded: false }
+    }
+
     /// Where it is expected.
-    fn expected(&self) -> [f32; 3] {
+    pub(super) fn expected(&self) -> [f32; 3] {
         let velocity = self.velocity.unwrap_or_default();
         std::array::from_fn(|c| self.look.position[c] + self.ago as f32 * velocity[c])
     }
@@ -81,7 +88,7 @@ impl Track {
             None => step,
             Some(velocity) => std::array::from_fn(|c| 0.5 * (velocity[c] + step[c])),
         });
-        (self.look, self.ago) = (look, 1);
+        (self.look, self.ago, self.is_succeeded) = (look, 1, false);
     }
 
     /// The Gaussians it may go on as.
