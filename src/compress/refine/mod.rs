@@ -899,22 +899,32 @@ mod tests {
             let scene = Scene::new(path.clone(), input, made.rig(), Some(Split::Train)).unwrap();
             let recipe = Recipe::preset("default").unwrap();
             let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-            let [alike, along] = [0, 4].map(|knots| {
-                let reduction = Reduction::pruned(scored.ranked().take(200), &recipe.merge);
-                let few = Refine { steps: 300, knots, ..Refine::of(&recipe, None, false).unwrap() };
-                few.run(&scene, &scored, reduction, 200, &mut Journal::default()).unwrap()
-            });
-            assert_eq!((alike.course.0.len(), along.course.0.len()), (0, 4));
-            assert!(along.change == alike.change && !along.course.columns().contains(Columns::SH), "{name}");
-            let [before, after] = [&alike, &along].map(|reduction| held_out(&scene, &made.rig(), reduction));
-            assert!(after > before + 0.1, "{name}: {before:.2} dB of all times alike, {after:.2} along time");
-            let expected = read(&*scene.input.reduced(&along).unwrap());
             let given = read(scene.source());
-            // What does not change with time does not begin to, Gaussian by Gaussian.
             let is_still = |states: &[Gaussians], column: Columns, row: usize| {
                 let values = |frame: &Gaussians| frame.column(column).pick(&[row as u32]);
                 states.iter().all(|frame| values(frame) == values(&states[0]))
             };
+            // Of those that are always there half of what moves and an eighth of what does not.
+            let is_there = |id: usize| given.iter().all(|frame| frame.opacity_logit.plane(0)[id] > -30.0);
+            let part = |&id: &u32| {
+                let one_in = if is_still(&given, Columns::POSITION, id as usize) { 8 } else { 2 };
+                id % one_in == 0 && is_there(id as usize)
+            };
+            let kept: Vec<u32> = (0..given[0].len() as u32).filter(part).collect();
+            let [alike, along] = [0, 4].map(|knots| {
+                let reduction = Reduction::pruned(kept.clone(), &recipe.merge);
+                let few = Refine { steps: 300, knots, ..Refine::of(&recipe, None, false).unwrap() };
+                few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()
+            });
+            assert_eq!((alike.course.0.len(), along.course.0.len()), (0, 4));
+            assert!(along.change == alike.change, "{name}");
+            // Some tracks are of two Gaussians of this scene, which have colours of their own.
+            assert!(link == Link::Apart || !along.course.columns().contains(Columns::SH), "{name}");
+            let [before, after] = [&alike, &along].map(|reduction| held_out(&scene, &made.rig(), reduction));
+            // What moves is a small part of these pictures, and the rest does not begin to.
+            assert!(after > before + 0.02, "{name}: {before:.2} dB of all times alike, {after:.2} along time");
+            let expected = read(&*scene.input.reduced(&along).unwrap());
+            // What does not change with time does not begin to, Gaussian by Gaussian.
             let mut still = [0, 0];
             for (place, &id) in along.kept.iter().enumerate() {
                 for column in Columns::all().iter() {
