@@ -147,7 +147,7 @@ fn png_is_the_array_clamped_and_rounded_and_one_is_the_same_as_all() {
 }
 
 #[test]
-fn background_is_the_asked_one_else_the_cameras_else_black() {
+fn background_is_the_asked_one_else_the_cameras_else_that_of_the_model_beside_them_else_black() {
     let folder = scene();
     let corner = |extra: &str| {
         done(
@@ -158,7 +158,17 @@ fn background_is_the_asked_one_else_the_cameras_else_black() {
     };
     assert_eq!(corner("--background 1,0.2,0"), [255, 51, 0]);
     assert_eq!(corner(""), [0, 128, 255]);
+    let model = |text: &str| fs::write(folder.path().join("cfg_args"), text).unwrap();
+    model("Namespace(sh_degree=3, white_background=True, eval=True)");
+    assert_eq!(corner(""), [0, 128, 255]);
     write_cameras(folder.path(), Value::Null);
+    assert_eq!(corner(""), [255, 255, 255]);
+    assert_eq!(corner("--background 1,0.2,0"), [255, 51, 0]);
+    for other in ["Namespace(white_background=False)", "Namespace(sh_degree=3)", "Namespace(white_background=[", ""] {
+        model(other);
+        assert_eq!(corner(""), [0, 0, 0], "{other}");
+    }
+    fs::remove_file(folder.path().join("cfg_args")).unwrap();
     assert_eq!(corner(""), [0, 0, 0]);
 }
 

@@ -480,7 +480,8 @@ pub(super) enum ImageKind {
 /// What is behind the scene.
 #[derive(Debug, Args)]
 pub(super) struct Background {
-    /// Colour behind the scene, each from 0 to 1 [default: the cameras' own, else the model's, else black]
+    /// Colour behind the scene, each from 0 to 1 [default: the cameras' own, else the model's, else
+    /// that of the model in whose folder the cameras are, else black]
     #[arg(long, value_name = "R,G,B", value_parser = parse_colour)]
     pub(super) background: Option<[f32; 3]>,
 }

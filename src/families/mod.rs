@@ -31,6 +31,7 @@ use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
 
+use deform_folder::Arguments;
 pub use family::{ColumnInfo, Conventions, Family, Link, OpenOptions, Residence, Timing};
 pub use four_d_gaussians::ModelFolder;
 pub use linked::Linked;
@@ -56,6 +57,14 @@ const FAMILIES: [Entry; 14] = [
     container::ENTRY,
     archive::ENTRY,
 ];
+
+/// Colour behind the scene that a model was trained with in whose folder `cameras` is, or which it is: white where the
+/// `cfg_args` there says so, as those of 3DGS and of what derives from it do; none where it does not, or cannot be read.
+pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
+    let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };
+    let arguments = Arguments::read(&folder.join("cfg_args")).ok()?;
+    arguments.get("white_background").bool(false).ok()?.then_some([1.0; 3])
+}
 
 /// Opens a path by what is there. Frames of a family that is continuous in time are still to be chosen.
 ///

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
 use crate::error::Result;
-use crate::families::{Conventions, Family, Link, OpenOptions};
+use crate::families::{self, Conventions, Family, Link, OpenOptions};
 use crate::ingest::cameras::{self, CameraOptions, Clock, Times};
 use crate::model::{Rig, Split};
 use crate::work;
@@ -75,7 +75,8 @@ pub struct Opened {
 }
 
 /// The cameras of a file, if there is one, with times as `times` and `clock` say; where the file does not count the frames,
-/// there are `trained`, else as many as `options` say.
+/// there are as many as `input` was trained on, else as many as `options` say. Behind them is what the file says; of an input
+/// that is states alone, which do not say it, else what the model was trained with in whose folder they are.
 ///
 /// # Errors
 /// A file that is not there, or holds no cameras.
@@ -84,8 +85,12 @@ pub fn load_cameras(
     path: Option<&Path>,
     times: Times,
     clock: Clock,
-    trained: Option<usize>,
+    input: Option<&dyn Family>,
 ) -> Result<Option<Rig>> {
-    let camera_options = CameraOptions { size: options.size, frames: trained.or(options.frames), times, clock };
-    path.map(|path| cameras::load(path, &camera_options)).transpose()
+    let Some(path) = path else { return Ok(None) };
+    let frames = input.and_then(Family::data_frames).or(options.frames);
+    let rig = cameras::load(path, &CameraOptions { size: options.size, frames, times, clock })?;
+    let is_states = input.is_none_or(Family::stands_in_frames);
+    let beside = || is_states.then(|| families::trained_background(path)).flatten();
+    Ok(Some(Rig { background: rig.background.or_else(beside), ..rig }))
 }

@@ -39,7 +39,7 @@ pub struct Scene {
     /// virtual rig, which may see only what is in front of it.
     pub has_cameras: bool,
     /// Colour behind the scene, red, green, blue in [0, 1]: the cameras' own, else the one that the input was trained
-    /// with, else black.
+    /// with, else the model in whose folder the cameras are, else black.
     pub background: [f32; 3],
     /// What passes over it keep in memory at a time.
     pub limits: Limits,

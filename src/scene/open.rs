@@ -75,7 +75,7 @@ fn cameras_of(options: &InputOptions, input: &dyn Family) -> Result<Option<Rig>>
         Times::Own if is_still && by_name => Times::None,
         _ => options.times.clone(),
     };
-    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, input.data_frames());
+    let load = |clock| load_cameras(options, path.as_deref(), times.clone(), clock, Some(input));
     let rig = load(input.clock())?;
     let fits = |rig: &Rig| rig.schedule(&input.source().info().times, options.split).is_ok();
     match rig.as_ref().is_some_and(|rig| input.timing() == Timing::Stamped && !fits(rig)) {
