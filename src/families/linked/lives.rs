@@ -1,8 +1,9 @@
 //! Which lives are made one and what is held along them, and what that costs in pictures.
 
+use std::ops::Range;
 use std::path::Path;
 
-use super::steady::{Bound, Steady};
+use super::steady::{Bound, Steady, Sums};
 use super::tracks::Tracks;
 use crate::error::Result;
 use crate::ingest::cameras::virtual_rig;
@@ -53,8 +54,11 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut Tracks) -> Resu
 /// # Errors
 /// A frame that cannot be read; a failed write to `scratch`.
 pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>> {
+    let first = tracks.first();
     for bound in BOUNDS {
-        let steady = Steady::of(tracks, bound, scratch)?;
+        // Tracks are numbered by their births.
+        let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
+        let steady = Steady::of(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
         let parts = steady.parts();
         if parts == [0.0; 4] {
             return Ok(None);
@@ -79,6 +83,19 @@ pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>
         tracks.hold(None);
     }
     Ok(None)
+}
+
+/// Sums along the tracks of `range`, none of which is there before the frame `born`.
+fn sums(tracks: &Tracks, born: usize, range: Range<usize>) -> Result<Sums> {
+    let sh_degree = tracks.frames().sh_degree();
+    let (mut sums, mut state) = (Sums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
+    for frame in born..tracks.frames().paths().len() {
+        let rows = tracks.rows(frame, range.clone())?;
+        for at in tracks.blended(&tracks.frames().frame(frame)?, &rows, &mut state)? {
+            sums.add(rows[at].track as usize - range.start, &state, at);
+        }
+    }
+    Ok(sums)
 }
 
 /// PSNR of pictures of joined lives against those of lives apart, where any are blended.

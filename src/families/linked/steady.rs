@@ -13,7 +13,6 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::tracks::Tracks;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::work::{Spill, Spilling};
@@ -48,22 +47,21 @@ pub(super) struct Means {
 }
 
 impl Steady {
-    /// What changes by at most `bound` along each of `tracks`.
+    /// What changes by at most `bound` along each of `count` tracks, of those of each range that `sums` gives the sums of.
     ///
     /// # Errors
-    /// A frame that cannot be read; a failed write to `scratch`.
-    pub(super) fn of(tracks: &Tracks, bound: Bound, scratch: &Path) -> Result<Steady> {
-        let sh_degree = tracks.frames().sh_degree();
-        let (mut columns, mut means) = (Vec::with_capacity(tracks.count()), Spilling::new(scratch)?);
-        let first = tracks.first();
-        let batches: Vec<usize> = (0..tracks.count()).step_by(BATCH).collect();
+    /// Those of `sums`; a failed write to `scratch`.
+    pub(super) fn of(
+        count: usize,
+        sh_degree: usize,
+        sums: impl Fn(Range<usize>) -> Result<Sums> + Sync,
+        bound: Bound,
+        scratch: &Path,
+    ) -> Result<Steady> {
+        let (mut columns, mut means) = (Vec::with_capacity(count), Spilling::new(scratch)?);
+        let batches: Vec<Range<usize>> = (0..count).step_by(BATCH).map(|at| at..count.min(at + BATCH)).collect();
         for at_once in batches.chunks(rayon::current_num_threads()) {
-            let of_batch = |&start: &usize| {
-                let range = start..tracks.count().min(start + BATCH);
-                // Tracks are numbered by their births.
-                Sums::of(tracks, range, first[start].frame as usize)
-            };
-            for sums in at_once.par_iter().map(of_batch).collect::<Result<Vec<Sums>>>()? {
+            for sums in at_once.par_iter().cloned().map(&sums).collect::<Result<Vec<Sums>>>()? {
                 for track in 0..sums.len() {
                     columns.push(sums.steady(track, bound));
                     means.write(bytemuck::cast_slice(&sums.means(track)))?;
@@ -125,7 +123,7 @@ impl Means {
 }
 
 /// Sums over the frames of some tracks, of each one after the other.
-struct Sums {
+pub(super) struct Sums {
     sh_width: usize,
     /// Σ 1, Σ α, Σ α².
     opacity: Vec<[f64; 3]>,
@@ -142,36 +140,25 @@ struct Sums {
 }
 
 impl Sums {
-    /// Of the tracks of `range`, none of which is there before the frame `born`.
-    fn of(tracks: &Tracks, range: Range<usize>, born: usize) -> Result<Sums> {
-        let (len, sh_degree) = (range.len(), tracks.frames().sh_degree());
-        let width = HELD.width(sh_degree);
-        let mut sums = Sums {
+    /// Of `len` tracks that were not seen at any frame yet.
+    pub(super) fn new(len: usize, sh_degree: usize) -> Sums {
+        Sums {
             sh_width: Columns::SH.width(sh_degree),
             opacity: vec![[0.0; 3]; len],
-            values: vec![0.0; width * len],
+            values: vec![0.0; HELD.width(sh_degree) * len],
             turns: vec![[0.0; 4]; len],
             scales: vec![[0.0; 3]; len],
             colours: vec![[0.0; 3]; len],
             first: vec![[0.0; 4]; len],
-        };
-        let mut state = Gaussians::zeros(0, sh_degree);
-        for frame in born..tracks.frames().paths().len() {
-            let rows = tracks.rows(frame, range.clone())?;
-            let firsts = tracks.blended(&tracks.frames().frame(frame)?, &rows, &mut state)?;
-            for at in firsts {
-                sums.add(rows[at].track as usize - range.start, &state, at);
-            }
         }
-        Ok(sums)
     }
 
     fn len(&self) -> usize {
         self.opacity.len()
     }
 
-    /// Adds row `at` of `state`.
-    fn add(&mut self, track: usize, state: &Gaussians, at: usize) {
+    /// Adds row `at` of `state`, in which `track` is at a frame.
+    pub(super) fn add(&mut self, track: usize, state: &Gaussians, at: usize) {
         let [logit] = state.opacity_logit.row(at);
         let alpha = 1.0 / (1.0 + (-f64::from(logit)).exp());
         for (sum, term) in self.opacity[track].iter_mut().zip([1.0, alpha, alpha * alpha]) {
