@@ -796,6 +796,9 @@ pub(super) struct Demo {
     /// Frames of the scene
     #[arg(long, value_name = "T", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub(super) frames: u32,
+    /// Fraction of the Gaussians to keep
+    #[arg(long, value_name = "R", default_value_t = 0.3)]
+    pub(super) target_ratio: f64,
     #[command(flatten)]
     pub(super) memory: Memory,
     #[command(flatten)]

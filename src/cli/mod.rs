@@ -31,6 +31,7 @@ use crate::scene::{InputOptions, scratch_beside};
 use crate::selfcheck;
 use crate::stream::{Mode, Progress};
 use crate::verbs::container::Storing;
+use crate::verbs::demo::DemoOptions;
 use crate::verbs::evaluate::EvaluateOptions;
 use crate::verbs::method::Method;
 use crate::verbs::precision::{PrecisionOptions, Turned};
@@ -267,12 +268,17 @@ fn run(cli: Cli) -> Result<()> {
             print(&if args.json { json(&listed) } else { work::text(&listed) })
         }
         Verb::Demo(args) => {
-            let recipe = args.recipe.recipe()?;
-            let output = args.output.as_deref();
-            let (gaussians, frames) = (args.gaussians as usize, args.frames as usize);
-            let report = demo::run(gaussians, frames, recipe, output, args.earlier.replace(), budget_of(args.memory))?;
-            print(&report.text())?;
-            if let Some(folder) = output {
+            let options = DemoOptions {
+                gaussians: args.gaussians as usize,
+                frames: args.frames as usize,
+                kept: Target::Ratio(args.target_ratio),
+                recipe: args.recipe.recipe()?,
+                output: args.output,
+                overwrite: args.earlier.replace(),
+                memory: budget_of(args.memory),
+            };
+            print(&demo::run(&options)?.text())?;
+            if let Some(folder) = options.output {
                 tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
             }
             Ok(())

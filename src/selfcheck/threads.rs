@@ -5,12 +5,13 @@ use std::fs;
 use super::case::{Case, Worst};
 use super::made::clouds::{camera, scene};
 use crate::budget::Budget;
+use crate::compress::Target;
 use crate::emit::atomic::{Replace, ScratchFolder};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gradients};
 use crate::recipe::Recipe;
 use crate::render::{Image, Renderer};
-use crate::verbs::demo;
+use crate::verbs::demo::{self, DemoOptions};
 
 /// Byte by byte: which thread does what must not show.
 pub(super) fn same_bytes() -> Case {
@@ -32,7 +33,15 @@ fn made_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
         let mut recipe = Recipe::preset("default")?;
         // Enough to go through all of it.
         recipe.refine.refine_steps = 10;
-        demo::run(400, 6, recipe, Some(&output), Replace::Never, Budget::default())?;
+        demo::run(&DemoOptions {
+            gaussians: 400,
+            frames: 6,
+            kept: Target::Ratio(0.5),
+            recipe,
+            output: Some(output.clone()),
+            overwrite: Replace::Never,
+            memory: Budget::default(),
+        })?;
         let path = output.join("compressed.gseq");
         let bytes = fs::read(&path).map_err(Error::io("read", &path))?;
         let scene = scene(31, 3000, 1);

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::budget::Budget;
 use crate::compress::summary::Detail;
 use crate::compress::summary::Summary;
-use crate::compress::{Request, compress_scene, keep_to_budget};
+use crate::compress::{Request, Target, compress_scene, keep_to_budget};
 use crate::demo::{self, Body};
 use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::emit::kind::OutputKind;
@@ -19,6 +19,25 @@ use crate::model::{Camera, Rig, Split};
 use crate::recipe::Recipe;
 use crate::scene::{InputOptions, Scene};
 
+/// What the demo is asked for.
+#[derive(Debug)]
+pub struct DemoOptions {
+    /// Gaussians of the scene.
+    pub gaussians: usize,
+    /// Frames of the scene.
+    pub frames: usize,
+    /// How many of the Gaussians stay.
+    pub kept: Target,
+    /// How the scene is compressed.
+    pub recipe: Recipe,
+    /// Folder that keeps `scene.gseq`, `cameras.json` and `compressed.gseq`; without one everything is gone afterwards.
+    pub output: Option<PathBuf>,
+    /// What may be replaced there.
+    pub overwrite: Replace,
+    /// Memory to keep to.
+    pub memory: Budget,
+}
+
 /// What the demo did.
 #[derive(Debug)]
 pub struct DemoReport {
@@ -28,30 +47,25 @@ pub struct DemoReport {
     pub bodies: Vec<(Body, usize, usize, usize)>,
 }
 
-/// Generates the scene, packs it, compresses it. With `output` the folder keeps `scene.gseq`,
-/// `cameras.json` and `compressed.gseq`; without, everything is gone afterwards.
-pub fn run(
-    gaussians: usize,
-    frames: usize,
-    recipe: Recipe,
-    output: Option<&Path>,
-    overwrite: Replace,
-    memory: Budget,
-) -> Result<DemoReport> {
-    if let Some(output) = output {
-        check_folder_name(output, "demo")?;
-        check_target(output, Kind::Folder, &[], overwrite)?;
-        let staged = StagedFolder::new(output, overwrite)?;
-        let report = run_in(staged.path(), gaussians, frames, recipe, memory)?;
-        staged.commit()?;
-        return Ok(report);
-    }
-    let folder = ScratchFolder::new(&std::env::temp_dir())?;
-    run_in(folder.path(), gaussians, frames, recipe, memory)
+/// Generates the scene, packs it, compresses it.
+///
+/// # Errors
+/// A number to keep that cannot be; those of compressing; a failed write.
+pub fn run(options: &DemoOptions) -> Result<DemoReport> {
+    options.kept.count(options.gaussians)?;
+    let Some(output) = &options.output else {
+        return run_in(ScratchFolder::new(&std::env::temp_dir())?.path(), options);
+    };
+    check_folder_name(output, "demo")?;
+    check_target(output, Kind::Folder, &[], options.overwrite)?;
+    let staged = StagedFolder::new(output, options.overwrite)?;
+    let report = run_in(staged.path(), options)?;
+    staged.commit()?;
+    Ok(report)
 }
 
-fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory: Budget) -> Result<DemoReport> {
-    let made = demo::Scene::new(gaussians, frames);
+fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
+    let made = demo::Scene::new(options.gaussians, options.frames);
     let packed = folder.join("scene.gseq");
     write_sequence(&made, OutputKind::Gseq, &packed, 1)?;
     let rig = made.rig();
@@ -60,8 +74,11 @@ fn run_in(folder: &Path, gaussians: usize, frames: usize, recipe: Recipe, memory
 
     let input = Box::new(Container::open(&packed)?);
     let mut scene = Scene::new(PathBuf::from("scene.gseq"), input, rig, Some(Split::Train))?;
-    let request =
-        Request::new(InputOptions { memory, ..InputOptions::default() }, folder.join("compressed.gseq"), recipe);
+    let plain = InputOptions { memory: options.memory, ..InputOptions::default() };
+    let request = Request {
+        target: Some(options.kept),
+        ..Request::new(plain, folder.join("compressed.gseq"), options.recipe.clone())
+    };
     keep_to_budget(&mut scene, &request)?;
     let (mut summary, map) = compress_scene(&scene, &request)?;
     // Where it lies now it does not stay.
