@@ -17,12 +17,13 @@ pub(super) struct Grid {
     mask: usize,
     /// Where the Gaussians of each bucket start; one more at the end.
     starts: Vec<u32>,
+    /// Of each Gaussian its cell: apart from the rest, so that those of other cells are passed over in the cache.
+    cells: Vec<u64>,
     points: Vec<Point>,
 }
 
-/// A Gaussian in its cell.
+/// A Gaussian in a cell.
 struct Point {
-    cell: u64,
     look: Look,
     number: u32,
 }
@@ -44,37 +45,41 @@ impl Grid {
             order[*to as usize] = place as u32;
             *to += 1;
         }
-        let point = |&place: &u32| {
-            let number = numbers[place as usize];
-            Point { cell: cells[place as usize], look: looks[number as usize], number }
-        };
-        let mut points: Vec<Point> = order.iter().map(point).collect();
+        let look = |place: u32| &looks[numbers[place as usize] as usize];
         for bucket in starts.windows(2) {
-            let of_bucket = &mut points[bucket[0] as usize..bucket[1] as usize];
+            let of_bucket = &mut order[bucket[0] as usize..bucket[1] as usize];
             if of_bucket.len() > CROWD {
-                of_bucket.sort_unstable_by(|a, b| {
-                    let brightness = a.look.brightness().total_cmp(&b.look.brightness());
-                    a.cell.cmp(&b.cell).then(brightness).then(a.number.cmp(&b.number))
+                // Places are in the order of numbers.
+                of_bucket.sort_unstable_by(|&a, &b| {
+                    let brightness = look(a).brightness().total_cmp(&look(b).brightness());
+                    cells[a as usize].cmp(&cells[b as usize]).then(brightness).then(a.cmp(&b))
                 });
             }
         }
-        Grid { reach, mask, starts, points }
+        let points = order.iter().map(|&place| Point { look: *look(place), number: numbers[place as usize] });
+        let points = points.collect();
+        let cells = order.iter().map(|&place| cells[place as usize]).collect();
+        Grid { reach, mask, starts, cells, points }
     }
 
     /// Hands `each` the Gaussians, with their numbers, that lie within `radius` of `at` along each axis, or further, of
     /// about the size of `look`.
     pub(super) fn near(&self, look: &Look, at: [f32; 3], radius: f32, mut each: impl FnMut(u32, &Look)) {
+        let brightness = look.brightness();
         for level in levels(look.ln_size) {
             let side = side(level, self.reach);
             let along = |c: usize| -> RangeInclusive<i64> {
-                let cell = |x: f64| (x / side).floor() as i64;
+                let cell = |x: f64| floor(x / side);
                 let low = cell(f64::from(at[c]) - f64::from(radius));
                 low..=cell(f64::from(at[c]) + f64::from(radius)).min(low.saturating_add(MOST_CELLS - 1))
             };
-            for x in along(0) {
-                for y in along(1) {
-                    for z in along(2) {
-                        self.of_cell(cell(level, [x, y, z]), look.brightness(), &mut each);
+            let (along, level) = ([along(0), along(1), along(2)], Name::of(level));
+            for x in along[0].clone() {
+                let x = level.then(x);
+                for y in along[1].clone() {
+                    let y = x.then(y);
+                    for z in along[2].clone() {
+                        self.of_cell(y.then(z).cell(), brightness, &mut each);
                     }
                 }
             }
@@ -83,26 +88,32 @@ impl Grid {
 
     fn of_cell(&self, cell: u64, brightness: f32, each: &mut impl FnMut(u32, &Look)) {
         let bucket = cell as usize & self.mask;
-        let mut points = &self.points[self.starts[bucket] as usize..self.starts[bucket + 1] as usize];
-        if points.len() > CROWD {
-            let from = points.partition_point(|point| point.cell < cell);
-            points = &points[from..];
-            points = &points[..points.partition_point(|point| point.cell == cell)];
-            if points.len() > CROWD {
+        let mut places = self.starts[bucket] as usize..self.starts[bucket + 1] as usize;
+        if places.len() > CROWD {
+            let cells = &self.cells[places.clone()];
+            let first = places.start + cells.partition_point(|&other| other < cell);
+            places = first..places.start + cells.partition_point(|&other| other <= cell);
+            if places.len() > CROWD {
+                let points = &self.points[places.clone()];
                 let middle = points.partition_point(|point| point.look.brightness().total_cmp(&brightness).is_lt());
-                let first = middle.saturating_sub(CROWD / 2).min(points.len() - CROWD);
-                points = &points[first..first + CROWD];
+                let first = places.start + middle.saturating_sub(CROWD / 2).min(points.len() - CROWD);
+                places = first..first + CROWD;
             }
         }
-        // Cells of other places share the bucket.
-        points.iter().filter(|point| point.cell == cell).for_each(|point| each(point.number, &point.look));
+        for place in places {
+            // Cells of other places share the bucket.
+            if self.cells[place] == cell {
+                let point = &self.points[place];
+                each(point.number, &point.look);
+            }
+        }
     }
 }
 
 /// Octaves of sizes that those within a factor of √2 are in.
 fn levels(ln_size: f32) -> RangeInclusive<i64> {
     let octave = f64::from(ln_size) / std::f64::consts::LN_2;
-    (octave - 0.5).floor() as i64..=(octave + 0.5).floor() as i64
+    floor(octave - 0.5)..=floor(octave + 0.5)
 }
 
 /// A cell is as wide as a search among the largest of its octave.
@@ -111,12 +122,35 @@ fn side(level: i64, reach: f64) -> f64 {
 }
 
 fn own_cell(look: &Look, reach: f64) -> u64 {
-    let level = (f64::from(look.ln_size) / std::f64::consts::LN_2).floor() as i64;
+    let level = floor(f64::from(look.ln_size) / std::f64::consts::LN_2);
     let side = side(level, reach);
-    cell(level, look.position.map(|x| (f64::from(x) / side).floor() as i64))
+    look.position.iter().fold(Name::of(level), |name, &x| name.then(floor(f64::from(x) / side))).cell()
 }
 
-/// The name of a cell: two that share it would cost time and change nothing.
-fn cell(level: i64, at: [i64; 3]) -> u64 {
-    at.iter().fold(mix(level as u64), |hash, &x| mix(hash ^ x as u64))
+/// The largest integer that is not above `x`, inlined where the machine's own instruction may not be counted on.
+fn floor(x: f64) -> i64 {
+    let toward_zero = x as i64;
+    toward_zero - i64::from(x < toward_zero as f64)
+}
+
+/// What a cell is called, from its level and its place along each axis: two that share it would cost time and change
+/// nothing. The eight cells of a cube differ in the last bits alone, so that they are neighbours in the table.
+#[derive(Clone, Copy)]
+struct Name {
+    cube: u64,
+    within: u64,
+}
+
+impl Name {
+    fn of(level: i64) -> Name {
+        Name { cube: mix(level as u64), within: 0 }
+    }
+
+    fn then(self, place: i64) -> Name {
+        Name { cube: mix(self.cube ^ (place >> 1) as u64), within: self.within << 1 | (place & 1) as u64 }
+    }
+
+    fn cell(self) -> u64 {
+        self.cube << 3 | self.within
+    }
 }
