@@ -554,6 +554,57 @@ fn a_stream_of_any_number_of_gaussians_gives_the_bytes_of_files() {
 }
 
 #[test]
+fn lives_of_a_container_and_of_its_stream_are_joined_where_asked() {
+    let workplace = Workplace::new();
+    let (count, frames) = (300, 40);
+    for t in 0..frames {
+        workplace.ply(&format!("frames/{t}.ply"), &fading(count, t));
+    }
+    workplace.done("pack frames -o lives.gseq --link apart");
+    // It says itself who is who, and is believed; that lives are short is told.
+    let [auto, apart, joined] =
+        [Link::Auto, Link::Apart, Link::Always].map(|link| open(&workplace, "lives.gseq", link));
+    let [auto_count, apart_count, joined_count] = [&auto, &apart, &joined].map(|scene| scene.source().info().count);
+    assert_eq!((auto.input.kind(), joined.input.kind()), ("gseq container", "linked gseq container"));
+    assert!(auto_count > 4 * count && apart_count > 4 * count, "{auto_count}, {apart_count}");
+    assert!((count..=count + count / 20).contains(&joined_count), "{joined_count}");
+    assert_eq!(joined.source().info().times, auto.source().info().times);
+    assert_eq!(joined.input.bytes().unwrap(), auto.input.bytes().unwrap());
+    let compress = |to: &str, link: &str| {
+        workplace.done(&format!("compress lives.gseq -o {to} --target-count 200 --no-refine --verbose --link {link}"))
+    };
+    let said = compress("apart.gseq", "auto");
+    assert!(said.contains(" of 40 frames in the median: --link always makes one of lives that are one"), "{said}");
+    let said = compress("joined.gseq", "always");
+    assert!(said.contains("were joined to these tracks") && !said.contains("--link always makes"), "{said}");
+    // In each frame what was there is there once.
+    for t in (0..frames).step_by(13) {
+        let mut whole = Gaussians::zeros(count, 1);
+        (0..count).for_each(|i| row(i, t, &mut whole, i));
+        let found = state(joined.source(), t);
+        let is_one_row = |&i: &usize| {
+            let is_it = |&track: &usize| {
+                let apart = |c: usize| (found.position.plane(c)[track] - whole.position.plane(c)[i]).abs();
+                (0..3).all(|c| apart(c) < 1e-5) && found.opacity_logit.plane(0)[track] > -30.0
+            };
+            (0..found.len()).filter(is_it).count() == 1
+        };
+        let one_row = (0..count).filter(is_one_row).count();
+        assert!(one_row * 100 >= 97 * count, "frame {t}: {one_row}");
+    }
+    // The stream of it is linked like it.
+    let stream = workplace.piped("unpack lives.gseq --stream --quiet", b"").stdout;
+    assert!(workplace.piped("pack - -o of_stream.gseq --link always", &stream).status.success());
+    workplace.done("pack lives.gseq -o of_container.gseq --link always");
+    let bytes = |name: &str| fs::read(workplace.path(name)).unwrap();
+    assert!(bytes("of_stream.gseq") == bytes("of_container.gseq"));
+    let output =
+        workplace.piped("compress - -o of_stream_joined.gseq --target-count 200 --no-refine --link always", &stream);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(bytes("of_stream_joined.gseq") == bytes("joined.gseq"));
+}
+
+#[test]
 fn a_stream_that_breaks_off_or_has_no_frame_leaves_nothing() {
     let workplace = Workplace::new();
     let frames: Vec<Gaussians> = (0..3).map(|t| frame(50, t, |_| true).0).collect();

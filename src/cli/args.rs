@@ -123,8 +123,8 @@ pub(super) struct Input {
     #[arg(long, hide_short_help = true)]
     pub(super) allow_gaps: bool,
     /// Whether to find out which Gaussian of a folder's frames is which: where they differ in number, or their order does
-    /// not tell, `always`, or `never`; `apart`: always, and neither are lives joined that seem to be one, nor is held what
-    /// hardly changes along them [default: auto]
+    /// not tell, `always` (and so of a container or stream, whose lives may be short), or `never`; `apart`: always, and
+    /// neither are lives joined that seem to be one, nor is held what hardly changes along them [default: auto]
     #[arg(long, hide_short_help = true)]
     pub(super) link: Option<LinkArg>,
     /// Folder for scratch files while the run lasts: the packed frames of a stream or of linked frames, what does not fit
@@ -252,7 +252,7 @@ pub(super) struct Cameras {
 pub(super) enum LinkArg {
     /// Where they differ in number, or their order does not tell which Gaussian is which
     Auto,
-    /// Whatever their order tells
+    /// Whatever their order tells, or a container or stream
     Always,
     /// Whatever their order tells; lives that seem to be one stay apart, and what hardly changes is not held
     Apart,

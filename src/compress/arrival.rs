@@ -24,7 +24,8 @@ use crate::ingest::frame_stream::FrameStream;
 use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::recipe;
 use crate::scene::{
-    InputOptions, Opened, Room, Scene, link_stream, load_cameras, open_scene, open_stream, receiving, scene_of,
+    InputOptions, Opened, Room, Scene, is_linked, link_stream, load_cameras, open_scene, open_stream, receiving,
+    scene_of,
 };
 use crate::source::{FrameSource, Reads};
 use crate::stats::{RobustBox, ScanPlan};
@@ -45,7 +46,7 @@ pub fn open_to_measure<S: Stages>(
         let normalised = cameras::Clock::Normalised;
         let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalised, None)?;
         let stream = open_stream(options)?;
-        if !stream.header().is_unlinked {
+        if !is_linked(stream.header(), options) {
             let found = receive_measured(stream, rig, options, plan, journal)?;
             journal.opened("receive", start, found.0.source().info().count, Reads::default());
             return Ok(found);

@@ -50,6 +50,9 @@ pub struct Score {
     pub user: UserOverrides,
 }
 
+/// Lives of at most this part of all frames are short: it is worth asking which of them are one.
+const SHORT_LIFE: usize = 4;
+
 /// A scene with statistics and a selection of every Gaussian.
 #[derive(Serialize, Deserialize)]
 pub struct Scored {
@@ -152,6 +155,7 @@ impl Score {
             let selection = select(&scores, &self.select, &overrides)?;
             let reference = Reference { frame: reference_frame, extent };
             let position_ulp = ulp(scanned.largest_coordinate);
+            let median_life = median_life(&rows.life);
             let scored = Scored {
                 frames: info.times.len(),
                 frames_to_see: frames_to_see(&rows.life, info.times.len()),
@@ -167,7 +171,7 @@ impl Score {
                 position_ulp,
                 rereads: self.rereads,
             };
-            scored.write_down(scene, journal);
+            scored.write_down(scene, median_life, journal);
             progress.advance(info.count as u64);
             Ok((scored, info.count))
         })
@@ -294,9 +298,16 @@ impl Scored {
         self.terms.iter().map(summarise).collect()
     }
 
-    /// Writes down what the scene did not need in scan and score, and how many Gaussians are odd.
-    fn write_down(&self, scene: &Scene, journal: &mut Journal) {
+    /// Writes down what the scene did not need in scan and score, how many Gaussians are odd, and what may be done about short
+    /// lives.
+    fn write_down(&self, scene: &Scene, median_life: u32, journal: &mut Journal) {
         let info = scene.source().info();
+        if scene.input.may_be_linked() && (1..=info.times.len() / SHORT_LIFE).contains(&(median_life as usize)) {
+            journal.notes.push(format!(
+                "Gaussians live {median_life} of {} frames in the median: --link always makes one of lives that are one",
+                info.times.len()
+            ));
+        }
         if info.times.len() <= 1 {
             let why = format!("{} frame{}", info.times.len(), if info.times.len() == 1 { "" } else { "s" });
             journal.leave_out("motion, curvature, opacity variance", why);
@@ -331,6 +342,13 @@ impl Scored {
             }
         }
     }
+}
+
+/// Frames that Gaussians live, in the median of those that do; 0 where none does.
+fn median_life(life: &[u32]) -> u32 {
+    let mut lives: Vec<u32> = life.iter().copied().filter(|&frames| frames > 0).collect();
+    let middle = lives.len() / 2;
+    if lives.is_empty() { 0 } else { *lives.select_nth_unstable(middle).1 }
 }
 
 fn constant(column: Columns) -> &'static str {

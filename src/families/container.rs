@@ -3,6 +3,7 @@
 use gseq::{Encoding, Reader, TileId};
 
 use super::family::{ColumnInfo, Entry, Family, Residence, Timing};
+use super::linked::Linked;
 use super::size::bytes_of;
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
@@ -15,6 +16,10 @@ pub(super) const ENTRY: Entry = Entry {
     open: |path, options| {
         let container = Container::open(path)?;
         options.refuse_for(path)?;
+        if options.link.is_asked() && container.info().times.len() > 1 {
+            let (joins, scratch) = (options.link.joins(), options.scratch());
+            return Ok(Box::new(Linked::anew(&container, "linked gseq container", joins, &scratch)?));
+        }
         Ok(Box::new(container))
     },
 };
@@ -34,6 +39,10 @@ impl Family for Container {
 
     fn bytes(&self) -> Result<u64> {
         bytes_of([self.path()])
+    }
+
+    fn may_be_linked(&self) -> bool {
+        true
     }
 
     fn stands_in_frames(&self) -> bool {

@@ -183,6 +183,11 @@ pub trait Family: Send + Sync {
         Err(Error::usage(NO_ARCHIVE))
     }
 
+    /// Whether it says which Gaussian is which and can be linked all the same.
+    fn may_be_linked(&self) -> bool {
+        false
+    }
+
     /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`Reduction::course`]).
     fn stands_in_frames(&self) -> bool {
         false
@@ -349,14 +354,14 @@ pub struct Conventions {
     pub rot4d_unflipped: bool,
 }
 
-/// Whether the frames of a folder are linked, so that they say which Gaussian is which.
+/// Whether frames are linked, so that they say which Gaussian is which.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Link {
-    /// Where they have different numbers of Gaussians, or their order does not tell.
+    /// Those of a folder where they have different numbers of Gaussians, or their order does not tell.
     #[default]
     Auto,
-    /// Whatever their order tells.
+    /// Whatever their order tells, or a container or stream.
     Always,
     /// Whatever their order tells; lives that seem to be one stay apart, and what hardly changes along them is not held.
     Apart,
@@ -364,7 +369,24 @@ pub enum Link {
     Never,
 }
 
+impl Link {
+    /// Whether frames are linked that say which Gaussian is which.
+    pub fn is_asked(self) -> bool {
+        matches!(self, Link::Always | Link::Apart)
+    }
+
+    /// Whether lives are joined that are one.
+    pub fn joins(self) -> bool {
+        self != Link::Apart
+    }
+}
+
 impl OpenOptions {
+    /// Folder for scratch files.
+    pub(super) fn scratch(&self) -> PathBuf {
+        self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
+
     /// Refuses what only model folders take.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {

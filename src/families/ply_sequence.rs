@@ -48,17 +48,14 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
     options.refuse_for(path)?;
     let order = match options.link {
         _ if frames.paths().len() == 1 => Order::Believed,
-        Link::Never => Order::Believed,
-        Link::Always | Link::Apart => Order::Lost("as asked".to_owned()),
+        link if link.is_asked() => Order::Lost("as asked".to_owned()),
         Link::Auto => order(&frames)?,
+        _ => Order::Believed,
     };
     match order {
         Order::Believed => Ok(Box::new(PlySequence::new(frames)?)),
         Order::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
-        Order::Lost(why) => {
-            let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
-            Ok(Box::new(Linked::open(frames, &why, options.link != Link::Apart, &scratch)?))
-        }
+        Order::Lost(why) => Ok(Box::new(Linked::open(frames, &why, options.link.joins(), &options.scratch())?)),
     }
 }
 

@@ -76,6 +76,10 @@ impl Family for Streamed {
         self.container.bytes()
     }
 
+    fn may_be_linked(&self) -> bool {
+        true
+    }
+
     fn stands_in_frames(&self) -> bool {
         true
     }

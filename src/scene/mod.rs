@@ -21,7 +21,7 @@ use crate::work::Work;
 
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
-pub use stream::{Room, link_stream, open_stream, receiving, room_to_pack};
+pub use stream::{Room, is_linked, link_stream, open_stream, receiving, room_to_pack};
 pub use work::kept_work;
 pub(crate) use work::stamps;
 

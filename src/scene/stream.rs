@@ -8,7 +8,7 @@ use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::stream::{AHEAD, Streamed, frame_block};
-use crate::families::{Family, Link, Linked};
+use crate::families::{Family, Linked};
 use crate::ingest::cameras::Clock;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
@@ -47,21 +47,32 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
     let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalised, None)?;
     let stream = open_stream(options)?;
-    if stream.header().is_unlinked {
+    if is_linked(stream.header(), options) {
         return link_stream(stream, options, rig);
     }
-    let mut room = room_to_pack(options, stream.header())?;
-    let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| room.admit(held.len()))?;
-    Ok(Opened { input: Box::new(streamed), rig, notes: Vec::new() })
+    Ok(Opened { input: Box::new(pack_arriving(stream, options)?), rig, notes: Vec::new() })
 }
 
-/// Receives and links a stream of frames that do not know one another.
+fn pack_arriving(stream: FrameStream<Stdin>, options: &InputOptions) -> Result<Streamed> {
+    let mut room = room_to_pack(options, stream.header())?;
+    Streamed::receive(stream, &options.scratch_folder(), |held| room.admit(held.len()))
+}
+
+/// Whether a stream is linked: one of frames that do not know one another, or any where that is asked for.
+pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
+    header.is_unlinked || options.link.is_asked()
+}
+
+/// Receives a stream that [is linked](is_linked).
 ///
 /// # Errors
-/// What is wrong with the stream.
+/// What is wrong with the stream; a budget that does not hold the frames that are packed together.
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
-    let joins = options.link != Link::Apart;
-    let input = Linked::receive(stream, Path::new(STANDARD_INPUT), joins, &options.scratch_folder())?;
+    let (joins, scratch) = (options.link.joins(), options.scratch_folder());
+    let input = match stream.header().is_unlinked {
+        true => Linked::receive(stream, Path::new(STANDARD_INPUT), joins, &scratch)?,
+        false => Linked::anew(&pack_arriving(stream, options)?, "linked frame stream", joins, &scratch)?,
+    };
     let notes = input.notes();
     Ok(Opened { input: Box::new(input), rig, notes })
 }

@@ -28,7 +28,9 @@ use crate::ingest::container::Container;
 use crate::ingest::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::model::Columns;
-use crate::scene::{InputOptions, Opened, first_box, kept_work, link_stream, open_input, open_stream, room_to_pack};
+use crate::scene::{
+    InputOptions, Opened, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
+};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 use crate::stream::{Frames, Progress};
 use crate::work::Spilling;
@@ -79,7 +81,7 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
     check_container_name(output, "pack")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
-        Some(stream) if stream.header().is_unlinked => link_stream(stream, input, None)?,
+        Some(stream) if is_linked(stream.header(), input) => link_stream(stream, input, None)?,
         Some(stream) => return pack_arriving(stream, input, output, storing, overwrite),
         None => open_input(input)?,
     };

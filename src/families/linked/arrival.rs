@@ -1,18 +1,51 @@
-//! A stream of frames that do not know one another (format/STREAM.md, version 2): kept as files, then linked like files.
+//! Frames that came another way than as files, kept as files and then linked like files: a stream of frames that do not know
+//! one another (format/STREAM.md, version 2), or what says which Gaussian is which and is linked all the same.
 //!
-//! Memory while it arrives: a frame. On the disk, in a folder without a name, every frame as PLY.
+//! Memory while they arrive: a frame, and what the readers of a container keep of the frames that are decoded together. On
+//! the disk, in a folder without a name, every frame as PLY.
 
 use std::io::Read;
 use std::path::Path;
 
-use super::Linked;
+use super::{Arrived, Linked};
 use crate::emit::atomic::ScratchFolder;
 use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
+use crate::families::Family;
 use crate::ingest::frame_stream::FrameStream;
 use crate::ingest::ply_frames::PlyFrames;
-use crate::model::Gaussians;
-use crate::stream::Progress;
+use crate::model::{Columns, Gaussians, opacity};
+use crate::source::{BlockReader, Ids, Wanted};
+use crate::stream::{Frames, Progress};
+
+/// Of a lower opacity no picture shows anything.
+const LEAST_OPACITY: f64 = 1.0 / 255.0;
+/// Most bytes of frames that are decoded together and kept, if that is one frame at least.
+const HELD_BYTES: u64 = 256 << 20;
+
+/// Files of frames that are arriving, and their times.
+struct Arriving {
+    folder: ScratchFolder,
+    times: Vec<f64>,
+}
+
+impl Arriving {
+    fn new(scratch: &Path) -> Result<Arriving> {
+        Ok(Arriving { folder: ScratchFolder::new(scratch)?, times: Vec::new() })
+    }
+
+    fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
+        write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
+        self.times.push(time);
+        Ok(())
+    }
+
+    fn link(self, kind: &'static str, bytes: u64, why: &str, joins: bool, scratch: &Path) -> Result<Linked> {
+        let linked = Linked::open(PlyFrames::open(self.folder.path())?, why, joins, scratch)?;
+        let arrived = Some(Arrived { _folder: self.folder, kind, bytes });
+        Ok(Linked { info: linked.info.with_times(self.times)?, arrived, ..linked })
+    }
+}
 
 impl Linked {
     /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`, with scratch files in
@@ -21,20 +54,43 @@ impl Linked {
     /// # Errors
     /// What is wrong with the stream; none but the end of it; a failed write.
     pub fn receive(mut stream: FrameStream<impl Read>, name: &Path, joins: bool, scratch: &Path) -> Result<Linked> {
-        let folder = ScratchFolder::new(scratch)?;
-        let (mut state, mut times) = (Gaussians::zeros(0, stream.header().sh_degree), Vec::new());
+        let mut arriving = Arriving::new(scratch)?;
+        let mut state = Gaussians::zeros(0, stream.header().sh_degree);
         let progress = Progress::counting("receive", "frames");
         while let Some(time) = stream.next_frame(&mut state)? {
-            write_inria(&state, &[], &folder.path().join(format!("frame_{:05}.ply", times.len())))?;
-            times.push(time);
+            arriving.push(time, &state)?;
             progress.advance(1);
         }
         drop(progress);
-        if times.is_empty() {
+        if arriving.times.is_empty() {
             return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
         }
-        let frames = PlyFrames::open(folder.path())?;
-        let linked = Linked::open(frames, "the stream does not say which Gaussian is which", joins, scratch)?;
-        Ok(Linked { info: linked.info.with_times(times)?, arrived: Some(folder), ..linked })
+        let why = "the stream does not say which Gaussian is which";
+        arriving.link("linked frame stream", stream.received(), why, joins, scratch)
+    }
+
+    /// Links what `input` shows, which says itself which Gaussian is which, and lives that are one if `joins`: in each frame
+    /// those that any picture may show. `kind` says what that is.
+    ///
+    /// # Errors
+    /// A frame that cannot be read; a failed write.
+    pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, scratch: &Path) -> Result<Linked> {
+        let mut arriving = Arriving::new(scratch)?;
+        let source = input.source();
+        let info = source.info();
+        let frame_bytes = 4 * (info.count * info.varying.width(info.sh_degree)) as u64;
+        let wanted = Wanted::every().holding((HELD_BYTES / frame_bytes.max(1)) as usize);
+        let mut frames = Frames::open(source, Ids::Range(0..info.count), Columns::all(), &wanted)?;
+        let mut state = frames.state();
+        let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+        for (frame, &time) in info.times.iter().enumerate() {
+            frames.read(frame, Columns::all(), &mut state)?;
+            let is_seen = |&row: &u32| opacity(state.opacity_logit.plane(0)[row as usize]) >= LEAST_OPACITY;
+            let seen: Vec<u32> = (0..info.count as u32).filter(is_seen).collect();
+            arriving.push(time, &state.pick(&seen))?;
+            progress.advance(1);
+        }
+        drop((progress, frames, state));
+        arriving.link(kind, input.bytes()?, "as asked", joins, scratch)
     }
 }

@@ -47,8 +47,18 @@ pub struct Linked {
     notes: Vec<String>,
     /// Keeps the container's file until nobody reads it any more.
     _scratch: ScratchFile,
-    /// The folder of frames that came by a stream.
-    arrived: Option<ScratchFolder>,
+    /// What the frames came as, if not as files.
+    arrived: Option<Arrived>,
+}
+
+/// Frames that came another way than as files.
+struct Arrived {
+    /// Keeps their files until nobody reads them any more.
+    _folder: ScratchFolder,
+    /// What they are, for people.
+    kind: &'static str,
+    /// Bytes that they came as.
+    bytes: u64,
 }
 
 impl Linked {
@@ -98,10 +108,7 @@ impl FrameSource for Linked {
 
 impl Family for Linked {
     fn kind(&self) -> &'static str {
-        match self.arrived {
-            None => "linked PLY frames",
-            Some(_) => "linked frame stream",
-        }
+        self.arrived.as_ref().map_or("linked PLY frames", |arrived| arrived.kind)
     }
 
     fn source(&self) -> &dyn FrameSource {
@@ -115,7 +122,10 @@ impl Family for Linked {
     }
 
     fn bytes(&self) -> Result<u64> {
-        bytes_of(self.tracks.frames().paths().iter().map(PathBuf::as_path))
+        match &self.arrived {
+            None => bytes_of(self.tracks.frames().paths().iter().map(PathBuf::as_path)),
+            Some(arrived) => Ok(arrived.bytes),
+        }
     }
 
     fn stored_bytes(&self) -> Result<u64> {
