@@ -1,11 +1,13 @@
 //! Lives that are one: a track that ends where and when another begins that looks alike (part 6 of the [module](super)).
 
+use std::mem::size_of;
+
 use rayon::prelude::*;
 
 use super::grid::Grid;
 use super::linker::Linker;
 use super::look::Look;
-use super::track::{NONE, Offers, Round, Track};
+use super::track::{NAMED, NONE, Offer, Offers, Round, Track};
 use crate::model::{Column, Gaussians};
 
 /// r and q of lives that may be one, and of those that are one to the eye.
@@ -56,6 +58,13 @@ impl Default for Joiner {
 }
 
 impl Joiner {
+    /// Bytes for each track there has been, in lists that grow by being copied to twice their length, and what they end as.
+    pub const BYTES_PER_TRACK: usize = 2 * RULES.len() * (size_of::<u32>() + size_of::<bool>());
+    /// Bytes for each track that may go on.
+    pub const BYTES_PER_LIVING: usize = 2 * size_of::<Look>()
+        + 6 * size_of::<u32>()
+        + RULES.len() * NAMED * (size_of::<Offer>() + 2 * size_of::<Pair>());
+
     /// Takes in the frame that `linker` has linked last.
     pub fn see(&mut self, linker: &Linker) {
         let tracks = linker.living();

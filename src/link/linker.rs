@@ -44,9 +44,14 @@ pub struct Linked {
 impl Linker {
     /// Bytes for each Gaussian of the frame that is linked, beside the frame.
     pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<Look>() + 9 * size_of::<u32>();
-    /// Bytes for each track that may go on.
+    /// Bytes for each track that may go on, in a list that grows by being copied to twice its length.
     pub const BYTES_PER_TRACK: usize =
-        size_of::<Track>() + 2 * size_of::<u32>() + NAMED * size_of::<Offer>() + size_of::<f32>();
+        2 * size_of::<Track>() + 2 * size_of::<u32>() + NAMED * size_of::<Offer>() + size_of::<f32>();
+
+    /// How many tracks may go on.
+    pub fn may_go_on(&self) -> usize {
+        self.tracks.len()
+    }
 
     /// Those that may go on, by their numbers.
     pub(super) fn living(&self) -> &[Track] {

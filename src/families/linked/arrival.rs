@@ -12,6 +12,7 @@ use crate::emit::atomic::ScratchFolder;
 use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
 use crate::families::Family;
+use crate::families::trajectories::state_bytes;
 use crate::ingest::frame_stream::FrameStream;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::model::{Columns, Gaussians, opacity};
@@ -21,28 +22,34 @@ use crate::stream::{Frames, Progress};
 /// Of a lower opacity no picture shows anything.
 const LEAST_OPACITY: f64 = 1.0 / 255.0;
 /// Most bytes of frames that are decoded together and kept, if that is one frame at least.
-const HELD_BYTES: u64 = 256 << 20;
+const HELD_BYTES: u64 = 64 << 20;
 
 /// Files of frames that are arriving, and their times.
 struct Arriving {
     folder: ScratchFolder,
     times: Vec<f64>,
+    /// Bytes of what they are read from, and of the largest as it is read.
+    beside: u64,
+    largest: u64,
 }
 
 impl Arriving {
-    fn new(scratch: &Path) -> Result<Arriving> {
-        Ok(Arriving { folder: ScratchFolder::new(scratch)?, times: Vec::new() })
+    fn new(scratch: &Path, beside: u64) -> Result<Arriving> {
+        Ok(Arriving { folder: ScratchFolder::new(scratch)?, times: Vec::new(), beside, largest: 0 })
     }
 
     fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
         write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
         self.times.push(time);
+        self.largest = self.largest.max(state.len() as u64 * state_bytes(state.sh_degree(), Columns::all()));
         Ok(())
     }
 
+    /// Links them: a `kind` of input of `bytes`.
     fn link(self, kind: &'static str, bytes: u64, why: &str, joins: bool, scratch: &Path) -> Result<Linked> {
         let linked = Linked::open(PlyFrames::open(self.folder.path())?, why, joins, scratch)?;
-        let arrived = Some(Arrived { _folder: self.folder, kind, bytes });
+        let memory = self.beside + 2 * self.largest;
+        let arrived = Some(Arrived { _folder: self.folder, kind, bytes, memory });
         Ok(Linked { info: linked.info.with_times(self.times)?, arrived, ..linked })
     }
 }
@@ -54,7 +61,7 @@ impl Linked {
     /// # Errors
     /// What is wrong with the stream; none but the end of it; a failed write.
     pub fn receive(mut stream: FrameStream<impl Read>, name: &Path, joins: bool, scratch: &Path) -> Result<Linked> {
-        let mut arriving = Arriving::new(scratch)?;
+        let mut arriving = Arriving::new(scratch, 0)?;
         let mut state = Gaussians::zeros(0, stream.header().sh_degree);
         let progress = Progress::counting("receive", "frames");
         while let Some(time) = stream.next_frame(&mut state)? {
@@ -75,11 +82,12 @@ impl Linked {
     /// # Errors
     /// A frame that cannot be read; a failed write.
     pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, scratch: &Path) -> Result<Linked> {
-        let mut arriving = Arriving::new(scratch)?;
         let source = input.source();
         let info = source.info();
-        let frame_bytes = 4 * (info.count * info.varying.width(info.sh_degree)) as u64;
-        let wanted = Wanted::every().holding((HELD_BYTES / frame_bytes.max(1)) as usize);
+        let frame_bytes = info.count as u64 * state_bytes(info.sh_degree, info.varying);
+        let held = (HELD_BYTES / frame_bytes.max(1)).max(1);
+        let mut arriving = Arriving::new(scratch, reading(input, held))?;
+        let wanted = Wanted::every().holding(held as usize);
         let mut frames = Frames::open(source, Ids::Range(0..info.count), Columns::all(), &wanted)?;
         let mut state = frames.state();
         let progress = Progress::new("unpack", "frames", info.times.len() as u64);
@@ -93,4 +101,15 @@ impl Linked {
         drop((progress, frames, state));
         arriving.link(kind, input.bytes()?, "as asked", joins, scratch)
     }
+}
+
+/// Bytes of reading `input` with `held` frames that are decoded together: readers, one frame, those that are held, and
+/// what decodes them.
+fn reading(input: &dyn Family, held: u64) -> u64 {
+    let (residence, info) = (input.residence(), input.source().info());
+    let [whole, varying] = [Columns::all(), info.varying].map(|columns| state_bytes(info.sh_degree, columns));
+    let count = info.count as u64;
+    let tile = residence.gaussian_block.min(count) * residence.frame_block * state_bytes(info.sh_degree, Columns::SH);
+    let held = held.min(residence.frame_block) + 2;
+    count * (residence.reader + whole + held * varying) + 3 * rayon::current_num_threads() as u64 * tile
 }

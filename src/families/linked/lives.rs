@@ -3,6 +3,7 @@
 use std::ops::Range;
 use std::path::Path;
 
+use super::memory::LOOKED_AT;
 use super::steady::{Bound, Steady, Sums};
 use super::tracks::Tracks;
 use crate::error::Result;
@@ -15,8 +16,7 @@ use crate::stats::RobustBox;
 
 /// Pictures with joined lives are at least as near to those of lives apart, and those with what is held to those without, dB.
 const LEAST_DB: f64 = 40.0;
-/// Frames that are looked at, and views of each.
-const FRAMES: usize = 3;
+/// Views of each frame that is looked at.
 const VIEWS: usize = 3;
 /// What may change along a track and be held: no more than trainers leave between lives, or half of that.
 const BOUNDS: [Bound; 2] = [Bound { colour: 0.04, other: 0.02 }, Bound { colour: 0.02, other: 0.01 }];
@@ -117,7 +117,7 @@ fn cost(tracks: &Tracks) -> Result<Option<f64>> {
 
 /// Some of `frames`, evenly spread.
 fn looked_at(frames: &[u32]) -> impl Iterator<Item = usize> {
-    let count = frames.len().min(FRAMES);
+    let count = frames.len().min(LOOKED_AT);
     (0..count).map(move |k| frames[(2 * k + 1) * frames.len() / (2 * count)] as usize)
 }
 

@@ -6,14 +6,13 @@
 //! nowhere and costs next to nothing. Then colours, scales, rotations and opacities that hardly change along a track are at
 //! every frame what they are in the mean ([`steady`]), where pictures with them stay within 40 dB of those without.
 //!
-//! Memory of opening: two frames and what [`Linker`](crate::link::Linker) keeps, 18 bytes for each track and four times 20
-//! for each that began in the last few frames; 12 more per track to join lives, 4 per track and some 8 per value of 65,536
-//! tracks and thread to find what is steady, and a few pictures; then, while packing, 12 bytes per track, 12 per Gaussian of
-//! a block of frames, and a tile of every column and thread. On the disk, in files without a name, 4 bytes per Gaussian and
-//! frame and 4 per track and value that may be steady, beside the container.
+//! Memory: [`Sizes`](memory::Sizes); of frames two while they are linked, one for every thread and a few to look at while
+//! lives are joined and held, and up to 128 MiB while they are packed. On the disk, in files without a name, 4 bytes per
+//! Gaussian and frame and 4 per track and value that may be steady, beside the container.
 
 mod arrival;
 mod lives;
+mod memory;
 mod steady;
 mod tracks;
 mod write;
@@ -59,6 +58,8 @@ struct Arrived {
     kind: &'static str,
     /// Bytes that they came as.
     bytes: u64,
+    /// Bytes of memory that this took.
+    memory: u64,
 }
 
 impl Linked {
@@ -137,7 +138,14 @@ impl Family for Linked {
     }
 
     fn residence(&self) -> Residence {
-        self.container.residence()
+        let (sizes, count) = (self.tracks.sizes(), self.info.count.max(1) as u64);
+        let arriving = self.arrived.as_ref().map_or(0, |arrived| arrived.memory);
+        Residence {
+            per_gaussian: sizes.open().div_ceil(count),
+            opening: sizes.opening().max(arriving).div_ceil(count),
+            file: sizes.frame_file().div_ceil(count),
+            ..self.container.residence()
+        }
     }
 
     fn hold_decoded(&self) {

@@ -20,7 +20,7 @@ use crate::work::{Spill, Spilling};
 /// What may be held: positions move.
 const HELD: Columns = Columns::all().difference(Columns::POSITION);
 /// Tracks whose means are taken at a time, by each thread.
-const BATCH: usize = 1 << 16;
+pub(super) const BATCH: usize = 1 << 16;
 
 /// How little changes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -151,6 +151,11 @@ impl Sums {
             colours: vec![[0.0; 3]; len],
             first: vec![[0.0; 4]; len],
         }
+    }
+
+    /// Bytes of a track.
+    pub(super) fn bytes(sh_degree: usize) -> u64 {
+        (8 * (3 + HELD.width(sh_degree) + 4 + 3 + 3) + 16) as u64
     }
 
     fn len(&self) -> usize {

@@ -6,8 +6,9 @@ use std::path::Path;
 
 use gseq::Compression;
 
+use super::memory::Sizes;
 use super::steady::{Means, Steady};
-use crate::emit::container::{ContainerWriter, FRAME_BLOCK, GAUSSIAN_BLOCK, Lives};
+use crate::emit::container::{ContainerWriter, GAUSSIAN_BLOCK, Lives};
 use crate::error::Result;
 use crate::ingest::ply::Ply;
 use crate::ingest::ply_frames::PlyFrames;
@@ -38,6 +39,8 @@ pub(super) struct At {
 pub(super) struct Tracks {
     frames: PlyFrames,
     count: usize,
+    /// Most tracks of `of_rows` that might go on at a frame.
+    living: usize,
     /// Of every track of `of_rows` the one it is part of, if lives are joined.
     lives: Option<Vec<u32>>,
     /// What is held along tracks, if anything is.
@@ -111,7 +114,7 @@ impl Tracks {
         mut joiner: Option<&mut Joiner>,
         scratch: &Path,
     ) -> Result<(Tracks, Found, Linker)> {
-        let mut linker = Linker::default();
+        let (mut linker, mut living) = (Linker::default(), 0);
         let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
         let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
@@ -120,6 +123,7 @@ impl Tracks {
             let ply = frames.frame(frame)?;
             ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
             let linked = linker.link(&state);
+            living = living.max(linker.may_go_on());
             if let Some(joiner) = &mut joiner {
                 joiner.see(&linker);
             }
@@ -140,6 +144,7 @@ impl Tracks {
         }
         let tracks = Tracks {
             count: births.len(),
+            living,
             frames,
             lives: None,
             steady: None,
@@ -218,6 +223,16 @@ impl Tracks {
         }
     }
 
+    /// What memory depends on.
+    pub(super) fn sizes(&self) -> Sizes {
+        Sizes {
+            of_frame: self.frames.counts().iter().copied().max().unwrap_or(0).into(),
+            sh_degree: self.frames.sh_degree(),
+            linked: self.births.len() as u64,
+            living: self.living as u64,
+        }
+    }
+
     /// The files.
     pub(super) fn frames(&self) -> &PlyFrames {
         &self.frames
@@ -279,11 +294,12 @@ impl Tracks {
         let mut held = self.first();
         let (times, degree) = (self.frames.times(), self.frames.sh_degree());
         let compression = Compression::Zstd(1);
-        let mut writer = ContainerWriter::create(path, self.count, degree, FRAME_BLOCK, compression, BTreeMap::new())?;
+        let together = self.sizes().frame_block();
+        let mut writer = ContainerWriter::create(path, self.count, degree, together, compression, BTreeMap::new())?;
         let progress = Progress::new("pack", "frames", times.len() as u64);
         let mut was_still = vec![false; self.count.div_ceil(GAUSSIAN_BLOCK)];
-        for start in (0..times.len()).step_by(FRAME_BLOCK) {
-            let of_block = start..times.len().min(start + FRAME_BLOCK);
+        for start in (0..times.len()).step_by(together) {
+            let of_block = start..times.len().min(start + together);
             let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
             let rows: Vec<Vec<Row>> =
                 of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;

@@ -1,0 +1,60 @@
+//! What opening linked frames keeps in memory, counted in bytes allocated: what it says itself, which is what `--memory`
+//! goes by.
+
+#[path = "corpus/memory.rs"]
+mod memory;
+
+use std::path::Path;
+
+use splatsieve::emit::ply::write_inria;
+use splatsieve::families::{OpenOptions, open};
+use splatsieve::model::Gaussians;
+use splatsieve::select::hash_id;
+
+#[global_allocator]
+static ALLOCATOR: memory::Counting = memory::Counting;
+
+const LIVING: usize = 20_000;
+const FRAMES: usize = 40;
+/// Frames that each lives, before another begins elsewhere.
+const LIFE: usize = 5;
+
+/// Even numbers in [0, 1) that follow from what they are for.
+fn uniform(of: usize) -> f32 {
+    (hash_id(of as u64) >> 40) as f32 / (1u64 << 24) as f32
+}
+
+/// Frames of as many Gaussians each, in an order of their own.
+fn write_frames(folder: &Path) {
+    for frame in 0..FRAMES {
+        let mut out = Gaussians::zeros(LIVING, 1);
+        for at in 0..LIVING {
+            let place = (at + 7919 * frame) % LIVING;
+            let (life, age) = ((frame + place % LIFE) / LIFE, (frame + place % LIFE) % LIFE);
+            let value = |k: usize| uniform(32 * (place + LIVING * life) + k);
+            out.position.set_row(at, [0, 1, 2].map(|k| 4.0 * value(k) + 0.002 * age as f32));
+            out.rotation.set_row(at, [3, 4, 5, 6].map(|k| value(k) - 0.5));
+            out.log_scale.set_row(at, [7, 8, 9].map(|k| -5.0 + 0.3 * value(k)));
+            out.opacity_logit.set_row(at, [3.0 * value(10)]);
+            out.sh.set_row::<3>(at, [11, 12, 13].map(|k| 3.0 * value(k) - 1.5));
+        }
+        write_inria(&out, &[], &folder.join(format!("{frame}.ply"))).unwrap();
+    }
+}
+
+#[test]
+fn memory_of_opening_is_what_is_stated() {
+    let folder = tempfile::tempdir().unwrap();
+    rayon::ThreadPoolBuilder::new().num_threads(2).build_global().unwrap();
+    write_frames(folder.path());
+    let options = OpenOptions { scratch: Some(folder.path().to_owned()), ..OpenOptions::default() };
+    let (input, peak) = memory::peak(|| open(folder.path(), &options).unwrap());
+    let tracks = input.source().info().count;
+    assert!((LIVING * FRAMES / LIFE..LIVING * FRAMES / LIFE * 6 / 5).contains(&tracks), "{tracks}");
+    let residence = input.residence();
+    let stated = tracks as u64 * (residence.opening + residence.per_gaussian);
+    eprintln!("{tracks} tracks: at most {peak} bytes, {stated} stated");
+    // What is stated counts the pages of files too, and all that a picture may take.
+    assert!(peak as u64 <= stated, "{peak} bytes, {stated} stated");
+    assert!(3 * peak as u64 >= stated, "{stated} stated for {peak} bytes");
+}
