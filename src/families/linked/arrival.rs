@@ -1,14 +1,19 @@
 //! Frames that came another way than as files, kept as files and then linked like files: a stream of frames that do not know
 //! one another (format/STREAM.md, version 2), or what says which Gaussian is which and is linked all the same.
 //!
-//! Memory while they arrive: a frame, and what the readers of a container keep of the frames that are decoded together. On
-//! the disk, in a folder without a name, every frame as PLY.
+//! Memory while they arrive: a frame; of a container up to 128 MiB of what is seen, and a tile of every column and thread.
+//! On the disk, in a folder without a name, every frame as PLY.
 
 use std::io::Read;
+use std::ops::Range;
 use std::path::Path;
 
+use rayon::prelude::*;
+
+use super::memory::TOGETHER_BYTES;
 use super::{Arrived, Linked};
 use crate::emit::atomic::ScratchFolder;
+use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
 use crate::families::Family;
@@ -16,14 +21,11 @@ use crate::families::trajectories::state_bytes;
 use crate::ingest::frame_stream::FrameStream;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::model::{Columns, Gaussians, opacity};
-use crate::source::{BlockReader, Ids, Wanted};
-use crate::stream::{Frames, Progress};
+use crate::source::{FrameSource, Ids, Wanted};
+use crate::stream::Progress;
 
 /// Of a lower opacity no picture shows anything.
 const LEAST_OPACITY: f64 = 1.0 / 255.0;
-/// Most bytes of frames that are decoded together and kept, if that is one frame at least.
-const HELD_BYTES: u64 = 64 << 20;
-
 /// Files of frames that are arriving, and their times.
 struct Arriving {
     folder: ScratchFolder,
@@ -82,34 +84,87 @@ impl Linked {
     /// # Errors
     /// A frame that cannot be read; a failed write.
     pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, scratch: &Path) -> Result<Linked> {
-        let source = input.source();
-        let info = source.info();
-        let frame_bytes = info.count as u64 * state_bytes(info.sh_degree, info.varying);
-        let held = (HELD_BYTES / frame_bytes.max(1)).max(1);
-        let mut arriving = Arriving::new(scratch, reading(input, held))?;
-        let wanted = Wanted::every().holding(held as usize);
-        let mut frames = Frames::open(source, Ids::Range(0..info.count), Columns::all(), &wanted)?;
-        let mut state = frames.state();
+        let (source, info) = (input.source(), input.source().info());
+        let seen = count_seen(source)?;
+        let state = state_bytes(info.sh_degree, Columns::all());
+        let residence = input.residence();
+        let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
+        let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Columns::SH));
+        let unpacked = TOGETHER_BYTES.min(state * seen.iter().sum::<u64>());
+        let mut arriving = Arriving::new(scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
         let progress = Progress::new("unpack", "frames", info.times.len() as u64);
-        for (frame, &time) in info.times.iter().enumerate() {
-            frames.read(frame, Columns::all(), &mut state)?;
-            let is_seen = |&row: &u32| opacity(state.opacity_logit.plane(0)[row as usize]) >= LEAST_OPACITY;
-            let seen: Vec<u32> = (0..info.count as u32).filter(is_seen).collect();
-            arriving.push(time, &state.pick(&seen))?;
-            progress.advance(1);
+        let mut start = 0;
+        while start < seen.len() {
+            let mut bytes = 0;
+            let more = seen[start..].iter().take_while(|&&seen| {
+                bytes += state * seen;
+                bytes <= TOGETHER_BYTES
+            });
+            let together = start..start + more.count().max(1);
+            start = together.end;
+            let blocks = unpack(source, together.clone())?;
+            for (at, frame) in together.enumerate() {
+                let mut whole = Gaussians::zeros(seen[frame] as usize, info.sh_degree);
+                let mut first = 0;
+                for block in &blocks {
+                    whole.write_rows(first, &block[at]);
+                    first += block[at].len();
+                }
+                arriving.push(info.times[frame], &whole)?;
+                progress.advance(1);
+            }
         }
-        drop((progress, frames, state));
+        drop(progress);
         arriving.link(kind, input.bytes()?, "as asked", joins, scratch)
     }
 }
 
-/// Bytes of reading `input` with `held` frames that are decoded together: readers, one frame, those that are held, and
-/// what decodes them.
-fn reading(input: &dyn Family, held: u64) -> u64 {
-    let (residence, info) = (input.residence(), input.source().info());
-    let [whole, varying] = [Columns::all(), info.varying].map(|columns| state_bytes(info.sh_degree, columns));
-    let count = info.count as u64;
-    let tile = residence.gaussian_block.min(count) * residence.frame_block * state_bytes(info.sh_degree, Columns::SH);
-    let held = held.min(residence.frame_block) + 2;
-    count * (residence.reader + whole + held * varying) + 3 * rayon::current_num_threads() as u64 * tile
+/// Blocks of Gaussians of `source`, as they are read.
+fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
+    let count = source.info().count;
+    (0..count.div_ceil(GAUSSIAN_BLOCK))
+        .into_par_iter()
+        .map(move |block| block * GAUSSIAN_BLOCK..count.min((block + 1) * GAUSSIAN_BLOCK))
+}
+
+/// Rows of `state` that any picture may show.
+fn seen(state: &Gaussians) -> Vec<u32> {
+    let opacities = (0u32..).zip(state.opacity_logit.plane(0));
+    opacities.filter(|&(_, &logit)| opacity(logit) >= LEAST_OPACITY).map(|(row, _)| row).collect()
+}
+
+/// How many are [seen] in each frame of `source`.
+fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
+    let frames = source.info().times.len();
+    let count = |range: Range<usize>| -> Result<Vec<u64>> {
+        let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, 0));
+        (0..frames)
+            .map(|frame| {
+                reader.read(frame, Columns::OPACITY, &mut state)?;
+                Ok(seen(&state).len() as u64)
+            })
+            .collect()
+    };
+    let add = |mut a: Vec<u64>, b: Vec<u64>| {
+        a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        Ok(a)
+    };
+    blocks(source).map(count).try_reduce(|| vec![0; frames], add)
+}
+
+/// Those of every block that are [seen] in each of `frames`.
+fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
+    let wanted = Wanted::of(frames.clone());
+    let unpack = |range: Range<usize>| {
+        let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, source.info().sh_degree));
+        reader.expect(&wanted);
+        frames
+            .clone()
+            .map(|frame| {
+                reader.read(frame, Columns::all(), &mut state)?;
+                Ok(state.pick(&seen(&state)))
+            })
+            .collect()
+    };
+    blocks(source).map(unpack).collect()
 }

@@ -9,8 +9,8 @@ use crate::link::{Joiner, Linker};
 use crate::model::Columns;
 use crate::render::{BYTES_PER_VISIBLE, STRIP_BYTES};
 
-/// Most bytes of frames that are packed together, if that is one frame at least.
-const PACKED_BYTES: u64 = 128 << 20;
+/// Most bytes of frames that are packed, or unpacked, together, if that is one frame at least.
+pub(super) const TOGETHER_BYTES: u64 = 128 << 20;
 /// Of a row in a list of those of a frame: itself, and once more while they are brought into order.
 const PER_ROW: u64 = 16;
 /// Frames that are looked at before and after lives are joined, or anything is held.
@@ -49,7 +49,7 @@ impl Sizes {
 
     /// Frames that are packed together: whole tiles where they are small.
     pub(super) fn frame_block(&self) -> usize {
-        (PACKED_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
+        (TOGETHER_BYTES / self.frame_file().max(1)).clamp(1, FRAME_BLOCK as u64) as usize
     }
 
     /// Bytes while they are opened, at most.
