@@ -2,14 +2,16 @@
 """Quality against bytes: archives at several ratios, beside what pruning alone leaves, packed, and beside peers.
 
     cargo build --release
-    python3 scripts/size_curve.py target/release/splatsieve DATA [MODEL ...] [--ratios 0.2,0.1,0.05] [--peer COMMAND]
+    python3 scripts/size_curve.py target/release/splatsieve DATA [MODEL ...] [--ratios 0.2,0.1,0.05] [--peer COMMAND] [--frames]
 
 DATA/<name>/ is a 4DGaussians model folder with its cameras inside; DATA/static/<name>.ply is a model without cameras, for
 which an orbit is made as refine_table.py does. Prints for each, by the part of the Gaussians that was kept, the mean PSNR
 of held-out pictures against the original's own, and bytes as a part of the original's files that a renderer opens: of the
 archive (.gsz, preset default); of what pruning alone leaves (--no-refine --prune-only --field exact), packed by
 `zstd -19` if that program is there, else by xz of Python's own library, which packs about as tightly; and of static models
-what COMMAND, a splat-transform of PlayCanvas, makes of as many (.sog and .spz, decimated by itself). Standard library only.
+what COMMAND, a splat-transform of PlayCanvas, makes of as many (.sog and .spz, decimated by itself). With --frames instead
+the archive of the model's frames as PLY files, which say nothing of what they follow from, as a part of those. Standard
+library only.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -55,6 +57,15 @@ def ours(binary, model, cameras, ratio, folder):
     yield f"pruned alone, {packer}", pruned, sum(map(packed, files(pruned)))
 
 
+def of_frames(binary, model, cameras, ratio, folder):
+    """The same of the archive of a model's frames, and the files that these are."""
+    packed, frames, archive = folder / "all.gseq", folder / "frames", folder / "frames.gsz"
+    run(binary, "pack", model, "--cameras", cameras, "-o", packed)
+    run(binary, "unpack", packed, "-o", frames)
+    run(binary, "compress", frames, "--cameras", cameras, "--target-ratio", ratio, "--json", "-o", archive)
+    yield "of PLY frames (.gsz)", archive, size([archive]), sorted(frames.glob("*.ply"))
+
+
 def peers(command, model, ratio, folder):
     """The same of splat-transform."""
     for kind in ["sog", "spz"]:
@@ -73,6 +84,7 @@ def main():
     parser.add_argument("models", nargs="*")
     parser.add_argument("--ratios", default="0.2,0.1,0.05")
     parser.add_argument("--peer")
+    parser.add_argument("--frames", action="store_true")
     args = parser.parse_args()
     found = [path.parent for path in sorted(args.data.glob("*/cfg_args"))] + sorted(args.data.glob("static/*.ply"))
     print("| model | kept | | PSNR dB to the original | bytes | of the original |")
@@ -84,12 +96,15 @@ def main():
             with tempfile.TemporaryDirectory() as scratch:
                 folder = Path(scratch)
                 cameras = model if model.is_dir() else orbit(model, folder / "orbit.json")
-                made = list(ours(args.binary, model, cameras, ratio, folder))
+                if args.frames:
+                    made = list(of_frames(args.binary, model, cameras, ratio, folder))
+                else:
+                    made = [(*made, files(model)) for made in ours(args.binary, model, cameras, ratio, folder)]
                 if args.peer and model.is_file():
-                    made += peers(args.peer, model, ratio, folder)
-                for method, result, count in made:
+                    made += [(*made, files(model)) for made in peers(args.peer, model, ratio, folder)]
+                for method, result, count, original in made:
                     quality = evaluated(args.binary, model, result, cameras)["psnr"]
-                    part = f"{100 * count / size(files(model)):.1f}%"
+                    part = f"{100 * count / size(original):.2g}%" if args.frames else f"{100 * count / size(original):.1f}%"
                     print(f"| {model.stem} | {float(ratio):.0%} | {method} | {quality:.1f} | {count:,} | {part} |", flush=True)
 
 

@@ -228,6 +228,12 @@ impl Workload {
         vec![("blocks", 2 * self.threads * block), self.arriving(), ("index", self.written_index())]
     }
 
+    /// What zstd takes at a level where tiles of `frames` frames are compressed.
+    pub fn compressing(&self, level: i32, frames: usize) -> Part {
+        let widest = Columns::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
+        ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
+    }
+
     /// Full reads of the input that reading `frames` frames, evenly spread, takes at most: whole tiles, again and
     /// again where readers may hold too few of their frames.
     pub fn reads(&self, frames: u64, limits: &Limits) -> f64 {
@@ -593,6 +599,18 @@ pub fn peak_memory_bytes() -> Option<u64> {
 /// Lets [`peak_memory_bytes`] begin anew from what is resident now; false where the system has no such thing.
 pub fn reset_peak_memory() -> bool {
     fs::write("/proc/self/clear_refs", "5").is_ok()
+}
+
+/// Bytes of the tables by which zstd, at a level, finds matches in `bytes` bytes: at most those of each level's group, and
+/// 4 for each entry of two tables that have no more than twice as many entries as there are bytes.
+fn zstd_tables(level: i32, bytes: u64) -> u64 {
+    let most_mebibytes = match level {
+        ..=3 => 1,
+        4..=9 => 12,
+        10..=15 => 64,
+        _ => 80,
+    };
+    (16 * bytes.next_power_of_two()).min(most_mebibytes << 20)
 }
 
 /// Bytes for a person.

@@ -6,8 +6,9 @@ use std::fs;
 use std::path::Path;
 
 use scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, state, tiny};
+use splatsieve::emit::container::write_container;
 use splatsieve::families::{Family, ModelFolder};
-use splatsieve::model::Gaussians;
+use splatsieve::model::{Columns, Gaussians};
 
 /// How to have the tiny model archived without refining anything.
 const TINY: &str = "{tiny} --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only --archive-psnr 50";
@@ -98,6 +99,55 @@ fn the_bytes_of_an_archive_do_not_depend_on_threads() {
 }
 
 #[test]
+fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_asked_for() {
+    let workplace = Workplace::new();
+    let made = splatsieve::demo::Scene::new(1500, 20);
+    let raw = gseq::Compression::Raw;
+    write_container(&made, &workplace.path("frames.gseq"), raw, Default::default(), |_| ()).unwrap();
+    let how = "--target-ratio 0.5 --no-refine --prune-only";
+    let exact = workplace.summary(&format!("frames.gseq {how} -o exact.gseq"));
+    let summary = workplace.summary(&format!("frames.gseq {how} -o small.gsz --archive-psnr 45"));
+    let [exact_bytes, bytes] = [&exact, &summary].map(|summary| summary["output_bytes"].as_u64().unwrap());
+    assert!(4 * bytes < exact_bytes, "{bytes} of {exact_bytes}");
+    assert_eq!(fs::metadata(workplace.path("small.gsz")).unwrap().len(), bytes);
+    let archive = &summary["archive"];
+    assert!(archive["psnr"].as_f64().unwrap() >= 45.0 && archive.get("parts").is_none(), "{archive}");
+    // What was looked at before it was written is what is there.
+    let run = workplace.done("evaluate exact.gseq small.gsz --json");
+    let found: serde_json::Value = serde_json::from_str(&run).unwrap();
+    let psnr = found["psnr"].as_f64().unwrap_or_else(|| panic!("{found}"));
+    assert!((44.0..48.0).contains(&psnr), "{psnr} dB");
+    // Every value is within the bound that is named.
+    let open = |name: &str| splatsieve::families::open(&workplace.path(name), &Default::default()).unwrap();
+    let [before, after] = ["exact.gseq", "small.gsz"].map(open);
+    assert_eq!(after.kind(), "gseq container");
+    for frame in [0, 7, 19] {
+        let [before, after] = [&before, &after].map(|input| state(input.source(), frame));
+        for column in Columns::all().iter() {
+            let bound = archive["bounds"][column.name()].as_f64().unwrap();
+            let off = before.column(column).planes().iter().zip(after.column(column).planes());
+            let off = off.map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0.0, f64::max);
+            assert!(bound > 0.0 && off <= bound, "{} is {off} off, not {bound}", column.name());
+        }
+    }
+    // Threads change no byte, nor does the way that frames come.
+    workplace.done(&format!("--threads 3 compress frames.gseq {how} -o three.gsz --archive-psnr 45"));
+    let stream = workplace.piped("unpack frames.gseq --stream --quiet", b"").stdout;
+    let output = workplace.piped(&format!("compress - {how} -o piped.gsz --archive-psnr 45"), &stream);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let read = |name: &str| fs::read(workplace.path(name)).unwrap();
+    assert!(read("three.gsz") == read("small.gsz") && read("piped.gsz") == read("small.gsz"));
+    // A size, and one that is too small.
+    let most = bytes / 2;
+    let sized = workplace.summary(&format!("frames.gseq --no-refine --prune-only -o sized.gsz --target-size {most}"));
+    assert!((most / 2..=most).contains(&sized["output_bytes"].as_u64().unwrap()), "{sized}");
+    workplace.refused(2, "compress frames.gseq -o none.gsz --target-size 100", &["--target-size", "expected at least"]);
+    workplace.done("unpack small.gsz -o back");
+    let plys = files(&workplace.path("back")).into_keys().filter(|name| name.extension().is_some_and(|e| e == "ply"));
+    assert_eq!(plys.count(), 20);
+}
+
+#[test]
 fn a_single_ply_comes_back_with_its_header_and_close_to_its_values() {
     let workplace = Workplace::new();
     let mut gaussians = Gaussians::zeros(400, 1);
@@ -142,7 +192,8 @@ fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
     workplace.refused(1, "unpack flipped.gsz -o out", &["flipped.gsz", "checksum"]);
     workplace.refused(1, "info other.gsz", &["other.gsz", "archive"]);
     workplace.done("demo --gaussians 200 --frames 3 -o demo");
-    workplace.refused(2, "compress demo/scene.gseq --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
+    workplace.done("convert demo/scene.gseq curves.splatv");
+    workplace.refused(2, "compress curves.splatv --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
     workplace.refused(
         2,
         "compress {tiny} --cameras {tiny} --target-size 1MB --archive-psnr 45 -o a.gsz",

@@ -107,6 +107,7 @@ fn peak(result: &Path) -> Option<u64> {
 fn the_least_that_is_named_works_holds_and_changes_no_byte() {
     let workplace = prepared();
     for (input, rest) in [
+        ("packed.gseq", "--target-ratio 0.4 --refine-steps 30 --refine-cut-steps 5 --as archive"),
         ("packed.gseq", "--no-refine"),
         ("raw.gseq", "--no-refine"),
         ("packed.gseq", "--target-ratio 0.4 --no-refine"),

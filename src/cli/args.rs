@@ -296,7 +296,7 @@ pub(super) struct Compress {
     #[arg(long = "as", value_enum, value_name = "KIND")]
     pub(super) kind: Option<OutputKind>,
     /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
-    /// grids: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50dB
+    /// grids, or within bounds: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50dB
     /// where that is closer]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
@@ -392,7 +392,7 @@ pub(super) enum OutputKind {
     PlySequence,
     /// One PLY: the canonical cloud of a model, or a sequence of one frame
     Ply,
-    /// Archive of a model or of one PLY, the smallest: to store and to send
+    /// Archive of a model, of one PLY or of frames, the smallest: to store and to send
     Archive,
     /// Curved motion in windows of time, for splaTV and WebGS
     Splatv,

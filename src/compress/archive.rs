@@ -8,63 +8,39 @@
 
 use std::collections::BTreeMap;
 
-use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
+use super::bounds;
 use super::journal::Journal;
+use super::near::{
+    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, pictures,
+};
 use super::summary::ArchiveSummary;
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::emit::bounds::Bounds;
 use crate::error::{Error, Result};
 use crate::limits::Limits;
-use crate::metrics::psnr;
-use crate::model::{Columns, Picture};
+use crate::model::Columns;
 use crate::reduction::Reduction;
-use crate::render::{self, Image, render};
+use crate::render;
 use crate::scene::Scene;
-use crate::source::FrameSource;
-use crate::stream::{Batch, Subject, show, spread};
 
 /// What the stage is called.
 const NAME: &str = "archive";
-/// Fewest and most pictures that are looked at: fewer of large ones, ...
-const PICTURES: [u64; 2] = [4, 12];
-/// ... so that those of the result and of the original take so many bytes.
-const PICTURE_BYTES: u64 = 128 << 20;
-/// What an archive may cost against the original's pictures where nothing is asked for, dB.
-const LOSS: f64 = 0.5;
-/// Of a result whose pictures are closer to the original's than this, dB, nothing was lost that noise could hide behind:
-/// then the archive's are to be as close to the result's.
-const ENOUGH: f64 = 50.0;
-/// What a search for a quality leaves for the archive, dB: a third of the pruning's squared error. Where both are traded
-/// off best, errors go by how fast bytes fall with them: about three times as fast with the number of Gaussians.
-pub const LEFT_BY_SEARCH: f64 = 1.2;
-/// Bytes of a pixel.
-const PIXEL: u64 = 3 * size_of::<f32>() as u64;
-/// Times that errors and bits are measured.
-const ROUNDS: usize = 2;
-/// Octaves by which a step follows one measurement, at most.
-const FURTHEST: f64 = 2.5;
 /// Steps are at most so many deviations of their values: beyond that nothing is left of these.
 const COARSEST: f64 = 4.0;
-/// Errors are not told apart below this.
-const LEAST_ERROR: f64 = 1e-14;
-/// Octaves by which all steps become coarser in the end: the least and the most that is thought of, ...
-const ADDED: [f64; 2] = [-2.0, 2.0];
-/// ... and how often that range is halved.
-const HALVINGS: usize = 6;
-/// The same where so many bytes are asked for, the most first.
-const BYTES_ADDED: [f64; 2] = [4.0, -4.0];
-/// See [`BYTES_ADDED`].
-const BYTES_HALVINGS: usize = 10;
 /// Octaves by which grids that no picture was looked at for are taken to be coarser in the end: with this the count that
 /// fits leaves .5 and 1.2 dB to the grids of two trained models.
 const GUESSED: f64 = 3.3;
 
-/// How many pictures of so many pixels are looked at.
-fn pictures(pixels: u64) -> u64 {
-    let [fewest, most] = PICTURES;
-    (PICTURE_BYTES / (2 * PIXEL * pixels.max(1))).clamp(fewest, most)
+/// What an archive is written from.
+#[derive(Debug, Serialize, Deserialize)]
+pub enum Archived {
+    /// A model, or a cloud.
+    Content(Encoded),
+    /// What is left of frames, within bounds.
+    Frames(Bounds),
 }
 
 /// The making of an archive.
@@ -72,40 +48,6 @@ fn pictures(pixels: u64) -> u64 {
 pub struct Archive {
     /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
     pub psnr: Option<f64>,
-}
-
-/// What an archive is asked for, beside what its own flag says.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub enum Asked {
-    /// Nothing.
-    Nothing,
-    /// To cost no more than this against the original's pictures, dB.
-    Loss(f64),
-    /// To take no more bytes than this.
-    Bytes(u64),
-}
-
-/// What an archive is to be.
-#[derive(Debug, Clone, Copy)]
-enum Aim {
-    /// So close to the result's, dB.
-    Close(f64),
-    /// No more than so much further from the original's than the result's are, dB.
-    Loss(f64),
-    /// No more than so many bytes.
-    Bytes(u64),
-}
-
-impl Aim {
-    /// PSNR against the result's pictures, dB, that comes to where these are `level` from the original's.
-    fn close(self, level: f64) -> f64 {
-        match self {
-            Aim::Close(psnr) => psnr,
-            // Squared errors add.
-            Aim::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
-            Aim::Bytes(_) => Aim::Loss(LEFT_BY_SEARCH).close(level.min(ENOUGH)),
-        }
-    }
 }
 
 /// A group of values with one step.
@@ -134,48 +76,6 @@ impl Group {
     }
 }
 
-/// Pictures of the result, which others are compared with.
-struct Looks<'a> {
-    scene: &'a Scene,
-    pictures: Vec<Picture>,
-    images: Vec<Image>,
-}
-
-impl Looks<'_> {
-    fn of<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<Looks<'a>> {
-        let count = pictures(scene.workload().pixels) as usize;
-        let mut looks = Looks { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
-        looks.images = looks.render(source, |_, image| image)?;
-        Ok(looks)
-    }
-
-    fn render<T: Send>(&self, source: &dyn FrameSource, of: impl Fn(usize, Image) -> T + Sync) -> Result<Vec<T>> {
-        let mut made = Vec::with_capacity(self.pictures.len());
-        let batch = Batch::of_frame(&self.scene.limits);
-        show([Subject::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
-            let first = made.len();
-            let view = |(k, view): (usize, &crate::stream::View<'_, 1>)| {
-                of(first + k, render(view.states[0], view.camera, self.scene.background))
-            };
-            made.par_extend(views.par_iter().enumerate().map(view));
-            Ok(())
-        })?;
-        Ok(made)
-    }
-
-    /// Mean PSNR, dB.
-    fn psnr(&self, source: &dyn FrameSource) -> Result<f64> {
-        let found = self.render(source, |k, image| psnr(&image, &self.images[k]))?;
-        Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
-    }
-
-    /// Mean squared error.
-    fn error(&self, source: &dyn FrameSource) -> Result<f64> {
-        let found = self.render(source, |k, image| 10f64.powf(-0.1 * psnr(&image, &self.images[k])))?;
-        Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
-    }
-}
-
 impl Archive {
     /// What is left, its pictures, the archive and what it decodes to.
     pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
@@ -198,11 +98,13 @@ impl Archive {
                 ("pictures", PIXEL * (2 * count + work.threads) * work.pixels),
                 ("strips", work.threads * render::STRIP_BYTES as u64),
                 ("fields", 4 * work.input.fixed),
+                // Of frames a few blocks.
+                ("blocks", bounds::storing(work).iter().map(|part| part.1).sum()),
             ],
         }
     }
 
-    /// Encodes `reduction` so that it is what it is `asked` for.
+    /// Makes of `reduction` what it is `asked` for.
     ///
     /// # Errors
     /// An input that no archive holds, values that are not finite, frames that cannot be read, too few bytes.
@@ -212,13 +114,23 @@ impl Archive {
         reduction: &Reduction,
         asked: Asked,
         journal: &mut Journal,
-    ) -> Result<(Encoded, ArchiveSummary)> {
+    ) -> Result<(Archived, ArchiveSummary)> {
         let key = scene.work.key(&(self.psnr, asked, reduction));
-        let (encoded, summary): (Encoded, String) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
-            let (encoded, summary) = self.make(scene, reduction, asked)?;
-            Ok(((encoded, serde_json::to_string(&summary).expect("plain data")), reduction.len()))
+        let (archived, summary): (Archived, String) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+            let (archived, summary) = match scene.input.archives_frames() {
+                true => {
+                    let left = scene.input.reduced(reduction)?;
+                    let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
+                    (Archived::Frames(bounds), summary)
+                }
+                false => {
+                    let (encoded, summary) = self.make(scene, reduction, asked)?;
+                    (Archived::Content(encoded), summary)
+                }
+            };
+            Ok(((archived, serde_json::to_string(&summary).expect("plain data")), reduction.len()))
         })?;
-        Ok((encoded, serde_json::from_str(&summary).expect("as it was written")))
+        Ok((archived, serde_json::from_str(&summary).expect("as it was written")))
     }
 
     fn make(&self, scene: &Scene, reduction: &Reduction, asked: Asked) -> Result<(Encoded, ArchiveSummary)> {
@@ -226,13 +138,7 @@ impl Archive {
         let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
         let original = Looks::of(scene, scene.source())?;
         let level = looks.psnr(scene.source())?;
-        let aim = match (self.psnr, asked) {
-            (_, Asked::Bytes(most)) => Aim::Bytes(most),
-            (Some(psnr), _) => Aim::Close(psnr),
-            (None, Asked::Loss(loss)) if loss > 0.0 => Aim::Loss(loss),
-            (None, Asked::Nothing) if level < ENOUGH => Aim::Loss(LOSS),
-            _ => Aim::Close(ENOUGH),
-        };
+        let aim = Aim::of(self.psnr, asked, level);
         let asked = aim.close(level);
         let mut grids = Grids::of(&content);
         let mut measured = Vec::new();
@@ -266,15 +172,18 @@ impl Archive {
             }
         };
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
-        Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts, bits, measured }))
+        Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts: Some(parts), bounds: None, bits, measured }))
     }
 }
 
-/// Bytes of an archive of `reduction`, about: on grids as they are before any picture is looked at.
+/// Bytes of an archive of `reduction`, about: on grids, or within bounds, as they are before any picture is looked at.
 ///
 /// # Errors
 /// An input that no archive holds, values that are not finite.
 pub fn bytes(scene: &Scene, reduction: &Reduction) -> Result<u64> {
+    if scene.input.archives_frames() {
+        return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
+    }
     let content = scene.input.content(reduction)?;
     Ok(archive::encode(&content, &Grids::of(&content).steps(GUESSED))?.bytes.len() as u64)
 }
@@ -289,24 +198,6 @@ fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
         )));
     }
     Ok(encoded)
-}
-
-/// What `of` finds at the largest number between two, as far as halving their distance so often tells, that it finds
-/// something at.
-fn bisected<T>(
-    [mut low, mut high]: [f64; 2],
-    halvings: usize,
-    of: impl Fn(f64) -> Result<Option<T>>,
-) -> Result<Option<T>> {
-    let mut best = None;
-    for _ in 0..halvings {
-        let middle = 0.5 * (low + high);
-        match of(middle)? {
-            Some(found) => (low, best) = (middle, Some(found)),
-            None => high = middle,
-        }
-    }
-    Ok(best)
 }
 
 /// The grids of all groups of a content.
@@ -368,9 +259,9 @@ impl Grids {
         let mut measured = Vec::with_capacity(self.groups.len());
         for (g, group) in self.groups.iter().enumerate() {
             measured.push((group.name().to_owned(), self.octaves[g], errors[g], bits(&fine, group)));
-            let by = 0.5 * (error * saved[g] / all / errors[g].max(LEAST_ERROR)).log2();
+            let by = balanced(error * saved[g] / all, errors[g]);
             let coarsest = (COARSEST * self.deviations[g]).log2();
-            self.octaves[g] = (self.octaves[g] + by.clamp(-FURTHEST, FURTHEST)).min(coarsest);
+            self.octaves[g] = (self.octaves[g] + by).min(coarsest);
         }
         Ok(measured)
     }

@@ -1,17 +1,20 @@
 //! Stage `emit`: the smaller model and, beside it, the recipe, the index map and the summary.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::archive::Archived;
+use super::bounds;
 use super::choose::CLUSTERED;
 use super::journal::Journal;
 use super::request::Request;
 use super::score::scored;
 use super::summary::Summary;
-use crate::archive::Encoded;
 use crate::budget::{Need, Workload, of_left};
 use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFile, StagedFolder, check_target, commit_files};
-use crate::emit::container::FRAME_BLOCK;
+use crate::emit::bounds::Bounds;
+use crate::emit::container::{FRAME_BLOCK, write_container};
 use crate::emit::index_map::write_index_map;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -20,6 +23,8 @@ use crate::limits::Limits;
 use crate::model::Columns;
 use crate::reduction::Reduction;
 use crate::scene::Scene;
+use crate::source::FrameSource;
+use crate::stream::Progress;
 
 /// What the stage is called.
 const NAME: &str = "emit";
@@ -94,7 +99,8 @@ impl Emit {
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
             [scored(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
-        let mut fixed = work.writing();
+        let within = if self.kind == OutputKind::Archive { bounds::storing(work) } else { Vec::new() };
+        let mut fixed = if within.is_empty() { work.writing() } else { within };
         match self.kind {
             OutputKind::Gseq if self.merges && !is_solved => {
                 // Of each that is merged and of each that comes of it the frames of a block, and a state.
@@ -157,7 +163,7 @@ impl Emit {
         &self,
         scene: &Scene,
         reduction: &Reduction,
-        (map, archive): (&[Option<u32>], Option<&Encoded>),
+        (map, archive): (&[Option<u32>], Option<&Archived>),
         recipe: &str,
         mut journal: Journal,
         summarise: impl FnOnce(Journal, Size) -> Summary,
@@ -165,9 +171,13 @@ impl Emit {
         let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, reduction.len(), scene.source(), |journal| {
                 let size = match archive {
-                    Some(archive) => {
-                        fs::write(path, &archive.bytes).map_err(Error::io("write", path))?;
-                        archive.parts.into()
+                    Some(Archived::Content(encoded)) => {
+                        fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
+                        encoded.parts.into()
+                    }
+                    Some(Archived::Frames(bounds)) => {
+                        write_within(&*scene.input.reduced(reduction)?, *bounds, path)?;
+                        Size::of_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
                     }
                     None => {
                         journal.notes.extend(scene.input.write(reduction, self.kind, path, &scene.limits)?);
@@ -218,6 +228,13 @@ pub fn write_alone(
     }
     input.write(reduction, kind, path, limits)?;
     Ok(input.size_written(kind, path)?.whole())
+}
+
+/// Writes a container within `bounds`.
+fn write_within(source: &dyn FrameSource, bounds: Bounds, path: &Path) -> Result<()> {
+    let info = source.info();
+    let progress = Progress::new(NAME, "states", (info.count * info.times.len()) as u64);
+    write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))
 }
 
 fn write_text(path: &Path, text: &str) -> Result<()> {

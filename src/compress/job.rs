@@ -1,6 +1,6 @@
 //! What a run does: which stages, with which parameters, and what is left out and why. Made once, before any work.
 
-use super::archive::{Archive, LEFT_BY_SEARCH};
+use super::archive::Archive;
 use super::bands::Bands;
 use super::choose::Choose;
 use super::degree::Degree;
@@ -10,6 +10,7 @@ use super::ids::parse_ids;
 use super::journal::Journal;
 use super::measure::{Measure, Outlook, Stages};
 use super::merge::{self, Merge};
+use super::near::LEFT_BY_SEARCH;
 use super::prune::Prune;
 use super::refine::{self, Refine};
 use super::request::{Goal, Only, Quality, Request, decibels};

@@ -4,6 +4,7 @@
 pub mod archive;
 mod arrival;
 mod bands;
+mod bounds;
 mod choose;
 mod degree;
 pub mod emit;
@@ -15,6 +16,7 @@ mod job;
 pub mod journal;
 pub mod measure;
 mod merge;
+mod near;
 mod pace;
 mod prune;
 mod record;
@@ -45,11 +47,12 @@ use crate::reduction::Reduction;
 use crate::scene::{InputOptions, Scene};
 use crate::select::Ranking;
 use crate::stream::begin_run;
-use archive::{Asked, LEFT_BY_SEARCH};
+use archive::Archived;
 use arrival::measured_already;
 use journal::Journal;
 use measure::{Measure, Measured, Outlook, Stages};
 use merge::Outcome;
+use near::{Asked, LEFT_BY_SEARCH};
 use score::{Scored, UserOverrides};
 use size::Space;
 use summary::{CameraSummary, InputSummary, Summary};
@@ -204,7 +207,7 @@ fn reduce(
         }
         None => None,
     };
-    let (encoded, archive) = archived.unzip();
+    let (archived, archive) = archived.unzip();
     if let (Some(goal), Some(archive)) = (&mut goal, &archive) {
         (goal.searched, goal.held) = (goal.searched - archive.loss, goal.held - archive.loss);
         journal.notes.push(format!(
@@ -214,7 +217,7 @@ fn reduce(
         ));
     }
     let mut map = reduction.index_map(scene.source().info().count);
-    if let Some(encoded) = &encoded {
+    if let Some(Archived::Content(encoded)) = &archived {
         follow(&mut map, &encoded.order);
     }
     let summarise = |journal: Journal, output: Size| Summary {
@@ -243,7 +246,7 @@ fn reduce(
         input,
     };
     scene.work.not_divided("writing")?;
-    Ok((job.emit.run(scene, &reduction, (&map, encoded.as_ref()), &recipe, journal, summarise)?, map))
+    Ok((job.emit.run(scene, &reduction, (&map, archived.as_ref()), &recipe, journal, summarise)?, map))
 }
 
 /// That no Gaussian is left: nothing renders such a result.

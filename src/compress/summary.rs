@@ -133,12 +133,16 @@ pub struct ArchiveSummary {
     pub level: f64,
     /// How much less the archive's pictures have against the original's, dB.
     pub loss: f64,
-    /// Bytes of its parts.
-    pub parts: Parts,
-    /// Bits of every attribute and tensor, by name.
+    /// Bytes of its parts; none of frames, which are one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parts: Option<Parts>,
+    /// Of frames the bound of every column, by name, in its unit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bounds: Option<BTreeMap<String, f64>>,
+    /// Bits of every attribute and tensor, by name; of frames none.
     pub bits: BTreeMap<String, f64>,
-    /// Of every attribute and tensor its name, log2 of a step, the squared error that this step alone adds to pictures,
-    /// and the bits that it then takes: where the steps were found from.
+    /// Of every attribute and tensor, or column of frames, its name, log2 of a step (twice the bound), the squared error that
+    /// this alone adds to pictures, and the bits that it then takes, of frames in some blocks: where the steps were found from.
     pub measured: Vec<(String, f64, f64, f64)>,
 }
 

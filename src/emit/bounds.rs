@@ -2,11 +2,13 @@
 
 use std::str::FromStr;
 
+use serde::{Deserialize, Serialize};
+
 use crate::error::{Error, Result, quoted};
 use crate::model::Columns;
 
 /// Bound of each column in its unit, in the order of [`Columns::all`]; 0 keeps every bit.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Bounds([f64; 5]);
 
 /// What is asked of one column: `position=1e-3`, in the column's unit, or `position=0.01%` of the scene's extent.
@@ -19,6 +21,11 @@ pub struct MaxError {
 }
 
 impl Bounds {
+    /// Of every column, in the order of [`Columns::all`].
+    pub fn new(bounds: [f64; 5]) -> Bounds {
+        Bounds(bounds)
+    }
+
     /// Of `asked`, in a scene whose extent is asked for where a bound is of it.
     ///
     /// # Errors

@@ -320,6 +320,28 @@ fn encode_frames(
     Ok(())
 }
 
+/// Bytes that every column takes of some `blocks` of Gaussians of `source` over `frames`, those of a block.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub fn column_bytes(
+    source: &dyn FrameSource,
+    blocks: &[usize],
+    frames: Range<usize>,
+    packing: &Packing,
+) -> Result<Vec<usize>> {
+    let count = source.info().count;
+    let of_block = |&block: &usize| {
+        let start = block * GAUSSIAN_BLOCK;
+        encode_block(source, start..count.min(start + GAUSSIAN_BLOCK), frames.clone(), Columns::all(), packing)
+    };
+    let mut bytes = vec![0; Columns::all().iter().count()];
+    for tiles in blocks.par_iter().map(of_block).collect::<Result<Vec<_>>>()? {
+        bytes.iter_mut().zip(tiles).for_each(|(bytes, tile)| *bytes += tile.map_or(0, |tile| tile.to_bytes().len()));
+    }
+    Ok(bytes)
+}
+
 /// The tiles of one block of Gaussians over `frames`, one entry per column; none for those not in `columns`.
 fn encode_block(
     source: &dyn FrameSource,

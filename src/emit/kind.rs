@@ -18,7 +18,7 @@ pub enum OutputKind {
     PlySequence,
     /// One PLY: the canonical cloud of a model, or a sequence of one frame.
     Ply,
-    /// An archive: to store and to send.
+    /// An archive, to store and to send: of frames a container within bounds.
     Archive,
     /// A `.splatv`: Gaussians on cubic paths, for viewers of them.
     Splatv,
@@ -44,7 +44,7 @@ impl OutputKind {
         let Some(ending) = foreign_ending(path).filter(|_| !known) else { return Ok(()) };
         Err(Error::usage(format!(
             "{}: nothing that is written here ends in .{ending}; expected one of\n  \
-             NAME.gsz       archive of a model or of one PLY, the smallest\n  \
+             NAME.gsz       archive of a model, of one PLY or of frames, the smallest\n  \
              NAME.gseq      container of all frames\n  \
              NAME.ply       one PLY\n  \
              NAME.splatv    curved motion in windows of time, for splaTV and WebGS\n  \

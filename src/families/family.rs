@@ -139,7 +139,10 @@ pub trait Family: Send + Sync {
     /// # Errors
     /// A kind that this input cannot be written as, naming those that it can.
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
-        check_output(self.source().info().times.len(), kind, path)
+        match kind {
+            OutputKind::Archive if self.archives_frames() => Ok(()),
+            _ => check_output(self.source().info().times.len(), kind, path),
+        }
     }
 
     /// Raw parameters of the proxies that `clusters` become, compared at `reference`. A family without raw
@@ -191,6 +194,11 @@ pub trait Family: Send + Sync {
     /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`Reduction::course`]).
     fn stands_in_frames(&self) -> bool {
         false
+    }
+
+    /// Whether an archive of it is one of its frames: a container within bounds.
+    fn archives_frames(&self) -> bool {
+        self.stands_in_frames()
     }
 
     /// The frames of what `reduction` leaves, as they will be once it is written.

@@ -133,6 +133,10 @@ impl Family for PlySequence {
         true
     }
 
+    fn archives_frames(&self) -> bool {
+        self.paths().len() > 1
+    }
+
     fn residence(&self) -> Residence {
         Residence {
             per_gaussian: 0,
@@ -161,7 +165,7 @@ impl Family for PlySequence {
 
     fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
         match kind {
-            OutputKind::Archive if self.paths().len() == 1 => Ok(()),
+            OutputKind::Archive => Ok(()),
             _ => check_output(self.paths().len(), kind, path),
         }
     }

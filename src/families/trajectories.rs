@@ -27,8 +27,7 @@ const LEVEL: i32 = 1;
 pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
 
 /// Why most inputs cannot become an archive.
-pub(super) const NO_ARCHIVE: &str =
-    "only a trained model or a single PLY can be written as an archive\n  write a .gseq or --as ply-sequence";
+pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an archive\n  pack it into a .gseq first, or write one";
 
 /// Bytes of the columns `of` of one Gaussian at one frame.
 pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {

@@ -16,7 +16,7 @@ use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::bounds::{Bounds, MaxError};
 use crate::emit::container::{
-    BOUNDED_FRAME_BLOCK, FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, join_container, spill_blocks, write_container,
+    BOUNDED_FRAME_BLOCK, FRAME_BLOCK, Packing, join_container, spill_blocks, write_container,
 };
 use crate::emit::frame_stream::StreamWriter;
 use crate::emit::kind::{OutputKind, check_container_name, check_folder_name};
@@ -256,23 +256,9 @@ fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
         Storing::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
         Storing::Exact(_) => (FRAME_BLOCK, 0),
     };
-    let widest = Columns::all().iter().map(|column| work.state(column)).max().unwrap_or(0);
-    let tables = zstd_tables(level, (GAUSSIAN_BLOCK * together) as u64 * widest);
     let per_gaussian = vec![("positions", positions)];
-    let fixed = [work.writing_together(together), vec![("zstd", work.threads * tables)]].concat();
+    let fixed = [work.writing_together(together), vec![work.compressing(level, together)]].concat();
     vec![Need { stage: PACK, reads: 1.0, seconds, per_gaussian, fixed }]
-}
-
-/// Bytes of the tables by which zstd, at a level, finds matches in `bytes` bytes: at most those of each level's group, and
-/// 4 for each entry of two tables that have no more than twice as many entries as there are bytes.
-fn zstd_tables(level: i32, bytes: u64) -> u64 {
-    let most_mebibytes = match level {
-        ..=3 => 1,
-        4..=9 => 12,
-        10..=15 => 64,
-        _ => 80,
-    };
-    (16 * bytes.next_power_of_two()).min(most_mebibytes << 20)
 }
 
 /// What it takes to write every frame by itself.
