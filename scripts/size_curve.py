@@ -60,8 +60,8 @@ def ours(binary, model, cameras, ratio, folder):
 def of_frames(binary, model, cameras, ratio, folder):
     """The same of the archive of a model's frames, and the files that these are."""
     packed, frames, archive = folder / "all.gseq", folder / "frames", folder / "frames.gsz"
-    run(binary, "pack", model, "--cameras", cameras, "-o", packed)
-    run(binary, "unpack", packed, "-o", frames)
+    for words in [["pack", model, "--cameras", cameras, "-o", packed], ["unpack", packed, "-o", frames]]:
+        subprocess.run([binary, *words], check=True, capture_output=True)
     run(binary, "compress", frames, "--cameras", cameras, "--target-ratio", ratio, "--json", "-o", archive)
     yield "of PLY frames (.gsz)", archive, size([archive]), sorted(frames.glob("*.ply"))
 
