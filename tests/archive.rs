@@ -142,6 +142,13 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
     let sized = workplace.summary(&format!("frames.gseq --no-refine --prune-only -o sized.gsz --target-size {most}"));
     assert!((most / 2..=most).contains(&sized["output_bytes"].as_u64().unwrap()), "{sized}");
     workplace.refused(2, "compress frames.gseq -o none.gsz --target-size 100", &["--target-size", "expected at least"]);
+    // Of what shines without end no picture tells a bound.
+    let mut broken = state(before.source(), 0);
+    broken.sh.planes_mut().fill(f32::INFINITY);
+    workplace.ply("broken/0.ply", &broken);
+    workplace.ply("broken/1.ply", &broken);
+    let refused = ["--non-finite drop", ".gseq"];
+    workplace.refused(2, "compress broken -o broken.gsz --non-finite keep --no-refine --link never", &refused);
     workplace.done("unpack small.gsz -o back");
     let plys = files(&workplace.path("back")).into_keys().filter(|name| name.extension().is_some_and(|e| e == "ply"));
     assert_eq!(plys.count(), 20);

@@ -47,7 +47,7 @@ pub(super) fn storing(work: &Workload) -> Vec<Part> {
 /// The bounds within which `source`, a result of `scene`, is what it is `asked` for, or `psnr` close.
 ///
 /// # Errors
-/// Frames that cannot be read; too few bytes.
+/// Frames that cannot be read; pictures that are not finite; too few bytes.
 pub(super) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
@@ -56,6 +56,12 @@ pub(super) fn find(
 ) -> Result<(Bounds, ArchiveSummary)> {
     let (looks, original) = (Looks::of(scene, source)?, Looks::of(scene, scene.source())?);
     let level = looks.psnr(scene.source())?;
+    if level.is_nan() {
+        return Err(Error::usage(
+            "an archive is made by its pictures: expected numbers in every pixel, found NaN in some
+               --non-finite drop removes the Gaussians that are not finite; a .gseq holds them as they are",
+        ));
+    }
     let aim = Aim::of(psnr, asked, level);
     let asked = aim.close(level);
     let first = first(source)?;
