@@ -161,12 +161,8 @@ impl Archive {
                 })?
             }
             Aim::Close(_) | Aim::Loss(_) => {
-                let does = |[psnr, loss]: [f64; 2]| match aim {
-                    Aim::Loss(most) => loss <= most,
-                    _ => psnr >= asked,
-                };
                 let best = bisected(ADDED, HALVINGS, |added| {
-                    Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| does(found)))
+                    Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| aim.does(found, asked)))
                 })?;
                 best.map_or_else(|| looked_at(encoded(ADDED[0])?), Ok)?
             }

@@ -110,12 +110,8 @@ pub(super) fn find(
             })?
         }
         Aim::Close(_) | Aim::Loss(_) => {
-            let does = |[psnr, loss]: [f64; 2]| match aim {
-                Aim::Loss(most) => loss <= most,
-                _ => psnr >= asked,
-            };
             let best = bisected(ADDED, HALVINGS, |added| {
-                Ok(Some(looked_at(wider(&widths, added))?).filter(|&(_, found)| does(found)))
+                Ok(Some(looked_at(wider(&widths, added))?).filter(|&(_, found)| aim.does(found, asked)))
             })?;
             best.map_or_else(|| looked_at(wider(&widths, ADDED[0])), Ok)?
         }

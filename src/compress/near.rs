@@ -80,6 +80,15 @@ impl Aim {
         }
     }
 
+    /// Whether an archive does whose pictures are so close to the result's and lose so much, dB, where [close](Aim::close)
+    /// says `asked`.
+    pub(super) fn does(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
+        match self {
+            Aim::Loss(most) => loss <= most,
+            Aim::Close(_) | Aim::Bytes(_) => psnr >= asked,
+        }
+    }
+
     /// PSNR against the result's pictures, dB, that comes to where these are `level` from the original's.
     pub(super) fn close(self, level: f64) -> f64 {
         match self {
