@@ -14,9 +14,10 @@ every frame the script writes a file of the same name into OUT in which
 OUT/truth.npz says of the rows of all frames, one after the other, `gaussian` and `life`, both counted from 0, and with
 `starts`, [T + 1], where those of each frame begin.
 
-With --score: LINKED.gseq is what `splatsieve pack OUT -o LINKED.gseq` gives. A link is two rows of neighbouring frames in
-one track. Prints how many of the true ones, two rows of one life, were found, and how many that are there are wrong, both
-by life and by Gaussian, as parts of the true links, and how many tracks, lives and Gaussians there are.
+With --score: LINKED.gseq is what `splatsieve pack OUT -o LINKED.gseq --link apart` gives, which holds every row. A link is
+two rows of neighbouring frames in one track. Prints how many of the true ones, two rows of one life, were found, and how
+many that are there are wrong, both by life and by Gaussian, as parts of the true links, and how many tracks, lives and
+Gaussians there are.
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)
@@ -136,7 +137,8 @@ def score(folder, container):
         found = np.ascontiguousarray(linked.column("position", frame)[there]).view("V12").ravel()
         place = {key.tobytes(): track for key, track in zip(found, there)}
         if len(place) != len(rows) or len(there) != len(rows):
-            raise ValueError(f"{path}: {len(there)} of {len(rows)} Gaussians are in the container, in {len(place)} places")
+            missing = f"{len(there)} of {len(rows)} Gaussians are in the container, in {len(place)} places"
+            raise ValueError(f"{path}: {missing}; was it packed with --link apart?")
         tracks.append(np.array([place[key.tobytes()] for key in at]))
     for name in ("life", "gaussian"):
         true = found = wrong = 0

@@ -71,7 +71,7 @@ fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
     );
     let said = String::from_utf8(said).unwrap();
     assert!(said.contains("in 9 frames"), "{said}");
-    workplace.done("pack cut -o linked.gseq");
+    workplace.done("pack cut -o linked.gseq --link apart");
     let score = run(Command::new(&python).arg(&cut).args(["--score", "cut", "linked.gseq"]), &workplace);
     let score = String::from_utf8(score).unwrap();
     assert!(score.contains("by gaussian: ") && score.contains(" tracks, "), "{score}");
