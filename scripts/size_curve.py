@@ -47,18 +47,18 @@ def packed(path):
 
 
 def ours(binary, model, cameras, ratio, folder):
-    """Method, what to compare, and bytes: of the archive, and of pruning alone."""
+    """Method, what to compare, bytes, and files of the original: of the archive, and of pruning alone."""
     archive, pruned = folder / "small.gsz", folder / f"pruned{model.suffix}"
     common = ["compress", model, "--cameras", cameras, "--target-ratio", ratio, "--json", "-o"]
     run(binary, *common, archive)
-    yield "archive (.gsz)", archive, size([archive])
+    yield "archive (.gsz)", archive, size([archive]), files(model)
     run(binary, *common, pruned, "--no-refine", "--prune-only", "--field", "exact")
     packer = "zstd -19" if shutil.which("zstd") else "xz"
-    yield f"pruned alone, {packer}", pruned, sum(map(packed, files(pruned)))
+    yield f"pruned alone, {packer}", pruned, sum(map(packed, files(pruned))), files(model)
 
 
 def of_frames(binary, model, cameras, ratio, folder):
-    """The same of the archive of a model's frames, and the files that these are."""
+    """The same of the archive of a model's frames, whose files are the original."""
     packed, frames, archive = folder / "all.gseq", folder / "frames", folder / "frames.gsz"
     for words in [["pack", model, "--cameras", cameras, "-o", packed], ["unpack", packed, "-o", frames]]:
         subprocess.run([binary, *words], check=True, capture_output=True)
@@ -74,7 +74,7 @@ def peers(command, model, ratio, folder):
         for words in [decimated, [small, back]]:
             words = [*shlex.split(command), "-q", "-w", "-g", "cpu", *words]
             subprocess.run([str(word) for word in words], check=True, capture_output=True)
-        yield f"splat-transform .{kind}", back, size([small])
+        yield f"splat-transform .{kind}", back, size([small]), files(model)
 
 
 def main():
@@ -96,12 +96,9 @@ def main():
             with tempfile.TemporaryDirectory() as scratch:
                 folder = Path(scratch)
                 cameras = model if model.is_dir() else orbit(model, folder / "orbit.json")
-                if args.frames:
-                    made = list(of_frames(args.binary, model, cameras, ratio, folder))
-                else:
-                    made = [(*made, files(model)) for made in ours(args.binary, model, cameras, ratio, folder)]
+                made = list((of_frames if args.frames else ours)(args.binary, model, cameras, ratio, folder))
                 if args.peer and model.is_file():
-                    made += [(*made, files(model)) for made in peers(args.peer, model, ratio, folder)]
+                    made += peers(args.peer, model, ratio, folder)
                 for method, result, count, original in made:
                     quality = evaluated(args.binary, model, result, cameras)["psnr"]
                     part = f"{100 * count / size(original):.2g}%" if args.frames else f"{100 * count / size(original):.1f}%"

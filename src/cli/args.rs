@@ -296,8 +296,8 @@ pub(super) struct Compress {
     #[arg(long = "as", value_enum, value_name = "KIND")]
     pub(super) kind: Option<OutputKind>,
     /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
-    /// grids, or within bounds: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a decibel; 50dB
-    /// where that is closer]
+    /// grids, or within bounds: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a
+    /// decibel; 50dB where that is closer]
     #[arg(long, value_name = "DB", help_heading = HOW_SMALL, hide_short_help = true, value_parser = parse_decibels)]
     pub(super) archive_psnr: Option<f64>,
     #[command(flatten)]

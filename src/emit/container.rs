@@ -280,6 +280,12 @@ fn all_blocks(source: &dyn FrameSource, is_first: bool) -> Vec<Lives> {
     vec![lives; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
+/// The Gaussians of a block, of `count`.
+pub fn of_block(count: usize, block: usize) -> Range<usize> {
+    let start = block * GAUSSIAN_BLOCK;
+    start..count.min(start + GAUSSIAN_BLOCK)
+}
+
 /// Encodes `source` at the `frames` of a block, of which `lives` says how each block of Gaussians goes through it, and hands
 /// every tile to `each` in the order of the container, with its block of Gaussians and its column; none: it is that of the
 /// block before.
@@ -298,16 +304,16 @@ fn encode_frames(
         let tiles: Vec<Vec<Option<EncodedTile>>> = batch
             .par_iter()
             .map(|&block| {
-                let start = block as usize * GAUSSIAN_BLOCK;
-                let end = (start + GAUSSIAN_BLOCK).min(info.count);
+                let gaussians = of_block(info.count, block as usize);
+                let count = gaussians.len();
                 let (columns, frames) = match lives[block as usize] {
                     Lives::New => (Columns::all(), frames.clone()),
                     Lives::Varying => (info.varying, frames.clone()),
                     Lives::Still => (Columns::all(), frames.start..frames.start + 1),
                     Lives::Repeating => (Columns::empty(), 0..0),
                 };
-                let tiles = encode_block(source, start..end, frames.clone(), columns, packing);
-                advance(((end - start) * frames.len()) as u64);
+                let tiles = encode_block(source, gaussians, frames.clone(), columns, packing);
+                advance((count * frames.len()) as u64);
                 tiles
             })
             .collect::<Result<_>>()?;
@@ -331,12 +337,9 @@ pub fn column_bytes(
     packing: &Packing,
 ) -> Result<Vec<usize>> {
     let count = source.info().count;
-    let of_block = |&block: &usize| {
-        let start = block * GAUSSIAN_BLOCK;
-        encode_block(source, start..count.min(start + GAUSSIAN_BLOCK), frames.clone(), Columns::all(), packing)
-    };
+    let encode = |&block: &usize| encode_block(source, of_block(count, block), frames.clone(), Columns::all(), packing);
     let mut bytes = vec![0; Columns::all().iter().count()];
-    for tiles in blocks.par_iter().map(of_block).collect::<Result<Vec<_>>>()? {
+    for tiles in blocks.par_iter().map(encode).collect::<Result<Vec<_>>>()? {
         bytes.iter_mut().zip(tiles).for_each(|(bytes, tile)| *bytes += tile.map_or(0, |tile| tile.to_bytes().len()));
     }
     Ok(bytes)

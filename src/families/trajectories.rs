@@ -27,7 +27,8 @@ const LEVEL: i32 = 1;
 pub const OWN_OUTPUT: OutputKind = OutputKind::PlySequence;
 
 /// Why most inputs cannot become an archive.
-pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an archive\n  pack it into a .gseq first, or write one";
+pub(super) const NO_ARCHIVE: &str = "only a 4DGaussians or 3DGS model, a PLY, or frames can be written as an archive\n  \
+                                     pack it into a .gseq first, or write one";
 
 /// Bytes of the columns `of` of one Gaussian at one frame.
 pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {

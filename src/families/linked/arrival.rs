@@ -13,19 +13,18 @@ use rayon::prelude::*;
 use super::memory::TOGETHER_BYTES;
 use super::{Arrived, Linked};
 use crate::emit::atomic::ScratchFolder;
-use crate::emit::container::GAUSSIAN_BLOCK;
+use crate::emit::container::{GAUSSIAN_BLOCK, of_block};
 use crate::emit::ply::write_inria;
 use crate::error::{Error, Result};
 use crate::families::Family;
 use crate::families::trajectories::state_bytes;
+use crate::fit::SEEN;
 use crate::ingest::frame_stream::FrameStream;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::model::{Columns, Gaussians, opacity};
 use crate::source::{FrameSource, Ids, Wanted};
 use crate::stream::Progress;
 
-/// Of a lower opacity no picture shows anything.
-const LEAST_OPACITY: f64 = 1.0 / 255.0;
 /// Files of frames that are arriving, and their times.
 struct Arriving {
     folder: ScratchFolder,
@@ -122,15 +121,13 @@ impl Linked {
 /// Blocks of Gaussians of `source`, as they are read.
 fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
     let count = source.info().count;
-    (0..count.div_ceil(GAUSSIAN_BLOCK))
-        .into_par_iter()
-        .map(move |block| block * GAUSSIAN_BLOCK..count.min((block + 1) * GAUSSIAN_BLOCK))
+    (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| of_block(count, block))
 }
 
 /// Rows of `state` that any picture may show.
 fn seen(state: &Gaussians) -> Vec<u32> {
     let opacities = (0u32..).zip(state.opacity_logit.plane(0));
-    opacities.filter(|&(_, &logit)| opacity(logit) >= LEAST_OPACITY).map(|(row, _)| row).collect()
+    opacities.filter(|&(_, &logit)| opacity(logit) >= SEEN).map(|(row, _)| row).collect()
 }
 
 /// How many are [seen] in each frame of `source`.
