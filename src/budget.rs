@@ -16,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::families::Residence;
 use crate::families::trajectories::state_bytes;
 use crate::ingest::frame_stream::StreamHeader;
-use crate::limits::Limits;
+use crate::limits::{Limits, ReadLimit};
 use crate::machine::memory_limit;
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
 use crate::render;
@@ -558,6 +558,12 @@ impl Budget {
     /// Bytes that the run may take.
     pub fn limit(self) -> u64 {
         self.bytes.unwrap_or_else(|| Budget::by_default().0)
+    }
+
+    /// Memory that opening an input may take: what the program itself leaves of the budget.
+    pub fn read_limit(self) -> ReadLimit {
+        let program = PROGRAM + PER_THREAD * rayon::current_num_threads() as u64;
+        ReadLimit::new(self.limit().saturating_sub(program))
     }
 
     /// Bytes that a run takes unless told otherwise, and where that number comes from.

@@ -11,7 +11,7 @@ use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::ingest::cameras::Clock;
-use crate::limits::Limits;
+use crate::limits::{Limits, ReadLimit};
 use crate::model::{Columns, Gaussians};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
@@ -351,6 +351,8 @@ pub struct OpenOptions {
     pub scratch: Option<PathBuf>,
     /// What its files do not say.
     pub conventions: Conventions,
+    /// Memory that opening it may take.
+    pub memory: ReadLimit,
 }
 
 /// What the files of some families do not say of how their models were trained.

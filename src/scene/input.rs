@@ -55,6 +55,7 @@ impl InputOptions {
             link: self.link,
             scratch: self.scratch.clone(),
             conventions: self.conventions,
+            memory: self.memory.read_limit(),
         }
     }
 

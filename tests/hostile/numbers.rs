@@ -1,0 +1,1 @@
+//! Tiny counts, empty inputs and one extreme value per attribute.

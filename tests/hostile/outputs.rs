@@ -1,0 +1,1 @@
+//! Links, devices, shared outputs, kills and failures in place of ordinary output files.
