@@ -27,7 +27,7 @@ mod static_3d_gaussians;
 pub mod stream;
 pub mod trajectories;
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::Read;
 use std::path::Path;
 
@@ -38,6 +38,7 @@ pub use linked::Linked;
 pub use size::Size;
 
 use crate::error::{Error, Result};
+use crate::ingest::open::open_file;
 use family::{Entry, Found};
 
 /// Every family that lies in files; the first that recognises a path opens it.
@@ -74,7 +75,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
     let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
     let mut head = Vec::new();
     if !is_folder {
-        let file = File::open(path).map_err(Error::io("open", path))?;
+        let file = open_file(path)?;
         file.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
     }
     if is_folder {

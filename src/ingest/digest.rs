@@ -6,6 +6,7 @@ use std::path::Path;
 
 use xxhash_rust::xxh3::Xxh3;
 
+use super::open::open_file;
 use crate::error::{Error, Result};
 
 /// Bytes read at a time.
@@ -13,7 +14,7 @@ const PIECE: usize = 1 << 18;
 
 /// Adds the bytes of the file at `path` to `hash`.
 pub(crate) fn hash_file(path: &Path, hash: &mut Xxh3) -> Result<()> {
-    hash_rest(&mut File::open(path).map_err(Error::io("open", path))?, path, hash)
+    hash_rest(&mut open_file(path)?, path, hash)
 }
 
 /// Adds the bytes of `file`, which is at `path`, from where it is to its end.

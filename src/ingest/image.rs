@@ -4,12 +4,12 @@
 //! transparency over a background. Memory: the decoded rows beside the result; the size is checked
 //! before either is allocated.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
 use png::{BitDepth, ColorType, Decoder, DecodingError, Transformations};
 
+use super::open::open_file;
 use crate::error::{Error, Result};
 use crate::render::Image;
 
@@ -21,7 +21,7 @@ use crate::render::Image;
 /// # Errors
 /// A file that is no PNG, is damaged, or has another size.
 pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) -> Result<Image> {
-    let file = File::open(path).map_err(Error::io("open", path))?;
+    let file = open_file(path)?;
     let mut decoder = Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND);
     let mut reader = decoder.read_info().map_err(malformed(path))?;
@@ -52,6 +52,12 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
         ColorType::Rgb | ColorType::Indexed => values,
     };
     Ok(Image { width, height, data })
+}
+
+/// Reads the size of the PNG or JPEG at `path` in pixels, or `None` if it cannot be read.
+pub(crate) fn measure(path: &Path) -> Option<(u32, u32)> {
+    let size = imagesize::reader_size(BufReader::new(open_file(path).ok()?)).ok()?;
+    Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?))
 }
 
 fn malformed(path: &Path) -> impl Fn(DecodingError) -> Error {

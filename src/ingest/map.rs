@@ -2,12 +2,13 @@
 //!
 //! In: a path. Out: its bytes as a slice. Memory: pages the system may drop at any time.
 
-use std::fs::{self, File, Metadata};
+use std::fs::{self, Metadata};
 use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 use memmap2::Mmap;
 
+use super::open::open_file;
 use crate::error::{Error, Result};
 
 /// A whole file as bytes, read-only. No file descriptor stays open.
@@ -24,7 +25,7 @@ impl FileMap {
     /// # Errors
     /// When it cannot be opened or mapped (a folder, a pipe).
     pub(crate) fn open(path: &Path) -> Result<FileMap> {
-        let file = File::open(path).map_err(Error::io("open", path))?;
+        let file = open_file(path)?;
         let identity = Identity::of(&file.metadata().map_err(Error::io("read the size of", path))?);
         // SAFETY: the map is read-only and private to this value. The bytes must not change while it
         // lives: the user promises not to write to a model that is being read, and this program never
@@ -93,7 +94,7 @@ mod tests {
         fs::write(&path, vec![7; 10_000]).unwrap();
         let map = FileMap::open(&path).unwrap();
         map.check().unwrap();
-        File::options().write(true).open(&path).unwrap().set_len(10).unwrap();
+        fs::File::options().write(true).open(&path).unwrap().set_len(10).unwrap();
         let message = map.check().unwrap_err().to_string();
         assert!(message.contains("10000 bytes") && message.contains("10 bytes"), "{message}");
     }

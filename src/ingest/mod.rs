@@ -9,6 +9,7 @@ pub mod image;
 mod map;
 pub(crate) mod npy;
 pub(crate) mod npz;
+pub(crate) mod open;
 mod pickle;
 pub mod ply;
 pub mod ply_frames;

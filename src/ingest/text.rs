@@ -1,12 +1,12 @@
 //! Text files as people and editors leave them: UTF-8, with or without its byte order mark.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
 use serde_json::Value;
 use serde_json::error::Category;
 
+use super::open::open_file;
 use crate::error::{Error, Result};
 
 /// Largest text that is read: the cameras of 10⁵ pictures take some 60 MB of JSON.
@@ -17,7 +17,7 @@ const MAX_BYTES: u64 = 256 << 20;
 /// # Errors
 /// A file that cannot be read, or is larger.
 pub fn read_limited(path: &Path) -> Result<Vec<u8>> {
-    let file = File::open(path).map_err(Error::io("open", path))?;
+    let file = open_file(path)?;
     let mut bytes = Vec::new();
     file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
     if bytes.len() as u64 > MAX_BYTES {

@@ -35,6 +35,7 @@ use crate::compress::summary::TermSummary;
 use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
 use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
+use crate::ingest::text::read_text;
 use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
@@ -151,7 +152,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
 
 /// Reads the data that `verb` wrote.
 fn read_found<T: DeserializeOwned>(path: &Path, verb: &str) -> Result<T> {
-    let text = fs::read_to_string(path).map_err(Error::io("read", path))?;
+    let text = read_text(path)?;
     serde_json::from_str(&text).map_err(|error| {
         let expected = format!("what `splatsieve {verb}` wrote");
         Error::input(path, format!("line {}", error.line()), expected, error.to_string())

@@ -3,7 +3,6 @@
 //! In: the path of the result. Out: as much of the three as is there and fits the models; for the rest
 //! the reason, for the page to give. Memory: 8 bytes per Gaussian.
 
-use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 
@@ -14,6 +13,8 @@ use crate::compress::emit::{INDEX_MAP, RECIPE, beside};
 use crate::compress::summary::Summary;
 use crate::emit::atomic::MARKER;
 use crate::ingest::npy::header_is_sound;
+use crate::ingest::open::open_file;
+use crate::ingest::text::read_text;
 use crate::recipe::Recipe;
 
 /// What became of a Gaussian of the original.
@@ -66,19 +67,19 @@ impl Run {
 }
 
 fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
-    let text = fs::read_to_string(path).map_err(|e| e.to_string())?;
+    let text = read_text(path).map_err(|e| e.to_string())?;
     let whole: Value = serde_json::from_str(&text).map_err(|e| e.to_string())?;
     let summary = Summary::deserialize(&whole).map_err(|e| format!("not a summary of compress: {e}"))?;
     Ok((summary, whole))
 }
 
 fn read_recipe(path: &Path) -> Result<Recipe, String> {
-    let text = fs::read_to_string(path).map_err(|e| e.to_string())?;
+    let text = read_text(path).map_err(|e| e.to_string())?;
     Recipe::from_toml(&text, "default")
 }
 
 fn read_fates(path: &Path, original: usize, compressed: usize) -> Result<Vec<Fate>, String> {
-    let file = File::open(path).map_err(|e| e.to_string())?;
+    let file = open_file(path).map_err(|e| e.to_string())?;
     let bytes = file.metadata().map_err(|e| e.to_string())?.len();
     let mut file = BufReader::new(file);
     if !header_is_sound(file.fill_buf().map_err(|e| e.to_string())?, bytes) {
@@ -112,6 +113,8 @@ fn fates(map: &[i64], compressed: usize) -> Result<Vec<Fate>, String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::emit::index_map::write_index_map;
 

@@ -1,6 +1,6 @@
 //! The verb `unpack` of an archive: the model that it holds, as files that its renderer opens.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::Read;
 use std::path::Path;
 
@@ -10,6 +10,7 @@ use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check
 use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::families::archive::{is_folder, read_archive, unpack};
+use crate::ingest::open::open_file;
 use crate::model::Columns;
 
 /// What was unpacked.
@@ -31,7 +32,7 @@ pub fn is_archive(path: &Path) -> Result<bool> {
     if fs::metadata(path).map_err(Error::io("open", path))?.is_dir() {
         return Ok(false);
     }
-    let file = File::open(path).map_err(Error::io("open", path))?;
+    let file = open_file(path)?;
     let mut head = Vec::new();
     file.take(MAGIC.len() as u64).read_to_end(&mut head).map_err(Error::io("read", path))?;
     Ok(head == MAGIC)

@@ -111,7 +111,7 @@ impl<L: Deforming + 'static> Folder<L> {
         let path = &self.paths.cfg_args;
         match sh_degree < self.model.info().sh_degree {
             true => with_sh_degree(&read(path)?, sh_degree, path).map(String::into_bytes),
-            false => fs::read(path).map_err(Error::io("read", path)),
+            false => read(path).map(String::into_bytes),
         }
     }
 

@@ -1,6 +1,5 @@
 //! The files of a model folder with a `deform` folder in it.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -12,6 +11,7 @@ use crate::error::{Error, Result};
 use crate::families::iterations::numbers;
 use crate::families::pth::{names, read_state_dict};
 use crate::ingest::digest::hash_file;
+use crate::ingest::open::open_file;
 
 const CLOUDS: &str = "point_cloud";
 const NETWORKS: &str = "deform";
@@ -121,7 +121,7 @@ fn is_pair(path: &Path) -> bool {
     // The pair may be given a number to be named by, of one byte or four.
     const BINPUT: u8 = b'q';
     const LONG_BINPUT: u8 = b'r';
-    let Some(mut archive) = File::open(path).ok().and_then(|file| ZipArchive::new(file).ok()) else { return false };
+    let Some(mut archive) = open_file(path).ok().and_then(|file| ZipArchive::new(file).ok()) else { return false };
     let Some(name) = archive.file_names().find(|name| name.ends_with("data.pkl")).map(str::to_owned) else {
         return false;
     };

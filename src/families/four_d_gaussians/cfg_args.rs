@@ -1,6 +1,5 @@
 //! `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`, parsed and never evaluated.
 
-use std::fs;
 use std::path::Path;
 
 use crate::deform::{FieldConfig, Tensors};
@@ -8,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::model::Columns;
 
 use crate::families::python_literal::{Literal, parse_call};
+use crate::ingest::open::read_small;
 
 /// Larger than any namespace an argument parser prints.
 const MAX_BYTES: u64 = 1 << 20;
@@ -165,11 +165,7 @@ impl ModelConfig {
 
 /// The text of the `cfg_args` file at `path`.
 pub(in crate::families) fn read(path: &Path) -> Result<String> {
-    let bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
-    if bytes > MAX_BYTES {
-        return Err(Error::input(path, "", format!("at most {MAX_BYTES} bytes"), format!("{bytes} bytes")));
-    }
-    let bytes = fs::read(path).map_err(Error::io("read", path))?;
+    let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
     String::from_utf8(bytes).map_err(|error| {
         let valid = error.utf8_error().valid_up_to();
         Error::input(path, format!("byte {valid}"), "UTF-8 text", "a byte that is not")

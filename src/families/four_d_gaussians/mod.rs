@@ -227,7 +227,7 @@ impl ModelFolder {
         let path = &self.paths().cfg_args;
         match sh_degree < self.info().sh_degree {
             true => with_sh_degree(&cfg_args::read(path)?, sh_degree, path).map(String::into_bytes),
-            false => fs::read(path).map_err(Error::io("read", path)),
+            false => cfg_args::read(path).map(String::into_bytes),
         }
     }
 

@@ -1,12 +1,12 @@
 //! What files beside a checkpoint say of how it was trained: `cfg_args`, and the YAML that training was given, where somebody put
 //! it there: it is not saved with the model.
 
-use std::fs;
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
 use crate::families::in_checkpoint::texts_in;
 use crate::families::python_literal::{Literal, parse_call};
+use crate::ingest::open::read_small_text;
 use crate::ingest::text::read_text;
 
 /// What matters of it.
@@ -30,7 +30,7 @@ impl Configuration {
         if !path.is_file() {
             return Ok(found);
         }
-        let text = fs::read_to_string(&path).map_err(Error::io("read", &path))?;
+        let text = read_small_text(&path, "a cfg_args")?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(&path, &text))?;
         for argument in arguments {
             match (argument.name.as_str(), argument.value) {
@@ -82,6 +82,8 @@ fn span(text: &str) -> Option<Vec<&str>> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

@@ -12,7 +12,7 @@ mod motion;
 mod proxies;
 mod splatv;
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -30,6 +30,7 @@ use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result, quoted};
 use crate::ingest::cameras::Clock;
 use crate::ingest::digest::hash_file;
+use crate::ingest::open::open_file;
 use crate::ingest::text::read_text;
 use crate::limits::Limits;
 use crate::model::{Raw, colour};
@@ -63,9 +64,9 @@ pub(super) const ENTRY: Entry = Entry {
 pub(super) fn is_marked(path: &Path) -> bool {
     // Enough for any header of this family; nothing of a model's values.
     let mut head = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(1 << 14).read_to_end(&mut head));
+    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
     let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
-    read.is_ok() && header.windows(MARK.len()).any(|bytes| bytes == MARK.as_bytes())
+    read && header.windows(MARK.len()).any(|bytes| bytes == MARK.as_bytes())
 }
 
 /// The files of a model.

@@ -17,6 +17,7 @@ use hashbrown::HashMap;
 use super::assemble::{Picture, assemble};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
 use crate::error::{Error, Result, quoted};
+use crate::ingest::open::open_file;
 use crate::ingest::text::read_text;
 use crate::model::{Camera, Rig, Split};
 
@@ -254,7 +255,7 @@ struct Binary<'a> {
 
 impl<'a> Binary<'a> {
     fn open(path: &'a Path) -> Result<Binary<'a>> {
-        let file = File::open(path).map_err(Error::io("open", path))?;
+        let file = open_file(path)?;
         let len = file.metadata().map_err(Error::io("read the size of", path))?.len();
         Ok(Binary { path, file: BufReader::new(file), at: 0, len })
     }

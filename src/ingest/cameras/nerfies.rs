@@ -16,6 +16,7 @@ use super::CameraOptions;
 use super::assemble::{Picture, assemble, from_camera_to_world};
 use super::fields::{Fields, describe};
 use crate::error::{Error, Result, quoted};
+use crate::ingest::image::measure;
 use crate::ingest::text::read_json;
 use crate::model::{Rig, Split};
 
@@ -87,9 +88,7 @@ fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<Picture> 
     let own = Fields::of(&file, None, &document)?;
     let [width, height] = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));
-    let measured = imagesize::size(&image).ok();
-    let measured = measured.and_then(|size| Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?)));
-    let size = options.size.or(measured).unwrap_or(((width / 2).max(1), (height / 2).max(1)));
+    let size = options.size.or_else(|| measure(&image)).unwrap_or(((width / 2).max(1), (height / 2).max(1)));
     let focal = own.number("focal_length")?;
     let (x, y) = (f64::from(size.0) / f64::from(width), f64::from(size.1) / f64::from(height));
     let intrinsics = [focal * x, focal * y, 0.5 * f64::from(size.0), 0.5 * f64::from(size.1)];

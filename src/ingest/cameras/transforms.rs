@@ -19,6 +19,7 @@ use super::assemble::{Listing, Picture, assemble, from_camera_to_world, view_in_
 use super::fields::Fields;
 use super::{CameraOptions, Clock};
 use crate::error::Result;
+use crate::ingest::image::measure;
 use crate::ingest::text::read_json;
 use crate::model::{Rig, Split};
 
@@ -113,9 +114,7 @@ fn size(shared: Fields<'_>, own: Fields<'_>, image: Option<&Path>, options: &Cam
         return Ok((width, height));
     }
     // A picture that is missing or unreadable is no error: the size may be given instead.
-    let measured = image.and_then(|image| imagesize::size(image).ok());
-    let measured = measured.and_then(|size| Some((u32::try_from(size.width).ok()?, u32::try_from(size.height).ok()?)));
-    measured.or(options.size).ok_or_else(|| {
+    image.and_then(measure).or(options.size).ok_or_else(|| {
         let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.display()));
         own.wrong("w", format!("the picture size as w and h{tried}"))
             .hint("give --size WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")

@@ -1,0 +1,128 @@
+//! The one way to open an input file: regular files only.
+//!
+//! Opening a named pipe waits for its writer, a device such as `/dev/zero` never ends, and reading one may have side
+//! effects. Every reader of a file that a user names opens it here.
+
+use std::fs::{self, File, FileType, OpenOptions};
+use std::io::{self, Read};
+use std::path::Path;
+
+use crate::error::{Error, Result};
+
+/// Opens the regular file at `path`, which may be a link to one, for reading.
+///
+/// # Errors
+/// Nothing there; a folder, named pipe, socket or device, which is not opened.
+pub(crate) fn open_file(path: &Path) -> Result<File> {
+    // Checked before opening, because opening a device may have side effects, and after it, because the file may have
+    // been replaced between the two.
+    check_regular(path, fs::metadata(path).map_err(Error::io("open", path))?.file_type())?;
+    let mut options = OpenOptions::new();
+    options.read(true);
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::OpenOptionsExt;
+        // A named pipe that takes the place of the file must not be waited for. Regular files ignore the flag.
+        options.custom_flags(libc::O_NONBLOCK);
+    }
+    let file = options.open(path).map_err(Error::io("open", path))?;
+    check_regular(path, file.metadata().map_err(Error::io("open", path))?.file_type())?;
+    Ok(file)
+}
+
+/// Reads the whole file at `path`, which must be regular and hold at most `most_bytes`. `what` names its content in the
+/// message, as in "a configuration".
+///
+/// # Errors
+/// Those of [`open_file`]; a larger file, of which nothing is read; a failed read.
+pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec<u8>> {
+    let file = open_file(path)?;
+    let length = file.metadata().map_err(Error::io("read the size of", path))?.len();
+    let larger = |found: String| {
+        Error::input(path, "", format!("{what} of at most {most_bytes} bytes"), found)
+            .hint("check that the path is the intended one")
+    };
+    if length > most_bytes {
+        return Err(larger(format!("{length} bytes")));
+    }
+    let mut bytes = Vec::with_capacity(length as usize);
+    // Some file systems report a length of 0 for files that have content, and the file may grow.
+    file.take(most_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
+    if bytes.len() as u64 > most_bytes {
+        return Err(larger("more".to_owned()));
+    }
+    Ok(bytes)
+}
+
+/// Reads the UTF-8 text of a file of at most 1 MiB, such as a configuration.
+///
+/// # Errors
+/// Those of [`read_small`]; bytes that are not UTF-8.
+pub(crate) fn read_small_text(path: &Path, what: &str) -> Result<String> {
+    let bytes = read_small(path, 1 << 20, what)?;
+    String::from_utf8(bytes).map_err(|error| {
+        let at = error.utf8_error().valid_up_to();
+        Error::input(path, format!("byte {at}"), "text in UTF-8", "another byte").hint("save the file as UTF-8")
+    })
+}
+
+/// Refuses a file of another kind than a regular one.
+fn check_regular(path: &Path, kind: FileType) -> Result<()> {
+    if kind.is_file() {
+        return Ok(());
+    }
+    if kind.is_dir() {
+        return Err(Error::io("open", path)(io::ErrorKind::IsADirectory.into()));
+    }
+    Err(Error::input(path, "", "a regular file", name_of(kind))
+        .hint("copy its content into a file and give that; a frame stream is read from standard input, given as -"))
+}
+
+#[cfg(unix)]
+fn name_of(kind: FileType) -> &'static str {
+    use std::os::unix::fs::FileTypeExt;
+    match kind {
+        kind if kind.is_fifo() => "a named pipe",
+        kind if kind.is_socket() => "a socket",
+        kind if kind.is_char_device() || kind.is_block_device() => "a device",
+        _ => "another kind of file",
+    }
+}
+
+#[cfg(not(unix))]
+fn name_of(_: FileType) -> &'static str {
+    "another kind of file"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn larger_files_are_refused_before_they_are_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        fs::write(&path, b"12345").unwrap();
+        assert_eq!(read_small(&path, 5, "a configuration").unwrap(), b"12345");
+        let message = read_small(&path, 4, "a configuration").unwrap_err().to_string();
+        assert!(message.contains("a configuration of at most 4 bytes, found 5 bytes"), "{message}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn devices_sockets_pipes_and_folders_are_refused_by_kind() {
+        let folder = tempfile::tempdir().unwrap();
+        let socket = folder.path().join("socket");
+        let _listener = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+        let pipe = folder.path().join("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status().unwrap();
+        assert!(made.success());
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink("/dev/zero", &link).unwrap();
+        let found = [(&*socket, "found a socket"), (&pipe, "found a named pipe"), (&link, "found a device")];
+        for (path, expected) in found.into_iter().chain([(folder.path(), "directory")]) {
+            let message = open_file(path).unwrap_err().to_string();
+            assert!(message.contains(expected), "{expected:?} is not in {message:?}");
+        }
+    }
+}
