@@ -69,21 +69,23 @@ impl Rounds {
         let turns = (self.turns as u64).min(all).max(1);
         let per_gaussian =
             [scored(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking].concat();
-        let seconds = (0..self.rounds(self.usual) as i32).map(|round| {
-            let left = work.count() * self.fraction.powi(round);
+        let seconds = (0..self.rounds(self.usual)).map(|round| {
+            let left = work.count() * self.fraction.powi(round as i32);
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
             work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
         });
         // The first round takes all turns, each of its own frames.
         let frames = all.min(work.frames).div_ceil(turns);
-        let later = (self.rounds(self.fewest) - 1.0).max(0.0);
+        let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
         let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
         Need { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
-    /// Rounds until a part `fewest` is left at most.
-    fn rounds(&self, fewest: f64) -> f64 {
-        (fewest.ln() / self.fraction.ln()).ceil().max(0.0)
+    /// Returns the number of rounds after which at most a part `fewest` is left. At most 2207, for a recipe's fraction is
+    /// at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most `u32::MAX` Gaussians.
+    fn rounds(&self, fewest: f64) -> u32 {
+        let fewest = fewest.max(1.0 / f64::from(u32::MAX));
+        (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
     }
 
     /// The rounds that leave `fewest` of `count` Gaussians, for people.
@@ -154,11 +156,13 @@ impl Rounds {
         Ok(Ranking::new(protected.iter().copied().chain(free).chain(gone).collect()))
     }
 
-    /// How many of so many free Gaussians each round leaves, until a round leaves at most `fewest` with those protected.
+    /// Returns how many of so many free Gaussians each round leaves, until a round leaves at most `fewest` with those
+    /// protected. Every round removes at least one.
     fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
         let mut sizes = Vec::new();
         while free > 0 && free + protected > fewest {
-            free = (((free + protected) as f64 * self.fraction) as usize).saturating_sub(protected);
+            let left = (((free + protected) as f64 * self.fraction) as usize).saturating_sub(protected);
+            free = left.min(free - 1);
             sizes.push(free);
         }
         sizes
@@ -326,6 +330,32 @@ mod tests {
             let read: usize = parts.iter().map(frames).sum();
             assert_eq!(read == all.chunk_by(|a, b| a.frame == b.frame).count(), frames_apart, "{turns} turns");
         }
+    }
+
+    #[test]
+    fn every_round_removes_a_gaussian_whatever_the_fraction() {
+        let recipe = Recipe::preset("default").unwrap();
+        for fraction in [0.1, 0.5, 0.9, recipe::MOST_LEFT_BY_ROUND, 0.999_999_999_9, 1.0 - f64::EPSILON / 2.0] {
+            let rounds = Rounds { fraction, ..Rounds::of(&recipe.select, None).unwrap() };
+            for (count, protected) in (0..=50).flat_map(|count| [(count, 0), (count, 7)]) {
+                for fewest in 0..=count {
+                    let sizes = rounds.sizes(count, protected, fewest);
+                    let before = std::iter::once(count).chain(sizes.iter().copied());
+                    assert!(
+                        before.zip(&sizes).all(|(before, &left)| left < before),
+                        "{fraction} of {count}: {sizes:?}"
+                    );
+                    assert!(sizes.last().copied().unwrap_or(count) + protected <= fewest.max(protected));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_number_of_rounds_is_bounded_for_no_gaussians_at_all() {
+        let recipe = Recipe::preset("default").unwrap();
+        let rounds = Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::of(&recipe.select, Some(0.0)).unwrap() };
+        assert_eq!([0.0, 1e-300, 1.0, 2.0].map(|fewest| rounds.rounds(fewest)), [2207, 2207, 0, 0]);
     }
 
     #[test]

@@ -129,6 +129,7 @@ impl Space<'_> {
         journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
             let bytes = |reduction: &Reduction| self.emit.bytes(scene, reduction, self.recipe);
             let empty = bytes(&reduction.pick(&[]))?;
+            let mut tried = 0;
             loop {
                 let found = bytes(&reduction)?;
                 if found <= self.most {
@@ -144,8 +145,8 @@ impl Space<'_> {
                     )));
                 }
                 let part = self.most.saturating_sub(empty) as f64 / found.saturating_sub(empty).max(1) as f64;
-                let left = (0.998 * part * reduction.len() as f64) as usize;
-                let left = left.clamp(protected, reduction.len() - 1);
+                let left = next_size(reduction.len(), protected, part, tried);
+                tried += 1;
                 let places = self.best(scene, scored, &reduction, left)?;
                 reduction = reduction.pick(&places);
             }
@@ -160,5 +161,35 @@ impl Space<'_> {
         let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
         let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
         Ok(errors.most_missed(count, |place| scored.is_protected(reduction.kept[place])))
+    }
+}
+
+/// Returns how many of `count` Gaussians to try next where a `part` of their bytes is expected to fit, after so many sizes
+/// were `tried`. `protected` ones stay, fewer than `count`. Always fewer than `count`; after [`MOST_TRIED`] sizes at most
+/// half as many, so that bytes which follow no line end the search after at most 32 more.
+fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
+    let most = if tried < MOST_TRIED { count - 1 } else { count / 2 };
+    ((0.998 * part * count as f64) as usize).min(most).max(protected)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shrinking_to_a_size_ends_whatever_the_bytes_are() {
+        for (count, part) in
+            (1..=50).chain([4_000_000_000]).flat_map(|n| [0.0, 0.5, 1.0, 1e9, f64::NAN].map(|p| (n, p)))
+        {
+            for protected in [0, count / 3, count - 1] {
+                let (mut left, mut tried) = (count, 0);
+                while left > protected {
+                    let next = next_size(left, protected, part, tried);
+                    assert!((protected..left).contains(&next), "{left} to {next}, {protected} protected, part {part}");
+                    (left, tried) = (next, tried + 1);
+                }
+                assert!(tried <= MOST_TRIED + 33, "{tried} sizes of {count} tried");
+            }
+        }
     }
 }

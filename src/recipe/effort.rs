@@ -1,6 +1,6 @@
 //! How much time a run may take for how small an error: places on the curves that `splatsieve precision` draws.
 
-use super::Recipe;
+use super::{MOST_STEPS, Recipe};
 
 /// A place on the curves of error against run time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,7 +59,7 @@ impl Recipe {
     pub fn at_effort(&self, effort: Effort) -> Recipe {
         let Some(knobs) = effort.knobs() else { return self.clone() };
         let steps = knobs.steps * f64::from(self.refine.refine_steps);
-        let mut recipe = self.refining_by(steps.ceil() as u32);
+        let mut recipe = self.refining_by((steps.ceil() as u32).min(MOST_STEPS));
         // Never past what the recipe has by itself.
         let less = knobs.steps < 1.0;
         let moved = |own: usize, to: usize| if less { own.min(to) } else { own.max(to) };

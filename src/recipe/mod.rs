@@ -27,6 +27,13 @@ pub const PRESETS: [(&str, &str); 4] = [
     ("strong", include_str!("strong.toml")),
 ];
 
+/// Largest fraction of the Gaussians that a round may leave: with it 10 million Gaussians take 1300 rounds down to a few.
+pub const MOST_LEFT_BY_ROUND: f64 = 0.99;
+/// Most steps of refinement: a run of a day.
+const MOST_STEPS: u32 = 1_000_000;
+/// Most merge passes. Every pass reads all frames.
+const MOST_PASSES: usize = 16;
+
 /// Parameters of earlier versions, by table and key, and why they went: recipes written beside results name all.
 const REMOVED: [(&str, &str, &str); 3] = [
     ("score", "exact_percentiles", "as percentiles are always exact"),
@@ -466,8 +473,8 @@ impl Recipe {
             (
                 "select.round_fraction",
                 self.select.round_fraction,
-                (0.1..=1.0).contains(&self.select.round_fraction),
-                "0.1 to 1",
+                (0.1..=MOST_LEFT_BY_ROUND).contains(&self.select.round_fraction) || self.select.round_fraction == 1.0,
+                "0.1 to 0.99, or 1 for no rounds",
             ),
             ("select.round_pictures", self.select.round_pictures as f64, self.select.round_pictures > 0, "1 or more"),
             (
@@ -475,6 +482,24 @@ impl Recipe {
                 self.select.round_turns as f64,
                 (1..=1000).contains(&self.select.round_turns),
                 "1 to 1000",
+            ),
+            (
+                "refine.refine_steps",
+                f64::from(self.refine.refine_steps),
+                self.refine.refine_steps <= MOST_STEPS,
+                "0 to 1000000",
+            ),
+            (
+                "refine.refine_cut_steps",
+                f64::from(self.refine.refine_cut_steps),
+                self.refine.refine_cut_steps <= MOST_STEPS,
+                "0 to 1000000",
+            ),
+            (
+                "merge.passes",
+                self.merge.passes.len() as f64,
+                self.merge.passes.len() <= MOST_PASSES,
+                "at most 16 passes",
             ),
             (
                 "refine.refine_pictures",
@@ -590,6 +615,23 @@ mod tests {
             let text = format!("preset = \"paper\"\n[score]\nmu = 2.0\nexact_percentiles = {value}\n");
             let message = Recipe::from_toml(&text, "default").unwrap_err();
             assert!(message.contains("score.exact_percentiles") && message.contains("delete its line"), "{message}");
+        }
+    }
+
+    #[test]
+    fn values_that_make_a_run_endless_are_refused() {
+        let many = "[[merge.passes]]\nepsilon = 0.01\nd0 = 1.0\nrho = 0.9\ntau_m = 0.9\n".repeat(MOST_PASSES + 1);
+        for (text, parts) in [
+            ("[select]\nround_fraction = 0.9999999999\n", ["select.round_fraction", "0.1 to 0.99, or 1"]),
+            ("[refine]\nrefine_steps = 4000000000\n", ["refine.refine_steps", "0 to 1000000"]),
+            ("[refine]\nrefine_cut_steps = 4000000000\n", ["refine.refine_cut_steps", "0 to 1000000"]),
+            (&many, ["merge.passes", "at most 16 passes, found 17"]),
+        ] {
+            let message = Recipe::from_toml(text, "default").unwrap_err();
+            assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
+        for fraction in ["0.1", "0.95", "0.99", "1.0"] {
+            Recipe::from_toml(&format!("[select]\nround_fraction = {fraction}\n"), "default").unwrap();
         }
     }
 
