@@ -174,9 +174,20 @@ fn receive_measured<S: Stages>(
     let mut arrived = None;
     if let Some(measuring) = measuring {
         let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
-        match measuring.wrong(&complete, &scene) {
-            None => arrived = Some(measuring.finish(&complete)),
-            Some(why) => {
+        let found = match measuring.wrong(&complete, &scene) {
+            None => {
+                let found = measuring.finish(&complete);
+                // Frames were looked at with them before they turned out not to be finite.
+                match stages.measure().score.absent(&found.scanned.rows).is_empty() {
+                    true => Ok(found),
+                    false => Err("Gaussians with NaN or infinity are dropped from all frames"),
+                }
+            }
+            Some(why) => Err(why),
+        };
+        match found {
+            Ok(found) => arrived = Some(found),
+            Err(why) => {
                 let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
                 scene.notes.push(note);
             }

@@ -94,19 +94,37 @@ impl Measure {
     /// # Errors
     /// Those of the stages.
     pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
+        scene.set_absent(&[]);
         let Score { snap_noise, non_finite, score, select, user, .. } = &self.score;
         let key = scene.work.key(&(
             (&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user),
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
         ));
         let scored = journal.kept(&scene.work, score::NAME, key, |journal| self.measure(scene, arrived, journal))?;
+        scene.set_absent(&scored.absent);
         scored.within(&scene.limits, &scene.scratch)
+    }
+
+    /// Scans all frames. If Gaussians that are not finite are to be dropped, they are absent from the scene from then on, and
+    /// it is scanned again without them.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, or whose times cannot be scanned.
+    pub fn scan(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
+        scene.set_absent(&[]);
+        let scanned = self.scan.run(scene, journal)?;
+        let absent = self.score.absent(&scanned.rows);
+        if absent.is_empty() {
+            return Ok(scanned);
+        }
+        scene.set_absent(&absent);
+        self.scan.run(scene, journal)
     }
 
     fn measure(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         let Measured { scanned, seen } = match arrived {
             Some(measured) => measured,
-            None => Measured { scanned: self.scan.run(scene, journal)?, seen: None },
+            None => Measured { scanned: self.scan(scene, journal)?, seen: None },
         };
         let seen = match (&self.visible, seen) {
             (Some(visible), None) => Some(visible.run(scene, &scanned.rows.life, journal)?),

@@ -70,6 +70,8 @@ pub struct Scored {
     pub selection: Selection,
     /// Ids that are to be kept as they are, unmerged; increasing.
     pub protected: Vec<u32>,
+    /// Ids that were dropped because their values are not finite, increasing: the scene is read without them.
+    pub absent: Vec<u32>,
     /// Where Gaussians are compared with one another.
     pub reference: Reference,
     /// Distance between f32 values at the scene's largest coordinate: the noise floor of a position.
@@ -103,6 +105,11 @@ impl Score {
             ],
             fixed: vec![work.arriving()],
         }
+    }
+
+    /// Returns the ids of the Gaussians that are to be dropped because their values are not finite, increasing.
+    pub fn absent(&self, rows: &Rows) -> Vec<u32> {
+        if self.non_finite == NonFinite::Drop { non_finite(rows).collect() } else { Vec::new() }
     }
 
     /// Scores and selects by what was measured.
@@ -141,9 +148,10 @@ impl Score {
                 protected.extend(all.iter().copied().filter(|&id| inside(&corners, state.position.row(id as usize))));
             }
             let mut drop = self.user.drop.clone();
+            let absent = self.absent(&rows);
             match self.non_finite {
                 NonFinite::Error => refuse_non_finite(scene, &rows)?,
-                NonFinite::Drop => drop.extend(non_finite(&rows)),
+                NonFinite::Drop => drop.extend(&absent),
                 NonFinite::Keep => protected.extend(non_finite(&rows)),
             }
             for ids in [&mut protected, &mut drop] {
@@ -167,6 +175,7 @@ impl Score {
                 },
                 selection,
                 protected,
+                absent,
                 reference,
                 position_ulp,
                 rereads: self.rereads,

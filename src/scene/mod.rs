@@ -1,5 +1,6 @@
 //! An input with the cameras that look at it: what every verb starts from.
 
+mod absent;
 pub mod between;
 mod input;
 mod open;
@@ -16,9 +17,10 @@ use crate::error::Result;
 use crate::families::Family;
 use crate::limits::Limits;
 use crate::model::{Rig, Schedule, Split};
-use crate::source::{FrameSource, Reads};
+use crate::source::Reads;
 use crate::work::Work;
 
+use absent::Absent;
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
 pub use stream::{Room, is_linked, link_stream, open_stream, receiving, room_to_pack};
@@ -55,6 +57,8 @@ pub struct Scene {
     digest: Option<String>,
     /// Things a person should know.
     pub notes: Vec<String>,
+    /// Gaussians that its frames are read without.
+    absent: Absent,
 }
 
 impl Scene {
@@ -79,12 +83,8 @@ impl Scene {
             work: Work::none(),
             digest: None,
             notes: Vec::new(),
+            absent: Absent::default(),
         })
-    }
-
-    /// Its frames.
-    pub fn source(&self) -> &dyn FrameSource {
-        self.input.source()
     }
 
     /// What the need for memory depends on.

@@ -47,6 +47,8 @@ pub struct Asked {
 pub struct Work {
     place: Option<Place>,
     part: Option<Part>,
+    /// Key of the Gaussians that the input is read without; none: it is read with all.
+    absent: Mutex<Option<Key>>,
     said: Mutex<Vec<String>>,
 }
 
@@ -61,7 +63,7 @@ impl Work {
     /// # Errors
     /// A folder that cannot be created, or is none.
     pub fn open(asked: &Asked, about: String) -> Result<Work> {
-        Ok(Work { place: Some(Place::at(&asked.folder, about)?), part: asked.part, said: Mutex::default() })
+        Ok(Work { place: Some(Place::at(&asked.folder, about)?), part: asked.part, ..Work::default() })
     }
 
     /// From now on everything follows from what `context` stands for, too.
@@ -76,9 +78,20 @@ impl Work {
         self.place.is_some()
     }
 
+    /// Has all keys made from now on follow from the ids of the Gaussians that the input is read without, if there are any.
+    pub fn set_absent(&self, ids: &[u32]) {
+        *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
+            (self.keeps() && !ids.is_empty()).then(|| Key::of(&ids));
+    }
+
     /// The key of `value`; where nothing is kept it stands for nothing, and takes no time.
     pub fn key(&self, value: &impl Serialize) -> Key {
-        if self.keeps() { Key::of(value) } else { Key::NONE }
+        let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
+        match (self.keeps(), absent) {
+            (false, _) => Key::NONE,
+            (true, None) => Key::of(value),
+            (true, Some(absent)) => Key::of(value).and(&absent),
+        }
     }
 
     /// Things a person should know, said once.

@@ -220,7 +220,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
 
     let measure = Measure::new(&options.recipe, true, UserOverrides::default());
     let bench = Bench {
-        scanned: measure.scan.run(&scene, &mut Journal::default())?,
+        scanned: measure.scan(&scene, &mut Journal::default())?,
         judge: Judge::new(&scene)?,
         scene: &scene,
         input: &input,
