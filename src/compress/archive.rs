@@ -10,10 +10,12 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::as_toml::AsToml;
 use super::bounds;
 use super::journal::Journal;
 use super::near::{
-    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, pictures,
+    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, measurable,
+    pictures,
 };
 use super::summary::ArchiveSummary;
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
@@ -107,7 +109,7 @@ impl Archive {
     /// Makes of `reduction` what it is `asked` for.
     ///
     /// # Errors
-    /// An input that no archive holds, values that are not finite, frames that cannot be read, too few bytes.
+    /// An input that no archive holds, values or pictures that are not finite, frames that cannot be read, too few bytes.
     pub fn run(
         &self,
         scene: &Scene,
@@ -116,7 +118,7 @@ impl Archive {
         journal: &mut Journal,
     ) -> Result<(Archived, ArchiveSummary)> {
         let key = scene.work.key(&(self.psnr, asked, reduction));
-        let (archived, summary): (Archived, String) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+        let (archived, AsToml(summary)) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
             let (archived, summary) = match scene.input.archives_frames() {
                 true => {
                     let left = scene.input.reduced(reduction)?;
@@ -128,16 +130,16 @@ impl Archive {
                     (Archived::Content(encoded), summary)
                 }
             };
-            Ok(((archived, serde_json::to_string(&summary).expect("plain data")), reduction.len()))
+            Ok(((archived, AsToml(summary)), reduction.len()))
         })?;
-        Ok((archived, serde_json::from_str(&summary).expect("as it was written")))
+        Ok((archived, summary))
     }
 
     fn make(&self, scene: &Scene, reduction: &Reduction, asked: Asked) -> Result<(Encoded, ArchiveSummary)> {
         let mut content = scene.input.content(reduction)?;
         let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
         let original = Looks::of(scene, scene.source())?;
-        let level = looks.psnr(scene.source())?;
+        let level = measurable(looks.psnr(scene.source())?)?;
         let aim = Aim::of(self.psnr, asked, level);
         let asked = aim.close(level);
         let mut grids = Grids::of(&content);

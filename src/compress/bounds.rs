@@ -9,7 +9,9 @@
 use std::collections::BTreeMap;
 use std::fs;
 
-use super::near::{ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, ROUNDS, balanced, bisected};
+use super::near::{
+    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, ROUNDS, balanced, bisected, measurable,
+};
 use super::summary::ArchiveSummary;
 use crate::budget::{Part, Workload};
 use crate::emit::atomic::ScratchFolder;
@@ -55,13 +57,7 @@ pub(super) fn find(
     asked: Asked,
 ) -> Result<(Bounds, ArchiveSummary)> {
     let (looks, original) = (Looks::of(scene, source)?, Looks::of(scene, scene.source())?);
-    let level = looks.psnr(scene.source())?;
-    if level.is_nan() {
-        return Err(Error::usage(
-            "an archive is made by its pictures: expected numbers in every pixel, found NaN in some
-               --non-finite drop removes the Gaussians that are not finite; a .gseq holds them as they are",
-        ));
-    }
+    let level = measurable(looks.psnr(scene.source())?)?;
     let aim = Aim::of(psnr, asked, level);
     let asked = aim.close(level);
     let first = first(source)?;

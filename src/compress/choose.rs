@@ -9,7 +9,7 @@ use super::score::{Scored, scored};
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::metrics::psnr;
+use crate::metrics::{decibels_text, psnr};
 use crate::model::{Columns, Picture};
 use crate::reduction::Reduction;
 use crate::render::{self, Image};
@@ -96,7 +96,8 @@ impl Choose {
             return Ok(merged);
         }
         let why = format!(
-            "at the same {count} Gaussians scoring pictures keep {without:.2} dB without it, {with:.2} with it"
+            "at the same {count} Gaussians scoring pictures keep {} without it, {with:.2} with it",
+            decibels_text(without, 2)
         );
         Progress::undone("merging", &why);
         journal.leave_out("merging", why);

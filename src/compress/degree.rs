@@ -76,7 +76,10 @@ impl Degree {
             }
             // Of equal ones the one with more bands.
             let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
-            let of = |(fit, psnr): &(Fit, f64)| format!("{} of degree {} {psnr:.2}", fit.gaussians, fit.sh_degree);
+            let of = |(fit, psnr): &(Fit, f64)| {
+                let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };
+                format!("{} of degree {} {psnr}", fit.gaussians, fit.sh_degree)
+            };
             let (count, tried) = (targets.parted(false).apart.len(), tried.iter().map(of).collect::<Vec<_>>().join(", "));
             journal.notes.push(format!(
                 "of the Gaussians that fit, those of SH degree {} show most: {count} pictures kept apart keep, dB, with {tried}, \

@@ -7,10 +7,11 @@ use cpu_time::ProcessTime;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use super::as_toml::AsToml;
 use super::forecast::Forecast;
 use super::summary::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, Stage};
 use crate::budget::peak_memory_bytes;
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
 use crate::work::{Key, Spill, Work};
@@ -119,15 +120,12 @@ impl Journal {
             return compute(self);
         }
         let mut is_new = false;
-        // Summaries are made for JSON.
-        let (found, written): (T, String) = work.known(stage, key, || {
+        let (found, AsToml(mut own)) = work.known(stage, key, || {
             is_new = true;
             let mut own = Journal { whole: self.whole, ..Journal::default() };
             let found = compute(&mut own)?;
-            Ok((found, serde_json::to_string(&own).expect("plain data")))
+            Ok((found, AsToml(own)))
         })?;
-        let mut own: Journal =
-            serde_json::from_str(&written).map_err(|error| Error::usage(format!("work folder, {stage}: {error}")))?;
         own.stages.iter_mut().for_each(|stage| stage.kept |= !is_new);
         self.stages.extend(own.stages);
         self.left_out.extend(own.left_out);

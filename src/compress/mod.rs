@@ -3,6 +3,7 @@
 
 pub mod archive;
 mod arrival;
+mod as_toml;
 mod bands;
 mod bounds;
 mod choose;
@@ -255,7 +256,7 @@ fn nothing_left(scene: &Scene, scored: &Scored) -> Error {
     let dropped = scored.selection.counts.forced_drop;
     let found = match dropped {
         0 => format!("none of {all}"),
-        _ => format!("none of {all}, {dropped} of which --drop-ids drops"),
+        _ => format!("none of {all}, {dropped} of which --drop-ids or --non-finite drops"),
     };
     Error::input(&scene.path, "", "at least one Gaussian that stays", found)
         .hint("nothing was written: drop fewer, or ask for a size with --target-ratio")

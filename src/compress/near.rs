@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::metrics::psnr;
 use crate::model::Picture;
 use crate::render::{Image, render};
@@ -140,6 +140,20 @@ impl Looks<'_> {
         let found = self.render(source, |k, image| 10f64.powf(-0.1 * psnr(&image, &self.images[k])))?;
         Ok(found.iter().sum::<f64>() / found.len().max(1) as f64)
     }
+}
+
+/// Returns the PSNR of a result's pictures against the original's if it is a number.
+///
+/// # Errors
+/// NaN, which says that some pixels are NaN.
+pub(super) fn measurable(psnr: f64) -> Result<f64> {
+    if psnr.is_nan() {
+        return Err(Error::usage(
+            "an archive is made by its pictures: expected numbers in every pixel, found NaN in some\n  \
+             --non-finite drop removes the Gaussians that are not finite; a .gseq holds them as they are",
+        ));
+    }
+    Ok(psnr)
 }
 
 /// What `of` finds at the largest number between two, as far as halving their distance so often tells, that it finds

@@ -16,7 +16,7 @@ use crate::archive::Parts;
 use crate::error::Result;
 use crate::families::{Family, Size};
 use crate::merge::PassCounts;
-use crate::metrics::PSNR_CAP_DB;
+use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::recipe::ProxyOpacity;
 use crate::reduction::Cluster;
 use crate::scene::Scene;
@@ -303,10 +303,11 @@ impl FieldSummary {
     /// Why the field is as it is.
     pub(super) fn why(&self) -> String {
         let FieldSummary { pictures, rounding, result, least, .. } = self;
-        let result = result.map_or(String::new(), |result| format!(", {result:.1} dB from the original's to these"));
+        let from = |psnr: f64, what: &str| format!("{} from {what}", decibels_text(psnr, 1));
+        let result = result.map_or(String::new(), |result| format!(", {}", from(result, "the original's to these")));
         format!(
-            "{pictures} pictures with it are {rounding:.1} dB from those with the exact field{result}; \
-             at least {least:.1} dB were asked for"
+            "{pictures} pictures with it are {}{result}; at least {least:.1} dB were asked for",
+            from(*rounding, "those with the exact field")
         )
     }
 }
@@ -346,12 +347,13 @@ impl BandsSummary {
     /// Why bands went, or stayed.
     pub(super) fn why(&self) -> String {
         let BandsSummary { pictures, tried, result, least, .. } = self;
-        let of = |(degree, apart): &(usize, f64)| format!("{apart:.1} dB at degree {degree}");
+        let of = |(degree, apart): &(usize, f64)| format!("{} at degree {degree}", decibels_text(*apart, 1));
         let tried: Vec<String> = tried.iter().map(of).collect();
         format!(
-            "{pictures} pictures are {} from those with all bands, {result:.1} dB from the original's to these; at least \
+            "{pictures} pictures are {} from those with all bands, {} from the original's to these; at least \
              {least:.1} dB were asked for",
-            tried.join(", ")
+            tried.join(", "),
+            decibels_text(*result, 1)
         )
     }
 }
@@ -560,7 +562,7 @@ impl Summary {
     fn cost(&self) -> String {
         let to = |psnr: f64, by: &str| match psnr {
             same if same >= PSNR_CAP_DB => format!("no difference in {by}"),
-            _ => format!("pictures {psnr:.1} dB from the original's ({by})"),
+            _ => format!("pictures {} from the original's ({by})", decibels_text(psnr, 1)),
         };
         let bands = self.bands.as_ref().map(|bands| (bands.result, bands.pictures));
         let field = self.field.as_ref().and_then(|field| Some((field.result?, field.pictures)));

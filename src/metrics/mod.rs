@@ -39,6 +39,14 @@ pub fn decibels(mean_square: f64) -> f64 {
     if db > PSNR_CAP_DB { PSNR_CAP_DB } else { db }
 }
 
+/// Returns the text of a PSNR, with so many `digits` after the point; of NaN what NaN means.
+pub fn decibels_text(psnr: f64, digits: usize) -> String {
+    match psnr.is_nan() {
+        true => "an unmeasurable PSNR (some pixels are NaN)".to_owned(),
+        false => format!("{psnr:.digits$} dB"),
+    }
+}
+
 /// Error of frame-to-frame differences: the root mean square of (a₁ − a₀) − (b₁ − b₀) over pixels and
 /// channels, for one view at two successive frames; in [0, 2], 0 where `b` flickers exactly as `a` moves.
 ///
@@ -100,6 +108,14 @@ mod tests {
         let (a, b) = (image(3, 3, |_| 1.0), image(3, 3, |i| 1.0 + i as f32));
         assert_eq!(psnr(&a, &b), PSNR_CAP_DB);
         assert_eq!(ssim(&a, &b), 1.0);
+    }
+
+    #[test]
+    fn nan_decibels_are_named_in_words() {
+        assert_eq!(decibels_text(31.416, 1), "31.4 dB");
+        assert_eq!(decibels_text(PSNR_CAP_DB, 2), "100.00 dB");
+        let text = decibels_text(f64::NAN, 2);
+        assert!(text.starts_with("an unmeasurable PSNR") && !text.contains("NaN dB"), "{text}");
     }
 
     #[test]

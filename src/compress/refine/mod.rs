@@ -24,6 +24,7 @@ use super::summary::RefinedSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
+use crate::metrics::decibels_text;
 use crate::model::{ALL_HARMONICS, Columns};
 use crate::recipe;
 use crate::reduction::{Change, Course, Reduction};
@@ -590,6 +591,11 @@ impl<'a> Walk<'a> {
             _ => {
                 moving.find()?;
                 let before = moving.closeness(&self.apart)?;
+                if before.psnr.is_nan() {
+                    let why = format!("{count} pictures kept apart have {}", decibels_text(before.psnr, 2));
+                    journal.leave_out("refinement", why);
+                    return Ok(End::new(before, moving.change()));
+                }
                 if before.psnr >= CLOSE_ENOUGH {
                     let why = format!("{count} pictures kept apart keep {:.2} dB without", before.psnr);
                     journal.leave_out("refinement", why);

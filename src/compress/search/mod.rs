@@ -7,6 +7,7 @@
 
 mod gauge;
 
+use super::as_toml::AsToml;
 use super::bands::Bands;
 use super::choose::CLUSTERED;
 use super::field::Field;
@@ -146,6 +147,13 @@ impl Search {
             let walk = self.refine.as_ref().map(|refine| Walk::new(NAME, refine, scene, scored, &targets, parts));
             let mut way = Way { search: self, scene, scored, ranked, like, gauge: &gauge, walk, cuts: Vec::new() };
             let (best, tried) = self.bracket(&mut way, scored.protected.len().max(1), all)?;
+            if best.value.is_nan() {
+                return Err(Error::usage(format!(
+                    "--{}: the PSNR of pictures cannot be measured: expected numbers in every pixel, found NaN in some\n  \
+                     --non-finite drop removes the Gaussians that are not finite",
+                    self.name().replace('_', "-")
+                )));
+            }
             let result = scene.input.reduced(&best.reduction)?;
             let summary = self.summary(&best, self.value(&gauge, &*result, scene, true)?, gauge.held(), tried);
             drop(result);
@@ -155,10 +163,10 @@ impl Search {
             (journal.field, journal.bands) = (best.journal.field, best.journal.bands);
             journal.refined = best.journal.refined;
             journal.notes.push(note(&summary, gauge.searched(), count, does));
-            Ok(((best.reduction, serde_json::to_string(&summary).expect("plain data")), count))
+            Ok(((best.reduction, AsToml(summary)), count))
         });
-        let (reduction, summary): (Reduction, String) = found?;
-        Ok((reduction, serde_json::from_str(&summary).expect("as it was written")))
+        let (reduction, AsToml(summary)) = found?;
+        Ok((reduction, summary))
     }
 
     /// What the search follows from.
@@ -258,13 +266,27 @@ impl Search {
         }
     }
 
-    fn summary(&self, best: &Tried, held: f64, held_pictures: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
-        let (name, asked) = match self.quality {
-            Quality::Psnr(least) => ("min_psnr", least),
-            Quality::Loss { most, .. } => ("max_loss", most),
-        };
-        GoalSummary { name: name.to_owned(), asked, searched: best.value, held, held_pictures, tried }
+    /// Name of what is asked for, as a recipe has it.
+    fn name(&self) -> &'static str {
+        match self.quality {
+            Quality::Psnr(_) => "min_psnr",
+            Quality::Loss { .. } => "max_loss",
+        }
     }
+
+    fn summary(&self, best: &Tried, held: f64, held_pictures: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
+        let asked = match self.quality {
+            Quality::Psnr(least) => least,
+            Quality::Loss { most, .. } => most,
+        };
+        GoalSummary { name: self.name().to_owned(), asked, searched: best.value, held, held_pictures, tried }
+    }
+}
+
+/// Returns how many of `count` Gaussians the next prune step leaves on the way to `wanted`, of which there are fewer: a part
+/// [`CUT`], and always at least one Gaussian less than before.
+fn next_size(count: usize, wanted: usize) -> usize {
+    ((CUT * count as f64).ceil() as usize).min(count - 1).max(wanted)
 }
 
 /// What was found, for a person: of `gaussians`, by so many pictures searched on, and whether it `does`.
@@ -307,7 +329,7 @@ impl Way<'_> {
                 let cut = self.cuts.iter().rfind(|cut| first > size && cut.len() >= size);
                 let mut start = cut.cloned().unwrap_or_else(|| prefix(first));
                 while start.len() > size {
-                    let next = ((CUT * start.len() as f64).ceil() as usize).max(size);
+                    let next = next_size(start.len(), size);
                     start = walk.cut_down(&start, next, size)?;
                     if next > size {
                         self.cuts.push(start.clone());
@@ -327,5 +349,26 @@ impl Way<'_> {
         let value = self.search.value(self.gauge, &*result, self.scene, false)?;
         drop(result);
         Ok(Tried { reduction, value, journal })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn prune_steps_reach_every_size_from_every_count() {
+        for count in 0..=50 {
+            for wanted in 0..count {
+                let (mut left, mut steps) = (count, 0);
+                while left > wanted {
+                    let next = next_size(left, wanted);
+                    assert!((wanted..left).contains(&next), "{left} to {next} on the way to {wanted}");
+                    (left, steps) = (next, steps + 1);
+                }
+                assert!(steps <= count, "{steps} steps from {count} to {wanted}");
+            }
+        }
+        assert_eq!([next_size(1000, 3), next_size(1000, 900), next_size(5, 1)], [800, 900, 4]);
     }
 }
