@@ -161,12 +161,18 @@ impl Attack {
         self
     }
 
+    /// Changes how the program is started, for example as another user or with a limit of the system.
+    pub(crate) fn with(mut self, change: impl FnOnce(&mut Command)) -> Attack {
+        change(&mut self.command);
+        self
+    }
+
     /// Starts the program and returns without waiting.
     pub(crate) fn start(mut self) -> Running {
         let started = Instant::now();
         let mut child = self.command.spawn().unwrap();
-        let stdout = child.stdout.take().map(|pipe| collect(pipe));
-        let stderr = child.stderr.take().map(|pipe| collect(pipe));
+        let stdout = child.stdout.take().map(collect);
+        let stderr = child.stderr.take().map(collect);
         Running { child, stdout, stderr, started, seconds: self.seconds, shown: self.shown }
     }
 
