@@ -17,7 +17,7 @@ use gseq::Compression;
 use crate::budget::{self, Budget, Tell};
 use crate::compress::summary::Detail;
 use crate::compress::{Only, Request, Run, Target, compress, divided_stages, foresee};
-use crate::emit::atomic::{Replace, as_named};
+use crate::emit::atomic::{Replace, as_named, is_standard_output_used, take_warnings};
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
@@ -62,7 +62,12 @@ pub fn main() -> ExitCode {
     signals::install();
     Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
-    match run(cli) {
+    let result = run(cli);
+    // Results that these warnings name are in place, so the exit code stays.
+    for warning in take_warnings() {
+        tell(&format!("warning: {warning}"));
+    }
+    match result {
         Ok(()) => {
             if let Some(taken) = budget::taken().filter(|_| explains) {
                 tell(&taken);
@@ -113,7 +118,11 @@ fn run(cli: Cli) -> Result<()> {
             print(&if json { summary.json() } else { summary.text(detail) })?;
             // The summary is what stdout is for.
             if let Some(page) = page {
-                tell(&viewed(&page)?);
+                let shown = viewed(&page);
+                if shown.is_err() {
+                    tell(&format!("{} is complete and in place; its page is not:", request.output.display()));
+                }
+                tell(&shown?);
             }
             Ok(())
         }
@@ -614,6 +623,11 @@ fn print(text: &str) -> Result<()> {
 }
 
 fn write_stdout(bytes: &[u8]) -> Result<()> {
+    // The result itself went there: a report behind it would corrupt it.
+    if is_standard_output_used() {
+        let _ = io::stderr().write_all(bytes);
+        return Ok(());
+    }
     let mut out = io::stdout().lock();
     out.write_all(bytes).and_then(|()| out.flush()).map_err(Error::io("write", "standard output".as_ref()))
 }

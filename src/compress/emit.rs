@@ -12,7 +12,9 @@ use super::request::Request;
 use super::score::scored;
 use super::summary::Summary;
 use crate::budget::{Need, Workload, of_left};
-use crate::emit::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFile, StagedFolder, check_target, commit_files};
+use crate::emit::atomic::{
+    Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
+};
 use crate::emit::bounds::Bounds;
 use crate::emit::container::{FRAME_BLOCK, write_container};
 use crate::emit::index_map::write_index_map;
@@ -86,11 +88,12 @@ impl Emit {
         if self.kind.is_folder() {
             return check_target(&self.output, Kind::Folder, inputs, self.overwrite);
         }
-        check_target(&self.output, Kind::File, inputs, self.overwrite)?;
-        for name in [RECIPE, INDEX_MAP, MARKER] {
-            check_target(&beside(&self.output, false, name), Kind::File, inputs, self.overwrite)?;
-        }
-        Ok(())
+        check_targets(&self.output, &self.companions(), inputs, self.overwrite)
+    }
+
+    /// Paths of the files beside a result that is a file.
+    fn companions(&self) -> [PathBuf; 3] {
+        [MARKER, RECIPE, INDEX_MAP].map(|name| beside(&self.output, false, name))
     }
 
     /// What is left, a part `left` of the Gaussians, and buffers of what is written.
@@ -153,9 +156,8 @@ impl Emit {
         Ok(written + beside)
     }
 
-    /// Writes the result and what goes beside it; everything appears under its name at the end, a file
-    /// before its companions and the summary, which says that all is there, last. `summarise` is told the size of the
-    /// result.
+    /// Writes the result and the files beside it. They get their names at the end: a folder in one step, a file after the
+    /// files beside it. `summarise` is told the size of the result.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write; nothing is left behind then.
@@ -199,15 +201,14 @@ impl Emit {
             staged.commit()?;
             return Ok(summary);
         }
-        let staged = StagedFile::new(target, self.overwrite)?;
-        let companion = |name| StagedFile::new(&beside(target, false, name), self.overwrite);
-        let (recipe_file, index_map, marker) = (companion(RECIPE)?, companion(INDEX_MAP)?, companion(MARKER)?);
+        let staged = StagedFiles::new(target, self.companions().to_vec(), self.overwrite)?;
+        let [marker, recipe_file, index_map] = [0, 1, 2].map(|index| staged.companion(index));
         let size = write(staged.path())?;
-        write_text(recipe_file.path(), recipe)?;
-        write_index_map(map, index_map.path())?;
+        write_text(&recipe_file, recipe)?;
+        write_index_map(map, &index_map)?;
         let summary = summarise(journal, size);
-        write_text(marker.path(), &summary.json())?;
-        commit_files(&[staged, recipe_file, index_map, marker])?;
+        write_text(&marker, &summary.json())?;
+        staged.commit()?;
         Ok(summary)
     }
 }

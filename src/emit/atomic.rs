@@ -1,69 +1,54 @@
 //! Outputs that appear whole or not at all.
 //!
-//! In: where the user wants the output. Out: a hidden name beside it to write under; `commit` syncs what was written
-//! and gives it its name. Dropped without commit it is removed, and so is, by [`withdraw_all`], everything begun
-//! when the process is told to end. What killed runs left is removed when the next output of the same name begins,
-//! and a folder that such a run had moved aside is put back. Runs may share folders between containers and machines.
+//! An output is written in a hidden workspace beside its target ([`workspace`]). `commit` writes it through to the disk
+//! and publishes it under its name ([`publish`]); runs with the same output publish one after the other. Dropping an
+//! output without commit removes it, and [`withdraw_all`] removes everything begun when a signal ends the process. The next
+//! run with the same output repairs and removes what killed runs left ([`leftovers`]). Runs may share folders between
+//! containers and machines.
 //!
-//! What overwriting does to files that are not this program's is said at [`Replace`].
+//! [`Replace`] says what is overwritten. Only regular files, folders and links to regular files are ever replaced;
+//! output to a character device or FIFO is written into it.
 
+mod destination;
+mod handle;
+mod leftovers;
 mod named;
+mod publish;
+mod stream;
+mod warnings;
 mod workspace;
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
+use destination::{Destination, check_replace, destination, real_parent};
+pub use destination::{Kind, Replace};
+pub use leftovers::remove_leftovers;
+use leftovers::tidy;
 pub use named::MARKER;
-use named::{Owner, entries, files_below, is_our_file, name_files, parts, present};
+use named::{entries, files_below, name_files, parts, present};
+pub use stream::is_standard_output_used;
+pub use warnings::take_warnings;
 use workspace::{SCRATCH, Workspace, named_in};
 pub use workspace::{Withdrawn, withdraw_all};
 
-/// What an output is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
-    /// One file.
-    File,
-    /// A folder with everything in it.
-    Folder,
-}
-
-/// What an output may replace.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Replace {
-    /// Nothing.
-    #[default]
-    Never,
-    /// What is known as a result of this program. In its folder the files that its summary lists are replaced; every
-    /// other stays where it is, or with `.kept` behind its name where the new result has a file of that name. A single
-    /// file is known as a result if it is a container or a summary beside it lists it.
-    Ours,
-    /// Whatever is there; of a folder everything in it.
-    Any,
-}
-
-/// Confirms, before any work, that an output may be written to `target` by a run that reads `inputs`.
+/// Confirms, before any work, that an output may be written to `target` by a run that reads `inputs`. Completes or removes
+/// an output with this name that a killed run left unfinished.
 ///
 /// Refused are: a target without a name or in a folder that does not exist; a target that is an input,
-/// holds one or lies inside one, overwriting or not, whatever links lead there; an existing target that `replace` does
-/// not let go, but for an empty folder in place of a folder; a file in place of a folder or the reverse, and what is neither.
+/// contains one or lies inside one, whatever `replace` is and whatever links lead there; an existing target that `replace`
+/// does not allow to replace, except an empty folder in place of a folder; a file in place of a folder or the reverse;
+/// sockets, block devices and links to nothing.
 ///
 /// # Errors
-/// Each of these, as a matter of usage; a system that will not say what is there.
+/// Each of these, as [`Error::Usage`]; a failure of the system.
 pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> Result<()> {
     let shown = target.display();
-    let (parent, name) = parts(target)?;
-    let real_parent = fs::canonicalize(&parent).map_err(|_| {
-        Error::usage(format!(
-            "{shown}: the folder {} to write it into does not exist; create it first",
-            parent.display()
-        ))
-    })?;
-    if !real_parent.is_dir() {
-        return Err(Error::usage(format!("{shown}: {} is not a folder", parent.display())));
-    }
-    // Both what the name is and what it leads to: renaming over a link replaces the link alone,
-    // but a user who names the input through one does not mean it.
+    let real_parent = real_parent(target)?;
+    let (_, name) = parts(target)?;
+    // The entry itself and what it leads to: renaming over a link replaces only the link, but a user who names the
+    // input through a link does not mean that.
     let named = real_parent.join(name);
     let meant = fs::canonicalize(target).unwrap_or_else(|_| named.clone());
     for input in inputs {
@@ -81,120 +66,193 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
             return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
         }
     }
-    let Ok(found) = fs::symlink_metadata(target) else { return Ok(()) };
-    if kind == Kind::Folder && is_empty_folder(target) {
+    if kind == Kind::File && destination(target)? == Destination::Stream {
         return Ok(());
     }
-    if replace == Replace::Never {
-        return Err(exists(target));
-    }
-    match kind {
-        Kind::File if found.is_dir() => Err(Error::usage(format!("{shown} is a folder; a file cannot replace it"))),
-        Kind::File if !found.is_file() && !found.is_symlink() => {
-            Err(Error::usage(format!("{shown} is neither a file nor a folder; give another output")))
-        }
-        Kind::Folder if !found.is_dir() => {
-            Err(Error::usage(format!("{shown} is no folder; a folder cannot replace it")))
-        }
-        _ => may_go(target, kind, replace),
-    }
+    tidy(target);
+    check_replace(target, kind, replace)
 }
 
-/// A file that appears under its name at [`StagedFile::commit`].
+/// Confirms with [`check_target`] that a file and its `companions` may be written.
+///
+/// # Errors
+/// Those of [`check_target`]; a `target` that is a device or FIFO, which takes only one file.
+pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], replace: Replace) -> Result<()> {
+    for path in std::iter::once(target).chain(companions.iter().map(PathBuf::as_path)) {
+        check_target(path, Kind::File, inputs, replace)?;
+        if destination(path)? == Destination::Stream {
+            return Err(Error::usage(format!(
+                "{} is a device or FIFO, and the result is several files; give the name of a file",
+                path.display()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// A file that appears under its name at [`StagedFile::commit`], or is written into a device or FIFO then.
 #[derive(Debug)]
-pub struct StagedFile(Staged);
+pub struct StagedFile {
+    target: PathBuf,
+    content: PathBuf,
+    replace: Replace,
+    is_stream: bool,
+    workspace: Workspace,
+}
 
 impl StagedFile {
     /// Prepares to write `target`, which [`check_target`] has passed. The file itself is not created yet.
     ///
     /// # Errors
-    /// A target without a name; an existing one that `replace` does not let go; the system refuses.
+    /// A target without a name; an existing one that `replace` does not allow to replace; the system refuses.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFile> {
-        Staged::new(target, Kind::File, replace).map(StagedFile)
+        let is_stream = destination(target)? == Destination::Stream;
+        let workspace = match is_stream {
+            // Beside a device is no room.
+            true => scratch_in(&std::env::temp_dir())?,
+            false => staged(target, Kind::File, replace)?,
+        };
+        Ok(StagedFile { target: target.to_owned(), content: workspace.content(), replace, is_stream, workspace })
     }
 
-    /// Where to write it meanwhile.
+    /// Path to write the file to before [`StagedFile::commit`].
     pub fn path(&self) -> &Path {
-        &self.0.content
+        &self.content
     }
 
-    /// Makes what was written durable and gives it its name, over an earlier output if that is allowed.
+    /// Writes the file through to the disk and gives it its name, in place of an earlier output if that is allowed.
     ///
     /// # Errors
     /// Nothing was written; the target appeared meanwhile; the system refuses. The target is then as it was.
     pub fn commit(self) -> Result<()> {
-        commit_all(&[self])
+        if self.is_stream {
+            return stream::copy(&self.content, &self.target);
+        }
+        sync(&self.content)?;
+        publish::publish_files(&self.workspace, &[(workspace::CONTENT.to_owned(), &self.target)], self.replace)
     }
 }
 
-/// Commits a result of several files side by side, the last of which is its summary: it lists all of them.
-/// They get their names in order, so that the summary says that all are there.
-///
-/// # Errors
-/// A summary that is no JSON object; those of [`StagedFile::commit`] for each.
-pub fn commit_files(files: &[StagedFile]) -> Result<()> {
-    if let Some(summary) = files.last() {
-        let names = files.iter().map(|file| Ok(parts(&file.0.target)?.1.to_string_lossy().into_owned()));
+/// A file and its companions beside it, which appear together at [`StagedFiles::commit`].
+#[derive(Debug)]
+pub struct StagedFiles {
+    file: StagedFile,
+    companions: Vec<PathBuf>,
+}
+
+impl StagedFiles {
+    /// Prepares to write `target` and its `companions`, which [`check_targets`] has passed. The names of the companions
+    /// begin with that of `target`, and the first companion is the summary.
+    ///
+    /// # Errors
+    /// Those of [`StagedFile::new`] for each of them.
+    pub fn new(target: &Path, companions: Vec<PathBuf>, replace: Replace) -> Result<StagedFiles> {
+        let file = StagedFile::new(target, replace)?;
+        for companion in &companions {
+            check_replace(companion, Kind::File, replace)?;
+        }
+        Ok(StagedFiles { file, companions })
+    }
+
+    /// Path to write the file to before [`StagedFiles::commit`].
+    pub fn path(&self) -> &Path {
+        self.file.path()
+    }
+
+    /// Path to write the companion with this index to.
+    pub fn companion(&self, index: usize) -> PathBuf {
+        self.file.workspace.folder.join(companion_content(index))
+    }
+
+    /// Lists all files in the summary, writes them through to the disk and publishes them: the summary first, so that the
+    /// others are known as results from the start, the file itself last.
+    ///
+    /// Runs with the same output publish one after the other, so files of different runs are never mixed. After a kill in
+    /// between the next run with this output publishes the remaining files.
+    ///
+    /// # Errors
+    /// A summary that is no JSON object; those of [`StagedFile::commit`] for each.
+    pub fn commit(self) -> Result<()> {
+        let StagedFiles { file, companions } = &self;
+        let names = companions.iter().chain([&file.target]);
+        let names = names.map(|path| Ok(parts(path)?.1.to_string_lossy().into_owned()));
         let mut names = names.collect::<Result<Vec<String>>>()?;
         names.sort();
-        name_files(summary.path(), &names)?;
+        if !companions.is_empty() {
+            name_files(&self.companion(0), &names)?;
+        }
+        let mut files: Vec<(String, &Path)> = Vec::new();
+        for (index, target) in companions.iter().enumerate() {
+            sync(&self.companion(index))?;
+            files.push((companion_content(index), target));
+        }
+        sync(file.path())?;
+        files.push((workspace::CONTENT.to_owned(), &file.target));
+        publish::publish_files(&file.workspace, &files, file.replace)
     }
-    commit_all(files)
 }
 
-fn commit_all(files: &[StagedFile]) -> Result<()> {
-    for file in files {
-        sync(file.path())?;
-        file.0.refuse_newcomer()?;
-    }
-    let named: Vec<_> = files.iter().map(|StagedFile(staged)| (&staged.workspace, staged.target.as_path())).collect();
-    workspace::rename_files(&named)?;
-    for file in files {
-        sync(&parts(&file.0.target)?.0)?;
-    }
-    Ok(())
+fn companion_content(index: usize) -> String {
+    format!("companion-{index}")
 }
 
 /// A folder that appears under its name at [`StagedFolder::commit`].
 #[derive(Debug)]
-pub struct StagedFolder(Staged);
+pub struct StagedFolder {
+    target: PathBuf,
+    content: PathBuf,
+    replace: Replace,
+    workspace: Workspace,
+}
 
 impl StagedFolder {
     /// Creates an empty folder for `target`, which [`check_target`] has passed.
     ///
     /// # Errors
-    /// A target without a name; an existing one that `replace` does not let go; the system refuses.
+    /// A target without a name; an existing one that `replace` does not allow to replace; the system refuses.
     pub fn new(target: &Path, replace: Replace) -> Result<StagedFolder> {
-        let staged = Staged::new(target, Kind::Folder, replace)?;
-        fs::create_dir(&staged.content).map_err(Error::io("create", &staged.content))?;
-        Ok(StagedFolder(staged))
+        let workspace = staged(target, Kind::Folder, replace)?;
+        let content = workspace.content();
+        fs::create_dir(&content).map_err(Error::io("create", &content))?;
+        Ok(StagedFolder { target: target.to_owned(), content, replace, workspace })
     }
 
-    /// The folder to write into meanwhile.
+    /// Folder to write into before [`StagedFolder::commit`].
     pub fn path(&self) -> &Path {
-        &self.0.content
+        &self.content
     }
 
-    /// Lists its files in its summary, if it has one, makes everything durable and gives it its name.
+    /// Lists the files in the folder's summary, if it has one, writes everything through to the disk and publishes it.
     ///
-    /// An earlier output is moved aside, replaced, then deleted, and what was in it but not its own follows the name. A run
-    /// killed in between leaves the old or the new one whole; the foreign files are in it or in a hidden folder
-    /// beside it, from where the next output of that name moves them back.
+    /// An earlier output is moved aside, replaced, then deleted, and files in it that are not its own are moved into the new
+    /// one. A run that is killed in between leaves the earlier or the new folder whole; the foreign files are in it or in the
+    /// hidden workspace, from where the next run with this output moves them.
     ///
     /// # Errors
     /// A summary that is no JSON object; the target appeared meanwhile and may not be replaced; the system refuses.
     /// The target is then as it was.
     pub fn commit(self) -> Result<()> {
-        let Staged { target, content, replace, workspace, .. } = &self.0;
-        let summary = content.join(MARKER);
+        let summary = self.content.join(MARKER);
         if present(&summary) {
-            name_files(&summary, &files_below(content)?)?;
+            name_files(&summary, &files_below(&self.content)?)?;
         }
-        sync_tree(content)?;
-        self.0.refuse_newcomer()?;
-        workspace.replace_folder(*replace == Replace::Any)?;
-        sync(&parts(target)?.0)
+        sync_tree(&self.content)?;
+        publish::publish_folder(&self.workspace, &self.target, self.replace)
     }
+}
+
+/// Creates the workspace of an output. Leftovers of killed runs with this output are repaired and removed first.
+fn staged(target: &Path, kind: Kind, replace: Replace) -> Result<Workspace> {
+    tidy(target);
+    check_replace(target, kind, replace)?;
+    Workspace::beside(target)
+}
+
+/// Creates a workspace for scratch files in `folder`. Scratch files of killed runs are removed first.
+fn scratch_in(folder: &Path) -> Result<Workspace> {
+    let target = folder.join(SCRATCH);
+    tidy(&target);
+    Workspace::beside(&target)
 }
 
 /// A file for as long as a run lasts, for whoever needs a path: removed when this is dropped.
@@ -210,7 +268,7 @@ impl ScratchFile {
     /// # Errors
     /// A folder that does not exist; the system refuses.
     pub fn new(folder: &Path) -> Result<ScratchFile> {
-        let workspace = Workspace::beside(&folder.join(SCRATCH))?;
+        let workspace = scratch_in(folder)?;
         Ok(ScratchFile { content: workspace.content(), _workspace: workspace })
     }
 
@@ -241,69 +299,6 @@ impl ScratchFolder {
     }
 }
 
-/// A target and where its content is meanwhile.
-#[derive(Debug)]
-struct Staged {
-    target: PathBuf,
-    content: PathBuf,
-    kind: Kind,
-    replace: Replace,
-    workspace: Workspace,
-}
-
-impl Staged {
-    fn new(target: &Path, kind: Kind, replace: Replace) -> Result<Staged> {
-        let workspace = Workspace::beside(target)?;
-        let staged = Staged { target: target.to_owned(), content: workspace.content(), kind, replace, workspace };
-        staged.refuse_newcomer()?;
-        Ok(staged)
-    }
-
-    /// What has the name now may be another than when the run began.
-    fn refuse_newcomer(&self) -> Result<()> {
-        if present(&self.target) { may_go(&self.target, self.kind, self.replace) } else { Ok(()) }
-    }
-}
-
-fn exists(target: &Path) -> Error {
-    Error::usage(format!(
-        "{} exists already\n  --overwrite replaces a result of splatsieve, --force whatever is there",
-        target.display()
-    ))
-}
-
-/// Whether there is a folder, no link to one, with nothing in it.
-fn is_empty_folder(target: &Path) -> bool {
-    fs::symlink_metadata(target).is_ok_and(|found| found.is_dir())
-        && entries(target).is_ok_and(|entries| entries.is_empty())
-}
-
-/// Confirms that what is at `target` may be replaced.
-fn may_go(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
-    let shown = target.display();
-    match (kind, replace) {
-        (_, Replace::Any) => Ok(()),
-        (Kind::Folder, _) if is_empty_folder(target) => Ok(()),
-        (_, Replace::Never) => Err(exists(target)),
-        (Kind::File, Replace::Ours) if is_our_file(target) => Ok(()),
-        (Kind::File, Replace::Ours) => Err(Error::usage(format!(
-            "{shown} exists already, and nothing says that splatsieve wrote it: it is no container, and no summary beside \
-             it lists it\n  --force replaces it all the same; or give another output"
-        ))),
-        (Kind::Folder, Replace::Ours) => match Owner::of(&target.join(MARKER)) {
-            Owner::Listed(_) => Ok(()),
-            Owner::Unlisted => Err(Error::usage(format!(
-                "{shown} is a result of a splatsieve that did not list its files yet, so nobody can tell what else is in \
-                 it\n  --force replaces it with all that is in it; or give another output"
-            ))),
-            Owner::Unknown => Err(Error::usage(format!(
-                "{shown} is not a result of splatsieve (no {MARKER} of its own), so --overwrite leaves it alone\n  \
-                 --force replaces it with all that is in it; or give another output"
-            ))),
-        },
-    }
-}
-
 /// The same failure of the system, of the file that a person asked for where it is one that it grows in meanwhile.
 pub fn as_named(error: Error) -> Error {
     let (action, path, source) = match error {
@@ -321,10 +316,6 @@ pub fn as_named(error: Error) -> Error {
 
 /// Writes a file or the list of names of a folder through to the disk.
 fn sync(path: &Path) -> Result<()> {
-    // Only Unix opens folders as files.
-    if cfg!(not(unix)) && path.is_dir() {
-        return Ok(());
-    }
     File::open(path).and_then(|file| file.sync_all()).map_err(Error::io("sync", path))
 }
 

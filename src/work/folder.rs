@@ -8,7 +8,8 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::Serialize;
 
-use super::piece::{Name, Piece, names};
+use super::piece::{ENDING, Name, Piece, names};
+use crate::emit::atomic::remove_leftovers;
 use crate::error::{Error, Result};
 use crate::model::ranges;
 
@@ -97,6 +98,7 @@ pub fn clean(folder: &Path) -> Result<(usize, u64)> {
         fs::remove_file(&path).map_err(Error::io("remove", &path))?;
         files += 1;
     }
+    remove_leftovers(folder, ENDING);
     // Other files are somebody else's.
     let _ = fs::remove_dir(folder);
     Ok((files, bytes))

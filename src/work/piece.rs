@@ -32,7 +32,7 @@ const VERSION: u32 = 1;
 /// Bytes before the text.
 const HEADER: usize = 48;
 /// Ends the names of pieces.
-const ENDING: &str = ".piece";
+pub(super) const ENDING: &str = ".piece";
 /// Bytes of all texts in a piece, at most.
 const MOST_TEXT: u64 = 8 << 20;
 

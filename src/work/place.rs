@@ -11,8 +11,9 @@ use serde::de::DeserializeOwned;
 
 use super::key::Key;
 use super::part::MOST_PARTS;
-use super::piece::{Name, Piece, names};
+use super::piece::{ENDING, Name, Piece, names};
 use super::spill::{Spill, Spilling};
+use crate::emit::atomic::remove_leftovers;
 use crate::error::{Error, Result};
 
 /// A work folder that is written to.
@@ -32,7 +33,10 @@ impl Place {
                 Err(Error::io("create the work folder", folder)(error))
             }
             _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.display()))),
-            _ => Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about }),
+            _ => {
+                remove_leftovers(folder, ENDING);
+                Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about })
+            }
         }
     }
 

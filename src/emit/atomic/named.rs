@@ -5,37 +5,64 @@
 
 use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
-use std::fs;
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
+use serde::Deserialize;
+
+use super::handle::Handle;
 use crate::error::{Error, Result, quoted};
 
 /// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
 /// result's own; [`super::StagedFolder::commit`] and [`super::commit_files`] enter them.
 pub const MARKER: &str = "summary.json";
 
-/// What a summary says of the files it stands for.
+/// Bytes of the largest file that is read as a summary, 16 MiB: the list of some 500,000 files. A larger file is not a
+/// summary of this program, and not read.
+const MAX_SUMMARY: u64 = 16 << 20;
+
+/// Ownership that a summary declares.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Owner {
-    /// There is none, or another program's.
+    /// There is no summary, or it is another program's.
     Unknown,
-    /// This program's, from before it listed its files.
+    /// A result of this program from before summaries listed their files.
     Unlisted,
-    /// These files are a result's.
+    /// A result of this program with these files.
     Listed(BTreeSet<String>),
 }
 
+/// Entries of a summary that say whose it is. Other entries are skipped without keeping them in memory.
+#[derive(Deserialize)]
+struct Declared {
+    tool: String,
+    files: Option<BTreeSet<String>>,
+}
+
 impl Owner {
-    /// What the summary at `path` says.
-    pub(super) fn of(path: &Path) -> Owner {
-        let Ok(text) = fs::read_to_string(path) else { return Owner::Unknown };
-        let summary: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-        if !summary["tool"].as_str().is_some_and(|tool| tool.starts_with("splatsieve")) {
+    /// Reads the summary at `path`; a link to a summary counts as one.
+    pub(super) fn read(path: &Path) -> Owner {
+        // Opening a FIFO would wait for its writer.
+        let opened = File::options().read(true).custom_flags(libc::O_NONBLOCK).open(path);
+        opened.map_or(Owner::Unknown, Owner::read_file)
+    }
+
+    /// Reads the summary in `file`.
+    pub(super) fn read_file(mut file: File) -> Owner {
+        if !file.metadata().is_ok_and(|found| found.is_file() && found.len() <= MAX_SUMMARY) {
             return Owner::Unknown;
         }
-        match summary["files"].as_array() {
-            Some(files) => Owner::Listed(files.iter().filter_map(|file| Some(file.as_str()?.to_owned())).collect()),
-            None => Owner::Unlisted,
+        let mut text = Vec::new();
+        if (&mut file).take(MAX_SUMMARY).read_to_end(&mut text).is_err() || !text.trim_ascii_start().starts_with(b"{") {
+            return Owner::Unknown;
+        }
+        match serde_json::from_slice::<Declared>(&text) {
+            Ok(Declared { tool, files }) if tool.starts_with("splatsieve") => {
+                files.map_or(Owner::Unlisted, Owner::Listed)
+            }
+            _ => Owner::Unknown,
         }
     }
 }
@@ -52,7 +79,7 @@ pub(super) fn is_our_file(path: &Path) -> bool {
     // Of x.ply and of x.ply.recipe.toml it is x.ply.summary.json.
     let ends = name.match_indices('.').map(|(dot, _)| dot).chain([name.len()]);
     ends.map(|end| path.with_file_name(format!("{}.{MARKER}", &name[..end])))
-        .any(|summary| matches!(Owner::of(&summary), Owner::Listed(files) if files.contains(name)))
+        .any(|summary| matches!(Owner::read(&summary), Owner::Listed(files) if files.contains(name)))
 }
 
 /// Writes into the summary at `path` that these are its files.
@@ -90,46 +117,56 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
     Ok(files)
 }
 
-/// Moves from the folder `old` into `new` what the summary of `old` does not name. What has the place of a file
-/// that `new` has goes beside it, under its name with `.kept` behind.
+/// Moves the entries of the folder `old` that its summary does not list into the folder `new`. Where `new` has an entry of
+/// the same name, the moved one gets `.kept` behind its name.
 ///
-/// May be repeated after it was broken off at any point: nothing is ever in neither of the two.
-pub(super) fn carry_foreign(old: &Path, new: &Path) -> Result<()> {
-    let named = match Owner::of(&old.join(MARKER)) {
-        Owner::Listed(named) => named,
-        Owner::Unknown | Owner::Unlisted => BTreeSet::new(),
+/// Entries that cannot be moved stay, and the first failure is returned. May be repeated after it was interrupted at
+/// any point: every entry is always in exactly one of both folders.
+pub(super) fn carry_foreign(old: &Handle, new: &Path) -> io::Result<()> {
+    let listed = match old.open_file(MARKER, false).map(Owner::read_file) {
+        Ok(Owner::Listed(listed)) => listed,
+        _ => BTreeSet::new(),
     };
     let mut foreign = Vec::new();
-    find_foreign(old, new, Path::new(""), &named, &mut foreign)?;
+    let mut result = find_foreign(old, new, Path::new(""), &listed, &mut foreign);
     for relative in foreign {
-        let (from, to) = (old.join(&relative), free_place(new, &relative));
-        let folder = parts(&to)?.0;
-        fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
-        fs::rename(&from, &to).map_err(Error::io("keep", &from))?;
+        let to = free_place(new, &relative);
+        let made = to.parent().map_or(Ok(()), fs::create_dir_all);
+        result = result.and(made.and_then(|()| old.move_to(&relative, &to)));
     }
-    Ok(())
+    result
 }
 
-/// Files of `old` that `named` does not hold, and folders that hold nothing else and are not in `new`.
-fn find_foreign(old: &Path, new: &Path, inside: &Path, named: &BTreeSet<String>, out: &mut Vec<PathBuf>) -> Result<()> {
-    for entry in entries(&old.join(inside))? {
-        let relative = inside.join(entry);
+/// Collects the relative paths of files in `folder`, which is `inside` the old result, that `listed` does not hold, and of
+/// folders that hold no listed file and do not exist in `new`. Folders that cannot be read are skipped; the first failure
+/// is returned.
+fn find_foreign(
+    folder: &Handle,
+    new: &Path,
+    inside: &Path,
+    listed: &BTreeSet<String>,
+    out: &mut Vec<PathBuf>,
+) -> io::Result<()> {
+    let mut result = Ok(());
+    for entry in folder.entries()? {
+        let relative = inside.join(&entry);
         let name = listed_name(&relative);
-        if !is_folder(&old.join(&relative)) {
-            if !named.contains(&name) {
+        if !folder.has_folder(&entry) {
+            if !listed.contains(&name) {
                 out.push(relative);
             }
             continue;
         }
         let below = format!("{name}/");
-        let is_shared = named.range(below.clone()..).next().is_some_and(|next| next.starts_with(&below));
+        let is_shared = listed.range(below.clone()..).next().is_some_and(|next| next.starts_with(&below));
         if is_shared || is_folder(&new.join(&relative)) {
-            find_foreign(old, new, &relative, named, out)?;
+            let found = folder.open_folder(&entry);
+            result = result.and(found.and_then(|inner| find_foreign(&inner, new, &relative, listed, out)));
         } else {
             out.push(relative);
         }
     }
-    Ok(())
+    result
 }
 
 /// A path below `folder` that nothing has and that can be made: `relative`, but for what is in its way.

@@ -166,7 +166,7 @@ fn impossible_targets_are_refused() {
 /// What a run leaves beside `base/out` that is killed: its folder, and the file whose lock it held.
 fn left_behind(base: &Path, random: &str) -> PathBuf {
     let folder = base.join(format!(".out.{random}.splatsieve-tmp"));
-    put(&folder.join("lock"), "");
+    put(&folder.join("lock"), workspace::LOCK_LINE);
     folder
 }
 
@@ -183,7 +183,13 @@ fn leftovers_of_killed_runs_go_and_those_of_running_ones_stay() {
     fs4::FileExt::lock(&lock).unwrap();
     put(&runs.join("content"), "half");
     // Somebody else's, whatever they are called.
-    let kept = [".other.dead1.splatsieve-tmp/lock", ".out.a.b.splatsieve-tmp/lock", ".out.x.splatsieve-tmp/no lock"];
+    // A folder without the line in its lock is foreign.
+    let kept = [
+        ".other.dead1.splatsieve-tmp/lock",
+        ".out.a.b.splatsieve-tmp/lock",
+        ".out.x.splatsieve-tmp/no lock",
+        ".out.y.splatsieve-tmp/lock",
+    ];
     kept.iter().for_each(|name| put(&base.path().join(name), ""));
     let first = StagedFolder::new(&target, Replace::Never).unwrap();
     let second = StagedFolder::new(&target, Replace::Never).unwrap();
@@ -285,16 +291,22 @@ fn a_summary_lists_its_files_and_keeps_its_order() {
     assert_eq!(names(base.path()), ["out"]);
 }
 
+/// Prepares `x.ply` and its two companions in `base`, with `text` in each.
+fn stage_set(base: &Path, text: &str, replace: Replace) -> Result<StagedFiles> {
+    let companions = ["x.ply.summary.json", "x.ply.recipe.toml"].map(|name| base.join(name)).to_vec();
+    let staged = StagedFiles::new(&base.join("x.ply"), companions, replace)?;
+    put(staged.path(), text);
+    put(&staged.companion(0), r#"{"tool": "splatsieve 0.1.0"}"#);
+    put(&staged.companion(1), text);
+    Ok(staged)
+}
+
 #[test]
 fn files_side_by_side_are_known_by_the_summary_that_lists_them() {
     let base = tempfile::tempdir().unwrap();
     let target = |name: &str| base.path().join(name);
     let names_of = ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"];
-    let stage = |replace| names_of.map(|name| StagedFile::new(&target(name), replace).unwrap());
-    let files = stage(Replace::Never);
-    files.iter().for_each(|file| put(file.path(), r#"{"tool": "splatsieve 0.1.0"}"#));
-    commit_files(&files).unwrap();
-    drop(files);
+    stage_set(base.path(), "", Replace::Never).unwrap().commit().unwrap();
     assert_eq!(names(base.path()), names_of);
     put(&target("x.ply.notes"), "precious");
     put(&target("x.csv"), "precious");
@@ -305,7 +317,79 @@ fn files_side_by_side_are_known_by_the_summary_that_lists_them() {
         assert!(refusal(&target(name), Kind::File, &[], Replace::Ours).contains("--force"));
         check_target(&target(name), Kind::File, &[], Replace::Any).unwrap();
     }
-    drop(stage(Replace::Ours));
+    drop(stage_set(base.path(), "", Replace::Ours));
+}
+
+/// What a run leaves in `base` that is killed after it published `published` of its companions.
+fn leave_half_published(base: &Path, published: usize, replace: Replace) {
+    let left = base.join(".x.ply.dead.splatsieve-tmp");
+    put(&left.join("lock"), workspace::LOCK_LINE);
+    let files = [("a", "x.ply.recipe.toml"), ("b", "x.ply.summary.json"), ("content", "x.ply")];
+    for (index, (content, name)) in files.iter().enumerate() {
+        put(&if index < published { base.join(name) } else { left.join(content) }, "of the killed run");
+    }
+    let files = files.map(|(content, name)| (content.to_owned(), name.into())).to_vec();
+    let journal = serde_json::to_string(&leftovers::Journal { replace, files }).unwrap();
+    put(&left.join("journal"), &journal);
+}
+
+#[test]
+fn a_killed_publication_is_completed_by_the_next_run() {
+    for published in 0..=3 {
+        let base = tempfile::tempdir().unwrap();
+        leave_half_published(base.path(), published, Replace::Never);
+        assert!(refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Never).contains("exists already"));
+        assert_eq!(names(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
+        for name in names(base.path()) {
+            assert_eq!(fs::read_to_string(base.path().join(name)).unwrap(), "of the killed run");
+        }
+    }
+}
+
+#[test]
+fn a_killed_publication_is_never_completed_over_a_later_one() {
+    let base = tempfile::tempdir().unwrap();
+    let staged = stage_set(base.path(), "new", Replace::Any).unwrap();
+    leave_half_published(base.path(), 1, Replace::Any);
+    staged.commit().unwrap();
+    check_target(&base.path().join("x.ply"), Kind::File, &[], Replace::Any).unwrap();
+    assert_eq!(names(base.path()), ["x.ply", "x.ply.recipe.toml", "x.ply.summary.json"]);
+    assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "new");
+    assert_eq!(fs::read_to_string(base.path().join("x.ply.recipe.toml")).unwrap(), "new");
+}
+
+#[test]
+fn a_killed_publication_does_not_replace_a_file_that_came_later() {
+    let base = tempfile::tempdir().unwrap();
+    leave_half_published(base.path(), 1, Replace::Never);
+    put(&base.path().join("x.ply"), "precious");
+    refusal(&base.path().join("x.ply"), Kind::File, &[], Replace::Ours);
+    assert_eq!(fs::read_to_string(base.path().join("x.ply")).unwrap(), "precious");
+    assert!(take_warnings().iter().any(|warning| warning.contains("could not be repaired")));
+}
+
+#[test]
+fn of_two_runs_without_flags_one_publishes() {
+    let base = tempfile::tempdir().unwrap();
+    let staged = [0, 1].map(|run| stage_set(base.path(), &run.to_string(), Replace::Never).unwrap());
+    let mut done = 0;
+    std::thread::scope(|scope| {
+        let threads = staged.map(|staged| scope.spawn(move || staged.commit().is_ok()));
+        done = threads.into_iter().map(|thread| usize::from(thread.join().unwrap())).sum();
+    });
+    assert_eq!(done, 1);
+    let text = |name: &str| fs::read_to_string(base.path().join(name)).unwrap();
+    assert_eq!(text("x.ply"), text("x.ply.recipe.toml"));
+}
+
+#[test]
+fn a_summary_larger_than_the_limit_is_not_read() {
+    let base = tempfile::tempdir().unwrap();
+    let path = base.path().join("summary.json");
+    put(&path, r#"{"tool": "splatsieve 0.1.0", "files": ["a"]}"#);
+    assert!(matches!(named::Owner::read(&path), named::Owner::Listed(_)));
+    File::options().write(true).open(&path).unwrap().set_len(3 << 30).unwrap();
+    assert_eq!(named::Owner::read(&path), named::Owner::Unknown);
 }
 
 #[test]

@@ -1,103 +1,124 @@
-//! Where an output grows: a hidden folder beside its target, which a lock marks as somebody's.
+//! Hidden folders in which outputs are written before they get their names.
 //!
-//! `.<name>.<random>.splatsieve-tmp` holds `lock`; `content`, what is being written; and, while an earlier folder
-//! is replaced, that one. The system drops the lock with the process that holds it, whatever ends it, so a lock that
-//! can be taken is a leftover's. It holds between containers and, where the file system passes locks on, between
-//! machines; process ids, which mean something else in every container, decide nothing. On a file
-//! system without locks nothing is ever a leftover: it is for a person to remove.
+//! A workspace `.<name>.<random>.splatsieve-tmp` lies beside its target. It holds `lock`, what is being written, and, while
+//! an earlier folder is replaced, that folder. The lock file contains a line that marks the workspace as created by this
+//! program; a folder without it is somebody else's and stays untouched, whatever its name is.
+//!
+//! The system releases the lock when the process that holds it ends, for whatever reason, so a workspace whose lock can
+//! be taken is a leftover. Locks hold between containers and, where the file system supports it, between machines; process
+//! ids, which have another meaning in every container, are not used. On a file system without locks no workspace is
+//! recognized as a leftover; a person has to remove it.
 
 use std::collections::BTreeMap;
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use fs4::{FileExt, TryLockError};
 
-use super::named::{carry_foreign, entries, parts, present};
+use super::handle::{Handle, Identity};
+use super::named::{parts, present};
 use crate::error::{Error, Result};
 
-/// What the names of scratch files are made of, in whatever folder.
+/// Target name of scratch files, in any folder.
 pub(super) const SCRATCH: &str = "splatsieve-scratch";
-/// Ends the names of these folders.
+/// Ends the names of workspaces.
 const ENDING: &str = ".splatsieve-tmp";
-/// The file whose lock says that a run goes on.
+/// File whose lock says that the run goes on.
 const LOCK: &str = "lock";
-/// What is being written.
-const CONTENT: &str = "content";
-/// An earlier folder that is replaced but for files that are not its own: they have still to follow its name.
-const REPLACED: &str = "replaced";
-/// An earlier folder that is replaced with all in it.
-const REPLACED_WHOLE: &str = "replaced-whole";
-/// What has only to be deleted.
-const DISCARDED: &str = "discarded";
+/// Content of the lock file. It marks the folder as a workspace of this program.
+pub(super) const LOCK_LINE: &str = "workspace of a splatsieve run\n";
+/// File or folder that is being written.
+pub(super) const CONTENT: &str = "content";
+/// Earlier folder that is being replaced; entries that its summary does not list are moved into the new one.
+pub(super) const REPLACED: &str = "replaced";
+/// Earlier folder that is being replaced with everything in it.
+pub(super) const REPLACED_WHOLE: &str = "replaced-whole";
+/// Entries that only have to be deleted.
+pub(super) const DISCARDED: &str = "discarded";
+/// Journal of files that are being published together.
+pub(super) const JOURNAL: &str = "journal";
+/// Entries of a workspace that must not be deleted with it: the next run with the same output deals with them.
+const UNFINISHED: [&str; 3] = [REPLACED, REPLACED_WHOLE, JOURNAL];
 
-/// The folders of this process with their targets. Whoever renames holds it, so that a signal comes before a
-/// result has its name or after.
-static LIVE: Mutex<BTreeMap<PathBuf, PathBuf>> = Mutex::new(BTreeMap::new());
+/// Workspaces of this process. A thread that publishes a result holds the guard, so that a signal is handled either before
+/// the result has its name or after.
+static LIVE: Mutex<BTreeMap<PathBuf, Identity>> = Mutex::new(BTreeMap::new());
 
-fn live() -> MutexGuard<'static, BTreeMap<PathBuf, PathBuf>> {
-    // A map stays whole whatever panics beside it.
+pub(super) fn live() -> MutexGuard<'static, BTreeMap<PathBuf, Identity>> {
+    // The map is consistent even if a thread panicked beside it.
     LIVE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A hidden folder for the content of one target, gone when this is dropped.
+/// Hidden folder for the content of one target. Dropping it removes the folder.
 #[derive(Debug)]
 pub(super) struct Workspace {
-    folder: PathBuf,
-    target: PathBuf,
-    /// None on a file system without locks.
+    pub(super) folder: PathBuf,
+    identity: Identity,
+    /// `None` on a file system without locks.
     lock: Option<File>,
 }
 
 impl Workspace {
-    /// A new one beside `target`. What killed runs left there of theirs, and of scratch files, is settled and removed.
+    /// Creates a workspace beside `target`.
     pub(super) fn beside(target: &Path) -> Result<Workspace> {
         let (parent, name) = parts(target)?;
-        tidy(target)?;
-        tidy(&target.with_file_name(SCRATCH))?;
-        let mut prefix = std::ffi::OsString::from(".");
+        let mut prefix = OsString::from(".");
         prefix.push(name);
         prefix.push(".");
         loop {
-            // Held until the folder is listed: no signal finds it unknown.
+            // Held until the folder is listed, so that a signal handler knows of it.
             let mut live = live();
             let made = tempfile::Builder::new().prefix(&prefix).suffix(ENDING).tempdir_in(&parent);
             let made = made.map_err(Error::io("create a folder in", &parent))?;
             let claimed = claim(made.path()).map_err(Error::io("create a lock in", made.path()))?;
-            if let Claim::Held(lock) = claimed {
-                let folder = made.keep();
-                live.insert(folder.clone(), target.to_owned());
-                return Ok(Workspace { folder, target: target.to_owned(), lock });
+            if let Some(workspace) = claimed {
+                let _ = made.keep();
+                live.insert(workspace.folder.clone(), workspace.identity);
+                return Ok(workspace);
             }
         }
     }
 
-    /// Where to write.
+    /// Creates the workspace `name` in the folder `parent`; `None` if the name is taken.
+    pub(super) fn with_name(parent: &Path, name: &OsStr) -> io::Result<Option<Workspace>> {
+        let folder = parent.join(name);
+        let mut live = live();
+        match rustix::fs::mkdir(&folder, rustix::fs::Mode::RWXU) {
+            Err(rustix::io::Errno::EXIST) => return Ok(None),
+            made => made?,
+        }
+        let claimed = claim(&folder);
+        match &claimed {
+            Ok(Some(workspace)) => _ = live.insert(folder, workspace.identity),
+            Ok(None) => (),
+            Err(_) => {
+                let _ = fs::remove_file(folder.join(LOCK));
+                let _ = fs::remove_dir(&folder);
+            }
+        }
+        claimed
+    }
+
+    /// Path of the main file or folder that is written in this workspace.
     pub(super) fn content(&self) -> PathBuf {
         self.folder.join(CONTENT)
     }
 
-    /// Gives the content its name, over an earlier folder if there is one: with all in it if `whole`, else but for the
-    /// files that it does not name as its own.
-    ///
-    /// A run that is killed meanwhile leaves the old or the new one whole; the next output of that name or, after a
-    /// signal, this run moves what has still to follow.
-    pub(super) fn replace_folder(&self, whole: bool) -> Result<()> {
-        let held = live();
-        let aside = self.folder.join(if whole { REPLACED_WHOLE } else { REPLACED });
-        if present(&self.target) {
-            fs::rename(&self.target, &aside).map_err(Error::io("move aside", &self.target))?;
+    /// Whether the workspace holds files that must not be deleted with it.
+    fn is_unfinished(&self) -> bool {
+        UNFINISHED.iter().any(|name| present(&self.folder.join(name)))
+    }
+
+    /// Writes the lock file and the names in the workspace through to the disk.
+    pub(super) fn sync(&self) -> io::Result<()> {
+        if let Some(lock) = &self.lock {
+            lock.sync_all()?;
         }
-        if let Err(error) = fs::rename(self.content(), &self.target) {
-            let _ = fs::rename(&aside, &self.target);
-            return Err(Error::io("write", &self.target)(error));
-        }
-        settle(&self.folder, &self.target)?;
-        drop(held);
-        Ok(())
+        Handle::open(&self.folder)?.sync()
     }
 }
 
@@ -105,26 +126,52 @@ impl Drop for Workspace {
     fn drop(&mut self) {
         let mut live = live();
         live.remove(&self.folder);
-        // Nobody is left to tell of a failure; the next output of that name meets it again.
-        if settle(&self.folder, &self.target).is_ok() {
-            dismantle(&self.folder, self.lock.take());
+        if !self.is_unfinished() {
+            dismantle(&self.folder, self.identity, self.lock.take());
         }
     }
 }
 
-/// What a person calls the file at `path`, if it is one that grows in such a folder: the target, or a file in it; of a
-/// scratch file, which has no name that says anything, the folder that it is in.
+/// Name of the workspace of `name` that is not random, for the run that publishes its result under this name.
+pub(super) fn publishing_name(name: &OsStr) -> OsString {
+    let mut workspace = OsString::from(".");
+    workspace.push(name);
+    workspace.push(".publish");
+    workspace.push(ENDING);
+    workspace
+}
+
+/// Whether a workspace holds an earlier folder or a journal, which must be dealt with before it is removed.
+pub(super) fn is_unfinished(folder: &Handle) -> bool {
+    UNFINISHED.iter().any(|name| folder.has(name))
+}
+
+/// Whether an entry has the name of a workspace of `name`.
+pub(super) fn is_workspace(entry: &OsStr, name: &OsStr) -> bool {
+    let rest = entry.as_encoded_bytes().strip_prefix(b".").and_then(|rest| rest.strip_prefix(name.as_encoded_bytes()));
+    let random = rest.and_then(|rest| rest.strip_prefix(b".")?.strip_suffix(ENDING.as_bytes()));
+    random.is_some_and(|random| !random.is_empty() && random.iter().all(u8::is_ascii_alphanumeric))
+}
+
+/// Name of the target of the workspace `entry`; `None` if the name is not one of a workspace.
+pub(super) fn target_name(entry: &OsStr) -> Option<&str> {
+    hidden_name(entry, ENDING)
+}
+
+/// Returns `name` of `.name.random` before `ending`.
+fn hidden_name<'a>(entry: &'a OsStr, ending: &str) -> Option<&'a str> {
+    let name = entry.to_str()?.strip_prefix('.')?.strip_suffix(ending)?;
+    Some(name.rsplit_once('.')?.0)
+}
+
+/// Translates a path in a workspace into the path that the user gave: the target or a file in it. For a scratch file, whose
+/// name means nothing to the user, returns its folder and `true`. Returns `None` for other paths.
 pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
-    // Of `.name.random` the name.
-    let name_of = |part: &OsStr, ending: &str| -> Option<String> {
-        let name = part.to_str()?.strip_prefix('.')?.strip_suffix(ending)?;
-        Some(name.rsplit_once('.')?.0.to_owned())
-    };
     let mut parts = path.components();
     let mut before = PathBuf::new();
     let name = loop {
         let part = parts.next()?;
-        match name_of(part.as_os_str(), ENDING) {
+        match target_name(part.as_os_str()) {
             Some(name) => break name,
             None => before.push(part),
         }
@@ -133,43 +180,33 @@ pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
         return Some((before, true));
     }
     before.push(name);
-    // Containers grow under a hidden name of their own.
+    // Containers are written under a hidden name of their own.
     before.extend(
         parts
             .skip(1)
-            .map(|part| name_of(part.as_os_str(), ".tmp").map_or_else(|| part.as_os_str().to_owned(), Into::into)),
+            .map(|part| hidden_name(part.as_os_str(), ".tmp").map_or_else(|| part.as_os_str().to_owned(), Into::into)),
     );
     Some((before, false))
 }
 
-/// Gives files their names, all or none where a signal comes.
-pub(super) fn rename_files(files: &[(&Workspace, &Path)]) -> Result<()> {
-    let held = live();
-    for (workspace, target) in files {
-        fs::rename(workspace.content(), target).map_err(Error::io("write", target))?;
-    }
-    drop(held);
-    Ok(())
-}
-
-/// While this lasts nothing of this process gets a name any more, or is removed; see [`withdraw_all`].
+/// While this value exists, the process neither publishes nor removes an output; see [`withdraw_all`].
 #[must_use = "runs go on as soon as this is dropped"]
-pub struct Withdrawn(#[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, PathBuf>>);
+pub struct Withdrawn(#[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, Identity>>);
 
-/// Removes everything that this process has begun and not yet given its name; for a process about to end.
+/// Removes everything that this process has begun and not published, for a process that is about to end.
 ///
-/// A result that is being renamed is waited for, and is then whole. Files that this module did not hand out stay.
+/// Waits for a result that is being published, which is then complete. Files outside workspaces stay.
 pub fn withdraw_all() -> Withdrawn {
     let mut live = live();
-    for (folder, target) in std::mem::take(&mut *live) {
-        if settle(&folder, &target).is_err() {
+    for (folder, identity) in std::mem::take(&mut *live) {
+        if UNFINISHED.iter().any(|name| present(&folder.join(name))) {
             continue;
         }
-        // Whoever still writes into it finds no folder from here on.
+        // Threads that still write into it find no folder from here on.
         let _ = fs::rename(folder.join(CONTENT), folder.join(DISCARDED));
-        // What a writer just began may appear while the folder is emptied.
+        // A file that a thread is just creating may appear while the folder is emptied.
         for _ in 0..100 {
-            dismantle(&folder, None);
+            dismantle(&folder, identity, None);
             if !present(&folder) {
                 break;
             }
@@ -179,85 +216,107 @@ pub fn withdraw_all() -> Withdrawn {
     Withdrawn(live)
 }
 
-/// What became of a new folder.
-enum Claim {
-    /// It is this run's, with its lock where there are locks.
-    Held(Option<File>),
-    /// A run that tidies was faster.
-    Lost,
-}
-
-fn claim(folder: &Path) -> io::Result<Claim> {
+/// Locks and marks the new workspace `folder`; `None` if another run took it for a leftover and removes it.
+fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
     let path = folder.join(LOCK);
-    let file = match OpenOptions::new().read(true).write(true).create_new(true).open(&path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Claim::Lost),
+    let mut file = match OpenOptions::new().read(true).write(true).create_new(true).open(&path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         opened => opened?,
     };
-    Ok(match FileExt::try_lock(&file) {
-        Err(TryLockError::WouldBlock) => Claim::Lost,
-        // Whoever removes a folder holds its lock: what is still there under this one stays.
-        Ok(()) if present(&path) => Claim::Held(Some(file)),
-        Ok(()) => Claim::Lost,
-        Err(TryLockError::Error(_)) => Claim::Held(None),
-    })
+    let lock = match FileExt::try_lock(&file) {
+        Err(TryLockError::WouldBlock) => return Ok(None),
+        // Whoever removes a folder holds its lock: a lock file that still has its name stays.
+        Ok(()) if present(&path) => true,
+        Ok(()) => return Ok(None),
+        Err(TryLockError::Error(_)) => false,
+    };
+    file.write_all(LOCK_LINE.as_bytes())?;
+    let identity = match Handle::open(folder) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        opened => opened?.status()?.identity,
+    };
+    Ok(Some(Workspace { folder: folder.to_owned(), identity, lock: lock.then_some(file) }))
 }
 
-/// Settles and removes what killed runs left beside `target` of their own outputs of that name.
-fn tidy(target: &Path) -> Result<()> {
-    let (parent, name) = parts(target)?;
-    let mut left = entries(&parent)?;
-    left.retain(|entry| is_workspace(entry, name));
-    // A lock of this process may be lost by opening its file once more, where locks are the network's.
-    let live: Vec<PathBuf> = live().keys().cloned().collect();
-    for folder in left.iter().map(|entry| parent.join(entry)).filter(|folder| !live.contains(folder)) {
-        let lock = match OpenOptions::new().read(true).write(true).open(folder.join(LOCK)) {
+/// Workspace whose run has ended, with its lock.
+pub(super) struct Leftover {
+    name: OsString,
+    pub(super) folder: Handle,
+    lock: File,
+}
+
+/// Why a workspace is not a leftover that may be taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Refusal {
+    /// Its run goes on, or another run is looking at it.
+    Busy,
+    /// This program did not create it for this user, or it is gone.
+    Foreign,
+}
+
+impl Leftover {
+    /// Takes the workspace `name` in `parent` if this program created it for this user and its run has ended.
+    pub(super) fn take(parent: &Handle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
+        let foreign = |_: io::Error| Refusal::Foreign;
+        let folder = parent.open_folder(name).map_err(foreign)?;
+        let status = folder.status().map_err(foreign)?;
+        // SAFETY: the call takes no arguments and cannot fail.
+        let is_own = status.owner == unsafe { libc::geteuid() };
+        // A network file system may release this process's own lock when the lock file is opened a second time.
+        if !is_own || live().values().any(|&identity| identity == status.identity) {
+            return Err(Refusal::Foreign);
+        }
+        let mut lock = match folder.open_file(LOCK, true) {
             Ok(lock) => lock,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                // About to get its lock, which then fails and is tried again; or nearly gone.
-                let _ = fs::remove_dir(&folder);
-                continue;
+            Err(error) => {
+                // Its run is about to create the lock, then fails and tries again; or the folder is nearly removed.
+                if error.kind() == io::ErrorKind::NotFound {
+                    let _ = parent.remove_empty(name);
+                }
+                return Err(Refusal::Foreign);
             }
-            Err(_) => continue,
         };
-        if FileExt::try_lock(&lock).is_ok() {
-            settle(&folder, target)?;
-            dismantle(&folder, Some(lock));
+        match FileExt::try_lock(&lock) {
+            Ok(()) => (),
+            Err(TryLockError::WouldBlock) => return Err(Refusal::Busy),
+            Err(TryLockError::Error(_)) => return Err(Refusal::Foreign),
         }
+        let mut line = String::new();
+        (&mut lock).take(LOCK_LINE.len() as u64 + 1).read_to_string(&mut line).map_err(foreign)?;
+        // A run that was killed before it had written the line has left a private folder with an empty lock file.
+        let is_begun =
+            || LOCK_LINE.starts_with(&line) && status.is_private && folder.entries().is_ok_and(|names| names == [LOCK]);
+        let is_marked = line == LOCK_LINE || is_begun();
+        if is_marked { Ok(Leftover { name: name.to_owned(), folder, lock }) } else { Err(Refusal::Foreign) }
     }
-    Ok(())
+
+    /// Removes the workspace. What cannot be removed stays and does no harm.
+    pub(super) fn remove(self, parent: &Handle) {
+        empty(&self.folder, Some(self.lock));
+        let _ = parent.remove_empty(&self.name);
+    }
 }
 
-/// Whether an entry has the name of a folder for the content of `name`.
-fn is_workspace(entry: &OsStr, name: &OsStr) -> bool {
-    let rest = entry.as_encoded_bytes().strip_prefix(b".").and_then(|rest| rest.strip_prefix(name.as_encoded_bytes()));
-    let random = rest.and_then(|rest| rest.strip_prefix(b".")?.strip_suffix(ENDING.as_bytes()));
-    random.is_some_and(|random| !random.is_empty() && random.iter().all(u8::is_ascii_alphanumeric))
+/// Removes the workspace at `folder` if it is still the one with this identity.
+fn dismantle(folder: &Path, identity: Identity, lock: Option<File>) {
+    let Ok((parent, name)) = parts(folder) else { return };
+    let Ok(parent) = Handle::open(&parent) else { return };
+    let Ok(handle) = parent.open_folder(name) else { return };
+    if handle.status().is_ok_and(|status| status.identity == identity) {
+        empty(&handle, lock);
+        let _ = parent.remove_empty(name);
+    }
 }
 
-/// Ends what was between its renames: the earlier folder gets its name back if nothing else has it, else what is
-/// not its own follows the name.
-fn settle(folder: &Path, target: &Path) -> Result<()> {
-    let (replaced, discarded) = (folder.join(REPLACED), folder.join(DISCARDED));
-    for aside in [&replaced, &folder.join(REPLACED_WHOLE)] {
-        if present(aside) && !present(target) {
-            fs::rename(aside, target).map_err(Error::io("put back", aside))?;
-        }
+/// Removes everything in a workspace, its lock last.
+fn empty(folder: &Handle, lock: Option<File>) {
+    for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
+        let _ = folder.remove(entry);
     }
-    if present(&replaced) {
-        carry_foreign(&replaced, target)?;
-        // In one step: half of an earlier folder is not to be taken for one.
-        fs::rename(&replaced, &discarded).map_err(Error::io("discard", &replaced))?;
-    }
-    Ok(())
-}
-
-/// Removes a folder, its lock last. What cannot be removed harms nobody.
-fn dismantle(folder: &Path, lock: Option<File>) {
-    for entry in entries(folder).unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
-        let path = folder.join(entry);
-        let _ = if path.is_dir() && !path.is_symlink() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
-    }
-    // Network file systems keep a file that is open, under another name.
+    // Network file systems keep an open file under another name.
     drop(lock);
-    let _ = fs::remove_dir_all(folder);
+    let is_empty = folder.entries().is_ok_and(|entries| entries.iter().all(|entry| entry == LOCK));
+    if is_empty {
+        let _ = folder.remove(LOCK);
+    }
 }

@@ -1,0 +1,171 @@
+//! Kinds of outputs, what may be replaced, and what lies at an output path.
+
+use std::fs;
+use std::os::unix::fs::FileTypeExt;
+use std::path::{Path, PathBuf};
+
+use super::named::{MARKER, Owner, entries, is_our_file, parts};
+use crate::error::{Error, Result};
+
+/// Kind of an output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// One file.
+    File,
+    /// A folder with everything in it.
+    Folder,
+}
+
+/// Policy for an output path that already exists.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+pub enum Replace {
+    /// Nothing is replaced.
+    #[default]
+    Never,
+    /// Results of this program are replaced. In a result's folder these are the files that its summary lists; every
+    /// other file stays where it is, or gets `.kept` behind its name where the new result has a file of that name. A
+    /// single file is known as a result if it is a container or if a summary beside it lists it.
+    Ours,
+    /// Any file or folder is replaced, a folder with everything in it.
+    Any,
+}
+
+/// What lies at an output path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Destination {
+    /// Nothing.
+    Free,
+    /// A regular file or a link to one.
+    File,
+    /// A folder.
+    Folder,
+    /// A link to a folder.
+    FolderLink,
+    /// A character device or FIFO, or a link to one. Output is written into it; its name is never replaced.
+    Stream,
+}
+
+/// Finds out what lies at `target`.
+///
+/// # Errors
+/// Sockets, block devices, links to nothing, and links that lead through a system folder to a regular file, as
+/// [`Error::Usage`]: these are neither written nor replaced.
+pub(super) fn destination(target: &Path) -> Result<Destination> {
+    let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.display())));
+    let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
+    let is_link = named.is_symlink();
+    let found = match fs::metadata(target) {
+        Ok(found) => found.file_type(),
+        Err(_) if is_link => return refuse("a link to nothing, which is not replaced"),
+        Err(error) => return Err(Error::io("examine", target)(error)),
+    };
+    if found.is_char_device() || found.is_fifo() {
+        return Ok(Destination::Stream);
+    }
+    if found.is_file() {
+        // Standard output that is redirected to a file: replacing the link would replace a file of the system.
+        return match is_link && leads_through_system_link(target) {
+            true => refuse("a link of the system, which is not replaced"),
+            false => Ok(Destination::File),
+        };
+    }
+    if found.is_dir() {
+        return Ok(if is_link { Destination::FolderLink } else { Destination::Folder });
+    }
+    refuse(if found.is_socket() {
+        "a socket, which cannot be written"
+    } else {
+        "a block device, which is not replaced"
+    })
+}
+
+/// Whether `target` or a link that it leads to lies in `/dev` or `/proc`, as `/dev/stdout` does.
+fn leads_through_system_link(target: &Path) -> bool {
+    let mut link = target.to_owned();
+    // Linux follows at most 40 links.
+    for _ in 0..40 {
+        let Ok((parent, name)) = parts(&link) else { return false };
+        let Ok(parent) = fs::canonicalize(parent) else { return false };
+        let Ok(leads_to) = fs::read_link(parent.join(name)) else { return false };
+        if (parent.starts_with("/dev") && !parent.starts_with("/dev/shm")) || parent.starts_with("/proc") {
+            return true;
+        }
+        link = parent.join(leads_to);
+    }
+    false
+}
+
+/// Confirms that the entry at `target`, if there is one, may be replaced by an output of `kind`.
+///
+/// # Errors
+/// As [`Error::Usage`]: an entry of another kind, or one that `replace` does not allow to replace.
+pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
+    let shown = target.display();
+    let found = destination(target)?;
+    match (kind, found) {
+        (_, Destination::Free) => Ok(()),
+        (Kind::File, Destination::Stream) => {
+            Err(Error::usage(format!("{shown} became a device or FIFO, which is not replaced; give another output")))
+        }
+        (Kind::Folder, Destination::Folder) if is_empty_folder(target) => Ok(()),
+        (_, Destination::File | Destination::Folder | Destination::FolderLink) if replace == Replace::Never => {
+            Err(Error::usage(format!(
+                "{shown} exists already\n  --overwrite replaces a result of splatsieve, --force whatever is there"
+            )))
+        }
+        (Kind::File, Destination::Folder | Destination::FolderLink) => {
+            Err(Error::usage(format!("{shown} is a folder; a file cannot replace it")))
+        }
+        (Kind::Folder, Destination::File | Destination::FolderLink | Destination::Stream) => {
+            Err(Error::usage(format!("{shown} is no folder; a folder cannot replace it")))
+        }
+        _ if replace == Replace::Any => Ok(()),
+        (Kind::File, Destination::File) if is_our_file(target) => Ok(()),
+        (Kind::File, Destination::File) => Err(Error::usage(format!(
+            "{shown} exists already, and nothing says that splatsieve wrote it: it is no container, and no summary beside \
+             it lists it\n  --force replaces it all the same; or give another output"
+        ))),
+        (Kind::Folder, Destination::Folder) => check_folder(target),
+    }
+}
+
+/// Confirms that the folder at `target` is a result of this program that lists its files.
+fn check_folder(target: &Path) -> Result<()> {
+    let shown = target.display();
+    match Owner::read(&target.join(MARKER)) {
+        Owner::Listed(_) => Ok(()),
+        Owner::Unlisted => Err(Error::usage(format!(
+            "{shown} is a result of a splatsieve that did not list its files yet, so nobody can tell what else is in \
+             it\n  --force replaces it with all that is in it; or give another output"
+        ))),
+        Owner::Unknown => Err(Error::usage(format!(
+            "{shown} is not a result of splatsieve (no {MARKER} of its own), so --overwrite leaves it alone\n  \
+             --force replaces it with all that is in it; or give another output"
+        ))),
+    }
+}
+
+/// Whether `target` is an empty folder and not a link to one.
+fn is_empty_folder(target: &Path) -> bool {
+    fs::symlink_metadata(target).is_ok_and(|found| found.is_dir())
+        && entries(target).is_ok_and(|entries| entries.is_empty())
+}
+
+/// Returns the real path of the folder that `target` is written into.
+///
+/// # Errors
+/// As [`Error::Usage`]: a target without a name, a folder that does not exist, a parent that is no folder.
+pub(super) fn real_parent(target: &Path) -> Result<PathBuf> {
+    let (parent, _) = parts(target)?;
+    let real = fs::canonicalize(&parent).map_err(|_| {
+        Error::usage(format!(
+            "{}: the folder {} to write it into does not exist; create it first",
+            target.display(),
+            parent.display()
+        ))
+    })?;
+    match real.is_dir() {
+        true => Ok(real),
+        false => Err(Error::usage(format!("{}: {} is not a folder", target.display(), parent.display()))),
+    }
+}

@@ -1,0 +1,142 @@
+//! Folders addressed by open handles, so that no rename and no link can redirect an operation to another folder.
+
+use std::ffi::{OsStr, OsString};
+use std::fs::File;
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStringExt;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+use rustix::fs::{AtFlags, CWD, Dir, FileType, Mode, OFlags};
+
+/// Device and inode: equal for two paths exactly if both name the same file or folder.
+pub(super) type Identity = (u64, u64);
+
+/// An open folder. Names are relative to it and links are never followed.
+#[derive(Debug)]
+pub(super) struct Handle(OwnedFd);
+
+/// Owner, permissions and identity of a folder.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Status {
+    pub(super) identity: Identity,
+    /// User id of the owner.
+    pub(super) owner: u32,
+    /// Whether group and others may neither read nor write.
+    pub(super) is_private: bool,
+}
+
+impl Handle {
+    /// Opens the folder at `path`, or the folder that a link at `path` leads to.
+    pub(super) fn open(path: &Path) -> io::Result<Handle> {
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+        Ok(Handle(rustix::fs::open(path, flags, Mode::empty())?))
+    }
+
+    /// Opens the folder `name` in this folder. A link is an error.
+    pub(super) fn open_folder(&self, name: impl AsRef<OsStr>) -> io::Result<Handle> {
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        Ok(Handle(rustix::fs::openat(&self.0, name.as_ref(), flags, Mode::empty())?))
+    }
+
+    /// Opens the regular file `name` for reading and, if asked for, writing. Anything else is an error; a FIFO does
+    /// not block.
+    pub(super) fn open_file(&self, name: &str, writes: bool) -> io::Result<File> {
+        let access = if writes { OFlags::RDWR } else { OFlags::RDONLY };
+        let flags = access | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let file = File::from(rustix::fs::openat(&self.0, name, flags, Mode::empty())?);
+        match file.metadata()?.is_file() {
+            true => Ok(file),
+            false => Err(io::Error::other("not a regular file")),
+        }
+    }
+
+    pub(super) fn status(&self) -> io::Result<Status> {
+        let found = File::from(self.0.try_clone()?).metadata()?;
+        Ok(Status { identity: (found.dev(), found.ino()), owner: found.uid(), is_private: found.mode() & 0o077 == 0 })
+    }
+
+    /// Names of all entries, sorted.
+    pub(super) fn entries(&self) -> io::Result<Vec<OsString>> {
+        let mut names = Vec::new();
+        for entry in Dir::read_from(&self.0)? {
+            let name = entry?.file_name().to_bytes().to_owned();
+            if name != b"." && name != b".." {
+                names.push(OsString::from_vec(name));
+            }
+        }
+        names.sort();
+        Ok(names)
+    }
+
+    /// Whether an entry has this name, a link to nothing included.
+    pub(super) fn has(&self, name: impl AsRef<OsStr>) -> bool {
+        rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW).is_ok()
+    }
+
+    /// Whether the entry is a folder and not a link to one.
+    pub(super) fn has_folder(&self, name: impl AsRef<OsStr>) -> bool {
+        let found = rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW);
+        found.is_ok_and(|found| FileType::from_raw_mode(found.st_mode) == FileType::Directory)
+    }
+
+    /// Renames the entry `from` to `name` in `to`.
+    pub(super) fn rename(&self, from: impl AsRef<OsStr>, to: &Handle, name: impl AsRef<OsStr>) -> io::Result<()> {
+        Ok(rustix::fs::renameat(&self.0, from.as_ref(), &to.0, name.as_ref())?)
+    }
+
+    /// Renames the entry at the relative path `from` to `to`.
+    ///
+    /// The system moves a folder to another parent only if the folder itself is writable. A read-only folder of this
+    /// user is made writable for the moment of its move.
+    pub(super) fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let moved = || rustix::fs::renameat(&self.0, from, CWD, to);
+        let refused = match moved() {
+            Err(error) if is_denied(error) && self.has_folder(from) => error,
+            moved => return Ok(moved?),
+        };
+        let folder = self.open_folder(from)?;
+        let mode = Mode::from_raw_mode(rustix::fs::fstat(&folder.0)?.st_mode);
+        rustix::fs::fchmod(&folder.0, mode | Mode::RWXU).map_err(|_| refused)?;
+        let moved = moved();
+        let _ = rustix::fs::fchmod(&folder.0, mode);
+        Ok(moved?)
+    }
+
+    /// Removes the entry `name`, a folder with everything in it. A link is removed, its target is not.
+    ///
+    /// Read-only folders of this user are made writable first.
+    pub(super) fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
+        let name = name.as_ref();
+        if !self.has_folder(name) {
+            return Ok(rustix::fs::unlinkat(&self.0, name, AtFlags::empty())?);
+        }
+        let folder = self.open_folder(name)?;
+        let mut result = Ok(());
+        for entry in folder.entries()? {
+            let mut removed = folder.remove(&entry);
+            if removed.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied)
+                && rustix::fs::fchmod(&folder.0, Mode::RWXU).is_ok()
+            {
+                removed = folder.remove(&entry);
+            }
+            result = result.and(removed);
+        }
+        result.and_then(|()| self.remove_empty(name))
+    }
+
+    /// Removes the empty folder `name`; anything else is an error and stays.
+    pub(super) fn remove_empty(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
+        Ok(rustix::fs::unlinkat(&self.0, name.as_ref(), AtFlags::REMOVEDIR)?)
+    }
+
+    /// Writes the folder's list of names through to the disk.
+    pub(super) fn sync(&self) -> io::Result<()> {
+        Ok(rustix::fs::fsync(&self.0)?)
+    }
+}
+
+fn is_denied(error: rustix::io::Errno) -> bool {
+    error == rustix::io::Errno::ACCESS || error == rustix::io::Errno::PERM
+}

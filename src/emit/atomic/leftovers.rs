@@ -1,0 +1,210 @@
+//! Workspaces of runs that were killed: interrupted publications are completed or taken back, the rest is removed.
+
+use std::ffi::{OsStr, OsString};
+use std::io::{self, Read as _};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use super::destination::{Kind, Replace, check_replace};
+use super::handle::Handle;
+use super::named::{MARKER, carry_foreign, parts};
+use super::warnings::warn;
+use super::workspace::{
+    DISCARDED, JOURNAL, Leftover, REPLACED, REPLACED_WHOLE, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace,
+    publishing_name, target_name,
+};
+use crate::error::{Error, Result};
+
+/// Longest wait for another run that is publishing its result under the same name, which takes it milliseconds.
+const LONGEST_WAIT: Duration = Duration::from_secs(60);
+/// Longest wait for another run to stop looking at an unfinished workspace, which takes it microseconds.
+const LONGEST_LOOK: Duration = Duration::from_secs(5);
+/// Bytes of the largest journal that is read.
+const MAX_JOURNAL: u64 = 1 << 20;
+
+/// Lock that a run holds while it publishes a result under one name, or repairs an interrupted publication of it.
+///
+/// The lock is a workspace with a fixed name, so the rules for leftovers of killed runs hold for it as well.
+pub(super) struct PublishLock {
+    _workspace: Workspace,
+}
+
+impl PublishLock {
+    /// Waits until no other run publishes under the name of `target`.
+    ///
+    /// # Errors
+    /// Another run or a foreign folder that has the name of the lock for a minute; the system refuses.
+    pub(super) fn acquire(target: &Path) -> Result<PublishLock> {
+        let (parent, name) = parts(target)?;
+        let name = publishing_name(name);
+        let start = Instant::now();
+        loop {
+            let made = Workspace::with_name(&parent, &name).map_err(Error::io("create a folder in", &parent))?;
+            if let Some(workspace) = made {
+                return Ok(PublishLock { _workspace: workspace });
+            }
+            let folder = Handle::open(&parent).map_err(Error::io("open", &parent))?;
+            match Leftover::take(&folder, &name) {
+                Ok(leftover) => leftover.remove(&folder),
+                Err(_) if start.elapsed() > LONGEST_WAIT => {
+                    let source = io::Error::new(
+                        io::ErrorKind::TimedOut,
+                        format!(
+                            "{} has existed for {} s: another run is writing this output, or was killed on a file system \
+                             without locks or by another user\n  remove that folder if no other run is going on",
+                            parent.join(&name).display(),
+                            LONGEST_WAIT.as_secs()
+                        ),
+                    );
+                    return Err(Error::io("write", target)(source));
+                }
+                Err(_) => std::thread::sleep(Duration::from_millis(1)),
+            }
+        }
+    }
+}
+
+/// Files of a result that are published together, in this order.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Journal {
+    pub(super) replace: Replace,
+    /// Name of each file in the workspace, and its name beside it.
+    pub(super) files: Vec<(String, OsString)>,
+}
+
+/// Repairs and removes what killed runs left beside `target` of outputs with this name and of scratch files.
+///
+/// Never fails: what cannot be repaired stays, with a warning.
+pub(super) fn tidy(target: &Path) {
+    let Ok((path, name)) = parts(target) else { return };
+    let Ok(parent) = Handle::open(&path) else { return };
+    let entries = parent.entries().unwrap_or_default();
+    let left = |name: &OsStr| entries.iter().filter(|entry| is_workspace(entry, name)).collect::<Vec<_>>();
+    if left(name).iter().any(|entry| parent.open_folder(entry).is_ok_and(|folder| is_unfinished(&folder))) {
+        match PublishLock::acquire(target) {
+            Ok(_lock) => repair(target, false),
+            Err(error) => warn(error.to_string()),
+        }
+    }
+    for entry in left(name).into_iter().chain(left(SCRATCH.as_ref())) {
+        // A workspace that became unfinished meanwhile is left to the next run.
+        if let Ok(leftover) = Leftover::take(&parent, entry)
+            && !is_unfinished(&leftover.folder)
+        {
+            leftover.remove(&parent);
+        }
+    }
+}
+
+/// Removes what killed runs left in `folder` of files whose names end with `ending`.
+pub fn remove_leftovers(folder: &Path, ending: &str) {
+    let Ok(parent) = Handle::open(folder) else { return };
+    for entry in parent.entries().unwrap_or_default() {
+        let is_ours = target_name(&entry).is_some_and(|name| name.ends_with(ending));
+        let leftover = if is_ours { Leftover::take(&parent, &entry).ok() } else { None };
+        if let Some(leftover) = leftover.filter(|leftover| !is_unfinished(&leftover.folder)) {
+            leftover.remove(&parent);
+        }
+    }
+}
+
+/// Repairs interrupted publications under the name of `target`. The caller holds the [`PublishLock`].
+///
+/// A publication that cannot be completed is discarded if the caller publishes a result that `supersedes` it: a later run
+/// must not complete it over that result.
+pub(super) fn repair(target: &Path, supersedes: bool) {
+    let Ok((path, name)) = parts(target) else { return };
+    let Ok(parent) = Handle::open(&path) else { return };
+    for entry in parent.entries().unwrap_or_default().iter().filter(|entry| is_workspace(entry, name)) {
+        if !parent.open_folder(entry).is_ok_and(|folder| is_unfinished(&folder)) {
+            continue;
+        }
+        let Some(leftover) = take_unfinished(&parent, entry) else { continue };
+        if let Err(error) = settle(&leftover.folder, &parent, target) {
+            let _ = if supersedes { leftover.folder.remove(JOURNAL) } else { Ok(()) };
+            warn(format!("an interrupted run that wrote {} could not be repaired: {error}", target.display()));
+        }
+    }
+}
+
+/// Takes an unfinished workspace while this run holds the [`PublishLock`]. No run that goes on has one then, except after
+/// a failure and just before its end, so a lock on it is another run looking at it for a moment.
+fn take_unfinished(parent: &Handle, name: &OsStr) -> Option<Leftover> {
+    let start = Instant::now();
+    loop {
+        match Leftover::take(parent, name) {
+            Ok(leftover) => return Some(leftover),
+            Err(Refusal::Busy) if start.elapsed() < LONGEST_LOOK => std::thread::sleep(Duration::from_millis(1)),
+            Err(_) => return None,
+        }
+    }
+}
+
+/// Brings an interrupted publication to its end. The caller holds the [`PublishLock`].
+///
+/// Files of a journal get their names. An earlier folder gets its name back if no other entry has it; otherwise entries
+/// that its summary does not list are moved into the new folder. If that is refused, for example because a folder belongs
+/// to another user, the earlier folder is kept beside the result under a visible name.
+pub(super) fn settle(folder: &Handle, parent: &Handle, target: &Path) -> Result<()> {
+    let (_, name) = parts(target)?;
+    if folder.has(JOURNAL) {
+        complete(folder, parent, target)?;
+    }
+    for aside in [REPLACED, REPLACED_WHOLE] {
+        if folder.has(aside) && !parent.has(name) {
+            folder.rename(aside, parent, name).map_err(Error::io("put back", target))?;
+        }
+    }
+    // In one step: a part of an earlier result must not be taken for a result.
+    let discard =
+        |aside| folder.rename(aside, folder, DISCARDED).map_err(Error::io("discard the earlier folder of", target));
+    if folder.has(REPLACED_WHOLE) {
+        return discard(REPLACED_WHOLE);
+    }
+    if !folder.has(REPLACED) {
+        return Ok(());
+    }
+    let old = folder.open_folder(REPLACED).map_err(Error::io("open the earlier folder of", target))?;
+    let carried = match parent.has_folder(name) {
+        true => carry_foreign(&old, target),
+        false => Err(io::Error::from(io::ErrorKind::NotADirectory)),
+    };
+    let Err(refused) = carried else {
+        return discard(REPLACED);
+    };
+    let _ = old.remove(MARKER);
+    let mut kept = name.to_owned();
+    kept.push(".kept");
+    while parent.has(&kept) {
+        kept.push(".kept");
+    }
+    folder.rename(REPLACED, parent, &kept).map_err(Error::io("keep files of the earlier", target))?;
+    warn(format!(
+        "{} is in place, but files of the earlier folder that are not splatsieve's could not be moved into it ({refused}); \
+         they are in {}",
+        target.display(),
+        target.with_file_name(kept).display()
+    ));
+    Ok(())
+}
+
+/// Gives the remaining files of a journal their names.
+fn complete(folder: &Handle, parent: &Handle, target: &Path) -> Result<()> {
+    let failed = |error| Error::io("complete the interrupted output of", target)(error);
+    let (_, name) = parts(target)?;
+    let mut text = Vec::new();
+    let mut file = folder.open_file(JOURNAL, false).map_err(failed)?;
+    (&mut file).take(MAX_JOURNAL).read_to_end(&mut text).map_err(failed)?;
+    let journal: Journal = serde_json::from_slice(&text).map_err(|error| failed(error.into()))?;
+    for (content, published) in &journal.files {
+        let is_beside = published.as_encoded_bytes().starts_with(name.as_encoded_bytes());
+        if !is_beside || Path::new(published).components().count() != 1 || !folder.has(content) {
+            continue;
+        }
+        check_replace(&target.with_file_name(published), Kind::File, journal.replace)?;
+        folder.rename(content, parent, published).map_err(failed)?;
+    }
+    folder.remove(JOURNAL).map_err(failed)
+}

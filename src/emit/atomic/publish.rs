@@ -1,0 +1,111 @@
+//! Publication: finished outputs get their names, one run at a time for each name.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::path::Path;
+
+use super::destination::{Kind, Replace, check_replace};
+use super::handle::Handle;
+use super::leftovers::{Journal, PublishLock, repair, settle};
+use super::named::{parts, present};
+use super::warnings::warn;
+use super::workspace::{JOURNAL, REPLACED, REPLACED_WHOLE, Workspace, live};
+use crate::error::{Error, Result};
+
+/// Gives files in `workspace` the names beside it that go with them, in order; the last one is the output itself, the others
+/// are its companions. The files have been written through to the disk.
+///
+/// A journal says which files belong together: after a kill or a failure in between the next run with this output
+/// completes the set.
+///
+/// # Errors
+/// An entry that appeared meanwhile and that `replace` does not allow to replace; the system refuses.
+pub(super) fn publish_files(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
+    let Some((_, target)) = files.last() else { return Ok(()) };
+    let lock = PublishLock::acquire(target)?;
+    repair(target, true);
+    for (_, target) in files {
+        check_replace(target, Kind::File, replace)?;
+    }
+    let held = live();
+    let journal = workspace.folder.join(JOURNAL);
+    if files.len() > 1 {
+        write_journal(workspace, files, replace)?;
+    }
+    for (done, (content, target)) in files.iter().enumerate() {
+        let Err(error) = fs::rename(workspace.folder.join(content), target) else { continue };
+        if done == 0 {
+            let _ = fs::remove_file(&journal);
+        }
+        return Err(Error::io("write", target)(error));
+    }
+    let _ = fs::remove_file(&journal);
+    drop(held);
+    drop(lock);
+    sync_parent(target);
+    Ok(())
+}
+
+fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Replace) -> Result<()> {
+    let names = files.iter().map(|(content, target)| Ok((content.clone(), parts(target)?.1.to_owned())));
+    let journal = Journal { replace, files: names.collect::<Result<Vec<(String, OsString)>>>()? };
+    let text = serde_json::to_vec(&journal).expect("plain data");
+    // Under another name until it is complete.
+    let (begun, path) = (workspace.folder.join("journal-begun"), workspace.folder.join(JOURNAL));
+    let written = fs::write(&begun, text).and_then(|()| File::open(&begun)?.sync_all());
+    let written = written.and_then(|()| fs::rename(&begun, &path)).and_then(|()| workspace.sync());
+    written.map_err(|error| {
+        let _ = fs::remove_file(&path);
+        Error::io("write a journal in", &workspace.folder)(error)
+    })
+}
+
+/// Gives the folder in `workspace` the name `target`, in place of an earlier folder if there is one.
+///
+/// After a kill in between, the next run with this output puts the earlier folder back or moves what follows the name.
+///
+/// # Errors
+/// An entry that appeared meanwhile and that `replace` does not allow to replace; the system refuses. The target is then
+/// as it was. A failure after the folder has its name is a warning.
+pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Replace) -> Result<()> {
+    let lock = PublishLock::acquire(target)?;
+    repair(target, true);
+    check_replace(target, Kind::Folder, replace)?;
+    let held = live();
+    let aside = workspace.folder.join(if replace == Replace::Any { REPLACED_WHOLE } else { REPLACED });
+    if present(target) {
+        workspace.sync().map_err(Error::io("sync", &workspace.folder))?;
+        fs::rename(target, &aside).map_err(Error::io("move aside", target))?;
+    }
+    if let Err(error) = fs::rename(workspace.content(), target) {
+        let _ = fs::rename(&aside, target);
+        return Err(Error::io("write", target)(error));
+    }
+    let (parent, _) = parts(target)?;
+    let handles = Handle::open(&workspace.folder).and_then(|folder| Ok((folder, Handle::open(&parent)?)));
+    let settled =
+        handles.map_err(Error::io("open", &parent)).and_then(|(folder, parent)| settle(&folder, &parent, target));
+    if let Err(error) = settled {
+        warn(format!(
+            "{} is complete and in place, but the earlier folder could not be dealt with ({error}); the next run with this \
+             output tries again",
+            target.display()
+        ));
+    }
+    drop(held);
+    drop(lock);
+    sync_parent(target);
+    Ok(())
+}
+
+/// Writes the name of a published output through to the disk. A failure is a warning: the output is in place.
+fn sync_parent(target: &Path) {
+    let Ok((parent, _)) = parts(target) else { return };
+    if let Err(error) = File::open(&parent).and_then(|folder| folder.sync_all()) {
+        warn(format!(
+            "{} is complete and in place, but its name could not be written through to the disk ({error}): a power failure \
+             may lose it",
+            target.display()
+        ));
+    }
+}
