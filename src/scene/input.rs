@@ -1,9 +1,10 @@
 //! What to read and from where to look, before anything is opened.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::families::{self, Conventions, Family, Link, OpenOptions};
 use crate::ingest::cameras::{self, CameraOptions, Clock, Times};
 use crate::model::{Rig, Split};
@@ -57,6 +58,30 @@ impl InputOptions {
             conventions: self.conventions,
             memory: self.memory.read_limit(),
         }
+    }
+
+    /// Confirms that neither the work folder nor the folder for scratch files is the input or lies inside it: files that
+    /// appear in an input change what it is.
+    ///
+    /// # Errors
+    /// Such a folder, as [`Error::Usage`].
+    pub(super) fn check_folders(&self) -> Result<()> {
+        let Ok(input) = fs::canonicalize(&self.path) else { return Ok(()) };
+        let work = self.work.as_ref().map(|asked| asked.folder.as_path());
+        for (option, folder) in [("--work", work), ("--scratch-dir", self.scratch.as_deref())] {
+            let Some(folder) = folder else { continue };
+            // A work folder may have to be created.
+            let parent = folder.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            let real = fs::canonicalize(folder).or_else(|_| fs::canonicalize(parent));
+            if real.is_ok_and(|real| real.starts_with(&input)) {
+                return Err(Error::usage(format!(
+                    "{option} {} lies inside the input {}; give a folder outside it",
+                    folder.display(),
+                    self.path.display()
+                )));
+            }
+        }
+        Ok(())
     }
 
     /// Where scratch files go.

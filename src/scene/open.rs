@@ -21,6 +21,7 @@ use crate::stream::gather_all;
 /// # Errors
 /// Whatever is wrong with input or cameras; cameras of other frames; options that the input does not take.
 pub fn open_input(options: &InputOptions) -> Result<Opened> {
+    options.check_folders()?;
     if options.is_stream() {
         return check_frames(open_arriving(options)?, &options.path);
     }
@@ -179,8 +180,12 @@ pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     Ok(Some(RobustBox::of(&gather_all(source, 0, Columns::POSITION)?.position)))
 }
 
-/// Folder for scratch files of a run that writes `output`: where the result goes there is room for its input.
+/// Folder for scratch files of a run that writes `output`: where the result goes there is room for its input. `None` for a
+/// device or FIFO.
 pub fn scratch_beside(output: &Path) -> Option<PathBuf> {
+    if std::fs::metadata(output).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        return None;
+    }
     let parent = output.parent()?;
     Some(if parent.as_os_str().is_empty() { PathBuf::from(".") } else { parent.to_owned() })
 }
