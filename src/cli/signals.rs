@@ -4,6 +4,9 @@
 /// 128 + signal, as shells name such an end. A signal that is ignored already stays so: `nohup`, `&`.
 #[cfg(unix)]
 pub(super) fn install() {
+    // Without a handler a file that reaches the limit of `ulimit -f` ends the process; so the write fails, with a message.
+    // SAFETY: SIG_IGN is a valid disposition of SIGXFSZ; no other thread exists yet.
+    unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
     use signal_hook::iterator::Signals;
     use signal_hook::low_level::exit;
