@@ -52,16 +52,20 @@ impl Index {
     }
 
     /// Checks every entry, that no two tiles overlap but for constant ones that share all of their bytes, and adds
-    /// them to `digest`. Gives per column whether its values differ between frames.
+    /// them to `digest`. Gives per column whether its values differ between frames. Tiles out of the order of the index
+    /// take more memory, at most `memory` bytes.
     pub(crate) fn check(
         &self,
         file: &MappedFile,
         layout: &Layout,
         piece: &mut Vec<u8>,
         digest: &mut Digest,
+        memory: u64,
     ) -> Result<Vec<bool>> {
         let (varies, in_order) = self.go_through(file, layout, piece, digest)?;
         if !in_order {
+            let needed = self.tiles * (size_of::<TileRecord>() + size_of::<usize>()) as u64;
+            check_memory(self.offset, needed, memory).map_err(|fault| fault.at(file.path()))?;
             let tiles = (0..self.tiles).map(|index| self.record(file, layout, index)).collect::<Result<Vec<_>>>()?;
             self.check_overlap(&tiles).map_err(|fault| fault.at(file.path()))?;
         }
@@ -124,6 +128,16 @@ impl Index {
         }
         Ok(())
     }
+}
+
+/// Confirms that `needed` bytes for the index at `offset` are at most `memory`.
+pub(crate) fn check_memory(offset: u64, needed: u64, memory: u64) -> std::result::Result<(), Fault> {
+    if needed <= memory {
+        return Ok(());
+    }
+    let expected = format!("an index that takes at most {memory} bytes of memory");
+    Err(Fault::new(offset, expected, format!("{needed} bytes"))
+        .hint("if the container is meant to be this large, allow more memory (splatsieve: --memory)"))
 }
 
 #[cfg(test)]

@@ -109,6 +109,13 @@ impl Layout {
         (range.end - range.start) as u32
     }
 
+    /// Decoded bytes of the largest tile of a sequence of `frames` frames.
+    pub(crate) fn largest_tile(&self, frames: u64) -> u64 {
+        let widest = self.columns.iter().map(|column| column.width).max().unwrap_or(0);
+        let gaussians = self.gaussians.min(self.gaussian_block.into());
+        4 * u64::from(widest) * gaussians * frames.min(self.frame_block.into())
+    }
+
     /// Tiles of one frame block.
     pub(crate) fn tiles_per_frame_block(&self) -> u64 {
         self.columns.len() as u64 * u64::from(self.gaussian_blocks())

@@ -53,6 +53,6 @@ pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
 pub use error::{Error, Result, quoted};
 pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
 pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TilesRead, Touched};
-pub use recover::{RecoverReport, recover};
+pub use recover::{RecoverReport, recover, recover_within};
 pub use verify::VerifyReport;
 pub use writer::Writer;

@@ -10,7 +10,7 @@ use zstd::bulk::Decompressor;
 use crate::codec::{Encoding, Stats, Stored, Unfilter};
 use crate::error::{Error, Fault, Result};
 use crate::file::MappedFile;
-use crate::index::Index;
+use crate::index::{Index, check_memory};
 use crate::layout::{FIXED_HEADER, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD, Record, TRAILER, TileRecord, align, trailer_from_bytes};
 use crate::writer::check_times;
@@ -161,11 +161,17 @@ impl Reader {
     /// Opens a container and checks its header, footer and index: every length and place lies within its limits, no
     /// two tiles overlap. The tiles themselves are checked when they are read, or by [`Reader::verify`].
     pub fn open(path: impl AsRef<Path>) -> Result<Reader> {
-        let file = MappedFile::open(path.as_ref())?;
-        Self::read(file)
+        Self::open_within(path, u64::MAX)
     }
 
-    fn read(file: MappedFile) -> Result<Reader> {
+    /// [`Reader::open`] with at most `memory` bytes for time stamps and what is known of tiles. Errors: the container
+    /// needs more.
+    pub fn open_within(path: impl AsRef<Path>, memory: u64) -> Result<Reader> {
+        let file = MappedFile::open(path.as_ref())?;
+        Self::read(file, memory)
+    }
+
+    fn read(file: MappedFile, memory: u64) -> Result<Reader> {
         let fault = |fault: Fault| fault.at(file.path());
         let (layout, header) = read_header(&file)?;
         let first_record = align(header.len() as u64);
@@ -194,6 +200,10 @@ impl Reader {
         };
         let start = footer_offset + RECORD;
         check_footer(&footer, &layout, &header, footer_offset, trailer_offset - start).map_err(fault)?;
+        // A time stamp per frame, a flag per tile, and the last constant tile of each column and Gaussian block.
+        let slots = layout.tiles_per_frame_block().min(footer.tiles);
+        let needed = footer.frames.saturating_mul(8) + footer.tiles + slots * size_of::<Option<TileRecord>>() as u64;
+        check_memory(footer_offset, needed, memory).map_err(fault)?;
         let mut piece = Vec::new();
         let mut hash = Xxh3::new();
         file.read_pieces(start..trailer_offset, &mut piece, |_, bytes| {
@@ -221,7 +231,7 @@ impl Reader {
         let payloads = first_record + RECORD..footer_offset;
         let index = Index { offset: index_offset, tiles: footer.tiles, frames: footer.frames, payloads };
         let mut digest = Digest::new(&header, &times);
-        let varies = index.check(&file, &layout, &mut piece, &mut digest)?;
+        let varies = index.check(&file, &layout, &mut piece, &mut digest, memory - needed)?;
         let verified = (0..footer.tiles).map(|_| AtomicBool::new(false)).collect();
         Ok(Reader {
             file,

@@ -8,6 +8,7 @@ use xxhash_rust::xxh3::xxh3_64;
 use crate::codec::EncodedTile;
 use crate::error::{Fault, Result};
 use crate::file::MappedFile;
+use crate::index::check_memory;
 use crate::layout::Layout;
 use crate::reader::{TileBuffer, read_header, read_tile};
 use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
@@ -37,9 +38,14 @@ pub struct RecoverReport {
 /// Errors: the header of `src` is damaged, or `dst` cannot be written. No frames left is not an error:
 /// `dst` has none then, and the report says so.
 pub fn recover(src: impl AsRef<Path>, dst: impl AsRef<Path>) -> Result<RecoverReport> {
+    recover_within(src, dst, u64::MAX)
+}
+
+/// [`recover`] with at most `memory` bytes. Errors: those of [`recover`]; the container needs more.
+pub fn recover_within(src: impl AsRef<Path>, dst: impl AsRef<Path>, memory: u64) -> Result<RecoverReport> {
     let file = MappedFile::open(src.as_ref())?;
     let (layout, header) = read_header(&file)?;
-    let found = scan(&file, &layout, align(header.len() as u64))?;
+    let found = scan(&file, &layout, align(header.len() as u64), memory)?;
     let mut report = RecoverReport {
         frames: 0,
         frames_seen: found.times.values().map(|times| times.len() as u64).sum(),
@@ -98,22 +104,27 @@ struct Found {
     /// Constant tiles that have their own payload, by its place.
     constants: HashMap<u64, TileRecord>,
     skipped: u64,
+    /// Bytes of all time stamps.
+    time_bytes: u64,
 }
 
 /// Goes from record to record. Where one is damaged, tries every multiple of 64 after it: a record knows
 /// its place, so bytes inside a payload are not taken for one.
-fn scan(file: &MappedFile, layout: &Layout, start: u64) -> Result<Found> {
-    let mut found = Found { times: HashMap::new(), tiles: HashMap::new(), constants: HashMap::new(), skipped: 0 };
+fn scan(file: &MappedFile, layout: &Layout, start: u64, memory: u64) -> Result<Found> {
+    let mut found =
+        Found { times: HashMap::new(), tiles: HashMap::new(), constants: HashMap::new(), skipped: 0, time_bytes: 0 };
     let mut buffer = TileBuffer::default();
     let mut position = start;
     while position + RECORD <= file.len() {
         let mut bytes = [0; RECORD as usize];
         file.read_at(position, &mut bytes)?;
         let payload = position + RECORD;
+        check_memory(position, found.bytes(layout), memory).map_err(|fault| fault.at(file.path()))?;
         let len = match Record::from_bytes(&bytes, position) {
             Ok(Record::Tile(tile)) => found.take_tile(file, layout, &tile, position, start, &mut buffer),
             Ok(Record::Times(times)) => read_times(file, layout, &times, position).ok().map(|stamps| {
                 let len = 8 * stamps.len() as u64;
+                found.time_bytes += len;
                 found.times.entry(times.frame_block).or_insert(stamps);
                 len
             }),
@@ -136,6 +147,13 @@ fn scan(file: &MappedFile, layout: &Layout, start: u64) -> Result<Found> {
 }
 
 impl Found {
+    /// Bytes of what was found so far, of its tables while they grow, and of the largest tile, decoded.
+    fn bytes(&self, layout: &Layout) -> u64 {
+        let tiles = (self.tiles.capacity() + self.constants.capacity()) * 3 / 2 * (size_of::<TileRecord>() + 16);
+        let times = 2 * self.time_bytes + 64 * self.times.len() as u64;
+        tiles as u64 + times + 3 * layout.largest_tile(u64::MAX)
+    }
+
     /// Takes the tile of the record at `position` if it is intact. Gives the length of what follows the record: its payload,
     /// or nothing if it shares one.
     fn take_tile(

@@ -4,6 +4,7 @@ use std::collections::HashSet;
 
 use crate::codec::{Stats, stats};
 use crate::error::{Fault, Result};
+use crate::index::check_memory;
 use crate::reader::{Reader, TileBuffer};
 use crate::record::{RECORD, Record, TileRecord, TimesRecord, align};
 use crate::recover::read_times;
@@ -27,7 +28,14 @@ impl Reader {
     /// that passes has no byte that could be changed unnoticed. Memory: one [`TileBuffer`], 1 byte per
     /// tile, some 20 per constant tile.
     pub fn verify(&self) -> Result<VerifyReport> {
+        self.verify_within(u64::MAX)
+    }
+
+    /// [`Reader::verify`] with at most `memory` bytes. Errors: the container needs more.
+    pub fn verify_within(&self, memory: u64) -> Result<VerifyReport> {
         let fault = |fault: Fault| fault.at(self.file.path());
+        let tile = self.layout.largest_tile(self.times.len() as u64);
+        check_memory(0, 3 * tile + 32 * self.index.tiles, memory).map_err(fault)?;
         let mut report = VerifyReport { frames: self.times.len() as u64, tiles: 0, stored_bytes: 0, decoded_bytes: 0 };
         let mut buffer = TileBuffer::default();
         let mut met = vec![false; self.index.tiles as usize];
