@@ -1,7 +1,7 @@
 //! The file of an archive: a head with lengths and checksums, and four sections.
 //!
 //! In: sections. Out: bytes, and back. All that is believed of a file has been checked before: lengths against the file,
-//! checksums against the bytes, what is to be allocated against the file's length.
+//! checksums against the bytes, what is to be allocated against the file's length and the memory that reading may take.
 
 use std::path::Path;
 
@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::xxh3_64;
 
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 
 /// How an archive begins; the line ends show when a file was sent as text.
 pub const MAGIC: [u8; 8] = *b"\x89GSZ\r\n\x1a\n";
@@ -18,13 +19,18 @@ pub const VERSION: u16 = 1;
 const SECTIONS: usize = 4;
 const NAMES: [&str; SECTIONS] = ["table", "cloud", "field", "blobs"];
 /// Magic, version, two zero bytes; of each section its length in the file, that of its content and a checksum; their own.
-const HEAD: usize = 12 + SECTIONS * 24 + 8;
+pub const HEAD: usize = 12 + SECTIONS * 24 + 8;
 /// Level of zstd for what is small.
 const LEVEL: i32 = 19;
-/// Values' bytes that a byte may stand for: symbols take at least 1/200 of a bit each, and what nobody reads none.
-const MOST_PER_BYTE: u64 = 8192;
+/// Bytes of content that a byte of the file may stand for. Those of trained models are 20 to 60 times as large as their
+/// archives. Symbols could stand for 800 bytes each, and unread texels for any number, but a file of 300 KB must not cost
+/// gigabytes.
+const MOST_PER_BYTE: u64 = 512;
 /// What may be allocated whatever the file's length.
 const ALWAYS: u64 = 64 << 20;
+
+/// Largest table. Those of trained models have some 50 KB. The values read from it take up to 16 times its bytes.
+const MOST_TABLE: u64 = 1 << 20;
 
 /// The contents of the sections.
 #[derive(Debug, PartialEq)]
@@ -103,50 +109,90 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, Parts)> {
     Ok((out, parts))
 }
 
-/// The sections of an archive, each with its checksum right, and the sizes of its parts.
-pub(super) fn read(bytes: &[u8]) -> std::result::Result<(Sections, Parts), Damage> {
-    if !bytes.starts_with(&MAGIC) {
-        let head = bytes.get(..8.min(bytes.len())).unwrap_or_default();
-        return Err(Damage::new("byte 0", "the first bytes of an archive (.gsz)", format!("{head:02x?}")));
-    }
-    let version = bytes[MAGIC.len()..].first_chunk().map(|&bytes| u16::from_le_bytes(bytes));
-    if let Some(found) = version.filter(|&version| version != VERSION) {
-        return Err(Damage::new(
-            "byte 8",
-            format!("version {VERSION}"),
-            format!("version {found}: another splatsieve's"),
-        ));
-    }
-    let Some((head, mut rest)) = bytes.split_at_checked(HEAD) else {
-        return Err(Damage::new("head", format!("{HEAD} bytes"), format!("{} bytes", bytes.len())));
-    };
-    let number = |at: usize| head[at..at + 8].iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte));
-    if number(HEAD - 8) != xxh3_64(&head[..HEAD - 8]) {
-        return Err(Damage::new("head", "its checksum", "another"));
-    }
-    let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
-    let mut lengths = [0; SECTIONS];
-    for (k, name) in NAMES.iter().enumerate() {
-        let at = 12 + 24 * k;
-        let (stored, content) = (number(at), number(at + 8));
-        let place = format!("section {name}");
-        let Some((own, after)) = usize::try_from(stored).ok().and_then(|stored| rest.split_at_checked(stored)) else {
-            return Err(Damage::new(&place, format!("{stored} bytes"), format!("{} bytes", rest.len())));
-        };
-        if xxh3_64(own) != number(at + 16) {
-            return Err(Damage::new(&place, "its checksum", "another"));
+/// The head of an archive.
+pub(super) struct Head {
+    /// Bytes of the whole file.
+    whole: u64,
+    /// Of each section: bytes in the file, bytes of content, checksum of the bytes in the file.
+    sections: [[u64; 3]; SECTIONS],
+}
+
+impl Head {
+    /// Parses the first bytes of a file of `whole` bytes, at least [`HEAD`] of them if the file has so many.
+    pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<Head, Damage> {
+        if !head.starts_with(&MAGIC) {
+            let first = head.get(..8.min(head.len())).unwrap_or_default();
+            return Err(Damage::new("byte 0", "the first bytes of an archive (.gsz)", format!("{first:02x?}")));
         }
-        check_size(usize::try_from(content).ok(), bytes.len())?;
-        (sections[k], lengths[k], rest) = (own, content as usize, after);
+        let version = head[MAGIC.len()..].first_chunk().map(|&bytes| u16::from_le_bytes(bytes));
+        if let Some(found) = version.filter(|&version| version != VERSION) {
+            return Err(Damage::new(
+                "byte 8",
+                format!("version {VERSION}"),
+                format!("version {found}: another splatsieve's"),
+            ));
+        }
+        let Some(head) = head.get(..HEAD) else {
+            return Err(Damage::new("head", format!("{HEAD} bytes"), format!("{whole} bytes")));
+        };
+        let number = |at: usize| head[at..at + 8].iter().rev().fold(0u64, |sum, &byte| sum << 8 | u64::from(byte));
+        if number(HEAD - 8) != xxh3_64(&head[..HEAD - 8]) {
+            return Err(Damage::new("head", "its checksum", "another"));
+        }
+        let sections = std::array::from_fn(|k| [0, 8, 16].map(|field| number(12 + 24 * k + field)));
+        let mut rest = whole.saturating_sub(HEAD as u64);
+        for ([stored, content, _], name) in sections.into_iter().zip(NAMES) {
+            let place = format!("section {name}");
+            let Some(after) = rest.checked_sub(stored) else {
+                return Err(Damage::new(&place, format!("{stored} bytes"), format!("{rest} bytes")));
+            };
+            check_size(usize::try_from(content).ok(), whole)?;
+            rest = after;
+        }
+        if rest != 0 {
+            return Err(Damage::new("end", "nothing after the last section", format!("{rest} bytes")));
+        }
+        let table = sections[0][1];
+        if table > MOST_TABLE {
+            let expected = format!("at most {MOST_TABLE} bytes of content");
+            return Err(Damage::new("section table", expected, format!("{table} bytes")));
+        }
+        Ok(Head { whole, sections })
     }
-    if !rest.is_empty() {
-        return Err(Damage::new("end", "nothing after the last section", format!("{} bytes", rest.len())));
+
+    /// Bytes that the file and the contents of its sections take in memory, each twice: as a whole and in parts.
+    pub(super) fn bytes(&self) -> u64 {
+        let [[_, table, _], .., [_, blobs, _]] = self.sections;
+        2 * self.whole + 16 * table + 2 * blobs
+    }
+
+    /// Confirms that reading the archive at `path` keeps within `memory`.
+    pub(super) fn admit(&self, path: &Path, memory: ReadLimit) -> Result<()> {
+        memory.check(path, "head", "the archive and its content", self.bytes())
+    }
+}
+
+/// The sections of an archive with head `head`, each with its checksum right, and the sizes of its parts.
+pub(super) fn read(head: &Head, bytes: &[u8]) -> std::result::Result<(Sections, Parts), Damage> {
+    let mut rest = &bytes[HEAD..];
+    let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
+    for (k, name) in NAMES.iter().enumerate() {
+        let [stored, _, checksum] = head.sections[k];
+        // The head was parsed with the length of `bytes`.
+        let Some((own, after)) = rest.split_at_checked(stored as usize) else {
+            return Err(Damage::new(name, format!("{stored} bytes"), format!("{} bytes", rest.len())));
+        };
+        if xxh3_64(own) != checksum {
+            return Err(Damage::new(&format!("section {name}"), "its checksum", "another"));
+        }
+        (sections[k], rest) = (own, after);
     }
     let unpack = |k: usize| {
         let place = format!("section {}", NAMES[k]);
-        let wrong = |found: String| Damage::new(&place, format!("{} bytes of content", lengths[k]), found);
-        let content = zstd::bulk::decompress(sections[k], lengths[k]).map_err(|error| wrong(error.to_string()))?;
-        if content.len() == lengths[k] { Ok(content) } else { Err(wrong(content.len().to_string())) }
+        let length = head.sections[k][1] as usize;
+        let wrong = |found: String| Damage::new(&place, format!("{length} bytes of content"), found);
+        let content = zstd::bulk::decompress(sections[k], length).map_err(|error| wrong(error.to_string()))?;
+        if content.len() == length { Ok(content) } else { Err(wrong(content.len().to_string())) }
     };
     let [_, cloud, field, _] = sections;
     let parts = Parts::of(bytes.len() as u64, cloud.len() as u64, field.len() as u64);
@@ -155,8 +201,8 @@ pub(super) fn read(bytes: &[u8]) -> std::result::Result<(Sections, Parts), Damag
 }
 
 /// Confirms that so many bytes may be allocated for a file of `length`; none: they have no number.
-pub(super) fn check_size(bytes: Option<usize>, length: usize) -> std::result::Result<(), Damage> {
-    let most = (length as u64).saturating_mul(MOST_PER_BYTE).saturating_add(ALWAYS);
+pub(super) fn check_size(bytes: Option<usize>, length: u64) -> std::result::Result<(), Damage> {
+    let most = length.saturating_mul(MOST_PER_BYTE).saturating_add(ALWAYS);
     match bytes.map(|bytes| bytes as u64) {
         Some(bytes) if bytes <= most => Ok(()),
         bytes => {

@@ -24,15 +24,16 @@ use serde::{Deserialize, Serialize};
 
 pub use cloud::{ATTRIBUTES, CloudSteps};
 pub use field::{FieldSteps, Role, TensorSteps, rounded};
-pub use file::{MAGIC, Parts, VERSION};
+pub use file::{HEAD, MAGIC, Parts, VERSION};
 pub use importance::offsets;
 pub use step::{STEPS, nearest, step};
 
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 use crate::model::{Columns, Gaussians};
 use field::{Entry, Readers};
-use file::{Damage, Sections};
+use file::{Damage, Head, Sections};
 
 /// Name of the tensor that holds the box that planes cover.
 pub const BOX: &str = "deformation_net.grid.aabb";
@@ -133,15 +134,31 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
 /// Decodes the archive `bytes`, read from `path`.
 ///
 /// # Errors
-/// Bytes that are no archive, are cut short or damaged, of a later version, or that declare more than they can hold.
-/// Nothing is allocated by what they declare before it is checked.
-pub fn decode(bytes: &[u8], path: &Path) -> Result<(Content, Parts)> {
-    decoded(bytes).map_err(|damage| damage.of(path))
+/// Bytes that are no archive, are cut short or damaged, of a later version, or that declare more than they can hold, or
+/// more than `memory`. Nothing is allocated by what they declare before it is checked.
+pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, Parts)> {
+    let head = Head::parse(bytes, bytes.len() as u64).map_err(|damage| damage.of(path))?;
+    head.admit(path, memory)?;
+    let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.of(path))?;
+    let table = table(&sections, bytes.len()).map_err(|damage| damage.of(path))?;
+    let values = table.tensors.iter().filter_map(Entry::values).chain(table.cloud.values()).sum::<usize>() as u64;
+    // Decoding knows two values of each Gaussian and its error.
+    let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
+    memory.check(path, "table", "the archive and its content", needed)?;
+    decoded(sections, table, parts).map_err(|damage| damage.of(path))
 }
 
-fn decoded(bytes: &[u8]) -> std::result::Result<(Content, Parts), Damage> {
-    let (Sections { table, cloud, field, blobs }, parts) = file::read(bytes)?;
-    let table: Table = serde_json::from_slice(&table)
+/// Checks the first [`HEAD`] bytes of the archive at `path`, which has `whole` bytes, before the others are read.
+///
+/// # Errors
+/// A head that is not that of an archive of so many bytes; an archive that exceeds `memory` with its content.
+pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
+    Head::parse(head, whole).map_err(|damage| damage.of(path))?.admit(path, memory)
+}
+
+/// The table of an archive of `length` bytes, whose parts go together.
+fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damage> {
+    let table: Table = serde_json::from_slice(&sections.table)
         .map_err(|error| Damage::new("table", "a table of this version", error.to_string()))?;
     let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
     if !table.cloud.is_sound() {
@@ -154,7 +171,13 @@ fn decoded(bytes: &[u8]) -> std::result::Result<(Content, Parts), Damage> {
         .tensors
         .iter()
         .try_fold(table.cloud.values(), |sum, entry| Some(sum.and_then(|sum| sum.checked_add(entry.values()?))));
-    file::check_size(values.flatten().and_then(|values| values.checked_mul(4)), bytes.len())?;
+    file::check_size(values.flatten().and_then(|values| values.checked_mul(4)), length as u64)?;
+    Ok(table)
+}
+
+fn decoded(sections: Sections, table: Table, parts: Parts) -> std::result::Result<(Content, Parts), Damage> {
+    let Sections { cloud, field, blobs, .. } = sections;
+    let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
     let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("cloud"))?;
 
     let count = |entry: &&Entry| entry.role == Role::Exact;

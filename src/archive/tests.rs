@@ -79,7 +79,7 @@ proptest! {
         let steps = some_steps(&content, octave);
         let Encoded { bytes, parts, order, .. } = encode(&content, &steps).unwrap();
         prop_assert_eq!(parts.total(), bytes.len() as u64);
-        let (back, read) = decode(&bytes, Path::new("a.gsz")).unwrap();
+        let (back, read) = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap();
         prop_assert_eq!(read, parts);
         prop_assert_eq!(&encode(&content, &steps).unwrap().bytes, &bytes);
 
@@ -145,7 +145,7 @@ proptest! {
             bytes[at] ^= value;
         }
         reseal(&mut bytes);
-        let _ = decode(&bytes, Path::new("a.gsz"));
+        let _ = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE);
     }
 }
 
@@ -169,11 +169,16 @@ fn an_archive_cut_short_anywhere_is_an_error_that_names_it() {
     let content = content(3, 12, 0);
     let bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
     for length in 0..bytes.len() {
-        let message = decode(&bytes[..length], Path::new("a.gsz")).unwrap_err().to_string();
+        let message = decode(&bytes[..length], Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
         assert!(message.contains("a.gsz"), "{length}: {message}");
     }
     let longer = [&bytes[..], &[0]].concat();
-    assert!(decode(&longer, Path::new("a.gsz")).unwrap_err().to_string().contains("after the last section"));
+    assert!(
+        decode(&longer, Path::new("a.gsz"), ReadLimit::NONE)
+            .unwrap_err()
+            .to_string()
+            .contains("after the last section")
+    );
 }
 
 #[test]
@@ -183,7 +188,7 @@ fn any_bit_that_flips_is_seen() {
     for bit in 0..8 * bytes.len() {
         let mut damaged = bytes.clone();
         damaged[bit / 8] ^= 1 << (bit % 8);
-        assert!(decode(&damaged, Path::new("a.gsz")).is_err(), "bit {bit}");
+        assert!(decode(&damaged, Path::new("a.gsz"), ReadLimit::NONE).is_err(), "bit {bit}");
     }
 }
 
@@ -195,14 +200,24 @@ fn lengths_that_no_file_of_its_size_has_are_refused_before_anything_is_allocated
         let mut bytes = sound.clone();
         bytes[12 + place..][..8].copy_from_slice(&(1u64 << 50).to_le_bytes());
         reseal(&mut bytes);
-        assert!(decode(&bytes, Path::new("a.gsz")).is_err());
+        assert!(decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).is_err());
     }
     // So many Gaussians, of a table that is sound.
-    let (Sections { table, cloud, field, blobs }, _) = file::read(&sound).unwrap();
+    let (Sections { table, cloud, field, blobs }, _) =
+        file::read(&Head::parse(&sound, sound.len() as u64).unwrap(), &sound).unwrap();
     let table = String::from_utf8(table).unwrap().replace("\"gaussians\":12", "\"gaussians\":4000000000");
     let bytes = file::write(&Sections { table: table.into_bytes(), cloud, field, blobs }).unwrap().0;
-    let message = decode(&bytes, Path::new("a.gsz")).unwrap_err().to_string();
+    let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
     assert!(message.contains("bytes of content"), "{message}");
+}
+
+#[test]
+fn content_beyond_the_memory_limit_is_refused() {
+    let content = content(7, 20_000, 0);
+    let bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
+    decode(&bytes, Path::new("a.gsz"), ReadLimit::new(64 << 20)).unwrap();
+    let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::new(1 << 20)).unwrap_err().to_string();
+    assert!(message.contains("the archive and its content") && message.contains("--memory"), "{message}");
 }
 
 #[test]
@@ -210,7 +225,7 @@ fn a_later_version_is_named() {
     let content = content(6, 2, 0);
     let mut bytes = encode(&content, &some_steps(&content, -3)).unwrap().bytes;
     bytes[8] = 2;
-    let message = decode(&bytes, Path::new("a.gsz")).unwrap_err().to_string();
+    let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();
     assert!(message.contains("version 1") && message.contains("version 2"), "{message}");
 }
 
@@ -255,6 +270,6 @@ fn tensors_that_fit_no_role_are_refused_by_name_and_what_is_kept_to_the_bit_may_
     let mut odd = whole.clone();
     odd.tensors.get_mut("a.exact").unwrap().data[3] = f32::INFINITY;
     let encoded = encode(&odd, &steps).unwrap();
-    let (back, _) = decode(&encoded.bytes, Path::new("a.gsz")).unwrap();
+    let (back, _) = decode(&encoded.bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap();
     assert_eq!(back.tensors["a.exact"].data, odd.tensors["a.exact"].data);
 }

@@ -22,7 +22,7 @@ use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, Ten
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
 use crate::emit::bounds::Bounds;
 use crate::error::{Error, Result};
-use crate::limits::Limits;
+use crate::limits::{Limits, ReadLimit};
 use crate::model::Columns;
 use crate::reduction::Reduction;
 use crate::render;
@@ -149,7 +149,7 @@ impl Archive {
         }
         let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
         let looked_at = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
-            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path)?;
+            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
             let shown = scene.input.showing(&decoded)?;
             Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
         };

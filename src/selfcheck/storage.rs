@@ -17,6 +17,7 @@ use crate::emit::bounds::{Bounds, MaxError};
 use crate::emit::container::{Packing, write_container};
 use crate::error::{Error, Result};
 use crate::ingest::container::Container;
+use crate::limits::ReadLimit;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, FrameSource, Ids};
 
@@ -56,7 +57,7 @@ pub(super) fn archive_grid() -> Case {
     Case::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
         let (content, steps) = model();
         let Encoded { bytes, order, .. } = encode(&content, &steps)?;
-        let (back, _) = decode(&bytes, Path::new("made up"))?;
+        let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
         let expected = content.cloud.pick(&order);
         let mut worst = Worst::default();
         let half = |k: i32, value: f32| 0.5 * step(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
@@ -79,7 +80,7 @@ pub(super) fn archive_codes() -> Case {
     Case::new("archive's codes", "symbols and bytes: the same", 0.0, || {
         let (content, steps) = model();
         let Encoded { bytes, order, .. } = encode(&content, &steps)?;
-        let (back, _) = decode(&bytes, Path::new("made up"))?;
+        let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
         let mut expected = content.cloud.pick(&order);
         let attributes: Vec<usize> = (0..used_attributes(&content)).collect();
         round_cloud(&mut expected, &steps.cloud, &attributes);

@@ -11,6 +11,7 @@ use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::families::archive::{is_folder, read_archive, unpack};
 use crate::ingest::open::open_file;
+use crate::limits::ReadLimit;
 use crate::model::Columns;
 
 /// What was unpacked.
@@ -41,9 +42,9 @@ pub fn is_archive(path: &Path) -> Result<bool> {
 /// Writes what the archive at `path` holds to `output`: a model folder, or a PLY where it is of one.
 ///
 /// # Errors
-/// An archive that is damaged; an output that is there already, or that cannot be written.
-pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace) -> Result<Unpacked> {
-    let (content, parts) = read_archive(path)?;
+/// An archive that is damaged, or exceeds `memory`; an output that is there already, or that cannot be written.
+pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: ReadLimit) -> Result<Unpacked> {
+    let (content, parts) = read_archive(path, memory)?;
     let values: usize = content.tensors.values().map(|tensor| tensor.data.len()).sum();
     let attributes = content.cloud.len() * Columns::all().width(content.cloud.sh_degree());
     let unpacked = Unpacked { gaussians: content.cloud.len(), parts, bytes: 4 * (values + attributes) as u64 };

@@ -1,9 +1,10 @@
 //! The parts of an archive beside symbols, by name, and the PLY among them.
 
+use std::io::{self, Write};
 use std::path::Path;
 
 use crate::archive::Content;
-use crate::emit::ply::{beside, write_rows};
+use crate::emit::ply::{beside, bytes_beside, write_rows};
 use crate::error::{Error, Result};
 use crate::ingest::ply::{Header, Ply, name_without_bands};
 
@@ -22,11 +23,22 @@ pub(crate) const ITERATION: &str = "iteration";
 /// A template cut short since it was opened.
 pub(crate) fn add_cloud(content: &mut Content, template: &Ply, rows: impl Iterator<Item = u32>) -> Result<()> {
     template.check_unshrunk()?;
+    let [lead, tail] = template.bytes_around();
+    let what = "what the archive keeps beside the attributes of Gaussians";
+    let bytes = lead + tail + bytes_beside(template) * content.cloud.len();
+    // The content, and the archive that it is encoded to.
+    template.memory().check(template.path(), "element vertex", what, 2 * bytes as u64)?;
     content.beside = beside(template, rows);
+    let around = |write: &dyn Fn(&mut dyn Write) -> io::Result<()>| {
+        let mut bytes = Vec::new();
+        write(&mut bytes).map(|()| bytes).map_err(Error::io("read", template.path()))
+    };
+    let lead = around(&|out| template.write_lead(out))?;
+    let tail = around(&|out| template.write_tail(out))?;
     let name = |name: &str| name_without_bands(name, template.sh_degree(), content.cloud.sh_degree());
     let header = template.header().text_for(content.cloud.len(), name);
-    for (name, bytes) in [(HEADER, &header[..]), (LEAD, template.lead()), (TAIL, template.tail())] {
-        content.files.insert(name.to_owned(), bytes.to_vec());
+    for (name, bytes) in [(HEADER, header), (LEAD, lead), (TAIL, tail)] {
+        content.files.insert(name.to_owned(), bytes);
     }
     Ok(())
 }

@@ -5,6 +5,7 @@
 pub(super) mod files;
 
 use std::fs;
+use std::io::Read;
 use std::path::Path;
 
 use xxhash_rust::xxh3::xxh3_128;
@@ -18,7 +19,8 @@ use crate::archive::{self, Content, Parts};
 use crate::emit::atomic::ScratchFolder;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
-use crate::limits::Limits;
+use crate::ingest::open::open_file;
+use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
@@ -34,10 +36,23 @@ pub(super) const ENTRY: Entry = Entry {
 /// Reads an archive; gives also how many of its bytes are for what.
 ///
 /// # Errors
-/// Whatever is wrong with it.
-pub fn read_archive(path: &Path) -> Result<(Content, Parts)> {
-    let bytes = fs::read(path).map_err(Error::io("read", path))?;
-    archive::decode(&bytes, path)
+/// Whatever is wrong with it; more than `memory` takes.
+pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, Parts)> {
+    archive::decode(&load(path, memory)?, path, memory)
+}
+
+/// Reads the bytes of the archive at `path`. Its head is checked before the rest is read.
+fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
+    let failed = |error| Error::io("read", path)(error);
+    let mut file = open_file(path)?;
+    let whole = file.metadata().map_err(failed)?.len();
+    let mut bytes = Vec::new();
+    file.by_ref().take(archive::HEAD as u64).read_to_end(&mut bytes).map_err(failed)?;
+    archive::check_head(&bytes, whole, path, memory)?;
+    // The head is part of the checked length.
+    bytes.reserve_exact((whole - bytes.len() as u64) as usize);
+    file.take(whole - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
+    Ok(bytes)
 }
 
 /// Writes what an archive, read from `path`, holds, as it was: into the folder `to` the files of a model, or a single
@@ -76,19 +91,22 @@ struct Archive {
 impl Archive {
     fn open(path: &Path, options: &OpenOptions) -> Result<Archive> {
         options.refuse_for(path)?;
-        let bytes = fs::read(path).map_err(Error::io("read", path))?;
-        let (content, parts) = archive::decode(&bytes, path)?;
+        let bytes = load(path, options.memory)?;
+        let (content, parts) = archive::decode(&bytes, path, options.memory)?;
+        let digest = format!("{:032x}", xxh3_128(&bytes));
+        drop(bytes);
         let folder = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
         let scratch = ScratchFolder::new(&folder)?;
         let inner: Box<dyn Family> = if is_folder(&content) {
             unpack(&content, path, scratch.path())?;
+            drop(content);
             (four_d_gaussians::ENTRY.open)(scratch.path(), options)?
         } else {
             let file = scratch.path().join("cloud.ply");
             unpack(&content, path, &file)?;
+            drop(content);
             (ply_sequence::FILE.open)(&file, options)?
         };
-        let digest = format!("{:032x}", xxh3_128(&bytes));
         Ok(Archive { inner, scratch, digest, size: parts.into() })
     }
 }
