@@ -24,6 +24,9 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
     let file = open_file(path)?;
     let mut decoder = Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::EXPAND);
+    // Texts and color profiles are not used, and may decompress to any length.
+    decoder.set_ignore_text_chunk(true);
+    decoder.set_ignore_iccp_chunk(true);
     let mut reader = decoder.read_info().map_err(malformed(path))?;
     let found = (reader.info().width, reader.info().height);
     if found != (width, height) {

@@ -1,10 +1,11 @@
 //! numpy's `.npz` archives, of which arrays are read where they lie.
 //!
-//! In: a path. Out: the shape of every array, and values of those asked for. Memory: pages of the mapped file. An array
-//! that is compressed or not f32 is decoded once, into a scratch file that is mapped in its place.
+//! In: a path. Out: the shape of every array, and values of those asked for. Memory: 2 MiB of a map of the file. An array
+//! that is compressed or not f32 is decoded once, into a scratch file without a name that is mapped in its place.
 
 use std::fs::File;
-use std::io::{BufWriter, Cursor, Read, Write};
+use std::io::{BufReader, BufWriter, Read, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -15,11 +16,18 @@ use zip::read::ZipFile;
 
 use super::map::FileMap;
 use super::npy::{HEAD, header_is_sound};
-use crate::emit::atomic::ScratchFile;
+use super::open::open_file;
+use super::zip_end::check_end;
 use crate::error::{Error, Result};
 
 /// Most arrays of an archive.
 const MAX_ARRAYS: usize = 4096;
+/// Bytes of decoded arrays that each byte of an archive may stand for, beside [`SCRATCH`]. Trained models have 1 to 2.
+const SCRATCH_PER_BYTE: u64 = 64;
+/// Bytes of decoded arrays that any archive may have.
+const SCRATCH: u64 = 64 << 20;
+/// Most bytes that DEFLATE packs into one.
+const MOST_PER_BYTE: u64 = 1032;
 
 /// An open archive.
 #[derive(Debug)]
@@ -44,6 +52,8 @@ pub(crate) struct Entry {
     pub(crate) is_fortran: bool,
     /// Whether it is compressed.
     pub(crate) is_compressed: bool,
+    /// Bytes in the archive.
+    stored: u64,
     /// Place in the archive.
     index: usize,
     /// Bytes of its header, and where in the file its values begin if it is not compressed.
@@ -117,8 +127,7 @@ impl Npz {
             Error::input(path, place, "arrays as numpy.savez writes them", found)
                 .hint("if the file was copied, copy it again: one that is cut short has lost its list of arrays")
         };
-        let mut archive = ZipArchive::new(Cursor::new(&map[..]))
-            .map_err(|error| wrong("list of arrays".into(), error.to_string()))?;
+        let mut archive = open_zip(path)?.map_err(|found| wrong("list of arrays".into(), found))?;
         if archive.len() > MAX_ARRAYS {
             return Err(wrong("list of arrays".into(), format!("{} arrays", archive.len())));
         }
@@ -133,6 +142,8 @@ impl Npz {
             let entry = Entry::read(&mut file, index, name.clone()).map_err(|found| wrong(name.clone(), found))?;
             let bytes = entry.float.map(|float| entry.len() * float.bytes);
             if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
+                || entry.stored > map.len() as u64
+                || file.size() > entry.stored.saturating_mul(MOST_PER_BYTE).saturating_add(64)
                 || !entry.is_compressed && entry.start as u64 + (file.size() - entry.header as u64) > map.len() as u64
             {
                 return Err(wrong(name, {
@@ -161,12 +172,30 @@ impl Npz {
         self.entries.iter().find(|entry| entry.name == name)
     }
 
-    /// The values of the array called `name`, decoded into a file in `scratch` where they cannot be read where they lie.
+    /// Confirms that the arrays called `names` are there, hold floating-point numbers in C order, and decode to no more
+    /// scratch bytes than an archive of this length may have. Nothing is decoded.
     ///
     /// # Errors
-    /// An array that is not there or holds no floating-point numbers in C order; one that does not decode; a scratch file
-    /// that cannot be written.
-    pub(crate) fn floats(&self, name: &str, scratch: &Path) -> Result<Floats> {
+    /// One of these does not hold; the error names the array.
+    pub(crate) fn check_floats(&self, names: &[&str]) -> Result<()> {
+        let most = SCRATCH + SCRATCH_PER_BYTE * self.map.len() as u64;
+        let mut decoded = 0u64;
+        for name in names {
+            let (entry, float) = self.float(name)?;
+            if !entry.is_in_place(float) {
+                decoded = decoded.saturating_add(4 * entry.len() as u64);
+            }
+            if decoded > most {
+                let expected = format!("arrays of at most {most} bytes in an archive of {}", self.map.len());
+                return Err(Error::input(&self.path, *name, expected, format!("{decoded} bytes up to this one"))
+                    .hint("if the model is meant to hold so many equal values, save it with numpy.savez"));
+            }
+        }
+        Ok(())
+    }
+
+    /// The array called `name` and the type of its values.
+    fn float(&self, name: &str) -> Result<(&Entry, Float)> {
         let Some(entry) = self.entry(name) else {
             let names: Vec<&str> = self.entries.iter().map(|entry| entry.name.as_str()).collect();
             return Err(Error::input(&self.path, name, "an array of this name", names.join(", ")));
@@ -175,11 +204,22 @@ impl Npz {
             let found = format!("{} in another order or type", entry.descr);
             return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found));
         };
-        if !entry.is_compressed && float == Float::F32 {
-            return Ok(Floats { map: Arc::clone(&self.map), start: entry.start, len: entry.len(), _scratch: None });
+        Ok((entry, float))
+    }
+
+    /// The values of the array called `name`, decoded into a file in `scratch` where they cannot be read where they lie.
+    ///
+    /// # Errors
+    /// An array that is not there or holds no floating-point numbers in C order; one that does not decode; a scratch file
+    /// that cannot be written.
+    pub(crate) fn floats(&self, name: &str, scratch: &Path) -> Result<Floats> {
+        let (entry, float) = self.float(name)?;
+        if entry.is_in_place(float) {
+            return Ok(Floats { map: Arc::clone(&self.map), start: entry.start, len: entry.len() });
         }
-        let decoded = ScratchFile::new(scratch)?;
-        let mut out = BufWriter::new(File::create(decoded.path()).map_err(Error::io("create", decoded.path()))?);
+        let file = tempfile::tempfile_in(scratch).map_err(Error::io("create a scratch file in", scratch))?;
+        let failed = |error| Error::io("write a scratch file in", scratch)(error);
+        let mut out = BufWriter::new(&file);
         let mut piece = vec![0; entry.len().min(1 << 16) * float.bytes];
         let mut left = entry.len() * float.bytes;
         self.read(entry, |values| {
@@ -188,14 +228,15 @@ impl Npz {
                 values.read_exact(piece).map_err(|error| self.damaged(entry, &error))?;
                 for stored in piece.chunks_exact(float.bytes) {
                     let value = float.decode(stored).to_le_bytes();
-                    out.write_all(&value).map_err(Error::io("write", decoded.path()))?;
+                    out.write_all(&value).map_err(failed)?;
                 }
                 left -= piece.len();
             }
-            out.flush().map_err(Error::io("write", decoded.path()))
+            out.flush().map_err(failed)
         })?;
-        let map = Arc::new(FileMap::open(decoded.path())?);
-        Ok(Floats { map, start: 0, len: entry.len(), _scratch: Some(Arc::new(decoded)) })
+        drop(out);
+        let map = FileMap::from_scratch(&file, 0..4 * entry.len() as u64, &self.path)?;
+        Ok(Floats { map: Arc::new(map), start: 0, len: entry.len() })
     }
 
     /// Has `take` read the stored values of `entry` from first to last.
@@ -204,9 +245,8 @@ impl Npz {
     /// Those of `take`; a file cut short since it was opened.
     pub(crate) fn read(&self, entry: &Entry, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
         self.map.check()?;
-        let broken = |error: zip::result::ZipError| self.damaged(entry, &error);
-        let mut archive = ZipArchive::new(Cursor::new(&self.map[..])).map_err(broken)?;
-        let mut file = archive.by_index(entry.index).map_err(broken)?;
+        let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;
+        let mut file = archive.by_index(entry.index).map_err(|error| self.damaged(entry, &error))?;
         let mut header = vec![0; entry.header];
         file.read_exact(&mut header).map_err(|error| self.damaged(entry, &error))?;
         take(&mut file)
@@ -218,7 +258,21 @@ impl Npz {
     }
 }
 
+/// Opens the zip archive at `path`. The inner error says what was found in it.
+fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
+    let mut file = open_file(path)?;
+    if let Err(found) = check_end(&mut file).map_err(Error::io("read", path))? {
+        return Ok(Err(found));
+    }
+    Ok(ZipArchive::new(BufReader::new(file)).map_err(|error| error.to_string()))
+}
+
 impl Entry {
+    /// Whether values of type `float` can be read where they lie.
+    fn is_in_place(&self, float: Float) -> bool {
+        !self.is_compressed && float == Float::F32
+    }
+
     fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<Entry, String> {
         let is_compressed = file.compression() != zip::CompressionMethod::Stored;
         let start = file.data_start();
@@ -237,6 +291,7 @@ impl Entry {
             descr: header.dtype().descr(),
             is_fortran: header.order() == Order::Fortran,
             is_compressed,
+            stored: file.compressed_size(),
             index,
             header: before,
             start: start as usize + before,
@@ -250,14 +305,17 @@ pub(crate) struct Floats {
     map: Arc<FileMap>,
     start: usize,
     len: usize,
-    /// Where they were decoded to.
-    _scratch: Option<Arc<ScratchFile>>,
 }
 
 impl Floats {
     /// Confirms that they are still there; call before a block of them is read.
     pub(crate) fn check(&self) -> Result<()> {
         self.map.check()
+    }
+
+    /// Records that the values of `range` were read, so that their pages can be released.
+    pub(crate) fn touched(&self, range: Range<usize>) {
+        self.map.touched(self.start + 4 * range.start..self.start + 4 * range.end);
     }
 
     /// The values from `first` on.

@@ -4,6 +4,7 @@
 //! entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The texture holds
 //! [`ROW_BYTES`] per Gaussian ([`Row`]), then zeros. Source: antmatter15/splaTV.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use half::f16;
@@ -20,6 +21,8 @@ pub const TEXELS: usize = 4096;
 pub const ROW_BYTES: usize = 64;
 /// Bytes of a texel: four words.
 const TEXEL_BYTES: usize = 16;
+/// Longest JSON text: some 3000 cameras. Its values take up to 30 times as much memory.
+const MOST_TEXT: usize = 1 << 20;
 /// Words of a Gaussian.
 pub const WORDS: usize = 16;
 
@@ -67,6 +70,20 @@ impl Row {
     }
 }
 
+/// Number of bytes of `texture` up to the last one that is not zero.
+fn used_bytes(map: &FileMap, texture: Range<usize>) -> usize {
+    let mut end = texture.end;
+    while end > texture.start {
+        let piece = texture.start.max(end.saturating_sub(1 << 20))..end;
+        map.touched(piece.clone());
+        if let Some(last) = map[piece.clone()].iter().rposition(|&byte| byte != 0) {
+            return piece.start + last + 1 - texture.start;
+        }
+        end = piece.start;
+    }
+    0
+}
+
 /// An open file.
 #[derive(Debug)]
 pub struct Splatv {
@@ -98,6 +115,10 @@ impl Splatv {
             return Err(Error::input(path, "byte 0", format!("the magic {MAGIC:#06x}"), format!("{magic:#06x}")));
         }
         let start = 8 + word(4)? as usize;
+        if start > MOST_TEXT && map.len() >= start {
+            let expected = format!("a text of at most {MOST_TEXT} bytes");
+            return Err(Error::input(path, "byte 4", expected, format!("{} bytes", start - 8)));
+        }
         let text = map.get(8..start).ok_or_else(|| cut(format!("{start} bytes up to the end of its text")))?;
         let document: Value = serde_json::from_slice(text)
             .map_err(|error| Error::input(path, "its text", "JSON", quoted(&error.to_string())))?;
@@ -122,8 +143,7 @@ impl Splatv {
         if there < size {
             return Err(cut(format!("{} bytes, {size} of them of its texture", start as u64 + size)));
         }
-        let texture = &map[start..start + size as usize];
-        let used = texture.iter().rposition(|&byte| byte != 0).map_or(0, |last| last + 1);
+        let used = used_bytes(&map, start..start + size as usize);
         let (count, cameras) = (used.div_ceil(ROW_BYTES), entry["cameras"].clone());
         u32::try_from(count)
             .map_err(|_| Error::input(path, "its texture", "at most 4294967295 Gaussians", count.to_string()))?;
@@ -147,6 +167,7 @@ impl Splatv {
 
     /// The words of Gaussian `i`.
     pub fn words(&self, i: usize) -> [u32; WORDS] {
+        self.map.touched(self.start + i * ROW_BYTES..self.start + (i + 1) * ROW_BYTES);
         let row = &self.map[self.start + i * ROW_BYTES..][..ROW_BYTES];
         std::array::from_fn(|k| u32::from_le_bytes(std::array::from_fn(|b| row[4 * k + b])))
     }

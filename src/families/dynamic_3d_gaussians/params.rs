@@ -56,13 +56,26 @@ impl Params {
             }
         };
         let said = |shape: &[usize]| format!("shape {shape:?}");
-        let floats = |name: &str, shape: &[usize]| match npz.entry(name) {
-            Some(entry) if entry.shape == shape => npz.floats(name, scratch),
-            Some(entry) => Err(Error::input(path, name, said(shape), said(&entry.shape))
-                .hint(format!("{MEANS} has {frames} frames of {count} Gaussians: all arrays must"))),
-            None => npz.floats(name, scratch),
-        };
-        let segments = npz.entry(SEGMENTS).is_some().then(|| floats(SEGMENTS, &[count, 3])).transpose()?;
+        let has_segments = npz.entry(SEGMENTS).is_some();
+        let expected: [(&str, &[usize]); 6] = [
+            (MEANS, &[frames, count, 3]),
+            (ROTATIONS, &[frames, count, 4]),
+            (COLOURS, &[frames, count, 3]),
+            (LOG_SCALES, &[count, 3]),
+            (OPACITIES, &[count, 1]),
+            (SEGMENTS, &[count, 3]),
+        ];
+        let expected = &expected[..if has_segments { 6 } else { 5 }];
+        // All shapes and types, before any array is decoded.
+        for &(name, shape) in expected {
+            if let Some(entry) = npz.entry(name).filter(|entry| entry.shape != shape) {
+                return Err(Error::input(path, name, said(shape), said(&entry.shape))
+                    .hint(format!("{MEANS} has {frames} frames of {count} Gaussians: all arrays must")));
+            }
+        }
+        npz.check_floats(&expected.iter().map(|&(name, _)| name).collect::<Vec<_>>())?;
+        let floats = |name: &str| npz.floats(name, scratch);
+        let segments = has_segments.then(|| floats(SEGMENTS)).transpose()?;
         let varying = Columns::POSITION | Columns::ROTATION | Columns::SH;
         let last = frames.saturating_sub(1).max(1) as f64;
         let info = SequenceInfo {
@@ -72,11 +85,11 @@ impl Params {
             varying: if frames > 1 { varying } else { Columns::empty() },
         };
         Ok(Params {
-            means: floats(MEANS, &[frames, count, 3])?,
-            rotations: floats(ROTATIONS, &[frames, count, 4])?,
-            colours: floats(COLOURS, &[frames, count, 3])?,
-            log_scales: floats(LOG_SCALES, &[count, 3])?,
-            opacities: floats(OPACITIES, &[count, 1])?,
+            means: floats(MEANS)?,
+            rotations: floats(ROTATIONS)?,
+            colours: floats(COLOURS)?,
+            log_scales: floats(LOG_SCALES)?,
+            opacities: floats(OPACITIES)?,
             segments,
             npz,
             info,
@@ -161,6 +174,18 @@ impl BlockReader for Block<'_> {
                     Columns::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
                     _ => out.sh.set_row(row, colours.row::<3>(3 * at).map(|colour| harmonic(colour.into()))),
                 }
+            }
+        }
+        let (first, last) = (self.ids.iter().min().copied(), self.ids.iter().max().copied());
+        if let (Some(first), Some(last)) = (first, last) {
+            for (floats, width, row) in [
+                (means, 3, frame * info.count),
+                (rotations, 4, frame * info.count),
+                (colours, 3, frame * info.count),
+                (log_scales, 3, 0),
+                (opacities, 1, 0),
+            ] {
+                floats.touched(width * (row + first)..width * (row + last + 1));
             }
         }
         Ok(())

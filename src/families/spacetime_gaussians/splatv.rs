@@ -22,8 +22,8 @@ use crate::ingest::cameras::Clock;
 use crate::ingest::digest::hash_file;
 use crate::ingest::splatv::{MAGIC, Row, Splatv};
 use crate::ingest::text::read_json;
-use crate::limits::Limits;
-use crate::model::{Column, Gaussians, Raw, colour, harmonic, logit, opacity};
+use crate::limits::{Limits, ReadLimit};
+use crate::model::{Column, Columns, Gaussians, Raw, colour, harmonic, logit, opacity};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
@@ -37,7 +37,7 @@ pub(in super::super) const SPLATV: Entry = Entry {
     recognises: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
         options.refuse_for(path)?;
-        Ok(Box::new(File::open(path)?))
+        Ok(Box::new(File::open(path, options.memory)?))
     },
 };
 
@@ -49,9 +49,11 @@ struct File {
 }
 
 impl File {
-    fn open(path: &Path) -> Result<File> {
+    fn open(path: &Path, memory: ReadLimit) -> Result<File> {
         let file = Splatv::open(path)?;
         let count = file.count();
+        let values = (Columns::all().width(0) + WIDTH) as u64;
+        memory.check(path, "its texture", "the Gaussians of the file", 4 * values * count as u64)?;
         let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
         for i in 0..count {
             let row = Row::of_words(&file.words(i));
