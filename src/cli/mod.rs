@@ -2,6 +2,7 @@
 //! else on stderr.
 
 mod args;
+mod cut_short;
 mod help;
 mod recipe_flags;
 mod signals;
@@ -60,6 +61,7 @@ pub fn main() -> ExitCode {
     };
     // Before anything is begun.
     signals::install();
+    cut_short::install();
     Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
     let result = run(cli);
@@ -244,7 +246,8 @@ fn run(cli: Cli) -> Result<()> {
                 return Ok(());
             };
             if !input.is_stream() && archive::is_archive(&input.path)? {
-                let unpacked = archive::unpack_archive(&input.path, &output, args.earlier.replace())?;
+                let unpacked =
+                    archive::unpack_archive(&input.path, &output, args.earlier.replace(), input.memory.read_limit())?;
                 return print(&format!(
                     "{}: {} Gaussians, {} bytes of values from {}\n",
                     output.display(),
