@@ -14,11 +14,11 @@ pub(super) const ENTRY: Entry = Entry {
     expected: "a .gseq",
     recognises: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
-        let container = Container::open(path)?;
+        let container = Container::open_within(path, options.memory)?;
         options.refuse_for(path)?;
         if options.link.is_asked() && container.info().times.len() > 1 {
-            let (joins, scratch) = (options.link.joins(), options.scratch());
-            return Ok(Box::new(Linked::anew(&container, "linked gseq container", joins, &scratch)?));
+            let joins = options.link.joins();
+            return Ok(Box::new(Linked::anew(&container, "linked gseq container", joins, &options.ply())?));
         }
         Ok(Box::new(container))
     },

@@ -37,7 +37,7 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
     if stdin.is_terminal() {
         return Err(Error::usage("standard input is a terminal; pipe a frame stream into it (format/STREAM.md)"));
     }
-    FrameStream::open(stdin, Path::new(STANDARD_INPUT))
+    FrameStream::open(stdin, Path::new(STANDARD_INPUT), options.memory.read_limit())
 }
 
 /// Packs a stream into a scratch container and opens that with its cameras.
@@ -68,10 +68,12 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 /// # Errors
 /// What is wrong with the stream; a budget that does not hold the frames that are packed together.
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
-    let (joins, scratch) = (options.link.joins(), options.scratch_folder());
+    let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
-        true => Linked::receive(stream, Path::new(STANDARD_INPUT), joins, &scratch)?,
-        false => Linked::anew(&pack_arriving(stream, options)?, "linked frame stream", joins, &scratch)?,
+        true => Linked::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
+        false => {
+            Linked::anew(&pack_arriving(stream, options)?, "linked frame stream", joins, &options.opening().ply())?
+        }
     };
     let notes = input.notes();
     Ok(Opened { input: Box::new(input), rig, notes })

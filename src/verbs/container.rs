@@ -10,7 +10,7 @@ use gseq::{Compression, Reader, RecoverReport, VerifyReport};
 use serde::Serialize;
 
 use crate::TOOL;
-use crate::budget::{Need, Plan, Workload};
+use crate::budget::{Budget, Need, Plan, Workload};
 use crate::compress::emit::ENCODING;
 use crate::compress::summary::InputSummary;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
@@ -191,9 +191,10 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     Ok(opened)
 }
 
-/// Reads every byte of a container and checks it.
+/// Reads every byte of a container and checks it, within the memory that a run takes by default.
 pub fn verify(path: &Path) -> Result<VerifyReport> {
-    Ok(Reader::open(path)?.verify()?)
+    let memory = Budget::default().read_limit().bytes();
+    Ok(Reader::open_within(path, memory)?.verify_within(memory)?)
 }
 
 /// Saves the complete frames of a container that was cut short.
@@ -201,7 +202,7 @@ pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<Recove
     check_container_name(output, "recover")?;
     check_target(output, Kind::File, &[input], overwrite)?;
     let staged = StagedFile::new(output, overwrite)?;
-    let report = gseq::recover(input, staged.path())?;
+    let report = gseq::recover_within(input, staged.path(), Budget::default().read_limit().bytes())?;
     if report.frames == 0 {
         let found = format!("{} time stamps and {} intact tiles", report.frames_seen, report.tiles_seen);
         return Err(Error::input(input, "", "at least one complete frame to save", found)

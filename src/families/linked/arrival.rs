@@ -20,6 +20,7 @@ use crate::families::Family;
 use crate::families::trajectories::state_bytes;
 use crate::fit::SEEN;
 use crate::ingest::frame_stream::FrameStream;
+use crate::ingest::ply::PlyOptions;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::model::{Columns, Gaussians, opacity};
 use crate::source::{FrameSource, Ids, Wanted};
@@ -46,9 +47,17 @@ impl Arriving {
         Ok(())
     }
 
-    /// Links them: a `kind` of input of `bytes`.
-    fn link(self, kind: &'static str, bytes: u64, why: &str, joins: bool, scratch: &Path) -> Result<Linked> {
-        let linked = Linked::open(PlyFrames::open(self.folder.path())?, why, joins, scratch)?;
+    /// Links them: a `kind` of input of `bytes`, called `name` in messages.
+    fn link(
+        self,
+        kind: &'static str,
+        name: &Path,
+        bytes: u64,
+        why: &str,
+        joins: bool,
+        options: &PlyOptions,
+    ) -> Result<Linked> {
+        let linked = Linked::open(PlyFrames::open(self.folder.path(), options)?, name, why, joins, options)?;
         let memory = self.beside + 2 * self.largest;
         let arrived = Some(Arrived { _folder: self.folder, kind, bytes, memory });
         Ok(Linked { info: linked.info.with_times(self.times)?, arrived, ..linked })
@@ -56,13 +65,17 @@ impl Arriving {
 }
 
 impl Linked {
-    /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`, with scratch files in
-    /// `scratch`.
+    /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`.
     ///
     /// # Errors
     /// What is wrong with the stream; none but the end of it; a failed write.
-    pub fn receive(mut stream: FrameStream<impl Read>, name: &Path, joins: bool, scratch: &Path) -> Result<Linked> {
-        let mut arriving = Arriving::new(scratch, 0)?;
+    pub fn receive(
+        mut stream: FrameStream<impl Read>,
+        name: &Path,
+        joins: bool,
+        options: &PlyOptions,
+    ) -> Result<Linked> {
+        let mut arriving = Arriving::new(&options.scratch, 0)?;
         let mut state = Gaussians::zeros(0, stream.header().sh_degree);
         let progress = Progress::counting("receive", "frames");
         while let Some(time) = stream.next_frame(&mut state)? {
@@ -74,7 +87,7 @@ impl Linked {
             return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
         }
         let why = "the stream does not say which Gaussian is which";
-        arriving.link("linked frame stream", stream.received(), why, joins, scratch)
+        arriving.link("linked frame stream", name, stream.received(), why, joins, options)
     }
 
     /// Links what `input` shows, which says itself which Gaussian is which, and lives that are one if `joins`: in each frame
@@ -82,7 +95,7 @@ impl Linked {
     ///
     /// # Errors
     /// A frame that cannot be read; a failed write.
-    pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, scratch: &Path) -> Result<Linked> {
+    pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, options: &PlyOptions) -> Result<Linked> {
         let (source, info) = (input.source(), input.source().info());
         let seen = count_seen(source)?;
         let state = state_bytes(info.sh_degree, Columns::all());
@@ -90,7 +103,7 @@ impl Linked {
         let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
         let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Columns::SH));
         let unpacked = TOGETHER_BYTES.min(state * seen.iter().sum::<u64>());
-        let mut arriving = Arriving::new(scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
+        let mut arriving = Arriving::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
         let progress = Progress::new("unpack", "frames", info.times.len() as u64);
         let mut start = 0;
         while start < seen.len() {
@@ -114,7 +127,7 @@ impl Linked {
             }
         }
         drop(progress);
-        arriving.link(kind, input.bytes()?, "as asked", joins, scratch)
+        arriving.link(kind, Path::new(kind), input.bytes()?, "as asked", joins, options)
     }
 }
 

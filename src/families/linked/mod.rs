@@ -29,6 +29,7 @@ use crate::emit::atomic::{ScratchFile, ScratchFolder};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
 use crate::ingest::container::Container;
+use crate::ingest::ply::PlyOptions;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::limits::Limits;
 use crate::link::Joiner;
@@ -63,14 +64,15 @@ struct Arrived {
 }
 
 impl Linked {
-    /// Links `frames`, which the notes say `why` of, and if `joins` lives that are one, along which what hardly changes is held,
-    /// with scratch files in `scratch`.
+    /// Links `frames`, which the notes say `why` of, and if `joins` lives that are one, along which what hardly changes is held.
+    /// Messages call the frames `name`.
     ///
     /// # Errors
-    /// A frame that cannot be read or has changed meanwhile; a failed write.
-    pub(super) fn open(frames: PlyFrames, why: &str, joins: bool, scratch: &Path) -> Result<Linked> {
+    /// A frame that cannot be read or has changed meanwhile; more memory than `options` allow; a failed write.
+    pub(super) fn open(frames: PlyFrames, name: &Path, why: &str, joins: bool, options: &PlyOptions) -> Result<Linked> {
+        let scratch = &*options.scratch;
         let mut joiner = joins.then(Joiner::default);
-        let (mut tracks, found, linker) = Tracks::link(frames, joiner.as_mut(), scratch)?;
+        let (mut tracks, found, linker) = Tracks::link(frames, name, joiner.as_mut(), options)?;
         let joined = joiner.map(|joiner| lives::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
         drop(linker);
         let held = if joins { lives::hold(&mut tracks, scratch)? } else { None };

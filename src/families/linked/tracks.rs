@@ -10,7 +10,7 @@ use super::memory::Sizes;
 use super::steady::{Means, Steady};
 use crate::emit::container::{ContainerWriter, GAUSSIAN_BLOCK, Lives};
 use crate::error::Result;
-use crate::ingest::ply::Ply;
+use crate::ingest::ply::{Ply, PlyOptions};
 use crate::ingest::ply_frames::PlyFrames;
 use crate::link::{Joiner, Linker, blend};
 use crate::model::{Columns, Gaussians, SequenceInfo};
@@ -108,18 +108,29 @@ impl Found {
 }
 
 impl Tracks {
-    /// Links `frames`, which `joiner` looks at too. Scratch files are in `scratch`.
+    /// Links `frames`, called `name` in messages, which `joiner` looks at too.
+    ///
+    /// # Errors
+    /// A frame that cannot be read; more memory than `options` allow; a failed write.
     pub(super) fn link(
         frames: PlyFrames,
+        name: &Path,
         mut joiner: Option<&mut Joiner>,
-        scratch: &Path,
+        options: &PlyOptions,
     ) -> Result<(Tracks, Found, Linker)> {
+        let scratch = &*options.scratch;
+        let of_frame = frames.counts().iter().copied().max().unwrap_or(0);
         let (mut linker, mut living) = (Linker::default(), 0);
         let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
         let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
         let progress = Progress::new("link", "frames", frames.paths().len() as u64);
         for frame in 0..frames.paths().len() {
+            // Before a frame is read at least its own Gaussians are counted as tracks.
+            let linked = births.len().max(of_frame as usize) as u64;
+            let sizes =
+                Sizes { of_frame: of_frame.into(), sh_degree: frames.sh_degree(), linked, living: living as u64 };
+            options.memory.check(name, &format!("frame {frame}"), "linking the frames", sizes.opening())?;
             let ply = frames.frame(frame)?;
             ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
             let linked = linker.link(&state);

@@ -8,6 +8,7 @@ use gseq::{Reader, TileBuffer, TileFrames, TileId, Touched};
 
 use super::held::HeldTiles;
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 use crate::model::{Columns, HIGHEST_DEGREE, SequenceInfo, sh_coefficients};
 use crate::source::Count;
 
@@ -43,8 +44,19 @@ pub(super) struct Lent<'a> {
 impl Container {
     /// Opens the container and checks that it holds Gaussians: position, rotation, log_scale,
     /// opacity_logit and sh, each of its width.
+    ///
+    /// # Errors
+    /// Those of [`Reader::open`]; other columns.
     pub fn open(path: &Path) -> Result<Container> {
-        let reader = Reader::open(path)?;
+        Self::open_within(path, ReadLimit::NONE)
+    }
+
+    /// [`Container::open`] with at most `memory` for what is known of frames and tiles.
+    ///
+    /// # Errors
+    /// Those of [`Container::open`]; a container that needs more memory.
+    pub fn open_within(path: &Path, memory: ReadLimit) -> Result<Container> {
+        let reader = Reader::open_within(path, memory.bytes())?;
         let layout = reader.layout();
         let mut places = Vec::new();
         let mut sh_degree = 0;

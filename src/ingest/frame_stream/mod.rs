@@ -1,7 +1,8 @@
 //! A frame stream, as another program pipes it in (format/STREAM.md).
 //!
-//! In: bytes from anywhere. Out: the columns that hold for all frames, then frame after frame. Memory: what
-//! the caller hands in to be filled; nothing is allocated for more than 1 MiB beyond the bytes received.
+//! In: bytes from anywhere. Out: the columns that hold for all frames, then frame after frame. Memory: the constant
+//! columns and the frame that is read, both refused before they are read if they exceed the limit; nothing is allocated
+//! for more than 1 MiB beyond twice the bytes received.
 
 mod framing;
 #[cfg(test)]
@@ -11,6 +12,7 @@ use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians};
 pub use framing::StreamHeader;
 pub(crate) use framing::{Illegal, Mark};
@@ -27,6 +29,7 @@ pub struct FrameStream<R> {
     frames: u32,
     last_time: Option<f64>,
     ended: bool,
+    memory: ReadLimit,
 }
 
 /// A source of bytes with the number of those that have come.
@@ -42,8 +45,8 @@ impl<R: Read> FrameStream<R> {
     /// Reads the header and the columns that hold for every frame. Messages call the stream `name`.
     ///
     /// # Errors
-    /// A header that STREAM.md refuses; a stream that ends within.
-    pub fn open(from: R, name: &Path) -> Result<FrameStream<R>> {
+    /// A header that STREAM.md refuses; a stream that ends within; constant columns that exceed `memory`.
+    pub fn open(from: R, name: &Path, memory: ReadLimit) -> Result<FrameStream<R>> {
         let mut bytes = Counted { from, name: name.to_owned(), received: 0 };
         let mut header = [0; StreamHeader::BYTES];
         let got = bytes.fill(&mut header)?;
@@ -53,12 +56,15 @@ impl<R: Read> FrameStream<R> {
         }
         let header = StreamHeader::from_bytes(&header).map_err(|illegal| bytes.error(0, None, illegal))?;
         let mut constant = Gaussians::zeros(0, header.sh_degree);
-        for column in Columns::all().difference(header.varying).iter() {
+        let columns = Columns::all().difference(header.varying);
+        let announced = 4 * columns.width(header.sh_degree) as u64 * header.count as u64;
+        memory.check(name, "byte 16", &format!("the constant columns of {} Gaussians", header.count), announced)?;
+        for column in columns.iter() {
             if !bytes.column(header.count, constant.column_mut(column))? {
                 return Err(bytes.ended(&format!("the constant column {}", column.name()), None));
             }
         }
-        Ok(FrameStream { bytes, header, constant, frames: 0, last_time: None, ended: false })
+        Ok(FrameStream { bytes, header, constant, frames: 0, last_time: None, ended: false, memory })
     }
 
     /// What the stream said of itself.
@@ -85,8 +91,8 @@ impl<R: Read> FrameStream<R> {
     /// alone, and gives its time; none after the end mark.
     ///
     /// # Errors
-    /// Everything STREAM.md calls one, with the frame and the byte; a failed read. The stream is of no use
-    /// afterwards.
+    /// Everything STREAM.md calls one, with the frame and the byte; a frame that exceeds the memory limit; a failed
+    /// read. The stream is of no use afterwards.
     pub fn next_frame(&mut self, out: &mut Gaussians) -> Result<Option<f64>> {
         if self.ended {
             return Ok(None);
@@ -102,6 +108,7 @@ impl<R: Read> FrameStream<R> {
             self.ended = true;
             return self.expect_nothing().map(|()| None);
         };
+        self.memory.check(&self.bytes.name, &place(start + 16, Some(frame)), "one frame", bytes)?;
         let count = match self.header.is_unlinked {
             true => (bytes / self.header.gaussian_bytes()) as usize,
             false => self.header.count,

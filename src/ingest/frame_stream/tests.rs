@@ -36,7 +36,7 @@ fn states(scene: &Scene) -> Vec<Gaussians> {
 
 /// Frames of a stream with all their columns, and their times.
 fn read(bytes: impl Read) -> Result<Vec<(f64, Gaussians)>> {
-    let mut stream = FrameStream::open(bytes, Path::new("test"))?;
+    let mut stream = FrameStream::open(bytes, Path::new("test"), ReadLimit::NONE)?;
     let mut state = stream.constant().clone();
     let mut frames = Vec::new();
     while let Some(time) = stream.next_frame(&mut state)? {
