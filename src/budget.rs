@@ -560,10 +560,11 @@ impl Budget {
         self.bytes.unwrap_or_else(|| Budget::by_default().0)
     }
 
-    /// Memory that opening an input may take: what the program itself leaves of the budget.
+    /// Memory that opening an input may take: what the program itself leaves of the budget, and at least 4 MiB, so that
+    /// small inputs open and the memory plan says what a run needs.
     pub fn read_limit(self) -> ReadLimit {
         let program = PROGRAM + PER_THREAD * rayon::current_num_threads() as u64;
-        ReadLimit::new(self.limit().saturating_sub(program))
+        ReadLimit::new(self.limit().saturating_sub(program).max(4 << 20))
     }
 
     /// Bytes that a run takes unless told otherwise, and where that number comes from.

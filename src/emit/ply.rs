@@ -91,7 +91,7 @@ pub(crate) fn write_rows_like(
     }
     create(path, |out| {
         out.write_all(&template.header().text_for(sources.len(), name))?;
-        out.write_all(template.lead())?;
+        template.write_lead(out)?;
         let mut changed = Vec::new();
         for (place, &source) in sources.iter().enumerate() {
             changed.clear();
@@ -99,7 +99,7 @@ pub(crate) fn write_rows_like(
             edit(place, &mut changed);
             left.iter().try_for_each(|range| out.write_all(&changed[range.clone()]))?;
         }
-        out.write_all(template.tail())
+        template.write_tail(out)
     })
 }
 
@@ -155,6 +155,11 @@ pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8>
     let ranges = ranges_beside(template.properties(), template.layout());
     rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
         .collect()
+}
+
+/// Bytes of each row of `template` that are no attribute of a Gaussian.
+pub(crate) fn bytes_beside(template: &Ply) -> usize {
+    ranges_beside(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
 }
 
 /// Writes a PLY with `header`, read from `from`, `cloud` as its rows with what is `beside` each, and what is before and

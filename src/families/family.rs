@@ -11,6 +11,7 @@ use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
 use crate::ingest::cameras::Clock;
+use crate::ingest::ply::PlyOptions;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::{Columns, Gaussians};
 use crate::recipe::Merge;
@@ -395,6 +396,11 @@ impl OpenOptions {
     /// Folder for scratch files.
     pub(super) fn scratch(&self) -> PathBuf {
         self.scratch.clone().unwrap_or_else(std::env::temp_dir)
+    }
+
+    /// How PLY files of the input are read.
+    pub(crate) fn ply(&self) -> PlyOptions {
+        PlyOptions { scratch: self.scratch(), memory: self.memory }
     }
 
     /// Refuses what only model folders take.

@@ -32,7 +32,7 @@ pub(super) const FOLDER: Entry = Entry {
     recognises: |found| found.is_folder,
     open: |path, options| {
         let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
-        open_frames(by(path)?, path, options)
+        open_frames(by(path, &options.ply())?, path, options)
     },
 };
 
@@ -40,7 +40,7 @@ pub(super) const FOLDER: Entry = Entry {
 pub(super) const FILE: Entry = Entry {
     expected: "a .ply",
     recognises: |found| found.is_file_of(b"ply", "ply"),
-    open: |path, options| open_frames(PlyFrames::single(path)?, path, options),
+    open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };
 
 /// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
@@ -55,7 +55,7 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
     match order {
         Order::Believed => Ok(Box::new(PlySequence::new(frames)?)),
         Order::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
-        Order::Lost(why) => Ok(Box::new(Linked::open(frames, &why, options.link.joins(), &options.scratch())?)),
+        Order::Lost(why) => Ok(Box::new(Linked::open(frames, path, &why, options.link.joins(), &options.ply())?)),
     }
 }
 

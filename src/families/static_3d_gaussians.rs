@@ -52,7 +52,11 @@ struct Static {
 impl Static {
     fn open(root: &Path, options: &OpenOptions) -> Result<Static> {
         let (iteration, folder) = iteration(&root.join(CLOUDS), options.iteration)?;
-        Ok(Static { root: root.to_owned(), iteration, cloud: PlySequence::single(&folder.join(CLOUD))? })
+        Ok(Static {
+            root: root.to_owned(),
+            iteration,
+            cloud: PlySequence::single(&folder.join(CLOUD), &options.ply())?,
+        })
     }
 
     fn beside(&self) -> impl Iterator<Item = PathBuf> {

@@ -1,29 +1,40 @@
-//! Files mapped into memory: the only module that maps.
+//! Files mapped into memory: the only module of this crate that maps.
 //!
-//! In: a path. Out: its bytes as a slice. Memory: pages the system may drop at any time.
+//! In: a path. Out: its bytes as a slice. Memory: mapped pages count as memory of this process until they are released,
+//! so readers report what they touched ([`FileMap::touched`]) and at most some 2 MiB of a map stay resident.
 
-use std::fs::{self, Metadata};
-use std::ops::Deref;
+use std::fs::{self, File, Metadata};
+use std::ops::{Deref, Range};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
-use memmap2::Mmap;
+use memmap2::{Mmap, MmapOptions};
 
 use super::open::open_file;
 use crate::error::{Error, Result};
 
-/// A whole file as bytes, read-only. No file descriptor stays open.
+/// Bytes of a map that may be resident before its pages are released. The call that releases them takes some 2 µs.
+const RESIDENT: usize = 2 << 20;
+/// Bytes about a touched page that the system may map with it, as Linux does.
+const AROUND: usize = 1 << 16;
+
+/// A whole file, or a part of a scratch file, as bytes, read-only. No file descriptor stays open.
 #[derive(Debug)]
 pub(crate) struct FileMap {
     path: PathBuf,
-    identity: Identity,
+    /// None for a scratch file, which nobody else can reach.
+    identity: Option<Identity>,
     map: Mmap,
+    /// Bytes touched since the pages were last released, and the end of the last touched range.
+    resident: AtomicUsize,
+    last_end: AtomicUsize,
 }
 
 impl FileMap {
     /// Maps the file at `path`.
     ///
     /// # Errors
-    /// When it cannot be opened or mapped (a folder, a pipe).
+    /// A file that is not regular, or cannot be opened or mapped.
     pub(crate) fn open(path: &Path) -> Result<FileMap> {
         let file = open_file(path)?;
         let identity = Identity::of(&file.metadata().map_err(Error::io("read the size of", path))?);
@@ -32,14 +43,33 @@ impl FileMap {
         // writes in place (outputs are renamed over, which leaves a mapped file's pages alone).
         // Shrinking, the one change that would end in SIGBUS, is looked for by `check`.
         let map = unsafe { Mmap::map(&file) }.map_err(Error::io("map", path))?;
-        Ok(FileMap { path: path.to_owned(), identity, map })
+        Ok(FileMap::new(path, Some(identity), map))
+    }
+
+    /// Maps `range` of a scratch file without a name, which holds data of the file at `path`.
+    ///
+    /// # Errors
+    /// A file that cannot be mapped.
+    pub(crate) fn from_scratch(file: &File, range: Range<u64>, path: &Path) -> Result<FileMap> {
+        let mut options = MmapOptions::new();
+        options.offset(range.start).len((range.end - range.start) as usize);
+        // SAFETY: the map is read-only. The file has no name, so only this process reaches it, and its writer only
+        // appends: the bytes of `range` were written before and stay as they are.
+        let map = unsafe { options.map(file) }.map_err(Error::io("map the scratch file of", path))?;
+        Ok(FileMap::new(path, None, map))
+    }
+
+    fn new(path: &Path, identity: Option<Identity>, map: Mmap) -> FileMap {
+        let (resident, last_end) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        FileMap { path: path.to_owned(), identity, map, resident, last_end }
     }
 
     /// Confirms that the file has not been cut short since it was mapped; call before each block
     /// that is read. A file that was replaced or removed meanwhile is fine: the map keeps the old one.
     pub(crate) fn check(&self) -> Result<()> {
+        let Some(identity) = &self.identity else { return Ok(()) };
         match fs::metadata(&self.path) {
-            Ok(now) if Identity::of(&now) == self.identity && now.len() < self.map.len() as u64 => Err(Error::input(
+            Ok(now) if Identity::of(&now) == *identity && now.len() < self.map.len() as u64 => Err(Error::input(
                 &self.path,
                 "end of file",
                 format!("{} bytes, as when it was opened", self.map.len()),
@@ -49,6 +79,44 @@ impl FileMap {
             _ => Ok(()),
         }
     }
+
+    /// Records that the bytes of `range` were or will be read, and releases the pages of the map once some 2 MiB of them
+    /// may be resident. Slices of the map stay valid: their pages are read from the file again.
+    pub(crate) fn touched(&self, range: Range<usize>) {
+        let gap = self.last_end.swap(range.end, Ordering::Relaxed).abs_diff(range.start).min(AROUND);
+        let more = gap + range.len();
+        if self.resident.fetch_add(more, Ordering::Relaxed) + more > RESIDENT {
+            self.resident.store(0, Ordering::Relaxed);
+            self.release();
+        }
+    }
+
+    /// Calls `each` with the bytes of `range` in pieces of at most 1 MiB.
+    pub(crate) fn pieces<E>(
+        &self,
+        range: Range<usize>,
+        mut each: impl FnMut(&[u8]) -> std::result::Result<(), E>,
+    ) -> std::result::Result<(), E> {
+        for start in range.clone().step_by(1 << 20) {
+            let piece = start..range.end.min(start + (1 << 20));
+            self.touched(piece.clone());
+            each(&self.map[piece])?;
+        }
+        Ok(())
+    }
+
+    /// Gives the pages of the map back to the system.
+    #[cfg(unix)]
+    fn release(&self) {
+        // SAFETY: the advice drops what was written to private pages. The map is read-only and backed by the file, so
+        // every dropped page comes back with the file's bytes: slices of it stay valid. A refusal leaves the pages
+        // where they are.
+        _ = unsafe { self.map.unchecked_advise(memmap2::UncheckedAdvice::DontNeed) };
+    }
+
+    /// Elsewhere the system takes pages back when it needs them.
+    #[cfg(not(unix))]
+    fn release(&self) {}
 }
 
 impl Deref for FileMap {

@@ -16,3 +16,4 @@ pub mod ply_frames;
 pub mod ply_sequence;
 pub mod splatv;
 pub mod text;
+pub(crate) mod zip_end;

@@ -2,7 +2,8 @@
 //!
 //! In: a folder with one PLY file per frame, or a single file. Out: their paths in order, the number of Gaussians in each,
 //! and each open when it is asked for. Memory: path and number of every frame; a frame's file is mapped only while it is
-//! read, so thousands of frames need neither thousands of maps nor of file descriptors.
+//! read, so thousands of frames need neither thousands of maps nor of file descriptors. Text files are converted once, when
+//! they are opened, into one scratch file.
 
 use std::cmp::Ordering;
 use std::ffi::OsStr;
@@ -12,8 +13,9 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::Xxh3;
 
 use super::digest::hash_file;
-use super::ply::{Ply, Property};
+use super::ply::{Ply, PlyOptions, Property, TextRows, TextStore};
 use crate::error::{Error, Result, quoted};
+use crate::limits::ReadLimit;
 
 /// PLY files with the same properties, one per frame.
 #[derive(Debug, Clone)]
@@ -22,6 +24,9 @@ pub struct PlyFrames {
     counts: Vec<u32>,
     properties: Vec<Property>,
     sh_degree: usize,
+    /// Converted rows of each text file.
+    texts: Vec<Option<TextRows>>,
+    memory: ReadLimit,
 }
 
 impl PlyFrames {
@@ -30,7 +35,7 @@ impl PlyFrames {
     /// # Errors
     /// A gap in the frames' numbers, or an entry called like a frame that is no file; a folder without PLY files; a file
     /// [`Ply::open`] refuses; frames that differ in their properties.
-    pub fn open(folder: &Path) -> Result<PlyFrames> {
+    pub fn open(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
         let (frames, others) = frames_of(folder)?;
         if let Some(other) = others.first() {
             let found = if other.is_dir() { "a folder" } else { "a link to nothing" };
@@ -40,40 +45,46 @@ impl PlyFrames {
             let found = format!("{before}, then {after}");
             return Err(Error::input(folder, "", format!("a frame {missing}"), found).hint(ALLOW_GAPS));
         }
-        Self::of(folder, frames)
+        Self::from_paths(folder, frames, options)
     }
 
     /// [`PlyFrames::open`] of the files that are there, whatever is missing between them.
     ///
     /// # Errors
     /// Those of [`PlyFrames::open`] but gaps.
-    pub fn open_with_gaps(folder: &Path) -> Result<PlyFrames> {
-        Self::of(folder, frames_of(folder)?.0)
+    pub fn open_with_gaps(folder: &Path, options: &PlyOptions) -> Result<PlyFrames> {
+        Self::from_paths(folder, frames_of(folder)?.0, options)
     }
 
     /// One PLY file as the only frame.
     ///
     /// # Errors
     /// A file [`Ply::open`] refuses.
-    pub fn single(path: &Path) -> Result<PlyFrames> {
-        Self::of(path, vec![path.to_owned()])
+    pub fn single(path: &Path, options: &PlyOptions) -> Result<PlyFrames> {
+        Self::from_paths(path, vec![path.to_owned()], options)
     }
 
-    fn of(origin: &Path, paths: Vec<PathBuf>) -> Result<PlyFrames> {
+    fn from_paths(origin: &Path, paths: Vec<PathBuf>, options: &PlyOptions) -> Result<PlyFrames> {
         let Some(first_path) = paths.first() else {
             return Err(Error::input(origin, "", "a folder with one .ply file per frame", "no .ply file in it"));
         };
-        let first = Ply::open(first_path)?;
+        let (store, memory) = (TextStore::new(&options.scratch), options.memory);
+        let first = Ply::open_into(first_path, memory, &store)?;
         let (properties, sh_degree) = (first.properties().to_vec(), first.sh_degree());
-        drop(first);
-        let mut counts = Vec::with_capacity(paths.len());
-        for path in &paths {
-            let ply = Ply::open(path)?;
-            check_properties(&ply, &properties, first_path)?;
+        let (mut counts, mut texts) = (Vec::with_capacity(paths.len()), Vec::with_capacity(paths.len()));
+        let mut take = |ply: &Ply| {
             // A PLY has at most 2³² − 1 rows.
             counts.push(ply.count() as u32);
+            texts.push(ply.text_rows().cloned());
+        };
+        take(&first);
+        drop(first);
+        for path in &paths[1..] {
+            let ply = Ply::open_into(path, memory, &store)?;
+            check_properties(&ply, &properties, first_path)?;
+            take(&ply);
         }
-        Ok(PlyFrames { paths, counts, properties, sh_degree })
+        Ok(PlyFrames { paths, counts, properties, sh_degree, texts, memory })
     }
 
     /// The files, in frame order.
@@ -109,7 +120,7 @@ impl PlyFrames {
         let Some(path) = self.paths.get(frame) else {
             return Err(Error::usage(format!("frame {frame} was asked for, of {} counted from 0", self.paths.len())));
         };
-        let ply = Ply::open(path)?;
+        let ply = Ply::open_again(path, self.memory, self.texts[frame].as_ref())?;
         check_properties(&ply, &self.properties, &self.paths[0])?;
         let expected = self.counts[frame] as usize;
         if ply.count() != expected {

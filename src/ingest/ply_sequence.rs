@@ -1,12 +1,11 @@
 //! A dynamic scene as one PLY file per frame.
 //!
-//! In: PLY files with the same Gaussians in the same order. Out: a [`FrameSource`]. Memory: that of [`PlyFrames`]. A text
-//! frame is parsed whole for every block: pack such a sequence first.
+//! In: PLY files with the same Gaussians in the same order. Out: a [`FrameSource`]. Memory: that of [`PlyFrames`].
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use super::ply::{Ply, check_ids};
+use super::ply::{Ply, PlyOptions, check_ids};
 use super::ply_frames::PlyFrames;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, SequenceInfo};
@@ -28,15 +27,15 @@ impl PlySequence {
     /// # Errors
     /// Those of [`PlyFrames::open`] and [`PlySequence::new`].
     pub fn open(folder: &Path) -> Result<PlySequence> {
-        Self::new(PlyFrames::open(folder)?)
+        Self::new(PlyFrames::open(folder, &PlyOptions::default())?)
     }
 
     /// One PLY file as a sequence of one frame, in which nothing varies.
     ///
     /// # Errors
     /// Those of [`PlyFrames::single`].
-    pub fn single(path: &Path) -> Result<PlySequence> {
-        Self::new(PlyFrames::single(path)?)
+    pub fn single(path: &Path, options: &PlyOptions) -> Result<PlySequence> {
+        Self::new(PlyFrames::single(path, options)?)
     }
 
     /// Frames that hold the same Gaussians in the same order. Frame i of T has time i / T; all columns vary when T > 1.

@@ -13,6 +13,8 @@ use splatsieve::families::{self, OpenOptions};
 use splatsieve::ingest::cameras::{self, CameraOptions};
 use splatsieve::ingest::container::Container;
 use splatsieve::ingest::frame_stream::FrameStream;
+use splatsieve::ingest::ply::check_header;
+use splatsieve::limits::ReadLimit;
 use splatsieve::model::{Columns, Gaussians};
 use splatsieve::recipe::Recipe;
 use splatsieve::source::FrameSource;
@@ -74,11 +76,11 @@ pub(crate) const PER_BYTE: usize = 512;
 const LITTLE: usize = 32 << 20;
 /// A tile may hold 256 MiB (format/SPEC.md), which are decoded beside what they are decoded from.
 const TILES: usize = 640 << 20;
-/// An archive may mean 64 MiB, and 8192 bytes for each of its own (format/ARCHIVE.md).
+/// An archive may mean 64 MiB, and 512 bytes for each of its own (format/ARCHIVE.md).
 const CONTENT: usize = 256 << 20;
 
 /// Every way in.
-pub(crate) const ENTRIES: [Entry; 15] = [
+pub(crate) const ENTRIES: [Entry; 16] = [
     Entry { name: "archive", corpus: "archive", read: archive, mended: mended_archive, most_bytes: CONTENT },
     Entry {
         name: "archive_sections",
@@ -96,6 +98,7 @@ pub(crate) const ENTRIES: [Entry; 15] = [
     Entry { name: "params", corpus: "params", read: params, mended: mended_zip, most_bytes: LITTLE },
     Entry { name: "pickle", corpus: "pickle", read: pickle, mended: mended_zip, most_bytes: LITTLE },
     Entry { name: "ply", corpus: "ply", read: ply, mended: |_| None, most_bytes: LITTLE },
+    Entry { name: "ply_header", corpus: "ply_header", read: ply_header, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "recipe", corpus: "recipe", read: recipe, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "recover", corpus: "container", read: recover, mended: mended_container, most_bytes: TILES },
     Entry { name: "splatv", corpus: "splatv", read: splatv, mended: |_| None, most_bytes: LITTLE },
@@ -159,7 +162,7 @@ fn look(source: &dyn FrameSource) -> Outcome {
 
 fn archive(bytes: &[u8], place: &Place) -> Outcome {
     let path = place.path("a.gsz");
-    let (content, _) = archive::decode(bytes, &path)?;
+    let (content, _) = archive::decode(bytes, &path, ReadLimit::NONE)?;
     let to = place.path("unpacked");
     let unpacked = unpack(&content, &path, &to);
     if to.is_dir() {
@@ -276,6 +279,12 @@ fn ply(bytes: &[u8], place: &Place) -> Outcome {
     model(&place.put("a.ply", bytes))
 }
 
+/// Headers alone, in memory: no file is written or opened.
+fn ply_header(bytes: &[u8], _: &Place) -> Outcome {
+    check_header(bytes, Path::new("a.ply"))?;
+    Ok(())
+}
+
 fn recipe(bytes: &[u8], _: &Place) -> Outcome {
     let recipe = Recipe::from_toml(std::str::from_utf8(bytes)?, "default")?;
     Recipe::from_toml(&recipe.to_toml(), "paper")?;
@@ -283,7 +292,7 @@ fn recipe(bytes: &[u8], _: &Place) -> Outcome {
 }
 
 fn stream(bytes: &[u8], _: &Place) -> Outcome {
-    let mut stream = FrameStream::open(bytes, Path::new("standard input"))?;
+    let mut stream = FrameStream::open(bytes, Path::new("standard input"), ReadLimit::NONE)?;
     let mut frame = Gaussians::zeros(0, stream.header().sh_degree);
     while stream.next_frame(&mut frame)?.is_some() {}
     Ok(())

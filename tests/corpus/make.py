@@ -115,6 +115,15 @@ def make_ply():
         ("bytes", b"x\n", b"\xff\xfe\n"),
     ):
         write("ply", name, whole.replace(before, after, 1))
+    write("ply_header", "whole", header())
+    write("ply_header", "ascii", header("ascii"))
+    write("ply_header", "big_endian_crlf", header("binary_big_endian").replace(b"\n", b"\r\n"))
+    write("ply_header", "many_comments", header().replace(b"element", b"comment trained by a program\n" * 40 + b"element"))
+    write("ply_header", "many_properties", header(names=[*NAMES, *(f"language_{k}" for k in range(300))]))
+    write("ply_header", "more_elements", header().replace(b"element", b"element camera 3\nproperty uchar id\nelement", 1))
+    write("ply_header", "largest_count", header(count=2**60))
+    write("ply_header", "a_list", header(names=["x"]).replace(b"end_header", b"property list uchar int nx\nend_header"))
+    write("ply_header", "no_end", header()[:-11])
     for name, value in (("nan", math.nan), ("infinite", math.inf), ("largest", 3.4e38)):
         write("ply", name, header() + floats([value] * len(NAMES) * COUNT))
     return whole

@@ -94,7 +94,7 @@ impl<L: Deforming + 'static> Folder<L> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
         let tensors = paths.tensors()?;
-        let ply = Ply::open(&paths.point_cloud)?;
+        let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
         let raw = raw(&ply)?;
         let (features, file, cloud) = (raw.own.width(), &*paths.network, &*paths.point_cloud);
         let parts = Parts { arguments: &arguments, tensors: &tensors, file, features, cloud };
@@ -149,8 +149,7 @@ fn heaviest(cluster: &Cluster) -> u32 {
 /// The parameters of a cloud, with its planes `fea_0`, `fea_1`, ….
 fn raw(ply: &Ply) -> Result<Raw> {
     let count = ply.count();
-    let mut gaussians = Gaussians::zeros(count, ply.sh_degree());
-    ply.gaussians(0..count, Columns::all(), &mut gaussians)?;
+    let gaussians = ply.whole()?;
     let find = |k: usize| ply.properties().iter().find(|property| property.name == format!("fea_{k}"));
     let features: Vec<_> = (0..).map_while(find).collect();
     let mut own = Column::zeros(features.len(), count);

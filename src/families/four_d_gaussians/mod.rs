@@ -40,7 +40,7 @@ pub(super) const ENTRY: Entry = Entry {
     recognises: |found| {
         found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
     },
-    open: |path, options| Ok(Box::new(ModelFolder::open(path, options.iteration)?)),
+    open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
 };
 
 impl Family for ModelFolder {

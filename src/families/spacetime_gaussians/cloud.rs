@@ -10,8 +10,8 @@ use super::decoder::Act;
 use super::law::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
 use crate::emit::ply::{out_rows, put, value, write_rows_like};
 use crate::error::{Error, Result};
-use crate::ingest::ply::{Encoding, Plane, Ply, Property};
-use crate::model::{Column, Columns, Gaussians, Raw, SH_C0, harmonic};
+use crate::ingest::ply::{Encoding, Plane, Ply, PlyOptions, Property};
+use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
 use crate::reduction::Reduction;
 
 /// The property that no other kind of cloud has.
@@ -30,8 +30,8 @@ impl Cloud {
     ///
     /// # Errors
     /// A PLY that is none of Gaussians; properties that are missing, or too many.
-    pub(super) fn open(path: &Path) -> Result<Cloud> {
-        let ply = Ply::open(path)?;
+    pub(super) fn open(path: &Path, options: &PlyOptions) -> Result<Cloud> {
+        let ply = Ply::open_with(path, options)?;
         let beginning =
             |prefix: &str| ply.properties().iter().filter(|property| property.name.starts_with(prefix)).count();
         let features = beginning("f_dc");
@@ -76,8 +76,7 @@ impl Cloud {
     /// A value that is no finite number; a file cut short since it was opened.
     pub(super) fn raw(&self, act: Act) -> Result<Raw> {
         let count = self.ply.count();
-        let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(0, count) };
-        self.ply.gaussians(0..count, Columns::all(), &mut raw.gaussians)?;
+        let mut raw = Raw { gaussians: self.ply.whole()?, own: Column::zeros(0, count) };
         let mut own = Vec::with_capacity(self.own.len() * count);
         for property in &self.own {
             own.extend(self.ply.values(&property.name)?.unwrap_or_default());

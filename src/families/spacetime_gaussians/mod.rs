@@ -145,7 +145,7 @@ struct SpacetimeGaussians {
 impl SpacetimeGaussians {
     fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
         let files = Files::of(path, options)?;
-        let cloud = Cloud::open(&files.cloud)?;
+        let cloud = Cloud::open(&files.cloud, &options.ply())?;
         let configuration =
             files.of_root(CFG_ARGS).map(|path| Configuration::read(&path)).transpose()?.unwrap_or_default();
         let mut notes = Vec::new();

@@ -1,59 +1,145 @@
 //! Text bodies turned into the binary body they stand for, so that one reader serves both.
 //!
-//! In: header and text. Out: little-endian rows of every element. Memory: the whole body.
+//! In: header and text. Out: little-endian rows of every element, appended to a scratch file. Memory: one line of text.
 
-use std::path::Path;
+use std::fs::File;
+use std::io::{BufRead, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use super::header::{Element, Header, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
-/// The body as little-endian rows. One row per line; blank lines are skipped; what follows the last
-/// row is ignored.
-///
-/// # Errors
-/// Too few rows, a row with too few or too many numbers, a word that is no number of its type; each
-/// names the line.
-pub(super) fn to_binary(path: &Path, header: &Header, body: &[u8]) -> Result<Vec<u8>> {
-    let mut size = 0;
+/// Bytes of a line of text, beside [`LINE_BYTES_PER_NUMBER`] for each number of its row.
+const LINE_BYTES: u64 = 1 << 20;
+/// An f64 in its longest usual form has 24 characters.
+const LINE_BYTES_PER_NUMBER: u64 = 64;
+
+/// Scratch file without a name for the binary rows of any number of text files; created when the first one is read.
+#[derive(Debug)]
+pub(crate) struct TextStore {
+    folder: PathBuf,
+    file: Mutex<Option<Arc<File>>>,
+}
+
+/// Binary rows of a text file.
+#[derive(Debug, Clone)]
+pub(crate) struct TextRows {
+    pub(super) file: Arc<File>,
+    /// Where they lie in the scratch file.
+    pub(super) range: Range<u64>,
+}
+
+impl TextStore {
+    /// Store whose scratch file lies in `folder`.
+    pub(crate) fn new(folder: &Path) -> TextStore {
+        TextStore { folder: folder.to_owned(), file: Mutex::new(None) }
+    }
+
+    /// Converts the body of the text file `text`, read from `path`, whose header is `header`. One row per line; blank
+    /// lines are skipped; what follows the last row is ignored.
+    ///
+    /// # Errors
+    /// Too few rows, a row with too few or too many numbers, a word that is not a number of its type, a line far longer
+    /// than its numbers take; each names the line. A scratch file that cannot be written.
+    pub(super) fn convert(&self, path: &Path, header: &Header, mut text: File) -> Result<TextRows> {
+        let failed = |action| Error::io(action, path);
+        let whole = text.metadata().map_err(failed("read the size of"))?.len();
+        check_counts(path, header, whole.saturating_sub(header.text.len() as u64))?;
+        text.seek(SeekFrom::Start(header.text.len() as u64)).map_err(failed("read"))?;
+        // Held until the rows are written: they lie together.
+        let mut slot = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let scratch = |action| Error::io(action, &self.folder);
+        let file = match &*slot {
+            Some(file) => Arc::clone(file),
+            None => Arc::new(tempfile::tempfile_in(&self.folder).map_err(scratch("create a scratch file in"))?),
+        };
+        let start = (&*file).seek(SeekFrom::End(0)).map_err(scratch("write a scratch file in"))?;
+        let mut out = BufWriter::with_capacity(1 << 18, &*file);
+        let mut lines = Lines { path, text: BufReader::new(text), number: header.lines, line: Vec::new() };
+        let mut row_bytes = Vec::new();
+        for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
+            for row in 0..element.count {
+                row_bytes.clear();
+                lines.read_row(element, row, &mut row_bytes)?;
+                out.write_all(&row_bytes).map_err(scratch("write a scratch file in"))?;
+            }
+        }
+        out.flush().map_err(scratch("write a scratch file in"))?;
+        drop(out);
+        let end = (&*file).stream_position().map_err(scratch("write a scratch file in"))?;
+        *slot = Some(Arc::clone(&file));
+        Ok(TextRows { file, range: start..end })
+    }
+}
+
+/// Confirms that `available` bytes of text can hold the announced rows: a number takes a digit and a separator.
+fn check_counts(path: &Path, header: &Header, available: u64) -> Result<()> {
     for element in &header.elements {
-        // A number takes a digit and a separator, which bounds the rows before anything is allocated.
         let least = element.count.checked_mul(2 * element.properties.len() as u64);
-        if least.is_none_or(|least| least > body.len() as u64 + 1) {
+        if least.is_none_or(|least| least > available + 1) {
             let expected = format!("{} rows of {} numbers", element.count, element.properties.len());
-            return Err(Error::input(path, place(element), expected, format!("{} bytes of text", body.len()))
+            return Err(Error::input(path, place(element), expected, format!("{available} bytes of text"))
                 .hint("the file is cut short or its header is wrong"));
         }
-        size += element.count as usize * element.stride;
     }
-    let mut binary = Vec::with_capacity(size);
-    let mut lines = body
-        .split(|&b| b == b'\n')
-        .map(<[u8]>::trim_ascii)
-        .zip(header.lines + 1..)
-        .filter(|(line, _)| !line.is_empty());
-    for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
-        for row in 0..element.count {
-            let Some((line, number)) = lines.next() else {
-                return Err(Error::input(
-                    path,
-                    place(element),
-                    format!("{} rows", element.count),
-                    format!("{row} rows"),
-                )
-                .hint("the file is cut short; copy it again"));
-            };
-            let words = || line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-            if words().count() != element.properties.len() {
-                let expected = format!("{} numbers, as {} declares", element.properties.len(), place(element));
-                return Err(Error::input(path, format!("line {number}"), expected, words().count().to_string()));
+    Ok(())
+}
+
+/// Lines of a text body.
+struct Lines<'a> {
+    path: &'a Path,
+    text: BufReader<File>,
+    /// Number of the line read last, counted from 1.
+    number: usize,
+    line: Vec<u8>,
+}
+
+impl Lines<'_> {
+    /// Reads row `row` of `element` from the next line that is not blank, and appends its numbers to `out`.
+    fn read_row(&mut self, element: &Element, row: u64, out: &mut Vec<u8>) -> Result<()> {
+        let numbers = element.properties.len();
+        if !self.read_line(numbers)? {
+            let (expected, found) = (format!("{} rows", element.count), format!("{row} rows"));
+            return Err(
+                Error::input(self.path, place(element), expected, found).hint("the file is cut short; copy it again")
+            );
+        }
+        let (path, number) = (self.path, self.number);
+        let words = || self.line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let count = words().count();
+        if count != numbers {
+            let expected = format!("{numbers} numbers, as {} declares", place(element));
+            return Err(Error::input(path, format!("line {number}"), expected, count.to_string()));
+        }
+        for (word, property) in words().zip(&element.properties) {
+            push_number(out, word, property.scalar).ok_or_else(|| unreadable(path, number, property, word))?;
+        }
+        Ok(())
+    }
+
+    /// Reads the next line that is not blank; false at the end of the file.
+    fn read_line(&mut self, numbers: usize) -> Result<bool> {
+        let most = LINE_BYTES + LINE_BYTES_PER_NUMBER * numbers as u64;
+        loop {
+            self.line.clear();
+            let read = self.text.by_ref().take(most).read_until(b'\n', &mut self.line);
+            if read.map_err(Error::io("read", self.path))? == 0 {
+                return Ok(false);
             }
-            for (word, property) in words().zip(&element.properties) {
-                push_number(&mut binary, word, property.scalar)
-                    .ok_or_else(|| unreadable(path, number, property, word))?;
+            self.number += 1;
+            if self.line.len() as u64 == most {
+                let expected = format!("a row of {numbers} numbers");
+                let place = format!("line {}", self.number);
+                return Err(Error::input(self.path, place, expected, format!("a line of more than {most} bytes"))
+                    .hint("the file is damaged: a text body has one row per line"));
+            }
+            if !self.line.trim_ascii().is_empty() {
+                return Ok(true);
             }
         }
     }
-    Ok(binary)
 }
 
 fn place(element: &Element) -> String {

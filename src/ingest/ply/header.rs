@@ -4,7 +4,12 @@
 
 use std::path::Path;
 
+use hashbrown::HashSet;
+
 use crate::error::{Error, Result, quoted};
+
+/// Most bytes of a header: some 50,000 properties, where models of Gaussians have 60 to a few hundred.
+const MOST_BYTES: usize = 1 << 20;
 
 /// How the body stores numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -110,9 +115,10 @@ impl Header {
     /// Parses the header at the start of `bytes`, the content of `path`. Lines may end in LF or CRLF.
     ///
     /// # Errors
-    /// Not a PLY; a header without `end_header`; a line, type or count that is none; a list property
+    /// Not a PLY; a header without `end_header`, or of more than 1 MiB; a line, type or count that is none; a list property
     /// (its rows have no fixed size); a name used twice. Each names the line.
     pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<Header> {
+        let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MOST_BYTES)]);
         let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
         if first.trim_ascii_end() != b"ply" {
             return Err(Error::input(path, "first line", "\"ply\"", found(first)).hint("this is not a PLY file"));
@@ -120,6 +126,8 @@ impl Header {
         let mut encoding = None;
         let mut elements: Vec<Element> = Vec::new();
         let mut comments = Vec::new();
+        let mut element_names: HashSet<&[u8]> = HashSet::new();
+        let mut property_names: HashSet<&[u8]> = HashSet::new();
         let mut end = 0;
         for (index, raw) in bytes.split_inclusive(|&b| b == b'\n').enumerate() {
             end += raw.len();
@@ -151,7 +159,7 @@ impl Header {
                     });
                 }
                 ["element", name, count] => {
-                    if elements.iter().any(|element| element.name == name) {
+                    if !element_names.insert(word(raw, 1)) {
                         return Err(Error::input(
                             path,
                             place(),
@@ -160,6 +168,7 @@ impl Header {
                         ));
                     }
                     let count = count.parse().map_err(|_| Error::input(path, place(), "a row count", quoted(count)))?;
+                    property_names.clear();
                     elements.push(Element { name: name.to_owned(), count, properties: Vec::new(), stride: 0 });
                 }
                 ["property", "list", .., name] => {
@@ -175,7 +184,7 @@ impl Header {
                     let Some(element) = elements.last_mut() else {
                         return Err(Error::input(path, place(), "an element before its properties", found(raw)));
                     };
-                    if element.properties.iter().any(|property| property.name == name) {
+                    if !property_names.insert(word(raw, 2)) {
                         let expected = format!("each property of element {} once", quoted(&element.name));
                         return Err(Error::input(path, place(), expected, format!("{} twice", quoted(name))));
                     }
@@ -194,7 +203,12 @@ impl Header {
                 }
             }
         }
-        let what = format!("the file ends after {} bytes without one", bytes.len());
+        if length > MOST_BYTES {
+            let expected = format!("an end_header line within {MOST_BYTES} bytes");
+            return Err(Error::input(path, "header", expected, format!("none, in a file of {length} bytes"))
+                .hint("a header of Gaussians has a few kilobytes: the file is damaged or not a model"));
+        }
+        let what = format!("the file ends after {length} bytes without one");
         Err(Error::input(path, "header", "an end_header line", what).hint("the file is cut short; copy it again"))
     }
 
@@ -234,6 +248,11 @@ impl Header {
     pub(crate) fn vertex(&self) -> Option<&Element> {
         self.elements.iter().find(|element| element.name == "vertex")
     }
+}
+
+/// Returns word `at` of a header line that has so many words.
+fn word(line: &[u8], at: usize) -> &[u8] {
+    excerpt(line).split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).nth(at).unwrap_or_default()
 }
 
 /// Enough of a line to hold any keyword with its arguments: binary data may lack line ends.

@@ -1,7 +1,7 @@
 //! Gaussians from a PLY file in the INRIA layout and its dialects.
 //!
 //! In: a path. Out: planes of f32 for any list of Gaussians, and the rows as they lie in the file for
-//! writers that keep them. Memory: a map of the file; text bodies are held as binary rows.
+//! writers that keep them. Memory: 2 MiB of a map of the file, or of a scratch file with the binary rows of a text file.
 //! Source: 3D Gaussian Splatting (Kerbl et al., 2023), `save_ply` of its public code.
 //!
 //! Accepted: binary of either byte order and text; any number type per property; properties in any
@@ -14,21 +14,55 @@ mod layout;
 #[cfg(test)]
 pub(crate) mod tests;
 
+use std::io::{self, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+pub(crate) use ascii::{TextRows, TextStore};
+use header::Element;
 pub(crate) use header::Header;
 pub use header::{Encoding, Property, Scalar};
 pub use layout::THIN_LOG_SCALE;
 pub(crate) use layout::{Layout, Plane, name_without_bands};
 
 use super::map::FileMap;
+use super::open::open_file;
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians};
 use crate::source::Ids;
 
 /// Rows handled together, so that all planes of them are taken from cache: 32 KiB at degree 3.
 const BLOCK_ROWS: usize = 128;
+/// Bytes of rows handled together.
+const BLOCK_BYTES: usize = 1 << 20;
+
+/// How PLY files may be read.
+#[derive(Debug, Clone)]
+pub struct PlyOptions {
+    /// Folder for the scratch file that holds the rows of text files while they are open.
+    pub scratch: PathBuf,
+    /// Memory that reading a whole file may take.
+    pub memory: ReadLimit,
+}
+
+impl Default for PlyOptions {
+    fn default() -> Self {
+        PlyOptions { scratch: std::env::temp_dir(), memory: ReadLimit::NONE }
+    }
+}
+
+/// Parses the header at the start of `bytes`, the content of `path`, and returns the number of Gaussians that it
+/// announces. Says nothing about the rows behind it.
+///
+/// # Errors
+/// Those of [`Ply::open_with`] that the header alone shows.
+pub fn check_header(bytes: &[u8], path: &Path) -> Result<u64> {
+    let header = Header::parse(path, bytes)?;
+    let vertex = vertex_of(&header, path)?;
+    Layout::of(path, vertex)?;
+    Ok(vertex.count)
+}
 
 /// An open PLY file of Gaussians.
 #[derive(Debug)]
@@ -42,50 +76,101 @@ pub struct Ply {
     /// Where the rows of `vertex` lie in the body.
     rows: Range<usize>,
     count: usize,
+    memory: ReadLimit,
 }
 
 /// The tables of a file after its header.
 #[derive(Debug)]
-enum Body {
-    /// The whole file; the tables start after the header.
-    Mapped { map: FileMap, start: usize },
-    /// The tables of a text file as little-endian rows, and how long the file is.
-    Parsed(Vec<u8>, u64),
+struct Body {
+    /// The whole file, or the converted rows of a text file.
+    map: FileMap,
+    /// Where the tables start in the map.
+    start: usize,
+    /// Of a text file: its length in bytes, and where its converted rows are.
+    text: Option<(u64, TextRows)>,
 }
 
 impl Body {
     fn bytes(&self) -> &[u8] {
-        match self {
-            Body::Mapped { map, start } => &map[*start..],
-            Body::Parsed(bytes, _) => bytes,
-        }
+        &self.map[self.start..]
+    }
+
+    /// Returns `range` of the body in the map.
+    fn range(&self, range: Range<usize>) -> Range<usize> {
+        self.start + range.start..self.start + range.end
     }
 }
 
 impl Ply {
+    /// Opens the file at `path` and checks its header against its size. Rows of a text file lie in the system's folder
+    /// for temporary files.
+    ///
+    /// # Errors
+    /// Those of [`Ply::open_with`].
+    pub fn open(path: &Path) -> Result<Ply> {
+        Self::open_with(path, &PlyOptions::default())
+    }
+
     /// Opens the file at `path` and checks its header against its size.
     ///
     /// # Errors
     /// Not a PLY; a malformed header; a missing property; a list property; a number of `f_rest_*` that
     /// belongs to no SH degree; more than `u32::MAX` Gaussians; fewer bytes than the header declares; in
     /// a text file, a row that cannot be read.
-    pub fn open(path: &Path) -> Result<Ply> {
+    pub fn open_with(path: &Path, options: &PlyOptions) -> Result<Ply> {
+        Self::open_into(path, options.memory, &TextStore::new(&options.scratch))
+    }
+
+    /// Opens the file at `path`; rows of a text file go to `texts`.
+    pub(crate) fn open_into(path: &Path, memory: ReadLimit, texts: &TextStore) -> Result<Ply> {
+        Self::with_text_rows(path, memory, |header| texts.convert(path, header, open_file(path)?))
+    }
+
+    /// Opens the file at `path` again. `text` are its rows if it is a text file.
+    pub(crate) fn open_again(path: &Path, memory: ReadLimit, text: Option<&TextRows>) -> Result<Ply> {
+        Self::with_text_rows(path, memory, |_| text.cloned().ok_or_else(|| changed(path)))
+    }
+
+    fn with_text_rows(
+        path: &Path,
+        memory: ReadLimit,
+        convert: impl FnOnce(&Header) -> Result<TextRows>,
+    ) -> Result<Ply> {
         let map = FileMap::open(path)?;
         let header = Header::parse(path, &map)?;
-        let Some(vertex) = header.vertex() else {
-            return Err(Error::input(path, "header", "an element \"vertex\"", "none"));
-        };
+        let vertex = vertex_of(&header, path)?;
         let (stride, properties) = (vertex.stride, vertex.properties.clone());
         let layout = Layout::of(path, vertex)?;
         let count = u32::try_from(vertex.count)
             .map_err(|_| Error::input(path, "element vertex", "at most 4294967295 rows", vertex.count.to_string()))?;
-        let start = header.text.len();
         let body = match header.encoding {
-            Encoding::Ascii => Body::Parsed(ascii::to_binary(path, &header, &map[start..])?, map.len() as u64),
-            Encoding::LittleEndian | Encoding::BigEndian => Body::Mapped { map, start },
+            Encoding::Ascii => {
+                let (length, rows) = (map.len() as u64, convert(&header)?);
+                let map = FileMap::from_scratch(&rows.file, rows.range.clone(), path)?;
+                Body { map, start: 0, text: Some((length, rows)) }
+            }
+            Encoding::LittleEndian | Encoding::BigEndian => Body { map, start: header.text.len(), text: None },
         };
         let rows = vertex_rows(path, &header, body.bytes().len())?;
-        Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, count: count as usize })
+        let count = count as usize;
+        Ok(Ply { path: path.to_owned(), header, layout, stride, properties, body, rows, count, memory })
+    }
+
+    /// The converted rows of a text file, for [`Ply::open_again`].
+    pub(crate) fn text_rows(&self) -> Option<&TextRows> {
+        self.body.text.as_ref().map(|(_, rows)| rows)
+    }
+
+    /// Reads all columns of all Gaussians.
+    ///
+    /// # Errors
+    /// More than the memory that reading may take; a file cut short since it was opened.
+    pub(crate) fn whole(&self) -> Result<Gaussians> {
+        let bytes = 4 * Columns::all().width(self.sh_degree()) as u64 * self.count as u64;
+        self.memory.check(&self.path, "element vertex", "the Gaussians of the file", bytes)?;
+        let mut out = Gaussians::zeros(self.count, self.sh_degree());
+        self.gaussians(0..self.count, Columns::all(), &mut out)?;
+        Ok(out)
     }
 
     /// The file.
@@ -137,9 +222,12 @@ impl Ply {
         let big_endian = self.header.encoding == Encoding::BigEndian;
         let mut starts = Vec::with_capacity(BLOCK_ROWS);
         let mut ids_left = ids.iter();
-        for first in (0..ids.len()).step_by(BLOCK_ROWS) {
+        // Rows with thousands of properties: few of them, so that few of their pages are resident.
+        let together = (BLOCK_BYTES / self.stride.max(1)).clamp(1, BLOCK_ROWS);
+        for first in (0..ids.len()).step_by(together) {
             starts.clear();
-            starts.extend(ids_left.by_ref().take(BLOCK_ROWS).map(|id| id * self.stride));
+            starts.extend(ids_left.by_ref().take(together).map(|id| id * self.stride));
+            self.touch(&starts);
             for column in want.iter() {
                 for (c, plane) in self.layout.planes(column).iter().enumerate() {
                     if let Plane::Property(property) = plane {
@@ -165,18 +253,22 @@ impl Ply {
     pub(crate) fn values(&self, name: &str) -> Result<Option<Vec<f32>>> {
         self.check_unshrunk()?;
         let Some(property) = self.properties.iter().find(|property| property.name == name) else { return Ok(None) };
-        let starts: Vec<usize> = (0..self.count).map(|i| i * self.stride).collect();
         let mut values = vec![0.0; self.count];
         let rows = &self.body.bytes()[self.rows.clone()];
-        read_plane(rows, &starts, property, self.header.encoding == Encoding::BigEndian, &mut values);
+        let big_endian = self.header.encoding == Encoding::BigEndian;
+        for (block, values) in values.chunks_mut(BLOCK_ROWS).enumerate() {
+            let starts: Vec<usize> = (0..values.len()).map(|i| (block * BLOCK_ROWS + i) * self.stride).collect();
+            self.touch(&starts);
+            read_plane(rows, &starts, property, big_endian, values);
+        }
         Ok(Some(values))
     }
 
     /// Bytes of the file that reading `rows` Gaussians takes, whatever their columns: of a text file all.
     pub(crate) fn bytes_of(&self, rows: usize) -> u64 {
-        match &self.body {
-            Body::Mapped { .. } => (rows * self.stride) as u64,
-            Body::Parsed(_, stored) => *stored,
+        match &self.body.text {
+            None => (rows * self.stride) as u64,
+            Some((stored, _)) => *stored,
         }
     }
 
@@ -192,26 +284,55 @@ impl Ply {
 
     /// The bytes of Gaussian `i` in a binary body.
     pub(crate) fn row(&self, i: usize) -> &[u8] {
+        self.touch(&[i * self.stride]);
         &self.body.bytes()[self.rows.clone()][i * self.stride..(i + 1) * self.stride]
     }
 
-    /// What a binary body holds before the rows of `vertex`.
-    pub(crate) fn lead(&self) -> &[u8] {
-        &self.body.bytes()[..self.rows.start]
+    /// Number of bytes that a binary body holds before the rows of `vertex`, and after them.
+    pub(crate) fn bytes_around(&self) -> [usize; 2] {
+        [self.rows.start, self.body.bytes().len() - self.rows.end]
     }
 
-    /// What a binary body holds after the rows of `vertex`.
-    pub(crate) fn tail(&self) -> &[u8] {
-        &self.body.bytes()[self.rows.end..]
+    /// Writes what a binary body holds before the rows of `vertex`.
+    pub(crate) fn write_lead(&self, out: &mut dyn Write) -> io::Result<()> {
+        self.body.map.pieces(self.body.range(0..self.rows.start), |piece| out.write_all(piece))
+    }
+
+    /// Writes what a binary body holds after the rows of `vertex`.
+    pub(crate) fn write_tail(&self, out: &mut dyn Write) -> io::Result<()> {
+        let end = self.body.bytes().len();
+        self.body.map.pieces(self.body.range(self.rows.end..end), |piece| out.write_all(piece))
+    }
+
+    /// Memory that reading the whole file may take.
+    pub(crate) fn memory(&self) -> ReadLimit {
+        self.memory
     }
 
     /// Confirms that a mapped file still has its bytes.
     pub(crate) fn check_unshrunk(&self) -> Result<()> {
-        match &self.body {
-            Body::Mapped { map, .. } => map.check(),
-            Body::Parsed(..) => Ok(()),
+        self.body.map.check()
+    }
+
+    /// Records that the rows which begin at `starts` are about to be read.
+    fn touch(&self, starts: &[usize]) {
+        let first = self.body.start + self.rows.start;
+        for run in starts.chunk_by(|a, b| a + self.stride == *b) {
+            let [start, end] = [run[0], run[run.len() - 1] + self.stride];
+            self.body.map.touched(first + start..first + end);
         }
     }
+}
+
+/// The element that holds the Gaussians.
+fn vertex_of<'a>(header: &'a Header, path: &Path) -> Result<&'a Element> {
+    header.vertex().ok_or_else(|| Error::input(path, "header", "an element \"vertex\"", "none"))
+}
+
+/// Error for a file that was binary when it was opened first.
+fn changed(path: &Path) -> Error {
+    Error::input(path, "header", "a binary body, as before", "a text body")
+        .hint("the file has changed since it was opened")
 }
 
 /// Confirms that every id is below `count`.

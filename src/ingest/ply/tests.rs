@@ -191,7 +191,10 @@ fn further_elements_and_bytes_are_stepped_over() {
     let bytes = [text.as_bytes(), &[9; 27], body, &[5; 4], b"trailing"].concat();
     let ply = open(&bytes).unwrap();
     assert_eq!(all(&ply), expected(2, &names));
-    assert_eq!((ply.lead(), ply.tail()), (&[9; 27][..], &b"\x05\x05\x05\x05trailing"[..]));
+    let (mut lead, mut tail) = (Vec::new(), Vec::new());
+    ply.write_lead(&mut lead).and_then(|()| ply.write_tail(&mut tail)).unwrap();
+    assert_eq!((&lead[..], &tail[..]), (&[9; 27][..], &b"\x05\x05\x05\x05trailing"[..]));
+    assert_eq!(ply.bytes_around(), [27, 12]);
 
     let list = text.replace("property uchar id", "property list uchar int vertex_indices");
     let message = refusal(list.as_bytes());

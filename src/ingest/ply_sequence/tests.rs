@@ -61,7 +61,9 @@ fn a_block_reads_the_same_bits_as_the_whole() {
 #[test]
 fn a_single_file_is_one_frame_in_which_nothing_varies() {
     let folder = folder(1);
-    for sequence in [PlySequence::single(&folder.path().join("f_0.ply")), PlySequence::open(folder.path())] {
+    for sequence in
+        [PlySequence::single(&folder.path().join("f_0.ply"), &PlyOptions::default()), PlySequence::open(folder.path())]
+    {
         let sequence = sequence.unwrap();
         assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Columns::empty(), &[0.0][..]));
         let mut out = Gaussians::zeros(0, 1);
@@ -103,7 +105,7 @@ fn other_files_are_no_frames_and_none_is_an_error() {
     fs::create_dir(folder.path().join("more.ply")).unwrap();
     let message = PlySequence::open(folder.path()).unwrap_err().to_string();
     assert!(message.contains("more.ply") && message.contains("a folder"), "{message}");
-    assert_eq!(PlyFrames::open_with_gaps(folder.path()).unwrap().paths().len(), 2);
+    assert_eq!(PlyFrames::open_with_gaps(folder.path(), &PlyOptions::default()).unwrap().paths().len(), 2);
     let empty = tempfile::tempdir().unwrap();
     assert!(PlySequence::open(empty.path()).unwrap_err().to_string().contains("no .ply file"));
 }

@@ -22,7 +22,7 @@ use super::small_field::rounded;
 use crate::families::iterations::iteration as iteration_folder;
 use crate::families::pth::read_state_dict;
 use crate::ingest::digest::hash_file;
-use crate::ingest::ply::Ply;
+use crate::ingest::ply::{Ply, PlyOptions};
 
 /// The files of a model folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -120,11 +120,14 @@ impl ModelFolder {
 
     /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
     pub fn open(root: &Path, iteration: Option<u32>) -> Result<Self> {
+        Self::open_with(root, iteration, &PlyOptions::default())
+    }
+
+    /// [`ModelFolder::open`] with the limits of `options`.
+    pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
         let paths = ModelPaths::locate(root, iteration)?;
-        let ply = Ply::open(&paths.point_cloud)?;
-        let mut canonical = Gaussians::zeros(ply.count(), ply.sh_degree());
-        ply.gaussians(0..ply.count(), Columns::all(), &mut canonical)?;
-        Self::with_cloud(paths, canonical, ply.sh_degree())
+        let ply = Ply::open_with(&paths.point_cloud, options)?;
+        Self::with_cloud(paths, ply.whole()?, ply.sh_degree())
     }
 
     /// The same field and frames with other Gaussians; of another SH degree only where no head deforms colour.
