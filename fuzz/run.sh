@@ -14,7 +14,10 @@ targets=("$@")
 mkdir -p logs artifacts
 for target in "${targets[@]}"; do
     saved=../tests/corpus/$target
-    [[ -d $saved ]] || saved=../tests/corpus/container
+    case $target in
+        recover) saved=../tests/corpus/container ;;
+        cameras_json) saved=../tests/corpus/cameras ;;
+    esac
     mkdir -p "corpus/$target"
     # Memory is counted by the target itself; the limit here is for what is not allocated.
     "target/$host/release/$target" "corpus/$target" "$saved" -max_total_time="$seconds" -max_len=16384 -timeout=10 \

@@ -60,8 +60,6 @@ const PER_WRITTEN_FRAME: u64 = 16;
 /// Resident per frame of an open input: its time stamp, as a container has it and as everybody does, and how many Gaussians
 /// live in it.
 const PER_FRAME: u64 = 8 + 8 + 8;
-/// Resident per picture that the cameras name: itself, its name, and three times its place in a schedule.
-const PER_SHOT: u64 = 160 + 3 * 40;
 /// Resident per picture in a list of those to be made.
 const PER_PICTURE: u64 = 24;
 
@@ -86,8 +84,8 @@ pub struct Workload {
     pub views: u64,
     /// Pictures of all frames.
     pub pictures: u64,
-    /// Pictures the cameras name one by one.
-    pub shots: u64,
+    /// Bytes of the cameras and of the pictures that they name one by one, see [`Rig::bytes`].
+    pub rig: u64,
     /// Threads to work on.
     pub threads: u64,
     /// How fast they are.
@@ -107,7 +105,7 @@ impl Workload {
             pixels: 0,
             views: 0,
             pictures: 0,
-            shots: 0,
+            rig: 0,
             threads: rayon::current_num_threads() as u64,
             pace: Pace::UNKNOWN,
         }
@@ -134,7 +132,7 @@ impl Workload {
             views,
             viewpoints: numbers.len() as u64,
             pictures: pairs,
-            shots: rig.shots.len() as u64,
+            rig: rig.bytes(),
             ..self
         }
     }
@@ -278,7 +276,7 @@ impl Workload {
                 slots * (PER_SLOT + PER_TILE * self.frames.div_ceil(frames))
             }
         };
-        index + self.input.fixed + PER_FRAME * self.frames + PER_SHOT * self.shots
+        index + self.input.fixed + PER_FRAME * self.frames + self.rig
     }
 
     /// What a container knows while it is written.

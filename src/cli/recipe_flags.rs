@@ -12,6 +12,9 @@ use crate::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 const RECIPE: &str = "Recipe";
 const HEADING: &str = "Recipe, every parameter (`splatsieve recipe` prints a documented file)";
 
+/// Maximum number of bytes of a recipe: a written one has about 4,000.
+const MAX_RECIPE: u64 = 1 << 20;
+
 /// The recipe as the command line gives it: a preset or a file, and single parameters over it.
 #[derive(Debug, Clone, Default)]
 pub(super) struct RecipeFlags {
@@ -27,7 +30,7 @@ impl RecipeFlags {
     /// What the recipe file, if there is one, says of the run it was written beside.
     pub(super) fn record(&self) -> Result<Record> {
         let Some(path) = &self.file else { return Ok(Record::default()) };
-        let text = read_text(path)?;
+        let text = read_text(path, MAX_RECIPE)?;
         Record::read(&text).map_err(|message| Error::usage(format!("{}: {message}", path.display())))
     }
 
@@ -37,7 +40,7 @@ impl RecipeFlags {
         let mut recipe = match &self.file {
             None => Recipe::preset(fallback)?,
             Some(path) => {
-                let text = read_text(path)?;
+                let text = read_text(path, MAX_RECIPE)?;
                 Recipe::from_toml(&text, fallback)
                     .map_err(|message| Error::usage(format!("{}: {message}", path.display())))?
             }

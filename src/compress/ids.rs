@@ -5,12 +5,18 @@ use std::path::Path;
 use crate::error::{Error, Result, quoted};
 use crate::ingest::text::read_text;
 
+/// Maximum number of bytes of a file of ids: four million ids take as many.
+const MAX_LIST: u64 = 32 << 20;
+
 /// Ids and ranges from a file, where `#` begins a comment, or from a list such as `3,10-20`, with commas, blanks or lines
 /// between; increasing, without repetition. Every id is below `count`.
 pub(super) fn parse_ids(spec: &str, count: usize) -> Result<Vec<u32>> {
     let is_list = spec.chars().all(|c| c.is_ascii_digit() || matches!(c, ',' | '-') || c.is_ascii_whitespace());
-    let (text, origin) =
-        if is_list { (spec.to_owned(), "id list".to_owned()) } else { (read_text(Path::new(spec))?, spec.to_owned()) };
+    let (text, origin) = if is_list {
+        (spec.to_owned(), "id list".to_owned())
+    } else {
+        (read_text(Path::new(spec), MAX_LIST)?, spec.to_owned())
+    };
     let mut ids = Vec::new();
     for (number, line) in text.lines().enumerate() {
         let wrong = |expected: String, found: &str| {

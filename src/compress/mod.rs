@@ -344,7 +344,7 @@ pub(crate) mod tests {
             views: 2,
             viewpoints: 2,
             pictures: 1200,
-            shots: 2,
+            rig: 560,
             threads: 2,
             ..Workload::new(&info, Residence::of_tiles(FRAME_BLOCK as u64))
         }

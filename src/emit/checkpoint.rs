@@ -210,7 +210,7 @@ fn confirm(
             .wrong("data.pkl", "tensors that have a shape each", "one that several share")
             .hint("load the checkpoint with torch.load, give each tensor a clone() of its own, and save it again")
     };
-    let pickle = Pickle::read(written).map_err(|_| wrong())?;
+    let pickle = Pickle::read(written, u64::MAX).map_err(|_| wrong())?;
     for tensor in all {
         let numbers = |id: NodeId| -> Option<Vec<usize>> {
             pickle.elements(id)?.iter().map(|&id| usize::try_from(pickle.int(id)?).ok()).collect()

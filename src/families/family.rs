@@ -322,6 +322,8 @@ pub(super) struct Found<'a> {
     pub(super) is_folder: bool,
     /// The first bytes of a file.
     pub(super) head: Vec<u8>,
+    /// Memory that looking at it may take.
+    pub(super) memory: ReadLimit,
 }
 
 impl Found<'_> {

@@ -7,6 +7,7 @@ use std::path::Path;
 use super::family::Entry;
 use crate::error::Error;
 use crate::ingest::checkpoint::{Checkpoint, Pickle};
+use crate::limits::ReadLimit;
 
 /// The way that works with every renderer.
 const WAY: &str = "write its frames as PLY files, one per frame and all with the same Gaussians in the same order, or as a \
@@ -19,8 +20,8 @@ pub(super) const ENTRY: Entry = Entry {
         true => in_folder(found.path).is_some(),
         false => found.is_checkpoint(),
     },
-    open: |path, _| {
-        let what = if path.is_dir() { in_folder(path).unwrap_or(UNKNOWN) } else { in_file(path)? };
+    open: |path, options| {
+        let what = if path.is_dir() { in_folder(path).unwrap_or(UNKNOWN) } else { in_file(path, options.memory)? };
         Err(Error::input(path, "", "a model of a family that is read", what).hint(WAY))
     },
 };
@@ -44,8 +45,8 @@ fn in_folder(folder: &Path) -> Option<&'static str> {
 ///
 /// # Errors
 /// A file that is no checkpoint.
-fn in_file(path: &Path) -> crate::error::Result<&'static str> {
-    let checkpoint = Checkpoint::open(path)?;
+fn in_file(path: &Path, memory: ReadLimit) -> crate::error::Result<&'static str> {
+    let checkpoint = Checkpoint::open(path, memory)?;
     let pickle = checkpoint.pickle();
     let has = |name: &str| pickle.item(pickle.root(), name).is_some();
     let named = |part: &str| names(pickle).any(|name| name.contains(part));

@@ -81,7 +81,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
     if is_folder {
         refuse_inside_a_model(path)?;
     }
-    let found = Found { path, is_folder, head };
+    let found = Found { path, is_folder, head, memory: options.memory };
     match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None => {

@@ -1,27 +1,33 @@
 //! PyTorch checkpoints: whatever `torch.save` wrote, with its tensors where they lie.
 //!
-//! In: a path. Out: the tree of the pickle, and the values of tensors asked for. Nothing in the pickle is executed. Memory:
-//! the tree, pages of the mapped file, and one storage at a time. A tensor is `torch._utils._rebuild_tensor_v2(storage, offset,
+//! Input: a path. Output: the tree of the pickle, and the values of tensors asked for. Nothing in the pickle is executed.
+//! Memory: the list of files, the tree, and one storage at a time, each checked against the [`ReadLimit`] before it is
+//! allocated. A tensor is `torch._utils._rebuild_tensor_v2(storage, offset,
 //! size, stride, …)`, or a parameter made of one; its storage is an entry of the archive, and storages may be shared. On which
 //! device one lay is no matter here.
 
-use std::io::{Cursor, Read};
+use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
+use flate2::Crc;
 use half::{bf16, f16};
 use hashbrown::HashMap;
 use zip::{CompressionMethod, ZipArchive};
 
-use super::map::FileMap;
-pub(crate) use super::pickle::{Node, NodeId, Pickle};
+use super::pickle::Wrong;
+pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
+use super::shared_file::SharedFile;
+use super::zip_directory::announced;
 use crate::error::{Error, Result, quoted};
+use crate::limits::ReadLimit;
 
-/// Most bytes of a pickle: one of ten thousand tensors has about one million.
+/// Maximum number of bytes of a pickle: that of ten thousand tensors has about one million.
 const MAX_PICKLE: u64 = 1 << 23;
-/// Most entries of an archive.
-const MAX_ENTRIES: usize = 1 << 16;
+/// Maximum number of files of an archive.
+const MAX_ENTRIES: u64 = 1 << 16;
+/// Bytes that the list of files takes for each of them, beside three times its own bytes.
+const ENTRY_BYTES: u64 = 640;
 /// A view may repeat its storage (stride 0), so a small file can declare any number of values. No trained model means more
 /// than so many times what it stores.
 const MAX_EXPANSION: usize = 4;
@@ -30,23 +36,14 @@ const MAX_EXPANSION: usize = 4;
 #[derive(Debug)]
 pub(crate) struct Checkpoint {
     path: PathBuf,
-    map: Arc<FileMap>,
-    archive: ZipArchive<Cursor<Mapped>>,
+    memory: ReadLimit,
+    file: SharedFile,
+    archive: ZipArchive<SharedFile>,
     pickle: Pickle,
     /// Place of the pickle among the entries.
     pickle_at: usize,
     /// By key the place of a storage among the entries, and its bytes.
     storages: HashMap<String, (usize, usize)>,
-}
-
-/// A map that several share.
-#[derive(Debug, Clone)]
-struct Mapped(Arc<FileMap>);
-
-impl AsRef<[u8]> for Mapped {
-    fn as_ref(&self) -> &[u8] {
-        &self.0
-    }
 }
 
 /// A type of the values of a tensor.
@@ -100,7 +97,8 @@ impl Kind {
         }
     }
 
-    fn is_float(self) -> bool {
+    /// Whether it is a floating-point type.
+    pub(crate) fn is_float(self) -> bool {
         !matches!(self, Kind::Other(..))
     }
 
@@ -188,48 +186,88 @@ impl Tensor {
 }
 
 impl Checkpoint {
-    /// Opens the checkpoint at `path`.
+    /// Opens the checkpoint at `path` within `memory`.
     ///
     /// # Errors
-    /// A file that is no zip archive of stored entries, or is cut short; a pickle that cannot be read.
-    pub(crate) fn open(path: &Path) -> Result<Checkpoint> {
-        let map = Arc::new(FileMap::open(path)?);
+    /// A file that is no zip archive of stored entries, or is cut short; a pickle that cannot be read; more memory than
+    /// allowed.
+    pub(crate) fn open(path: &Path, memory: ReadLimit) -> Result<Checkpoint> {
+        let file = SharedFile::open(path)?;
         let wrong = |place: &str, found: String| {
             Error::input(path, place, "a checkpoint as torch.save writes it", found).hint(
                 "if the file was copied, copy it again; one of PyTorch before 1.6 has to be loaded and saved anew",
             )
         };
-        let broken = |error: zip::result::ZipError| wrong("list of files", error.to_string());
-        let mut archive = ZipArchive::new(Cursor::new(Mapped(Arc::clone(&map)))).map_err(broken)?;
-        if archive.len() > MAX_ENTRIES {
-            return Err(wrong("list of files", format!("{} files", archive.len())));
+        let broken = |error: zip::result::ZipError| wrong(LIST, error.to_string());
+        let directory = announced(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
+        if directory.entries > MAX_ENTRIES {
+            return Err(wrong(LIST, format!("{} files", directory.entries)));
         }
+        let listed = 3 * directory.bytes.min(file.len()) + ENTRY_BYTES * directory.entries;
+        memory.check(path, LIST, &format!("the names of {} files", directory.entries), listed)?;
+        let mut archive = ZipArchive::new(file.clone()).map_err(broken)?;
         let (mut storages, mut pickle_at) = (HashMap::new(), None);
         for index in 0..archive.len() {
-            let file = archive.by_index(index).map_err(broken)?;
-            let fits = file.data_start().checked_add(file.size()).is_some_and(|end| end <= map.len() as u64);
-            if file.compression() != CompressionMethod::Stored || !fits {
-                return Err(wrong(&format!("file {}", quoted(file.name())), "compressed, or cut short".into()));
+            let entry = archive.by_index(index).map_err(broken)?;
+            let at = |found: &str| wrong(&format!("file {}", quoted(entry.name())), found.to_owned());
+            if entry.compression() != CompressionMethod::Stored || entry.compressed_size() != entry.size() {
+                return Err(Error::input(
+                    path,
+                    format!("file {}", quoted(entry.name())),
+                    "a file that is stored as it is, as torch.save stores it",
+                    "a compressed one",
+                )
+                .hint("load the checkpoint with torch.load and save it again with torch.save"));
             }
-            match inside(file.name()) {
-                PICKLE if file.size() > MAX_PICKLE => {
-                    return Err(wrong(file.name(), format!("{} bytes", file.size())));
+            if entry.data_start().checked_add(entry.size()).is_none_or(|end| end > file.len()) {
+                return Err(at("cut short"));
+            }
+            match inside(entry.name()) {
+                PICKLE if entry.size() > MAX_PICKLE => {
+                    let place = entry.name().to_owned();
+                    return Err(Error::input(
+                        path,
+                        place,
+                        format!("a pickle of at most {MAX_PICKLE} bytes"),
+                        format!("{} bytes", entry.size()),
+                    ));
                 }
-                PICKLE => pickle_at = Some(index),
-                "byteorder" if map[file.data_start() as usize..].starts_with(b"big") => {
+                PICKLE if pickle_at.is_some() => return Err(at("a second one")),
+                PICKLE => pickle_at = Some((index, entry.size())),
+                "byteorder" if starts_big(&file, entry.data_start()) => {
                     return Err(wrong("byteorder", "values of which the highest byte comes first".into()));
                 }
                 other => {
                     if let Some(key) = other.strip_prefix("data/") {
-                        storages.insert(key.to_owned(), (index, file.size() as usize));
+                        storages.insert(key.to_owned(), (index, entry.size() as usize));
                     }
                 }
             }
         }
-        let pickle_at = pickle_at.ok_or_else(|| wrong("list of files", format!("no {PICKLE}")))?;
-        let bytes = bytes_of(&mut archive, pickle_at).map_err(|error| wrong(PICKLE, error.to_string()))?;
-        let pickle = Pickle::read(&bytes).map_err(|(at, found)| wrong(&format!("{PICKLE}, byte {at}"), found))?;
-        Ok(Checkpoint { path: path.to_owned(), map, archive, pickle, pickle_at, storages })
+        let (pickle_at, bytes) = pickle_at.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
+        memory.check(path, PICKLE, "the list of files and the pickle", listed + bytes)?;
+        // An eighth is left to the allocator: what was freed before does not fit what is asked for now.
+        let left = (memory.bytes() - listed - bytes) / 8 * 7;
+        let bytes = bytes_of(&mut archive, &file, pickle_at).map_err(|error| wrong(PICKLE, error.to_string()))?;
+        let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
+            Wrong::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
+            Wrong::TooMuch(at, expected, found) => Error::input(path, format!("{PICKLE}, byte {at}"), expected, found)
+                .hint("a trained model has far fewer: load the checkpoint and save its state dict alone"),
+            Wrong::Memory(at, taken) => {
+                let place = format!("{PICKLE}, byte {at}");
+                let whole = listed + bytes.len() as u64 + taken / 7 * 8 + 8;
+                memory.check(path, &place, "the values of the pickle", whole).err().unwrap_or_else(|| {
+                    Error::input(path, place, "values of fewer than 128 MiB", "more")
+                        .hint("a trained model has far fewer: load the checkpoint and save its state dict alone")
+                })
+            }
+        })?;
+        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_at, storages })
+    }
+
+    /// Confirms that reading `what` at `place` may take `bytes` of memory.
+    pub(crate) fn allow(&self, place: &str, what: &str, bytes: u64) -> Result<()> {
+        self.memory.check(&self.path, place, what, bytes)
     }
 
     /// The tree.
@@ -287,7 +325,7 @@ impl Checkpoint {
 
     fn number(&self, id: NodeId) -> Option<(usize, Range<usize>)> {
         match self.pickle.node(id) {
-            Node::Int(value, at) => Some((usize::try_from(*value).ok()?, at.clone())),
+            Node::Int(value, at) => Some((usize::try_from(*value).ok()?, at.start as usize..at.end as usize)),
             _ => None,
         }
     }
@@ -308,8 +346,18 @@ impl Checkpoint {
         Ok(tensor)
     }
 
-    /// Confirms that the storage has every element of `tensor`.
+    /// Confirms that the storage has every element of `tensor`, and that these are not many more than it has values.
     pub(crate) fn check(&self, tensor: &Tensor) -> std::result::Result<(), String> {
+        let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
+        self.check_extent(tensor)?;
+        match tensor.len().is_some_and(|len| len <= values.saturating_mul(MAX_EXPANSION)) {
+            true => Ok(()),
+            false => Err(format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage)),
+        }
+    }
+
+    /// Confirms that the storage has every element of `tensor`.
+    pub(crate) fn check_extent(&self, tensor: &Tensor) -> std::result::Result<(), String> {
         let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
             return Err(format!("no file data/{}", tensor.storage));
         };
@@ -320,7 +368,7 @@ impl Checkpoint {
             last.checked_add(length.saturating_sub(1).checked_mul(stride)?)
         });
         match last {
-            Some(last) if len == 0 || last < values && len <= values.saturating_mul(MAX_EXPANSION) => Ok(()),
+            Some(last) if len == 0 || last < values => Ok(()),
             _ => Err(said()),
         }
     }
@@ -336,10 +384,13 @@ impl Checkpoint {
     /// A storage that is not there, or is not as it was written.
     pub(crate) fn storage(&self, key: &str) -> Result<Vec<u8>> {
         let place = format!("data/{key}");
-        let wrong = |found: String| self.wrong(&place, "the values as they were written", found);
-        let &(index, _) = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
-        self.map.check()?;
-        bytes_of(&mut self.archive.clone(), index).map_err(|error| wrong(error.to_string()))
+        let wrong = |found: String| {
+            self.wrong(&place, "the values as they were written", found)
+                .hint("the file is damaged or cut short: copy it again")
+        };
+        let &(index, bytes) = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
+        self.allow(&place, "its values", bytes as u64)?;
+        bytes_of(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
     }
 
     /// The elements of a floating-point tensor, which `place` names, as f32, the last index fastest.
@@ -347,9 +398,7 @@ impl Checkpoint {
     /// # Errors
     /// Values that are not as they were written, or no numbers.
     pub(crate) fn floats(&self, tensor: &Tensor, place: &str) -> Result<Vec<f32>> {
-        let stored = self.storage(&tensor.storage)?;
-        let (bytes, mut values) = (tensor.kind.bytes(), Vec::with_capacity(tensor.len().unwrap_or(0)));
-        tensor.each(|at| values.push(tensor.kind.decode(&stored[at * bytes..][..bytes])));
+        let values = self.values(tensor, place)?;
         match values.iter().position(|value| !value.is_finite()) {
             Some(at) => {
                 let row = at / tensor.shape.iter().skip(1).product::<usize>().max(1);
@@ -359,19 +408,32 @@ impl Checkpoint {
         }
     }
 
+    /// The elements of a floating-point tensor, which `place` names, as f32, the last index fastest; not checked to be finite.
+    ///
+    /// # Errors
+    /// Values that are not as they were written; more memory than allowed.
+    pub(crate) fn values(&self, tensor: &Tensor, place: &str) -> Result<Vec<f32>> {
+        let stored = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes as u64);
+        let (bytes, len) = (tensor.kind.bytes(), tensor.len().unwrap_or(0));
+        self.allow(place, "its values", stored.saturating_add(4 * len as u64))?;
+        let stored = self.storage(&tensor.storage)?;
+        let mut values = Vec::with_capacity(len);
+        tensor.each(|at| values.push(tensor.kind.decode(&stored[at * bytes..][..bytes])));
+        Ok(values)
+    }
+
     /// Every file of the archive in order: its name, what it is, its bytes.
     ///
     /// # Errors
     /// Those of `take`; a file that is not as it was written.
     pub(crate) fn files(&self, mut take: impl FnMut(&str, File<'_>, Vec<u8>) -> Result<()>) -> Result<()> {
-        self.map.check()?;
         let mut archive = self.archive.clone();
         for index in 0..archive.len() {
             let broken = |error: &dyn std::fmt::Display| {
                 self.wrong(&format!("file {index}"), "its bytes as they were written", error.to_string())
             };
             let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
-            let bytes = bytes_of(&mut archive, index).map_err(|error| broken(&error))?;
+            let bytes = bytes_of(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
             let what = match inside(&name).strip_prefix("data/") {
                 _ if index == self.pickle_at => File::Pickle,
                 Some(key) => File::Storage(key),
@@ -402,16 +464,33 @@ fn inside(name: &str) -> &str {
     name.split_once('/').map_or(name, |(_, rest)| rest)
 }
 
-/// All bytes of an entry, whose checksum is looked at.
-fn bytes_of(archive: &mut ZipArchive<Cursor<Mapped>>, index: usize) -> std::io::Result<Vec<u8>> {
-    let mut file = archive.by_index(index)?;
-    let size = file.size();
-    let mut bytes = Vec::with_capacity(size as usize);
-    file.read_to_end(&mut bytes)?;
-    // The directory may say otherwise than what lies there.
-    match bytes.len() as u64 == size {
+/// What the list of the archive's files is called in messages.
+const LIST: &str = "list of files";
+
+/// Whether the file has the text "big" at `at`.
+fn starts_big(file: &SharedFile, at: u64) -> bool {
+    let (mut file, mut text) = (file.clone(), [0; 3]);
+    file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
+}
+
+/// All bytes of a stored entry, checked against its checksum. PyTorch writes 0 for a checksum that it did not compute.
+fn bytes_of(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
+    let (start, size, expected) = {
+        let entry = archive.by_index(index)?;
+        (entry.data_start(), entry.size(), entry.crc32())
+    };
+    let mut file = file.clone();
+    if size > file.len() {
+        return Err(std::io::Error::other(format!("{size} bytes of a file of {}", file.len())));
+    }
+    let mut bytes = vec![0; size as usize];
+    file.seek(SeekFrom::Start(start))?;
+    file.read_exact(&mut bytes)?;
+    let mut sum = Crc::new();
+    sum.update(&bytes);
+    match expected == 0 || sum.sum() == expected {
         true => Ok(bytes),
-        false => Err(std::io::Error::other(format!("{} bytes of {size}", bytes.len()))),
+        false => Err(std::io::Error::other("other bytes than its checksum is of")),
     }
 }
 

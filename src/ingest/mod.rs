@@ -6,6 +6,9 @@ pub mod container;
 pub(crate) mod digest;
 pub mod frame_stream;
 pub mod image;
+#[doc(hidden)]
+pub mod in_memory;
+pub(crate) mod json;
 mod map;
 pub(crate) mod npy;
 pub(crate) mod npz;
@@ -14,6 +17,8 @@ mod pickle;
 pub mod ply;
 pub mod ply_frames;
 pub mod ply_sequence;
+mod shared_file;
 pub mod splatv;
 pub mod text;
+mod zip_directory;
 pub(crate) mod zip_end;

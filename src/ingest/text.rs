@@ -1,79 +1,102 @@
 //! Text files as people and editors leave them: UTF-8, with or without its byte order mark.
 
-use std::io::Read;
-use std::path::Path;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
 
-use serde_json::Value;
-use serde_json::error::Category;
-
-use super::open::open_file;
+use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 
-/// Largest text that is read: the cameras of 10⁵ pictures take some 60 MB of JSON.
-const MAX_BYTES: u64 = 256 << 20;
-
-/// The bytes of a file no larger than the limit.
+/// The text of a file of at most `most_bytes`, without a byte order mark.
 ///
 /// # Errors
-/// A file that cannot be read, or is larger.
-pub fn read_limited(path: &Path) -> Result<Vec<u8>> {
-    let file = open_file(path)?;
-    let mut bytes = Vec::new();
-    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(Error::io("read", path))?;
-    if bytes.len() as u64 > MAX_BYTES {
-        return Err(Error::input(path, "", format!("a file of at most {MAX_BYTES} bytes"), "a larger one"));
-    }
-    Ok(bytes)
+/// Those of [`read_small`]; bytes that are no UTF-8, with the place of the first.
+pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
+    let bytes = read_small(path, most_bytes, "a text")?;
+    let text = without_mark(path, &bytes)?;
+    utf_8(path, text, (bytes.len() - text.len()) as u64).map(str::to_owned)
 }
 
-/// The text of a file, without a byte order mark.
-///
-/// # Errors
-/// Those of [`read_limited`]; bytes that are no UTF-8, with the place of the first.
-pub fn read_text(path: &Path) -> Result<String> {
-    let bytes = read_limited(path)?;
-    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
-    if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = text {
-        return Err(
-            Error::input(path, "byte 0", "text in UTF-8", "the byte order mark of UTF-16").hint("save it as UTF-8")
-        );
+/// `bytes`, the first ones of the file at `path`, without a byte order mark.
+fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
+    if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = bytes {
+        let found = "the byte order mark of UTF-16";
+        return Err(Error::input(path, "byte 0", "text in UTF-8", found).hint("save it as UTF-8"));
     }
-    match str::from_utf8(text) {
-        Ok(text) => Ok(text.to_owned()),
-        Err(error) => {
-            let at = error.valid_up_to();
-            let place = format!("byte {}", at + bytes.len() - text.len());
-            Err(Error::input(path, place, "text in UTF-8", format!("the byte 0x{:02x}", text[at]))
-                .hint("save it as UTF-8: it may be in Latin-1 or another encoding"))
-        }
-    }
+    Ok(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 
-/// The JSON document in a file.
-///
-/// # Errors
-/// Those of [`read_text`]; what is no JSON, with line and column.
-pub fn read_json(path: &Path) -> Result<Value> {
-    let text = read_text(path)?;
-    serde_json::from_str(&text).map_err(|error| {
-        let (line, column) = (error.line(), error.column());
-        let whole = error.to_string();
-        let found = whole.strip_suffix(&format!(" at line {line} column {column}")).unwrap_or(&whole);
-        if error.classify() == Category::Eof {
-            let found = if text.trim().is_empty() { "an empty file" } else { "the end of the file within it" };
-            return Error::input(path, format!("line {line}, column {column}"), "JSON", found)
-                .hint("it was cut short when it was written or copied: write or copy it again");
-        }
-        let here = text.lines().nth(line.saturating_sub(1)).unwrap_or("");
-        let before = (0..column.min(here.len())).rev().find(|&at| here.is_char_boundary(at)).unwrap_or(0);
-        let is_number =
-            ["NaN", "Infinity", "-Infinity", "nan", "inf"].iter().any(|word| here[before..].starts_with(word));
-        let error = Error::input(path, format!("line {line}, column {column}"), "JSON", found);
-        match is_number {
-            true => error.hint("NaN and Infinity are no JSON: if a pose holds them, take the picture out of the file"),
-            false => error,
-        }
+/// `bytes` from byte `start` of the file at `path` on as text.
+fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
+    str::from_utf8(bytes).map_err(|error| {
+        let at = error.valid_up_to();
+        Error::input(
+            path,
+            format!("byte {}", start + at as u64),
+            "text in UTF-8",
+            format!("the byte 0x{:02x}", bytes[at]),
+        )
+        .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
     })
+}
+
+/// Maximum number of bytes of a line that is read.
+const MAX_LINE: u64 = 1 << 16;
+
+/// The lines of a text file of any length, one at a time.
+#[derive(Debug)]
+pub(crate) struct Lines {
+    path: PathBuf,
+    file: BufReader<File>,
+    line: Vec<u8>,
+    number: usize,
+    /// Place in the file of the next line.
+    at: u64,
+}
+
+impl Lines {
+    /// Opens the file at `path`.
+    ///
+    /// # Errors
+    /// A file that cannot be opened.
+    pub(crate) fn open(path: &Path) -> Result<Lines> {
+        let file = BufReader::new(open_file(path)?);
+        Ok(Lines { path: path.to_owned(), file, line: Vec::new(), number: 0, at: 0 })
+    }
+
+    /// Returns the next line without its end, and its number, from 1 on; `None` at the end of the file.
+    ///
+    /// # Errors
+    /// A line that is too long or no UTF-8; a failed read.
+    pub(crate) fn next_line(&mut self) -> Result<Option<(usize, &str)>> {
+        self.line.clear();
+        let mut limited = (&mut self.file).take(MAX_LINE + 1);
+        let count = limited.read_until(b'\n', &mut self.line).map_err(Error::io("read", &self.path))? as u64;
+        if count == 0 {
+            return Ok(None);
+        }
+        self.number += 1;
+        let start = self.at;
+        self.at += count;
+        if count > MAX_LINE {
+            let place = format!("line {}", self.number);
+            return Err(Error::input(&self.path, place, format!("a line of at most {MAX_LINE} bytes"), "a longer one"));
+        }
+        let line = self.line.strip_suffix(b"\n").unwrap_or(&self.line);
+        let line = line.strip_suffix(b"\r").unwrap_or(line);
+        let text = if start == 0 { without_mark(&self.path, line)? } else { line };
+        Ok(Some((self.number, utf_8(&self.path, text, start + (line.len() - text.len()) as u64)?)))
+    }
+
+    /// Passes over a line of any length.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(crate) fn skip_line(&mut self) -> Result<()> {
+        self.at += self.file.skip_until(b'\n').map_err(Error::io("read", &self.path))? as u64;
+        self.number += 1;
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -82,35 +105,44 @@ mod tests {
 
     use super::*;
 
-    fn refused(bytes: &[u8]) -> String {
+    fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
         let file = tempfile::NamedTempFile::new().unwrap();
         fs::write(file.path(), bytes).unwrap();
-        read_json(file.path()).unwrap_err().to_string()
+        file
     }
 
     #[test]
-    fn hints_fit_what_is_wrong() {
-        for (bytes, expected, absent) in [
-            (&b"{\"frames\": [{\"a"[..], "cut short", "NaN"),
-            (b"", "an empty file", "NaN"),
-            (b"{\"a\": NaN}", "NaN and Infinity are no JSON", "cut short"),
-            (b"{\"a\": -Infinity}", "line 1, column 8", "cut short"),
-            (b"{\"a\": \"caf\xe9\"}", "Latin-1", "NaN"),
-            (b"\xff\xfe{\0}\0", "UTF-16", "Latin-1"),
-            (b"{\"a\": 1,}", "line 1, column 9", "NaN"),
-            (b"{\"a\"; 1}", "expected `:`", "NaN"),
-        ] {
-            let message = refused(bytes);
-            assert!(message.contains(expected), "{expected:?} is not in {message:?}");
-            assert!(!message.contains(absent) && !message.contains("at line"), "{absent:?} is in {message:?}");
+    fn lines_are_those_of_the_whole_text() {
+        for text in ["", "\n", "a", "a\n", "\na\r\n\r\nb\rc\n\n d ", "\u{feff}ä\nö"] {
+            let file = file(text.as_bytes());
+            let mut lines = Lines::open(file.path()).unwrap();
+            let mut found = Vec::new();
+            while let Some((number, line)) = lines.next_line().unwrap() {
+                found.push(line.to_owned());
+                assert_eq!(number, found.len());
+            }
+            assert_eq!(found, read_text(file.path(), 100).unwrap().lines().collect::<Vec<_>>(), "{text:?}");
         }
     }
 
     #[test]
-    fn a_byte_order_mark_of_utf_8_is_passed_over() {
-        let file = tempfile::NamedTempFile::new().unwrap();
-        fs::write(file.path(), b"\xef\xbb\xbf{\"a\": 1}").unwrap();
-        assert_eq!(read_json(file.path()).unwrap()["a"], 1);
-        assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4"));
+    fn only_lines_that_are_read_have_a_longest_length() {
+        let long = [b"a\n".to_vec(), vec![b'x'; 1 << 20], b"\nb\n\xff\n".to_vec()].concat();
+        let file = file(&long);
+        let mut lines = Lines::open(file.path()).unwrap();
+        assert_eq!(lines.next_line().unwrap(), Some((1, "a")));
+        lines.skip_line().unwrap();
+        assert_eq!(lines.next_line().unwrap(), Some((3, "b")));
+        assert!(lines.next_line().unwrap_err().to_string().contains("byte 1048581"));
+        let mut lines = Lines::open(file.path()).unwrap();
+        lines.next_line().unwrap();
+        assert!(lines.next_line().unwrap_err().to_string().contains("line 2: expected a line of at most 65536 bytes"));
+    }
+
+    #[test]
+    fn texts_in_other_encodings_are_named() {
+        let refused = |bytes: &[u8]| read_text(file(bytes).path(), 100).unwrap_err().to_string();
+        assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4") && refused(b"caf\xe9").contains("Latin-1"));
+        assert!(refused(b"\xff\xfe{\0}\0").contains("UTF-16") && refused(&[b'a'; 101]).contains("at most 100 bytes"));
     }
 }

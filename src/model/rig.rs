@@ -53,6 +53,23 @@ pub struct Rig {
 const TIME_TOLERANCE: f64 = 1e-6;
 
 impl Rig {
+    /// Bytes that a distinct camera takes: itself, its copy in a schedule, and its place in a table while it is read.
+    pub const CAMERA_BYTES: u64 = 2 * size_of::<Camera>() as u64 + 16;
+
+    /// Bytes that a picture takes beside its camera and the name of its file: itself, its places in two tables while it is
+    /// read, and three times its place in a schedule.
+    pub const SHOT_BYTES: u64 = size_of::<Shot>() as u64 + 32 + 3 * 40;
+
+    /// Bytes that the name of a picture's file takes beside its text, for the allocator.
+    pub const NAME_BYTES: u64 = 32;
+
+    /// Bytes of all cameras and pictures, and of one schedule of them.
+    pub fn bytes(&self) -> u64 {
+        let names = self.shots.iter().filter_map(|shot| shot.image.as_ref());
+        let names: u64 = names.map(|image| image.as_os_str().len() as u64 + Rig::NAME_BYTES).sum();
+        Rig::CAMERA_BYTES * self.cameras.len() as u64 + Rig::SHOT_BYTES * self.shots.len() as u64 + names
+    }
+
     /// The distinct times of all pictures, increasing; empty when no picture has a time.
     ///
     /// Times within half the tolerance of [`Rig::schedule`] above another are that one: training and

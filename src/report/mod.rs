@@ -150,9 +150,12 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     Ok(report)
 }
 
+/// Maximum number of bytes of the data that another command wrote: a thousand runs take less than one million.
+const MAX_FOUND: u64 = 16 << 20;
+
 /// Reads the data that `verb` wrote.
 fn read_found<T: DeserializeOwned>(path: &Path, verb: &str) -> Result<T> {
-    let text = read_text(path)?;
+    let text = read_text(path, MAX_FOUND)?;
     serde_json::from_str(&text).map_err(|error| {
         let expected = format!("what `splatsieve {verb}` wrote");
         Error::input(path, format!("line {}", error.line()), expected, error.to_string())

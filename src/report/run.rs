@@ -66,15 +66,19 @@ impl Run {
     }
 }
 
+/// Maximum number of bytes of a summary and of a recipe.
+const MAX_SUMMARY: u64 = 16 << 20;
+const MAX_RECIPE: u64 = 1 << 20;
+
 fn read_summary(path: &Path) -> Result<(Summary, Value), String> {
-    let text = read_text(path).map_err(|e| e.to_string())?;
+    let text = read_text(path, MAX_SUMMARY).map_err(|e| e.to_string())?;
     let whole: Value = serde_json::from_str(&text).map_err(|e| e.to_string())?;
     let summary = Summary::deserialize(&whole).map_err(|e| format!("not a summary of compress: {e}"))?;
     Ok((summary, whole))
 }
 
 fn read_recipe(path: &Path) -> Result<Recipe, String> {
-    let text = read_text(path).map_err(|e| e.to_string())?;
+    let text = read_text(path, MAX_RECIPE).map_err(|e| e.to_string())?;
     Recipe::from_toml(&text, "default")
 }
 

@@ -115,7 +115,10 @@ pub fn load_cameras(
 ) -> Result<Option<Rig>> {
     let Some(path) = path else { return Ok(None) };
     let frames = input.and_then(Family::data_frames).or(options.frames);
-    let rig = cameras::load(path, &CameraOptions { size: options.size, frames, times, clock })?;
+    let rig = cameras::load(
+        path,
+        &CameraOptions { size: options.size, frames, times, clock, memory: options.memory.read_limit() },
+    )?;
     let is_states = input.is_none_or(Family::stands_in_frames);
     let beside = || is_states.then(|| families::trained_background(path)).flatten();
     Ok(Some(Rig { background: rig.background.or_else(beside), ..rig }))

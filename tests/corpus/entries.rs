@@ -13,6 +13,7 @@ use splatsieve::families::{self, OpenOptions};
 use splatsieve::ingest::cameras::{self, CameraOptions};
 use splatsieve::ingest::container::Container;
 use splatsieve::ingest::frame_stream::FrameStream;
+use splatsieve::ingest::in_memory;
 use splatsieve::ingest::ply::check_header;
 use splatsieve::limits::ReadLimit;
 use splatsieve::model::{Columns, Gaussians};
@@ -74,13 +75,17 @@ pub(crate) const PER_BYTE: usize = 512;
 
 /// What most readers may allocate whatever they read.
 const LITTLE: usize = 32 << 20;
+/// JSON is read through a buffer, and one text of a megabyte is kept at a time.
+const STREAMED: usize = 4 << 20;
+/// Memory that the reader of pickles is given, and room for messages.
+const PICKLE: usize = (1 << 20) + (64 << 10);
 /// A tile may hold 256 MiB (format/SPEC.md), which are decoded beside what they are decoded from.
 const TILES: usize = 640 << 20;
 /// An archive may mean 64 MiB, and 512 bytes for each of its own (format/ARCHIVE.md).
 const CONTENT: usize = 256 << 20;
 
 /// Every way in.
-pub(crate) const ENTRIES: [Entry; 16] = [
+pub(crate) const ENTRIES: [Entry; 18] = [
     Entry { name: "archive", corpus: "archive", read: archive, mended: mended_archive, most_bytes: CONTENT },
     Entry {
         name: "archive_sections",
@@ -97,6 +102,8 @@ pub(crate) const ENTRIES: [Entry; 16] = [
     Entry { name: "deform", corpus: "deform", read: deform, mended: mended_zip, most_bytes: LITTLE },
     Entry { name: "params", corpus: "params", read: params, mended: mended_zip, most_bytes: LITTLE },
     Entry { name: "pickle", corpus: "pickle", read: pickle, mended: mended_zip, most_bytes: LITTLE },
+    Entry { name: "cameras_json", corpus: "cameras", read: cameras_json, mended: |_| None, most_bytes: STREAMED },
+    Entry { name: "pickle_bytes", corpus: "pickle_bytes", read: pickle_bytes, mended: |_| None, most_bytes: PICKLE },
     Entry { name: "ply", corpus: "ply", read: ply, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "ply_header", corpus: "ply_header", read: ply_header, mended: |_| None, most_bytes: LITTLE },
     Entry { name: "recipe", corpus: "recipe", read: recipe, mended: |_| None, most_bytes: LITTLE },
@@ -258,6 +265,17 @@ fn splatv(bytes: &[u8], place: &Place) -> Outcome {
 fn pickle(bytes: &[u8], place: &Place) -> Outcome {
     place.put("of_field/point_cloud/iteration_7/deformation.pth", bytes);
     model(&place.path("of_field"))
+}
+
+/// A pickle alone, within one MiB of memory.
+fn pickle_bytes(bytes: &[u8], _: &Place) -> Outcome {
+    in_memory::pickle(bytes, 1 << 20).map(drop).ok_or_else(|| "no pickle".into())
+}
+
+/// The stream by which camera files are read.
+fn cameras_json(bytes: &[u8], _: &Place) -> Outcome {
+    in_memory::cameras_json(bytes)?;
+    Ok(())
 }
 
 fn container(bytes: &[u8], place: &Place) -> Outcome {

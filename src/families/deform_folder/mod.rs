@@ -93,7 +93,7 @@ impl<L: Deforming + 'static> Folder<L> {
     ) -> Result<Box<dyn Family>> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
-        let tensors = paths.tensors()?;
+        let tensors = paths.tensors(options.memory)?;
         let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
         let raw = raw(&ply)?;
         let (features, file, cloud) = (raw.own.width(), &*paths.network, &*paths.point_cloud);

@@ -1,23 +1,19 @@
 //! The files of a model folder with a `deform` folder in it.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
-use zip::ZipArchive;
 
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
 use crate::families::iterations::numbers;
-use crate::families::pth::{names, read_state_dict};
+use crate::families::pth::{is_pair, names, read_state_dict};
 use crate::ingest::digest::hash_file;
-use crate::ingest::open::open_file;
+use crate::limits::ReadLimit;
 
 const CLOUDS: &str = "point_cloud";
 const NETWORKS: &str = "deform";
 const NETWORK: &str = "deform.pth";
-/// Largest pickle that is looked at to say what it is.
-const MAX_PICKLE: u64 = 1 << 20;
 
 /// The files.
 #[derive(Debug, Clone)]
@@ -37,9 +33,9 @@ pub(in crate::families) fn has_network(root: &Path) -> bool {
 }
 
 /// Names of the tensors of the last network of a folder; none of what cannot be read, which is for its reader to say.
-pub(in crate::families) fn names_of_network(root: &Path) -> Vec<String> {
+pub(in crate::families) fn names_of_network(root: &Path, memory: ReadLimit) -> Vec<String> {
     let last = iterations(&root.join(NETWORKS), NETWORK).ok().and_then(|found| found.last().copied());
-    last.and_then(|k| names(&Paths::of(root, k).network).ok()).unwrap_or_default()
+    last.and_then(|k| names(&Paths::of(root, k).network, memory).ok()).unwrap_or_default()
 }
 
 /// K of the folders `iteration_K` in `within` that hold `file`, increasing.
@@ -92,15 +88,15 @@ impl Paths {
     ///
     /// # Errors
     /// A file that is no state dict; one of Grid4D.
-    pub(super) fn tensors(&self) -> Result<Tensors> {
-        if is_pair(&self.network) {
+    pub(super) fn tensors(&self, memory: ReadLimit) -> Result<Tensors> {
+        if is_pair(&self.network, memory) {
             return Err(Error::input(&self.network, "", "the state dict of one network", "two, as Grid4D saves them")
                 .hint(
                     "its hash grids are not read here; write what it renders from as a PLY for each time, and give \
                      the folder of them",
                 ));
         }
-        read_state_dict(&self.network)
+        read_state_dict(&self.network, memory)
     }
 
     /// xxh3-128 over the bytes of cloud, network and `cfg_args`, as 32 hex digits.
@@ -111,25 +107,4 @@ impl Paths {
             .try_for_each(|path| hash_file(path, &mut hash))?;
         Ok(format!("{:032x}", hash.digest128()))
     }
-}
-
-/// Whether a checkpoint is a tuple of two things: its pickle ends by making one. Of what cannot be read that is for its
-/// reader to say.
-fn is_pair(path: &Path) -> bool {
-    const TUPLE2: u8 = 0x86;
-    const STOP: u8 = b'.';
-    // The pair may be given a number to be named by, of one byte or four.
-    const BINPUT: u8 = b'q';
-    const LONG_BINPUT: u8 = b'r';
-    let Some(mut archive) = open_file(path).ok().and_then(|file| ZipArchive::new(file).ok()) else { return false };
-    let Some(name) = archive.file_names().find(|name| name.ends_with("data.pkl")).map(str::to_owned) else {
-        return false;
-    };
-    let mut bytes = Vec::new();
-    let read = archive.by_name(&name).is_ok_and(|file| file.take(MAX_PICKLE).read_to_end(&mut bytes).is_ok());
-    let made = matches!(
-        bytes[..],
-        [.., TUPLE2, STOP] | [.., TUPLE2, BINPUT, _, STOP] | [.., TUPLE2, LONG_BINPUT, _, _, _, _, STOP]
-    );
-    read && made
 }

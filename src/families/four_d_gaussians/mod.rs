@@ -145,7 +145,7 @@ impl Family for ModelFolder {
                 paths.deformation.display()
             )));
         }
-        let tensors = read_state_dict(&paths.deformation)?;
+        let tensors = read_state_dict(&paths.deformation, self.memory())?;
         let role = |(name, tensor): (&String, &Tensor)| {
             let role = match role(self.config().field(), name) {
                 // No level that is read.
@@ -186,7 +186,7 @@ impl Family for ModelFolder {
     }
 
     fn can_round_field(&self) -> Result<bool> {
-        is_floating(&self.paths().deformation)
+        is_floating(&self.paths().deformation, self.memory())
     }
 
     fn needs_all_bands(&self) -> Option<&'static str> {
@@ -238,7 +238,7 @@ impl ModelFolder {
             Precision::Exact => copy(own, path),
             Precision::Half => {
                 let from_zero = self.info().times.iter().all(|&time| time >= 0.0);
-                write_state_dict(path, &small_field::stored(&read_state_dict(own)?, from_zero))
+                write_state_dict(path, &small_field::stored(&read_state_dict(own, self.memory())?, from_zero))
             }
         }
     }

@@ -14,6 +14,7 @@ use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{About, InCheckpoint, Plane, Reading, count_of, numbered};
 use crate::error::{Error, Result, quoted};
 use crate::ingest::checkpoint::{Checkpoint, NodeId};
+use crate::limits::ReadLimit;
 use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
 use law::{DURATION, FreeTime, OWN, TIME, VELOCITY};
 
@@ -25,7 +26,7 @@ pub(super) const ENTRY: Entry = Entry {
     expected: "a gsplat checkpoint",
     recognises: |found| match found.is_folder {
         true => !checkpoints(found.path).is_empty(),
-        false => found.is_checkpoint() && splats_in(found.path),
+        false => found.is_checkpoint() && splats_in(found.path, found.memory),
     },
     open: |path, options| {
         let (root, file, notes) = match path.is_dir() {
@@ -38,7 +39,7 @@ pub(super) const ENTRY: Entry = Entry {
                 (None, path.to_owned(), Vec::new())
             }
         };
-        open(About { root, file, notes, ..About::default() })
+        open(About { root, file, notes, ..About::default() }, options)
     },
 };
 
@@ -75,14 +76,14 @@ fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> 
 }
 
 /// Whether the checkpoint at `path` has Gaussians as gsplat names them.
-fn splats_in(path: &Path) -> bool {
-    let Ok(checkpoint) = Checkpoint::open(path) else { return false };
+fn splats_in(path: &Path, memory: ReadLimit) -> bool {
+    let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
     pickle.item(pickle.root(), "splats").is_some_and(|splats| pickle.item(splats, "means").is_some())
 }
 
-fn open(about: About) -> Result<Box<dyn Family>> {
-    let checkpoint = Checkpoint::open(&about.file)?;
+fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
+    let checkpoint = Checkpoint::open(&about.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let Some(splats) = pickle.item(pickle.root(), "splats") else {
         let found = checkpoint.describe(pickle.root());
@@ -127,7 +128,7 @@ fn open(about: About) -> Result<Box<dyn Family>> {
         ));
     };
     let bands = sh_coefficients(degree);
-    let mut reading = Reading::new(checkpoint, count, degree, if moves { OWN } else { 0 });
+    let mut reading = Reading::new(checkpoint, count, degree, if moves { OWN } else { 0 })?;
     let planes = [
         (Columns::POSITION, &[3][..], 0, 3),
         (Columns::LOG_SCALE, &[3], 0, 3),

@@ -5,6 +5,7 @@ use crate::emit::kind::OutputKind;
 use crate::families;
 use crate::ingest::checkpoint::made::{Made, MadeTensor, named, tensor};
 use crate::limits::Limits;
+use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
 use crate::recipe::{Merge, Recipe};
 use crate::reduction::{Cluster, Reduction, Reference};
@@ -134,8 +135,8 @@ fn what_is_left_has_its_rows_in_splats_and_optimizers() {
     let result = place.written(&*model, &Reduction::pruned(vec![0, 3], &rule()));
     let left = open(&result).unwrap();
     states(&*left).iter().zip(states(&*model)).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[0, 3])));
-    let [before, after] =
-        [place.path("result"), result].map(|root| Checkpoint::open(&root.join("ckpts/ckpt_59999.pt")).unwrap());
+    let [before, after] = [place.path("result"), result]
+        .map(|root| Checkpoint::open(&root.join("ckpts/ckpt_59999.pt"), ReadLimit::NONE).unwrap());
     let shapes: Vec<Vec<usize>> = after.tensors().map(|tensor| tensor.shape).collect();
     // Nine of each kind; the steps have no rows.
     assert_eq!(shapes.len(), 36);

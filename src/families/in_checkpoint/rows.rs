@@ -7,6 +7,7 @@ use std::path::Path;
 
 use crate::emit::checkpoint::{Rows, write_like};
 use crate::error::Result;
+use crate::families::trajectories::state_bytes;
 use crate::ingest::checkpoint::{Checkpoint, NodeId, Tensor};
 use crate::model::{Column, Columns, Gaussians, Raw};
 use crate::reduction::Reduction;
@@ -69,10 +70,20 @@ pub(in crate::families) struct Reading {
 }
 
 impl Reading {
-    /// Of `count` Gaussians with so many planes of their own, all zero yet.
-    pub(in crate::families) fn new(checkpoint: Checkpoint, count: usize, sh_degree: usize, own: usize) -> Reading {
+    /// Makes room for `count` Gaussians with `own` planes beside the usual columns; all values are zero.
+    ///
+    /// # Errors
+    /// More memory than allowed.
+    pub(in crate::families) fn new(
+        checkpoint: Checkpoint,
+        count: usize,
+        sh_degree: usize,
+        own: usize,
+    ) -> Result<Reading> {
+        let row = state_bytes(sh_degree, Columns::all()) + 4 * own as u64;
+        checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
         let raw = Raw { gaussians: Gaussians::zeros(count, sh_degree), own: Column::zeros(own, count) };
-        Reading { table: Table { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw }
+        Ok(Reading { table: Table { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw })
     }
 
     /// Reads the tensor at `id`, called `name`, whose rows have the shape `row` and are `planes`.

@@ -49,7 +49,7 @@ fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
     let mut found: Option<(f64, String)> = None;
     for path in texts_in(root) {
         // Others may be of anything.
-        let Ok(text) = read_text(&path) else { continue };
+        let Ok(text) = read_text(&path, 1 << 20) else { continue };
         let Some(span) = span(&text) else { continue };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let wrong = |expected: String, found: String| Err(Error::input(&path, "key time_duration", expected, found));

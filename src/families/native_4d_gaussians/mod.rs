@@ -13,12 +13,13 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{Conventions, Entry, Family, OpenOptions};
+use super::family::{Entry, Family, OpenOptions};
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{About, InCheckpoint, Merging, Plane, Reading, count_of, numbered};
 use super::law::Model;
 use crate::error::{Error, Result};
 use crate::ingest::checkpoint::{Checkpoint, Node, NodeId};
+use crate::limits::ReadLimit;
 use crate::model::{Columns, Raw, sh_coefficients};
 use crate::recipe::Merge;
 use crate::reduction::Cluster;
@@ -35,10 +36,10 @@ pub(super) const ENTRY: Entry = Entry {
     recognises: |found| match found.is_folder {
         // Other families save checkpoints of their own beside their clouds.
         true if found.path.join("point_cloud").is_dir() => {
-            checkpoints(found.path).iter().any(|path| captures(path, &[MOVING]))
+            checkpoints(found.path).iter().any(|path| captures(path, &[MOVING], found.memory))
         }
         true => !checkpoints(found.path).is_empty(),
-        false => found.is_checkpoint() && captures(found.path, &[MOVING, STATIC]),
+        false => found.is_checkpoint() && captures(found.path, &[MOVING, STATIC], found.memory),
     },
     open: |path, options| {
         let about = match path.is_dir() {
@@ -51,7 +52,7 @@ pub(super) const ENTRY: Entry = Entry {
                 About { file: path.to_owned(), ..About::default() }
             }
         };
-        open(about, options.conventions)
+        open(about, options)
     },
 };
 
@@ -63,8 +64,8 @@ fn checkpoints(folder: &Path) -> Vec<PathBuf> {
 }
 
 /// Whether the checkpoint at `path` has a tuple of such a length and a number.
-fn captures(path: &Path, lengths: &[usize]) -> bool {
-    let Ok(checkpoint) = Checkpoint::open(path) else { return false };
+fn captures(path: &Path, lengths: &[usize], memory: ReadLimit) -> bool {
+    let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
     let pickle = checkpoint.pickle();
     match pickle.elements(pickle.root()) {
         Some(&[capture, iteration]) => {
@@ -96,8 +97,9 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
-fn open(about: About, conventions: Conventions) -> Result<Box<dyn Family>> {
-    let checkpoint = Checkpoint::open(&about.file)?;
+fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
+    let conventions = options.conventions;
+    let checkpoint = Checkpoint::open(&about.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let capture = match pickle.elements(pickle.root()) {
         Some(&[capture, _]) => capture,
@@ -170,7 +172,7 @@ fn open(about: About, conventions: Conventions) -> Result<Box<dyn Family>> {
     let mut of_rest = Plane::of(Columns::SH, 3, 3 * (bands - 1));
     of_rest.extend(Plane::own(TERMS, TERM * law.as_ref().map_or(0, |law| law.terms)));
     of_rest.resize(3 * (coefficients - 1), Plane::Unread);
-    let mut reading = Reading::new(checkpoint, count, degree, own);
+    let mut reading = Reading::new(checkpoint, count, degree, own)?;
     let mut read = |i: usize, name: &str, row: &[usize], planes| {
         let (id, place) = part(i, name);
         reading.read(id, &place, row, planes)

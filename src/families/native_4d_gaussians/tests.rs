@@ -5,10 +5,12 @@ use glam::{DMat3, DMat4, DVec4};
 
 use super::*;
 use crate::emit::kind::OutputKind;
+use crate::families::Conventions;
 use crate::families::in_checkpoint::linear::covariance;
 use crate::families::{self, OpenOptions};
 use crate::ingest::checkpoint::made::{Made, MadeTensor, named, tensor};
 use crate::limits::Limits;
+use crate::limits::ReadLimit;
 use crate::model::{Gaussians, opacity};
 use crate::recipe::Recipe;
 use crate::reduction::{Change, Cluster, Reduction, Reference};
@@ -217,8 +219,8 @@ fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
     let left = states(&*open(&result));
     left.iter().zip(&whole).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[1, 4, 5])));
     assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(place.path("model/cfg_args")).unwrap());
-    let checkpoints =
-        [place.path("model"), result].map(|root| Checkpoint::open(&root.join("chkpnt30000.pth")).unwrap());
+    let checkpoints = [place.path("model"), result]
+        .map(|root| Checkpoint::open(&root.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap());
     let [before, after] = checkpoints.each_ref().map(|checkpoint| checkpoint.tensors().collect::<Vec<_>>());
     // Nine parameters, two values that training keeps of each, four of its statistics.
     assert_eq!((before.len(), after.len()), (31, 31));
@@ -264,7 +266,7 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
         assert!((moved - 0.5).abs() < 1e-6, "{moved}");
     }
     // What training kept of it does not belong to it any more.
-    let checkpoint = Checkpoint::open(&result.join("chkpnt30000.pth")).unwrap();
+    let checkpoint = Checkpoint::open(&result.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap();
     let average = checkpoint.tensors().find(|tensor| tensor.storage == "20").unwrap();
     let values = checkpoint.floats(&average, "").unwrap();
     assert!(values[..3] == [0.0; 3] && values[3..].iter().all(|x| *x != 0.0), "{values:?}");

@@ -107,7 +107,7 @@ impl Scratch {
     fn read(&self, bytes: &[u8]) -> Result<Tensors> {
         let path: PathBuf = self.0.path().join("deformation.pth");
         fs::write(&path, bytes).unwrap();
-        read_state_dict(&path)
+        read_state_dict(&path, ReadLimit::NONE)
     }
 }
 
@@ -258,6 +258,6 @@ fn deep_nesting_is_refused_without_exhausting_the_stack() {
 
 #[test]
 fn a_missing_file_is_an_error_of_the_system() {
-    let error = read_state_dict(Path::new("nowhere/deformation.pth")).expect_err("must fail");
+    let error = read_state_dict(Path::new("nowhere/deformation.pth"), ReadLimit::NONE).expect_err("must fail");
     assert!(matches!(error, Error::Io { .. }), "{error}");
 }

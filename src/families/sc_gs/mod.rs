@@ -31,7 +31,7 @@ pub(super) const ENTRY: Entry = Entry {
         };
         found.is_folder
             && has_network(found.path)
-            && (typed() || names_of_network(found.path).iter().any(|name| name == "nodes"))
+            && (typed() || names_of_network(found.path, found.memory).iter().any(|name| name == "nodes"))
     },
     open: |path, options| Folder::open(path, options, Control::new),
 };

@@ -112,7 +112,7 @@ struct Configuration {
 
 impl Configuration {
     fn read(path: &Path) -> Result<Configuration> {
-        let text = read_text(path)?;
+        let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
         let named = |name: &str| arguments.iter().rev().find(|argument| argument.name == name);
         let text_of = |name: &str| match named(name).map(|argument| &argument.value) {
@@ -163,7 +163,7 @@ impl SpacetimeGaussians {
             })?,
         };
         let decoder = match (cloud.is_full(), &files.decoder) {
-            (true, Some(path)) => Some(Decoder::new(&read_state_dict(path)?, act, path)?),
+            (true, Some(path)) => Some(Decoder::new(&read_state_dict(path, options.memory)?, act, path)?),
             (true, None) if files.folder.is_some() => {
                 let path = files.cloud.with_file_name(DECODER);
                 return Err(Error::input(&path, "", "the network of a model with nine features", "no such file")

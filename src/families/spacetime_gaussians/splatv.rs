@@ -2,6 +2,7 @@
 //!
 //! The result of one keeps the words of what stays.
 
+use std::fs;
 use std::path::Path;
 
 use xxhash_rust::xxh3::Xxh3;
@@ -20,14 +21,16 @@ use crate::families::size::{Size, bytes_below, bytes_of};
 use crate::families::trajectories::write_sequence;
 use crate::ingest::cameras::Clock;
 use crate::ingest::digest::hash_file;
+use crate::ingest::json::read_json;
 use crate::ingest::splatv::{MAGIC, Row, Splatv};
-use crate::ingest::text::read_json;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::{Column, Columns, Gaussians, Raw, colour, harmonic, logit, opacity};
 use crate::recipe::Merge;
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::FrameSource;
 
+/// Maximum number of bytes of a list of cameras that a result gets: some seven thousand cameras.
+const MAX_LISTED: u64 = 4 << 20;
 /// Scales and widths are no less: their logs are finite.
 const LEAST_LENGTH: f64 = 1e-7;
 
@@ -107,7 +110,10 @@ pub(super) fn write(
     cameras: Option<&Path>,
     path: &Path,
 ) -> Result<()> {
-    let listed = cameras.map(read_json).transpose()?.filter(|cameras| !cameras[0]["rotation"].is_null());
+    // Of many cameras none is better than another one.
+    let is_small = |path: &&Path| fs::metadata(path).is_ok_and(|found| found.len() <= MAX_LISTED);
+    let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
+    let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());
     let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
     let words_of = |i: usize| {
         let row = row(raw, i);

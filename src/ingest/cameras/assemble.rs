@@ -1,13 +1,15 @@
 //! From pictures as a file lists them to a [`Rig`]: cameras checked and told apart, views numbered.
 
-use std::path::PathBuf;
+use std::hash::BuildHasher;
+use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
-use hashbrown::{HashMap, HashSet};
+use hashbrown::{DefaultHashBuilder, HashSet, HashTable};
 
 use super::fields::place;
 use super::{MAX_PICTURES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Shot, Split};
 
 /// Largest entry of |RᵀR − I| of a rotation. Matrices written in f32 reach 1e-6; at 1e-4 a point
@@ -32,65 +34,197 @@ pub(super) struct Picture {
     pub(super) view: Option<u32>,
 }
 
-/// The pictures of one file, in its order.
-pub(super) type Listing = (PathBuf, Vec<Picture>);
-
-/// Joins the pictures of all files of a data set.
+/// A [`Rig`] in the making: takes the pictures of all files of a data set one by one.
 ///
 /// Cameras equal in every bit become one. Views are numbered as the files state, or, unless they do
 /// so for every picture, by distinct camera in order of appearance. A picture without a time stands
 /// for every frame, so a second one of the same camera and split adds nothing and is left out.
-///
-/// # Errors
-/// No pictures or too many; a camera that is none; times for some pictures only; two pictures of one
-/// file with the same view, split and time.
-pub(super) fn assemble(files: Vec<Listing>, background: Option<[f32; 3]>, origin: String) -> Result<Rig> {
-    let total: usize = files.iter().map(|(_, pictures)| pictures.len()).sum();
-    let pictures = || files.iter().flat_map(|(_, pictures)| pictures);
-    if let (0, Some((path, _))) = (total, files.first()) {
-        return Err(Error::input(path, "", "at least one picture", "none"));
-    }
-    if let (true, Some((path, _))) = (total > MAX_PICTURES, files.first()) {
-        return Err(Error::input(path, "", format!("at most {MAX_PICTURES} pictures"), total.to_string()));
-    }
-    let views_stated = pictures().all(|picture| picture.view.is_some());
-    let timed = pictures().next().is_some_and(|picture| picture.time.is_some());
+#[derive(Debug)]
+pub(super) struct Assembly {
+    rig: Rig,
+    gauge: Gauge,
+    /// Indices of `rig.cameras` by their values.
+    known: HashTable<u32>,
+    hasher: DefaultHashBuilder,
+    /// (Camera, split) pairs that stand for every frame.
+    untimed: HashSet<(u32, Split)>,
+    /// Every file, and the index of its first shot.
+    files: Vec<(PathBuf, usize)>,
+    /// Number of pictures of the last file.
+    taken: usize,
+    are_views_stated: bool,
+    is_timed: Option<bool>,
+}
 
-    let mut rig = Rig { cameras: Vec::new(), shots: Vec::with_capacity(total), background, origin };
-    let mut known: HashMap<[u64; 18], u32> = HashMap::new();
-    let mut untimed_seen: HashSet<(u32, Split)> = HashSet::new();
-    for (path, pictures) in files {
-        let mut taken: HashMap<(u32, Split, u64), usize> = HashMap::new();
-        for (frame, picture) in pictures.into_iter().enumerate() {
-            let wrong = |expected: String, found: String| Error::input(&path, place(Some(frame)), expected, found);
-            if let Err((expected, found)) = check(&picture.camera) {
-                return Err(wrong(expected, found));
-            }
-            if picture.time.is_some() != timed {
-                return Err(wrong("a time for every picture or for none".into(), one_sided(timed).into()));
-            }
-            let camera = *known.entry(key(&picture.camera)).or_insert_with(|| {
-                rig.cameras.push(picture.camera);
-                rig.cameras.len() as u32 - 1
-            });
-            let view = picture.view.filter(|_| views_stated).unwrap_or(camera);
-            match picture.time {
-                None if !untimed_seen.insert((camera, picture.split)) => continue,
-                None => {}
-                // −0 and 0 are one time.
-                Some(time) => {
-                    if let Some(before) = taken.insert((view, picture.split, (time + 0.0).to_bits()), frame) {
-                        return Err(wrong(
-                            "one picture per view and time".into(),
-                            format!("view {view} at time {time} again, as in frame {before}"),
-                        ));
-                    }
-                }
-            }
-            rig.shots.push(Shot { view, camera, time: picture.time, split: picture.split, image: picture.image });
+impl Assembly {
+    pub(super) fn new(memory: ReadLimit) -> Assembly {
+        Assembly {
+            rig: Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() },
+            gauge: Gauge { limit: memory, used: 0 },
+            known: HashTable::new(),
+            hasher: DefaultHashBuilder::default(),
+            untimed: HashSet::new(),
+            files: Vec::new(),
+            taken: 0,
+            are_views_stated: true,
+            is_timed: None,
         }
     }
-    Ok(rig)
+
+    /// Counts the memory of what is kept beside the rig while it is made.
+    pub(super) fn gauge(&mut self) -> &mut Gauge {
+        &mut self.gauge
+    }
+
+    /// Makes room for the `count` pictures that `file` lists. Those that are added next are its pictures.
+    ///
+    /// # Errors
+    /// Too many pictures; more memory than allowed.
+    pub(super) fn begin(&mut self, file: &Path, count: usize) -> Result<()> {
+        let total = self.rig.shots.len() + count;
+        if total > MAX_PICTURES {
+            return Err(Error::input(file, "", format!("at most {MAX_PICTURES} pictures"), total.to_string()));
+        }
+        self.gauge.take(file, "", &format!("{count} pictures"), Rig::SHOT_BYTES * count as u64)?;
+        self.rig.shots.reserve_exact(count);
+        // Most often a camera is new, or few are. What is not used of the list takes no memory, but copying it would.
+        let affordable = self.gauge.limit.bytes() / 4 / Rig::CAMERA_BYTES;
+        self.rig.cameras.reserve_exact(count.min(affordable.min(1 << 20) as usize));
+        self.files.push((file.to_owned(), self.rig.shots.len()));
+        self.taken = 0;
+        Ok(())
+    }
+
+    /// Adds the next picture of the file that was begun last.
+    ///
+    /// # Errors
+    /// A camera that is none; times for some pictures only; more memory than allowed.
+    ///
+    /// # Panics
+    /// If no file was begun.
+    pub(super) fn add(&mut self, picture: Picture) -> Result<()> {
+        let path = &self.files.last().expect("a file was begun").0;
+        let frame = self.taken;
+        let wrong = |expected: String, found: String| Error::input(path, place(Some(frame)), expected, found);
+        self.taken += 1;
+        if let Err((expected, found)) = check(&picture.camera) {
+            return Err(wrong(expected, found));
+        }
+        let is_timed = *self.is_timed.get_or_insert(picture.time.is_some());
+        if picture.time.is_some() != is_timed {
+            return Err(wrong("a time for every picture or for none".into(), one_sided(is_timed).into()));
+        }
+        let values = key(&picture.camera);
+        let (cameras, hasher) = (&mut self.rig.cameras, &self.hasher);
+        let hash = hasher.hash_one(values);
+        let found = self.known.find(hash, |&at| key(&cameras[at as usize]) == values).copied();
+        let camera = match found {
+            Some(camera) => camera,
+            None => {
+                self.gauge.take(path, &place(Some(frame)), "the cameras", Rig::CAMERA_BYTES)?;
+                if cameras.len() == cameras.capacity() {
+                    // The old list and the new one are there together while one is copied to the other.
+                    let more = (cameras.len() / 4).max(64);
+                    let copied = (size_of::<Camera>() * (cameras.len() + more)) as u64;
+                    self.gauge.take(path, &place(Some(frame)), "the cameras", copied)?;
+                    cameras.reserve_exact(more);
+                    self.gauge.used -= copied;
+                }
+                let camera = cameras.len() as u32;
+                cameras.push(picture.camera);
+                self.known.insert_unique(hash, camera, |&at| hasher.hash_one(key(&cameras[at as usize])));
+                camera
+            }
+        };
+        self.are_views_stated &= picture.view.is_some();
+        if !is_timed && !self.untimed.insert((camera, picture.split)) {
+            return Ok(());
+        }
+        let mut image = picture.image;
+        if let Some(image) = &mut image {
+            image.shrink_to_fit();
+            let bytes = image.as_os_str().len() as u64 + Rig::NAME_BYTES;
+            self.gauge.take(path, &place(Some(frame)), "the names of pictures", bytes)?;
+        }
+        let view = picture.view.unwrap_or(0);
+        self.rig.shots.push(Shot { view, camera, time: picture.time, split: picture.split, image });
+        Ok(())
+    }
+
+    /// Largest time so far; `least` if none is larger.
+    pub(super) fn latest(&self, least: f64) -> f64 {
+        self.rig.shots.iter().filter_map(|shot| shot.time).fold(least, f64::max)
+    }
+
+    /// Divides all times by `span`.
+    pub(super) fn divide_times(&mut self, span: f64) {
+        for shot in &mut self.rig.shots {
+            shot.time = shot.time.map(|time| time / span);
+        }
+    }
+
+    /// Returns the rig of all pictures.
+    ///
+    /// # Errors
+    /// No pictures; two pictures of one file with the same view, split and time.
+    pub(super) fn finish(mut self, background: Option<[f32; 3]>, origin: String) -> Result<Rig> {
+        if let (true, Some((path, _))) = (self.rig.shots.is_empty(), self.files.first()) {
+            return Err(Error::input(path, "", "at least one picture", "none"));
+        }
+        if !self.are_views_stated {
+            self.rig.shots.iter_mut().for_each(|shot| shot.view = shot.camera);
+        }
+        let shots = &self.rig.shots;
+        // −0 and 0 are one time.
+        let key = |at: usize| {
+            let shot: &Shot = &shots[at];
+            shot.time.map(|time| (shot.view, shot.split, (time + 0.0).to_bits()))
+        };
+        for (k, (path, first)) in self.files.iter().enumerate() {
+            let end = self.files.get(k + 1).map_or(shots.len(), |next| next.1);
+            let mut taken: HashTable<u32> = HashTable::new();
+            for at in *first..end {
+                let Some(own) = key(at) else { continue };
+                let hash = self.hasher.hash_one(own);
+                if let Some(&before) = taken.find(hash, |&other| key(other as usize) == Some(own)) {
+                    let (view, time) = (own.0, shots[at].time.unwrap_or(0.0));
+                    return Err(Error::input(
+                        path,
+                        place(Some(at - first)),
+                        "one picture per view and time",
+                        format!("view {view} at time {time} again, as in frame {}", before as usize - first),
+                    ));
+                }
+                taken.insert_unique(hash, at as u32, |&other| self.hasher.hash_one(key(other as usize)));
+            }
+        }
+        Ok(Rig { background, origin, ..self.rig })
+    }
+}
+
+/// Counts the memory that is kept while cameras are read.
+#[derive(Debug)]
+pub(super) struct Gauge {
+    limit: ReadLimit,
+    used: u64,
+}
+
+impl Gauge {
+    /// Counts `bytes` that are about to be kept of the file at `path`; `what` names what they are for.
+    ///
+    /// # Errors
+    /// More memory than allowed.
+    pub(super) fn take(&mut self, path: &Path, place: &str, what: &str, bytes: u64) -> Result<()> {
+        let used = self.used.saturating_add(bytes);
+        self.limit.check(path, place, what, used)?;
+        self.used = used;
+        Ok(())
+    }
+
+    /// Counts `bytes` no more.
+    pub(super) fn release(&mut self, bytes: u64) {
+        self.used = self.used.saturating_sub(bytes);
+    }
 }
 
 fn one_sided(timed: bool) -> &'static str {

@@ -20,27 +20,35 @@
 
 use std::path::Path;
 
-use serde_json::Value;
-
-use super::assemble::{Picture, assemble, from_camera_to_world, view_in_name};
-use super::fields::{Fields, describe};
+use super::CameraOptions;
+use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
+use super::fields::{Fields, place};
+use super::pictures::each_picture;
 use super::times::{self, Times};
-use crate::error::{Error, Result};
+use crate::error::Result;
+use crate::ingest::json::small::Small;
+use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
-/// Reads this project's own file.
-pub(super) fn load_per_picture(file: &Path, document: &Value) -> Result<Rig> {
-    let shared = Fields::of(file, None, document)?;
+/// Keys of a picture.
+const PICTURE: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
+/// Keys of a camera.
+const CAMERA: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
+
+/// Reads this project's own file, of which `outline` is what lies around the pictures.
+pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
+    let shared = Fields::of(file, None, outline)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
     }
-    let mut pictures = Vec::new();
-    for (index, frame) in shared.list("frames")?.iter().enumerate() {
-        pictures.push(per_picture(file, Fields::of(file, Some(index), frame)?)?);
-    }
+    let mut assembly = Assembly::new(memory);
+    assembly.begin(file, shared.list("frames")?)?;
+    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
+        assembly.add(per_picture(file, Fields::of(file, Some(index), frame)?)?)
+    })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
-    assemble(vec![(file.to_owned(), pictures)], background, file.display().to_string())
+    assembly.finish(background, file.display().to_string())
 }
 
 fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
@@ -71,22 +79,32 @@ fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
     })
 }
 
-/// Reads the file of a 3DGS model folder.
-pub(super) fn load_per_camera(file: &Path, document: &Value, times: &Times) -> Result<Rig> {
-    let Value::Array(list) = document else {
-        return Err(Error::input(file, "", "a list of cameras", describe(document)));
-    };
-    let mut pictures = Vec::new();
-    for (index, entry) in list.iter().enumerate() {
-        pictures.push(per_camera(file, Fields::of(file, Some(index), entry)?)?);
-    }
+/// Reads the file of a 3DGS model folder, a list of `count` cameras.
+pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
+    let mut assembly = Assembly::new(options.memory);
+    assembly.begin(file, count)?;
     let mut origin = file.display().to_string();
-    if *times != Times::Own {
-        let name = |entry: &Value| entry.get("img_name").and_then(Value::as_str).unwrap_or("").to_owned();
-        let names: Vec<String> = list.iter().map(name).collect();
-        origin += &format!(" ({})", times::give(file, &mut pictures, &names, times)?);
+    let mut times = Vec::new();
+    if options.times != Times::Own {
+        let mut names: Vec<Box<str>> = Vec::new();
+        each_picture(file, None, &["img_name"], |index, camera| {
+            let name = match camera.get("img_name") {
+                Some(Small::Text(name)) => name.clone(),
+                _ => "".into(),
+            };
+            assembly.gauge().take(file, &place(Some(index)), "the names of pictures", name.len() as u64 + 96)?;
+            names.push(name);
+            Ok(())
+        })?;
+        let (given, said) = times::give(file, &names, &options.times, assembly.gauge())?;
+        origin += &format!(" ({said})");
+        times = given;
     }
-    assemble(vec![(file.to_owned(), pictures)], None, origin)
+    each_picture(file, None, &CAMERA, |index, camera| {
+        let time = times.get(index).copied().flatten();
+        assembly.add(Picture { time, ..per_camera(file, Fields::of(file, Some(index), camera)?)? })
+    })?;
+    assembly.finish(None, origin)
 }
 
 fn per_camera(file: &Path, own: Fields<'_>) -> Result<Picture> {

@@ -14,17 +14,21 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
-use super::assemble::{Picture, assemble};
+use super::assemble::{Assembly, Gauge, Picture};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
 use crate::error::{Error, Result, quoted};
 use crate::ingest::open::open_file;
-use crate::ingest::text::read_text;
+use crate::ingest::text::Lines;
 use crate::model::{Camera, Rig, Split};
 
 /// Longest name of a picture.
 const MAX_NAME: u64 = 4096;
 /// Bytes of a point that an image sees: two coordinates and a number.
 const POINT: u64 = 24;
+/// Bytes of a camera in its table, and of a picture in its list beside its name, while they grow by being copied to twice
+/// their size.
+const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
+const IMAGE_BYTES: u64 = 3 * size_of::<Image>() as u64 + 160;
 /// Furthest that the length of a quaternion may be from 1.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
@@ -55,7 +59,7 @@ struct Image {
     quaternion: [f64; 4],
     translation: [f64; 3],
     camera: u32,
-    name: String,
+    name: Box<str>,
 }
 
 /// Reads the reconstruction that `found` is, or is a file of.
@@ -67,8 +71,10 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     let binary = folder.join("cameras.bin").is_file();
     let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
     let (cameras, images) = (file("cameras"), file("images"));
-    let lenses = if binary { read_cameras(&cameras)? } else { parse_cameras(&cameras)? };
-    let mut listed = if binary { read_images(&images)? } else { parse_images(&images)? };
+    let mut assembly = Assembly::new(options.memory);
+    let gauge = assembly.gauge();
+    let lenses = if binary { read_cameras(&cameras, gauge)? } else { parse_cameras(&cameras, gauge)? };
+    let mut listed = if binary { read_images(&images, gauge)? } else { parse_images(&images, gauge)? };
     // A reconstruction lists its pictures in the order in which it found them.
     listed.sort_by(|a, b| natord::compare(&a.name, &b.name).then_with(|| a.name.cmp(&b.name)));
     let pictures_in = pictures_folder(&folder);
@@ -99,28 +105,34 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
             },
             time: None,
             split: split_of(&image.name),
-            image: Some(pictures_in.join(&image.name)),
+            image: Some(pictures_in.join(&*image.name)),
             view: None,
         })
     };
-    let mut pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
     if let (Some(first), Times::Own) = (frames::of(&folder), &options.times) {
         let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
-        if pictures.len().saturating_mul(frames) > MAX_PICTURES {
+        if listed.len().saturating_mul(frames) > MAX_PICTURES {
             return Err(Error::usage(format!(
                 "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
                 folder.display(),
-                pictures.len()
+                listed.len()
             )));
         }
         let origin = format!("{} (each of {frames} frames)", folder.display());
-        return assemble(vec![(images, frames::repeated(&pictures, &first, frames))], None, origin);
+        let pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
+        assembly.begin(&images, listed.len() * frames)?;
+        frames::repeated(&pictures, &first, frames).try_for_each(|picture| assembly.add(picture))?;
+        return assembly.finish(None, origin);
     }
-    let names: Vec<String> = listed.into_iter().map(|image| image.name).collect();
-    let said = times::give(&images, &mut pictures, &names, &options.times)?;
+    let names: Vec<Box<str>> = listed.iter().map(|image| image.name.clone()).collect();
+    let (given, said) = times::give(&images, &names, &options.times, assembly.gauge())?;
+    assembly.begin(&images, listed.len())?;
+    for (index, image) in listed.iter().enumerate() {
+        assembly.add(Picture { time: given.get(index).copied().flatten(), ..picture(image)? })?;
+    }
     let origin = folder.display().to_string();
     let origin = if said.is_empty() { origin } else { format!("{origin} ({said})") };
-    assemble(vec![(images, pictures)], None, origin)
+    assembly.finish(None, origin)
 }
 
 /// The folder that holds the files.
@@ -190,10 +202,11 @@ fn lens(
     Ok(Lens { size: (w, h), intrinsics })
 }
 
-fn parse_cameras(path: &Path) -> Result<HashMap<u32, Lens>> {
+fn parse_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
     let mut lenses = HashMap::new();
-    for (at, line) in read_text(path)?.lines().enumerate() {
-        let line = line.trim();
+    let mut lines = Lines::open(path)?;
+    while let Some((number, line)) = lines.next_line()? {
+        let (at, line) = (number - 1, line.trim());
         if line.is_empty() || line.starts_with('#') {
             continue;
         }
@@ -206,17 +219,17 @@ fn parse_cameras(path: &Path) -> Result<HashMap<u32, Lens>> {
         };
         let values: Vec<f64> =
             values.iter().map(|value| value.parse()).collect::<std::result::Result<_, _>>().map_err(|_| expected())?;
+        gauge.take(path, &format!("line {number}"), "the cameras", LENS_BYTES)?;
         lenses.insert(id, lens(wrong, model, (width, height), &values)?);
     }
     Ok(lenses)
 }
 
-fn parse_images(path: &Path) -> Result<Vec<Image>> {
-    let text = read_text(path)?;
+fn parse_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
     let mut images = Vec::new();
-    let mut lines = text.lines().enumerate();
-    while let Some((at, line)) = lines.next() {
-        let line = line.trim();
+    let mut lines = Lines::open(path)?;
+    while let Some((number, line)) = lines.next_line()? {
+        let (at, line) = (number - 1, line.trim());
         if line.is_empty() || line.starts_with('#') {
             continue;
         }
@@ -237,10 +250,11 @@ fn parse_images(path: &Path) -> Result<Vec<Image>> {
         }
         let camera = word().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
         let [w, x, y, z, tx, ty, tz] = values;
-        let name = rest.to_owned();
+        gauge.take(path, &format!("line {number}"), "the pictures", IMAGE_BYTES + 2 * rest.len() as u64)?;
+        let name = rest.into();
         images.push(Image { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
         // The points that it sees, on a line that may be empty.
-        lines.next();
+        lines.skip_line()?;
     }
     Ok(images)
 }
@@ -315,7 +329,7 @@ impl<'a> Binary<'a> {
     }
 }
 
-fn read_cameras(path: &Path) -> Result<HashMap<u32, Lens>> {
+fn read_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
     let mut file = Binary::open(path)?;
     let mut lenses = HashMap::new();
     for _ in 0..file.u64("a number of cameras")? {
@@ -328,21 +342,23 @@ fn read_cameras(path: &Path) -> Result<HashMap<u32, Lens>> {
         let values = (0..count).map(|_| Ok(file.f64s::<1>("a parameter")?[0])).collect::<Result<Vec<f64>>>()?;
         let wrong =
             |expected: String, found: String| Error::input(path, format!("byte {at}, camera {id}"), expected, found);
+        gauge.take(path, &format!("byte {at}"), "the cameras", LENS_BYTES)?;
         lenses.insert(id, lens(wrong, name, size, &values)?);
     }
     Ok(lenses)
 }
 
-fn read_images(path: &Path) -> Result<Vec<Image>> {
+fn read_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
     let mut file = Binary::open(path)?;
     let mut images = Vec::new();
     for _ in 0..file.u64("a number of images")? {
         file.u32("an image")?;
         let (quaternion, translation) = (file.f64s("a rotation")?, file.f64s("a translation")?);
         let (camera, name) = (file.u32("a camera")?, file.text("a picture's name")?);
+        gauge.take(path, &format!("byte {}", file.at), "the pictures", IMAGE_BYTES + 2 * name.len() as u64)?;
         let points = file.u64("a number of points")?;
         file.skip(points.checked_mul(POINT), "the points of a picture")?;
-        images.push(Image { quaternion, translation, camera, name });
+        images.push(Image { quaternion, translation, camera, name: name.into() });
     }
     Ok(images)
 }

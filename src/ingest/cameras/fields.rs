@@ -3,10 +3,13 @@
 use std::path::Path;
 
 use glam::{DMat3, DVec3};
-use serde_json::{Map, Value};
 
 use super::MAX_SIDE_PX;
 use crate::error::{Error, Result};
+use crate::ingest::json::small::{Object, Small};
+
+/// What a pose is, for messages.
+pub(super) const POSE: &str = "3 or 4 rows of 4 finite numbers";
 
 /// One JSON object of a camera file: a picture's, or the file's own.
 #[derive(Clone, Copy)]
@@ -14,21 +17,21 @@ pub(super) struct Fields<'a> {
     path: &'a Path,
     /// Index of the picture in the file; none for the file's own keys.
     frame: Option<usize>,
-    map: &'a Map<String, Value>,
+    map: &'a Object,
 }
 
 impl<'a> Fields<'a> {
     /// The keys of `value`, which must be an object.
-    pub(super) fn of(path: &'a Path, frame: Option<usize>, value: &'a Value) -> Result<Self> {
+    pub(super) fn of(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
         match value {
-            Value::Object(map) => Ok(Fields { path, frame, map }),
-            other => Err(Error::input(path, place(frame), "an object", describe(other))),
+            Small::Object(map) => Ok(Fields { path, frame, map }),
+            other => Err(Error::input(path, place(frame), "an object", other.describe())),
         }
     }
 
     /// An error about `key`.
     pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
-        let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), describe);
+        let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), Small::describe);
         let place = match self.frame {
             Some(frame) => format!("frame {frame}, key \"{key}\""),
             None => format!("key \"{key}\""),
@@ -39,7 +42,7 @@ impl<'a> Fields<'a> {
     /// A finite number, if the key is there and not null.
     pub(super) fn optional_number(&self, key: &str) -> Result<Option<f64>> {
         match self.map.get(key) {
-            None | Some(Value::Null) => Ok(None),
+            None | Some(Small::Null) => Ok(None),
             Some(value) => match value.as_f64().filter(|number| number.is_finite()) {
                 Some(number) => Ok(Some(number)),
                 None => Err(self.wrong(key, "a finite number")),
@@ -71,8 +74,8 @@ impl<'a> Fields<'a> {
     /// A text, if the key is there and not null.
     pub(super) fn optional_text(&self, key: &str) -> Result<Option<&'a str>> {
         match self.map.get(key) {
-            None | Some(Value::Null) => Ok(None),
-            Some(Value::String(text)) => Ok(Some(text)),
+            None | Some(Small::Null) => Ok(None),
+            Some(Small::Text(text)) => Ok(Some(text)),
             Some(_) => Err(self.wrong(key, "a text")),
         }
     }
@@ -80,7 +83,7 @@ impl<'a> Fields<'a> {
     /// A whole number that fits 32 bits, if the key is there and not null.
     pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {
         match self.map.get(key) {
-            None | Some(Value::Null) => Ok(None),
+            None | Some(Small::Null) => Ok(None),
             Some(value) => match value.as_u64().and_then(|number| u32::try_from(number).ok()) {
                 Some(number) => Ok(Some(number)),
                 None => Err(self.wrong(key, "a whole number, 0 or more")),
@@ -100,7 +103,7 @@ impl<'a> Fields<'a> {
     /// Three numbers, if the key is there.
     pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
         match self.map.get(key) {
-            None | Some(Value::Null) => Ok(None),
+            None | Some(Small::Null) => Ok(None),
             Some(value) => numbers(value).map(Some).ok_or_else(|| self.wrong(key, "3 finite numbers")),
         }
     }
@@ -112,17 +115,16 @@ impl<'a> Fields<'a> {
 
     /// A row-major 3 × 3 matrix.
     pub(super) fn matrix3(&self, key: &str) -> Result<DMat3> {
-        let rows = self.map.get(key).and_then(Value::as_array).filter(|rows| rows.len() == 3);
+        let rows = self.map.get(key).and_then(Small::elements).filter(|rows| rows.len() == 3);
         rows.and_then(|rows| Some(from_rows([numbers(&rows[0])?, numbers(&rows[1])?, numbers(&rows[2])?])))
             .ok_or_else(|| self.wrong(key, "3 rows of 3 finite numbers"))
     }
 
     /// The rotation and translation of a row-major 3 × 4 or 4 × 4 pose `[R | t]`.
     pub(super) fn pose(&self, key: &str) -> Result<(DMat3, DVec3)> {
-        let expected = "3 or 4 rows of 4 finite numbers";
-        let rows = self.map.get(key).and_then(Value::as_array).filter(|rows| matches!(rows.len(), 3 | 4));
+        let rows = self.map.get(key).and_then(Small::elements).filter(|rows| matches!(rows.len(), 3 | 4));
         let rows: Option<Vec<[f64; 4]>> = rows.and_then(|rows| rows.iter().map(numbers).collect());
-        let rows = rows.ok_or_else(|| self.wrong(key, expected))?;
+        let rows = rows.ok_or_else(|| self.wrong(key, POSE))?;
         if rows.get(3).is_some_and(|last| *last != [0.0, 0.0, 0.0, 1.0]) {
             return Err(self
                 .wrong(key, "0 0 0 1 as its last row")
@@ -132,9 +134,12 @@ impl<'a> Fields<'a> {
         Ok((rotation, DVec3::new(rows[0][3], rows[1][3], rows[2][3])))
     }
 
-    /// The list under `key`.
-    pub(super) fn list(&self, key: &str) -> Result<&'a [Value]> {
-        self.map.get(key).and_then(Value::as_array).map(Vec::as_slice).ok_or_else(|| self.wrong(key, "a list"))
+    /// Number of elements of the list under `key`.
+    pub(super) fn list(&self, key: &str) -> Result<usize> {
+        match self.map.get(key) {
+            Some(Small::List(_, total)) => Ok(*total),
+            _ => Err(self.wrong(key, "a list")),
+        }
     }
 }
 
@@ -143,28 +148,8 @@ pub(super) fn place(frame: Option<usize>) -> String {
     frame.map_or_else(String::new, |frame| format!("frame {frame}"))
 }
 
-/// What a JSON value is, short enough for a message.
-pub(super) fn describe(value: &Value) -> String {
-    const LONGEST: usize = 120;
-    match value {
-        Value::Array(list) if list.is_empty() => "an empty list".to_owned(),
-        Value::Object(map) if map.len() > 4 => {
-            let keys: Vec<&str> = map.keys().take(8).map(String::as_str).collect();
-            format!("an object with the keys {}", keys.join(", "))
-        }
-        Value::Array(list) if list.len() > 16 => format!("a list of {}", list.len()),
-        other => {
-            let text = other.to_string();
-            match text.char_indices().nth(LONGEST) {
-                Some((end, _)) => format!("{}…", &text[..end]),
-                None => text,
-            }
-        }
-    }
-}
-
-fn numbers<const W: usize>(value: &Value) -> Option<[f64; W]> {
-    let list: &[Value; W] = value.as_array()?.as_slice().try_into().ok()?;
+fn numbers<const W: usize>(value: &Small) -> Option<[f64; W]> {
+    let list: &[Small; W] = value.elements()?.try_into().ok()?;
     let mut out = [0.0; W];
     for (to, from) in out.iter_mut().zip(list) {
         *to = from.as_f64().filter(|number| number.is_finite())?;

@@ -38,8 +38,12 @@ pub(super) fn count(root: &Path, first: u32) -> usize {
 }
 
 /// `pictures`, all of frame `first` in `root`, at each of `frames` frames; the first of them is held out.
-pub(super) fn repeated(pictures: &[Picture], (root, first): &(PathBuf, u32), frames: usize) -> Vec<Picture> {
-    let at = |frame: usize| {
+pub(super) fn repeated<'a>(
+    pictures: &'a [Picture],
+    (root, first): &'a (PathBuf, u32),
+    frames: usize,
+) -> impl Iterator<Item = Picture> + 'a {
+    let at = move |frame: usize| {
         let folder = root.with_file_name(format!("{PREFIX}{}", u64::from(*first) + frame as u64));
         pictures.iter().enumerate().map(move |(k, picture)| {
             let image = picture.image.as_ref().map(|image| {
@@ -52,5 +56,5 @@ pub(super) fn repeated(pictures: &[Picture], (root, first): &(PathBuf, u32), fra
             Picture { time, view: Some(k as u32), split, image, ..picture.clone() }
         })
     };
-    (0..frames).flat_map(at).collect()
+    (0..frames).flat_map(at)
 }

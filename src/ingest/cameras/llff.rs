@@ -7,16 +7,17 @@
 //! Every camera sees every frame; frame i of n is at time i/n, so 1 is never reached (FORMATS:
 //! the DyNeRF loader of 4DGaussians).
 
+use std::io::{BufReader, Read, Seek};
 use std::path::Path;
 
 use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
-use super::assemble::{Listing, Picture, assemble, check, from_camera_to_world};
+use super::assemble::{Assembly, Gauge, Picture, check, from_camera_to_world};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
 use crate::error::{Error, Result};
-use crate::ingest::npy::header_is_sound;
-use crate::ingest::text::read_limited;
+use crate::ingest::npy::{HEAD, header_is_sound};
+use crate::ingest::open::open_file;
 use crate::model::{Camera, Rig, Split};
 
 /// Values per camera.
@@ -26,7 +27,8 @@ const DEFAULT_FRAMES: usize = 300;
 
 /// Reads `file`.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
-    let rows = read_rows(file, &read_limited(file)?)?;
+    let mut assembly = Assembly::new(options.memory);
+    let rows = read_rows(file, assembly.gauge())?;
     let cameras =
         rows.iter().enumerate().map(|(index, row)| camera(file, index, row, options)).collect::<Result<Vec<_>>>()?;
     let frames = options.frames.unwrap_or(DEFAULT_FRAMES);
@@ -41,20 +43,21 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     if options.frames.is_none() {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }
-    assemble(vec![pictures(file, &cameras, frames)], None, origin)
+    assembly.begin(file, frames * cameras.len())?;
+    pictures(&cameras, frames).try_for_each(|picture| assembly.add(picture))?;
+    assembly.finish(None, origin)
 }
 
 /// One picture per frame and camera, frame after frame.
-fn pictures(file: &Path, cameras: &[Camera], frames: usize) -> Listing {
-    let picture = |frame: usize, view: usize| Picture {
+fn pictures(cameras: &[Camera], frames: usize) -> impl Iterator<Item = Picture> {
+    let picture = move |frame: usize, view: usize| Picture {
         camera: cameras[view].clone(),
         time: Some(frame as f64 / frames as f64),
         split: if view == 0 { Split::Test } else { Split::Train },
         image: None,
         view: Some(view as u32),
     };
-    let all = (0..frames).flat_map(|frame| (0..cameras.len()).map(move |view| picture(frame, view)));
-    (file.to_owned(), all.collect())
+    (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| picture(frame, view)))
 }
 
 fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions) -> Result<Camera> {
@@ -77,13 +80,18 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
     Ok(camera)
 }
 
-/// The rows of the array in `bytes`, checked to be `[V, 17]` floats that are all there.
-fn read_rows(file: &Path, bytes: &[u8]) -> Result<Vec<[f64; WIDTH]>> {
+/// The rows of the array in `file`, checked to be `[V, 17]` floats that are all there.
+fn read_rows(file: &Path, gauge: &mut Gauge) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
-    if !header_is_sound(bytes, bytes.len() as u64) {
+    let mut opened = open_file(file)?;
+    let bytes = opened.metadata().map_err(Error::io("read the size of", file))?.len();
+    let mut head = Vec::new();
+    (&mut opened).take(HEAD).read_to_end(&mut head).map_err(Error::io("read", file))?;
+    if !header_is_sound(&head, bytes) {
         return Err(unreadable("a header that no array of numbers has".into()));
     }
-    let array = NpyFile::new(bytes).map_err(|error| unreadable(error.to_string()))?;
+    opened.rewind().map_err(Error::io("read", file))?;
+    let array = NpyFile::new(BufReader::new(opened)).map_err(|error| unreadable(error.to_string()))?;
     let dtype = array.dtype();
     let real = match &dtype {
         npyz::DType::Plain(plain) if plain.type_char() == TypeChar::Float => plain.num_bytes(),
@@ -100,14 +108,11 @@ fn read_rows(file: &Path, bytes: &[u8]) -> Result<Vec<[f64; WIDTH]>> {
             .hint("save it again with numpy.ascontiguousarray"));
     }
     // The length is checked against the bytes at hand before anything of that size is made.
-    if real.is_some_and(|size| count.saturating_mul(WIDTH as u64 * size as u64) > bytes.len() as u64) {
-        return Err(Error::input(
-            file,
-            "data",
-            format!("{count} rows of {WIDTH}"),
-            format!("{} bytes in all", bytes.len()),
-        ));
+    if real.is_some_and(|size| count.saturating_mul(WIDTH as u64 * size as u64) > bytes) {
+        return Err(Error::input(file, "data", format!("{count} rows of {WIDTH}"), format!("{bytes} bytes in all")));
     }
+    // The values as they are stored, as f64 and row by row, and a camera for each.
+    gauge.take(file, "data", &format!("{count} rows of {WIDTH}"), count.saturating_mul(24 * WIDTH as u64 + 256))?;
     let truncated =
         |error: std::io::Error| Error::input(file, "data", format!("{count} rows of {WIDTH}"), error.to_string());
     let values: Vec<f64> = match real {

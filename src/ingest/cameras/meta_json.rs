@@ -6,78 +6,169 @@
 
 use std::path::{Path, PathBuf};
 
-use serde_json::{Value, json};
+use glam::{DMat3, DVec3};
 
-use super::assemble::{Listing, Picture, assemble};
-use super::fields::{Fields, describe};
-use super::read_json;
+use super::assemble::{Assembly, Picture};
+use super::fields::{Fields, POSE, place};
+use super::pictures::outline;
 use crate::error::{Error, Result};
+use crate::ingest::json::lists::{Ask, At, each_element};
+use crate::ingest::json::small::Small;
+use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
 /// The files of a sequence, and what of it they list.
 const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
 
+/// Keys of lists by frame and camera.
+const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
+
 /// Whether a document is such a file.
-pub(super) fn is_one(document: &Value) -> bool {
-    ["k", "w2c"].iter().all(|key| document.get(key).is_some_and(Value::is_array))
+pub(super) fn is_one(outline: &Small) -> bool {
+    ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(Small::List(..))))
 }
 
-/// Reads `file`, whose content is `document`; with what lies beside it, if a folder was asked for.
+/// Reads `file`; with what lies beside it, if a folder was asked for.
 ///
 /// # Errors
 /// A value that is missing, of another length, or no camera; files of different numbers of frames.
-pub(super) fn load(file: &Path, document: &Value, with_others: bool) -> Result<Rig> {
+pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<Rig> {
     let split = |path: &Path| FILES.iter().find(|(name, _)| path.ends_with(name)).map_or(Split::Train, |found| found.1);
-    let (first, frames) = listing(file, document, split(file))?;
-    let mut files = vec![first];
+    let mut assembly = Assembly::new(memory);
+    let frames = add(&mut assembly, file, split(file))?;
     for (name, split) in FILES.iter().filter(|(name, _)| with_others && !file.ends_with(name)) {
         let other = file.with_file_name(name);
         if other.is_file() {
-            let (listing, found) = listing(&other, &read_json(&other)?, *split)?;
+            let found = add(&mut assembly, &other, *split)?;
             if found != frames {
                 let expected = format!("{frames} frames, as in {}", file.display());
                 return Err(Error::input(&other, "k", expected, format!("{found} frames")));
             }
-            files.push(listing);
         }
     }
-    assemble(files, None, file.display().to_string())
+    assembly.finish(None, file.display().to_string())
 }
 
-/// The pictures of a file, and how many frames it has.
-fn listing(file: &Path, document: &Value, split: Split) -> Result<(Listing, usize)> {
-    let shared = Fields::of(file, None, document)?;
-    let (width, height) = (shared.side("w")?, shared.side("h")?);
-    let by_frame = shared.list("k")?;
-    let frames = by_frame.len();
-    let mut pictures = Vec::new();
-    for (frame, of_frame) in by_frame.iter().enumerate() {
-        let Value::Array(cameras) = of_frame else {
-            return Err(Error::input(
-                file,
-                format!("k of frame {frame}"),
-                "a list with a matrix for every camera",
-                describe(of_frame),
-            ));
-        };
-        for (camera, k) in cameras.iter().enumerate() {
-            let of = |key: &str| document.get(key).and_then(|list| list.get(frame)?.get(camera)).cloned();
-            let entry = json!({ "k": k, "w2c": of("w2c"), "fn": of("fn"), "cam_id": of("cam_id") });
-            let own = Fields::of(file, Some(frame), &entry)?;
-            let (rotation, translation) = own.pose("w2c")?;
-            let [fx, fy, cx, cy] = {
+/// The values under one key, by frame and camera.
+#[derive(Debug)]
+struct Table<T> {
+    values: Vec<Option<T>>,
+    /// End of each frame's values.
+    ends: Vec<usize>,
+}
+
+impl<T> Table<T> {
+    const EMPTY: Table<T> = Table { values: Vec::new(), ends: Vec::new() };
+
+    /// Memory of one more value, as lists grow by being copied to twice their length.
+    const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
+
+    fn start(&self, frame: usize) -> usize {
+        frame.checked_sub(1).map_or(0, |before| self.ends[before])
+    }
+
+    fn len(&self, frame: usize) -> usize {
+        self.ends[frame] - self.start(frame)
+    }
+
+    fn get(&self, frame: usize, camera: usize) -> Option<&T> {
+        (frame < self.ends.len() && camera < self.len(frame))
+            .then(|| self.values[self.start(frame) + camera].as_ref())?
+    }
+}
+
+/// The values of a file.
+#[derive(Debug)]
+struct Tables {
+    intrinsics: Table<[f64; 4]>,
+    poses: Table<(DMat3, DVec3)>,
+    images: Table<Box<str>>,
+    views: Table<u32>,
+}
+
+impl Tables {
+    /// Takes the value of the key number `key` at `frame`.
+    fn take(&mut self, own: Fields<'_>, key: usize) -> Result<()> {
+        match key {
+            0 => {
                 let k = own.matrix3("k")?;
-                [k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]
-            };
-            let image = own.optional_text("fn")?.map(|name| PathBuf::from("ims").join(name));
-            pictures.push(Picture {
+                self.intrinsics.values.push(Some([k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]));
+            }
+            1 => self.poses.values.push(Some(own.pose("w2c")?)),
+            2 => self.images.values.push(own.optional_text("fn")?.map(Into::into)),
+            _ => self.views.values.push(own.optional_index("cam_id")?),
+        }
+        Ok(())
+    }
+
+    /// Ends a frame under the key number `key`.
+    fn end(&mut self, key: usize) {
+        match key {
+            0 => self.intrinsics.ends.push(self.intrinsics.values.len()),
+            1 => self.poses.ends.push(self.poses.values.len()),
+            2 => self.images.ends.push(self.images.values.len()),
+            _ => self.views.ends.push(self.views.values.len()),
+        }
+    }
+}
+
+/// Adds the pictures of a file; returns how many frames it has.
+fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
+    let outline = outline(file)?;
+    let shared = Fields::of(file, None, &outline)?;
+    let (width, height) = (shared.side("w")?, shared.side("h")?);
+    let frames = shared.list("k")?;
+    let mut tables =
+        Tables { intrinsics: Table::EMPTY, poses: Table::EMPTY, images: Table::EMPTY, views: Table::EMPTY };
+    let bytes =
+        [Table::<[f64; 4]>::BYTES, Table::<(DMat3, DVec3)>::BYTES, Table::<Box<str>>::BYTES + 32, Table::<u32>::BYTES];
+    let (mut used, mut next) = (0, [0; KEYS.len()]);
+    let ask = Ask { keys: &KEYS, nested: true, wanted: &[] };
+    each_element(file, ask, |At { key, index, inner }, value| {
+        let name = KEYS[key];
+        if index != next[key] {
+            return Err(Error::input(file, format!("key \"{name}\""), "this key once", "twice"));
+        }
+        let text = if let Small::Text(text) = &value { text.len() as u64 } else { 0 };
+        let taken = if inner.is_some() { bytes[key] + text } else { 3 * size_of::<usize>() as u64 };
+        assembly.gauge().take(file, &place(Some(index)), "its cameras", taken)?;
+        used += taken;
+        if inner.is_some() {
+            let entry = Small::of_entry(name, value);
+            return tables.take(Fields::of(file, Some(index), &entry)?, key);
+        }
+        next[key] += 1;
+        match value {
+            Small::List(..) => tables.end(key),
+            other if key == 0 => {
+                return Err(Error::input(
+                    file,
+                    format!("k of frame {index}"),
+                    "a list with a matrix for every camera",
+                    other.describe(),
+                ));
+            }
+            _ => tables.end(key),
+        }
+        Ok(())
+    })?;
+    let Tables { intrinsics, poses, images, views } = tables;
+    assembly.begin(file, intrinsics.values.len())?;
+    for frame in 0..intrinsics.ends.len() {
+        for camera in 0..intrinsics.len(frame) {
+            let nothing = || Error::input(file, format!("frame {frame}, key \"w2c\""), POSE, "nothing");
+            let [fx, fy, cx, cy] = *intrinsics.get(frame, camera).expect("a matrix for every camera");
+            let &(rotation, translation) = poses.get(frame, camera).ok_or_else(nothing)?;
+            let image = images.get(frame, camera).map(|name| PathBuf::from("ims").join(&**name));
+            assembly.add(Picture {
                 camera: Camera { width, height, fx, fy, cx, cy, rotation, translation, near: Camera::NEAR },
                 time: Some(frame as f64 / frames.saturating_sub(1).max(1) as f64),
                 split,
                 image: image.map(|image| file.with_file_name(image)),
-                view: own.optional_index("cam_id")?,
-            });
+                view: views.get(frame, camera).copied(),
+            })?;
         }
     }
-    Ok(((file.to_owned(), pictures), frames))
+    assembly.gauge().release(used);
+    Ok(frames)
 }

@@ -11,7 +11,8 @@
 //! | the first of several `colmap_K` with such in `sparse/0`, a folder for each frame (SpacetimeGaussians) | i/n | the first is test |
 //!
 //! Everything leaves in OpenCV axes, world to camera, in f64, rotations checked to be rotations.
-//! Memory: the parsed file; one small record per picture.
+//! Memory: one record per picture, which is checked against the limit before it is made. JSON and text are read as streams:
+//! once for what lies around the pictures, and once for these.
 
 mod assemble;
 mod cameras_json;
@@ -21,6 +22,7 @@ mod frames;
 mod llff;
 mod meta_json;
 mod nerfies;
+mod pictures;
 mod times;
 mod transforms;
 mod virtual_rig;
@@ -30,12 +32,12 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 
-use serde_json::Value;
-
 use crate::error::{Error, Result};
-use crate::ingest::text::read_json;
+use crate::ingest::json::small::Small;
+use crate::limits::ReadLimit;
 use crate::model::Rig;
 
+use pictures::outline;
 pub use times::Times;
 pub use virtual_rig::{surrounding_rig, virtual_rig};
 
@@ -76,6 +78,8 @@ pub struct CameraOptions {
     pub times: Times,
     /// What the times of `transforms*.json` count.
     pub clock: Clock,
+    /// Memory that the cameras may take while they are read.
+    pub memory: ReadLimit,
 }
 
 /// What the times of `transforms*.json` count.
@@ -117,18 +121,20 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
         timed()?;
         return llff::load(&file, options);
     }
-    let document = read_json(&file)?;
-    match kind(&document) {
-        Some(Kind::Transforms) => timed().and_then(|()| transforms::load(&file, document, path.is_dir(), options)),
-        Some(Kind::PerPicture) => timed().and_then(|()| cameras_json::load_per_picture(&file, &document)),
-        Some(Kind::PerCamera) => cameras_json::load_per_camera(&file, &document, &options.times),
-        Some(Kind::PerFrame) => timed().and_then(|()| meta_json::load(&file, &document, path.is_dir())),
+    let outline = outline(&file)?;
+    match kind(&outline) {
+        Some(Kind::Transforms) => timed().and_then(|()| transforms::load(&file, path.is_dir(), options)),
+        Some(Kind::PerPicture) => {
+            timed().and_then(|()| cameras_json::load_per_picture(&file, &outline, options.memory))
+        }
+        Some(Kind::PerCamera(count)) => cameras_json::load_per_camera(&file, count, options),
+        Some(Kind::PerFrame) => timed().and_then(|()| meta_json::load(&file, path.is_dir(), options.memory)),
         None => Err(Error::input(
             &file,
             "",
             "a list of cameras, or an object with a non-empty list \"frames\" of objects with \
              \"transform_matrix\" or \"w2c\"",
-            fields::describe(&document),
+            outline.describe(),
         )),
     }
 }
@@ -174,20 +180,21 @@ enum Kind {
     Transforms,
     /// This project's: one entry per picture.
     PerPicture,
-    /// 3DGS: one entry per camera.
-    PerCamera,
+    /// 3DGS: one entry per camera, so many.
+    PerCamera(usize),
     /// Dynamic3DGaussians: one list of cameras per frame.
     PerFrame,
 }
 
-fn kind(document: &Value) -> Option<Kind> {
-    if document.is_array() {
-        return Some(Kind::PerCamera);
+fn kind(outline: &Small) -> Option<Kind> {
+    if let Small::List(_, count) = outline {
+        return Some(Kind::PerCamera(*count));
     }
-    if meta_json::is_one(document) {
+    if meta_json::is_one(outline) {
         return Some(Kind::PerFrame);
     }
-    let first = document.get("frames")?.get(0)?;
+    let Small::List(first, _) = outline.get("frames")? else { return None };
+    let first = first.first()?;
     if first.get("w2c").is_some() {
         Some(Kind::PerPicture)
     } else if first.get("transform_matrix").is_some() {

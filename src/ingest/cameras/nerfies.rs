@@ -9,17 +9,20 @@
 
 use std::path::Path;
 
-use hashbrown::HashSet;
-use serde_json::Value;
+use hashbrown::{HashMap, HashSet};
 
 use super::CameraOptions;
-use super::assemble::{Picture, assemble, from_camera_to_world};
-use super::fields::{Fields, describe};
+use super::assemble::{Assembly, Gauge, Picture, from_camera_to_world};
+use super::fields::Fields;
+use super::pictures::whole;
 use crate::error::{Error, Result, quoted};
 use crate::ingest::image::measure;
-use crate::ingest::text::read_json;
+use crate::ingest::json::lists::{Ask, At, each_element, each_entry};
+use crate::ingest::json::small::Small;
 use crate::model::{Rig, Split};
 
+/// Keys of a camera's file.
+const CAMERA: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
 /// Pictures between one for training and the next, where a data set names none to hold out.
 const TRAIN_EVERY: usize = 4;
 
@@ -29,41 +32,85 @@ const TRAIN_EVERY: usize = 4;
 /// Files that are missing or malformed; a picture without a camera or a time.
 pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     let folder = file.parent().unwrap_or(Path::new(""));
-    let dataset = read_json(file)?;
-    let of = Fields::of(file, None, &dataset)?;
-    let names = |key: &str| -> Result<Vec<&str>> {
-        let name = |value: &'_ Value| value.as_str().is_some();
-        let list = of.list(key)?;
-        match list.iter().all(name) {
-            true => Ok(list.iter().filter_map(Value::as_str).collect()),
-            false => Err(of.wrong(key, "a list of names")),
-        }
-    };
-    let ids = names("ids")?;
-    let splits = splits(&ids, &names("val_ids")?, || names("train_ids"))?;
-    let metadata_file = folder.join("metadata.json");
-    let metadata = read_json(&metadata_file)?;
-    let mut warps = Vec::with_capacity(ids.len());
-    for id in &ids {
-        let own = metadata.get(*id).ok_or_else(|| {
-            Error::input(&metadata_file, "", format!("the picture {}", quoted(id)), describe(&metadata))
-        })?;
-        let own = Fields::of(&metadata_file, None, own)?;
-        warps.push(own.optional_index("warp_id")?.ok_or_else(|| own.wrong("warp_id", "a number"))?);
-    }
+    let mut assembly = Assembly::new(options.memory);
+    let [ids, val, train] = names(file, assembly.gauge())?;
+    let splits = splits(&ids, &val, &train);
+    let metadata = folder.join("metadata.json");
+    let warps = warps(&metadata, &ids, assembly.gauge())?;
     let latest = f64::from(warps.iter().copied().max().unwrap_or(0).max(1));
-    let mut pictures = Vec::new();
+    assembly.begin(file, splits.iter().map(Vec::len).sum())?;
     for ((id, warp), splits) in ids.iter().zip(warps).zip(splits) {
+        if splits.is_empty() {
+            continue;
+        }
+        let picture = picture(folder, id, options)?;
         for split in splits {
             let time = f64::from(warp) / latest;
-            pictures.push(Picture { time: Some(time), split, ..picture(folder, id, options)? });
+            assembly.add(Picture { time: Some(time), split, ..picture.clone() })?;
         }
     }
-    assemble(vec![(file.to_owned(), pictures)], None, folder.display().to_string())
+    assembly.finish(None, folder.display().to_string())
+}
+
+/// Keys of the lists of names: all pictures, those held out, those for training.
+const LISTS: [&str; 3] = ["ids", "val_ids", "train_ids"];
+/// Bytes that a name takes beside its text, in its list and in two tables.
+const NAME_BYTES: u64 = 200;
+
+/// Reads the names of `file`. Those for training may be left out where none are held out.
+fn names(file: &Path, gauge: &mut Gauge) -> Result<[Vec<Box<str>>; 3]> {
+    let outline = whole(file, &LISTS)?;
+    let of = Fields::of(file, None, &outline)?;
+    let held_out = of.list(LISTS[1])?;
+    of.list(LISTS[0])?;
+    if held_out > 0 {
+        of.list(LISTS[2])?;
+    }
+    let mut names = [const { Vec::new() }; 3];
+    each_element(file, Ask { keys: &LISTS, nested: false, wanted: &[] }, |At { key, index, .. }, name| {
+        if index != names[key].len() {
+            return Err(Error::input(file, format!("key \"{}\"", LISTS[key]), "this key once", "twice"));
+        }
+        let Small::Text(name) = name else {
+            let place = format!("key \"{}\", element {index}", LISTS[key]);
+            return Err(Error::input(file, place, "a list of names", name.describe()));
+        };
+        gauge.take(file, "", "the names of its pictures", name.len() as u64 + NAME_BYTES)?;
+        names[key].push(name);
+        Ok(())
+    })?;
+    Ok(names)
+}
+
+/// Reads the `warp_id` of each picture.
+fn warps(file: &Path, ids: &[Box<str>], gauge: &mut Gauge) -> Result<Vec<u32>> {
+    gauge.take(file, "", "the times of its pictures", 64 * ids.len() as u64)?;
+    // A name may be there twice.
+    let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
+    let mut found = Vec::new();
+    for id in ids {
+        places.entry(id).or_insert_with(|| {
+            found.push(None);
+            found.len() as u32 - 1
+        });
+    }
+    each_entry(file, &["warp_id"], |id, own| {
+        if let Some(&place) = places.get(id) {
+            let own = Fields::of(file, None, &own)?;
+            found[place as usize] =
+                Some(own.optional_index("warp_id")?.ok_or_else(|| own.wrong("warp_id", "a number"))?);
+        }
+        Ok(())
+    })?;
+    let warp = |id: &Box<str>| {
+        let warp = places.get(&**id).and_then(|&place| found[place as usize]);
+        warp.ok_or_else(|| Error::input(file, "", format!("the picture {}", quoted(id)), "none of this name"))
+    };
+    ids.iter().map(warp).collect()
 }
 
 /// The splits of every picture, mostly one; of some none.
-fn splits<'a>(ids: &[&str], val: &[&str], train: impl FnOnce() -> Result<Vec<&'a str>>) -> Result<Vec<Vec<Split>>> {
+fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
     if val.is_empty() {
         let trained = ids.len().div_ceil(TRAIN_EVERY);
         let held_out = |at: usize| at % TRAIN_EVERY == TRAIN_EVERY / 2 && at / TRAIN_EVERY + 1 < trained;
@@ -72,19 +119,20 @@ fn splits<'a>(ids: &[&str], val: &[&str], train: impl FnOnce() -> Result<Vec<&'a
             _ if held_out(at) => vec![Split::Test],
             _ => Vec::new(),
         };
-        return Ok((0..ids.len()).map(split).collect());
+        return (0..ids.len()).map(split).collect();
     }
-    let (train, val): (HashSet<&str>, HashSet<&str>) = (train()?.into_iter().collect(), val.iter().copied().collect());
-    let split = |id: &&str| {
+    let set = |names: &'_ [Box<str>]| -> HashSet<Box<str>> { names.iter().cloned().collect() };
+    let (train, val) = (set(train), set(val));
+    let split = |id: &Box<str>| {
         let is_in = [(Split::Train, train.contains(id)), (Split::Test, val.contains(id))];
         is_in.into_iter().filter(|(_, is_in)| *is_in).map(|(split, _)| split).collect()
     };
-    Ok(ids.iter().map(split).collect())
+    ids.iter().map(split).collect()
 }
 
 fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<Picture> {
     let file = folder.join("camera").join(format!("{id}.json"));
-    let document = read_json(&file)?;
+    let document = whole(&file, &CAMERA)?;
     let own = Fields::of(&file, None, &document)?;
     let [width, height] = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));

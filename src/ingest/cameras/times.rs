@@ -9,9 +9,12 @@ use std::path::{Path, PathBuf};
 
 use hashbrown::HashMap;
 
-use super::assemble::Picture;
+use super::assemble::Gauge;
 use crate::error::{Error, Result, quoted};
-use crate::ingest::text::read_text;
+use crate::ingest::text::Lines;
+
+/// Bytes of an entry of a table beside its name, while the table grows by being copied to twice its size.
+const TABLE_ENTRY: u64 = 3 * 40 + 32;
 
 /// Where times come from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -48,29 +51,37 @@ impl Times {
     }
 }
 
-/// Gives `pictures`, called `names` in `file`, their times; says where they come from, empty if there are none.
+/// Returns the times of the pictures called `names` in `file`, and where they come from, empty if there are none.
 ///
 /// # Errors
 /// A name without a number, or that the table does not have; a table that is none.
-pub(super) fn give(file: &Path, pictures: &mut [Picture], names: &[String], times: &Times) -> Result<String> {
+pub(super) fn give(
+    file: &Path,
+    names: &[Box<str>],
+    times: &Times,
+    gauge: &mut Gauge,
+) -> Result<(Vec<Option<f64>>, String)> {
+    gauge.take(file, "", "the times of its pictures", 40 * names.len() as u64)?;
+    let none = || Ok((Vec::new(), String::new()));
     match times {
-        Times::None => Ok(String::new()),
+        Times::None => none(),
         Times::Table(table) => {
-            let known = read_table(table)?;
-            for (picture, name) in pictures.iter_mut().zip(names) {
+            let known = read_table(table, gauge)?;
+            let time = |name: &Box<str>| {
                 let time = keys(name).find_map(|key| known.get(key)).copied();
-                picture.time = Some(time.ok_or_else(|| {
+                time.map(Some).ok_or_else(|| {
                     Error::input(table, "", format!("a line for the picture {}", quoted(name)), "none")
                         .hint(format!("the names are those of {}", file.display()))
-                })?);
-            }
-            Ok(format!("times from {}", table.display()))
+                })
+            };
+            let given = names.iter().map(time).collect::<Result<Vec<_>>>()?;
+            Ok((given, format!("times from {}", table.display())))
         }
         Times::Own | Times::Names => {
             let numbers: Vec<Option<u64>> = names.iter().map(|name| number(name)).collect();
             if let Some(at) = numbers.iter().position(Option::is_none) {
                 if *times == Times::Own {
-                    return Ok(String::new());
+                    return none();
                 }
                 return Err(Error::input(
                     file,
@@ -80,15 +91,12 @@ pub(super) fn give(file: &Path, pictures: &mut [Picture], names: &[String], time
                 )
                 .hint("give a table of names and times: --times TABLE.csv"));
             }
-            let numbers: Vec<u64> = numbers.into_iter().flatten().collect();
-            let (Some(&least), Some(&greatest)) = (numbers.iter().min(), numbers.iter().max()) else {
-                return Ok(String::new());
-            };
+            let bounds = numbers.iter().flatten();
+            let (Some(&least), Some(&greatest)) = (bounds.clone().min(), bounds.max()) else { return none() };
             let span = (greatest - least).max(1) as f64;
-            for (picture, number) in pictures.iter_mut().zip(numbers) {
-                picture.time = Some((number - least) as f64 / span);
-            }
-            Ok(format!("times from the numbers {least} to {greatest} in names"))
+            let time = |number: Option<u64>| number.map(|number| (number - least) as f64 / span);
+            let given = numbers.into_iter().map(time).collect();
+            Ok((given, format!("times from the numbers {least} to {greatest} in names")))
         }
     }
 }
@@ -119,10 +127,11 @@ fn keys(name: &str) -> impl Iterator<Item = &str> {
     [name, file, stem(file)].into_iter()
 }
 
-fn read_table(path: &Path) -> Result<HashMap<String, f64>> {
+fn read_table(path: &Path, gauge: &mut Gauge) -> Result<HashMap<String, f64>> {
     let mut known = HashMap::new();
-    for (at, line) in read_text(path)?.lines().enumerate() {
-        let line = line.trim();
+    let mut lines = Lines::open(path)?;
+    while let Some((number, line)) = lines.next_line()? {
+        let (at, line) = (number - 1, line.trim());
         if line.is_empty() || line.starts_with('#') {
             continue;
         }
@@ -132,6 +141,7 @@ fn read_table(path: &Path) -> Result<HashMap<String, f64>> {
         let name = name.trim().trim_matches('"');
         match time.trim().parse::<f64>() {
             Ok(time) if time.is_finite() => {
+                gauge.take(path, &format!("line {number}"), "the table of times", name.len() as u64 + TABLE_ENTRY)?;
                 if known.insert(name.to_owned(), time).is_some_and(|before| before != time) {
                     return Err(wrong("every name once", quoted(name)));
                 }

@@ -13,46 +13,46 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
-use serde_json::Value;
 
-use super::assemble::{Listing, Picture, assemble, from_camera_to_world, view_in_name};
+use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
 use super::fields::Fields;
+use super::pictures::{each_picture, outline};
 use super::{CameraOptions, Clock};
 use crate::error::Result;
 use crate::ingest::image::measure;
-use crate::ingest::text::read_json;
+use crate::ingest::json::small::Small;
 use crate::model::{Rig, Split};
 
 /// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
 const FLIP: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
 
-/// Reads `file`, parsed as `document`; if it stands for its folder, `with_others` of train, val and test beside it. Of those
-/// a file that was named itself takes the largest time alone.
-pub(super) fn load(file: &Path, document: Value, with_others: bool, options: &CameraOptions) -> Result<Rig> {
-    let split = split_of(file);
-    let mut listings = vec![(split, listing(file, &document, split, options)?)];
+/// Keys of a picture.
+const PICTURE: [&str; 11] =
+    ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
+
+/// Reads `file`; if it stands for its folder, `with_others` of train, val and test beside it. Of those a file that was named
+/// itself takes the largest time alone.
+pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> Result<Rig> {
+    let mut files = vec![file.to_owned()];
     let mut latest = 0.0;
     for other in others(file) {
-        let document = read_json(&other)?;
         if with_others {
-            let split = split_of(&other);
-            listings.push((split, listing(&other, &document, split, options)?));
+            files.push(other);
         } else {
-            latest = latest_in(&document).max(latest);
+            latest = latest_in(&other)?.max(latest);
         }
     }
-    listings.sort_by_key(|(split, _)| *split as u8);
-    let mut listings: Vec<Listing> = listings.into_iter().map(|(_, listing)| listing).collect();
-
-    let pictures = || listings.iter().flat_map(|(_, pictures)| pictures);
-    let latest = pictures().filter_map(|picture| picture.time).fold(latest, f64::max);
+    files.sort_by_key(|file| split_of(file) as u8);
+    let mut assembly = Assembly::new(options.memory);
+    for file in &files {
+        add(&mut assembly, file, options)?;
+    }
+    let latest = assembly.latest(latest);
     if latest > 0.0 && options.clock == Clock::Normalised {
-        for picture in listings.iter_mut().flat_map(|(_, pictures)| pictures) {
-            picture.time = picture.time.map(|time| time / latest);
-        }
+        assembly.divide_times(latest);
     }
-    let names: Vec<String> = listings.iter().map(|(path, _)| path.display().to_string()).collect();
-    assemble(listings, None, names.join(" and "))
+    let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
+    assembly.finish(None, names.join(" and "))
 }
 
 fn split_of(file: &Path) -> Split {
@@ -76,19 +76,25 @@ fn others(file: &Path) -> Vec<PathBuf> {
 }
 
 /// The largest time in a file that need not be in order otherwise.
-fn latest_in(document: &Value) -> f64 {
-    let frames = document.get("frames").and_then(Value::as_array).map_or(&[][..], Vec::as_slice);
-    let times = frames.iter().filter_map(|frame| frame.get("time")?.as_f64()).filter(|time| time.is_finite());
-    times.fold(0.0, f64::max)
+fn latest_in(file: &Path) -> Result<f64> {
+    let mut latest = 0.0;
+    each_picture(file, Some("frames"), &["time"], |_, frame| {
+        let time = frame.get("time").and_then(Small::as_f64).filter(|time| time.is_finite());
+        latest = time.map_or(latest, |time| time.max(latest));
+        Ok(())
+    })?;
+    Ok(latest)
 }
 
-fn listing(file: &Path, document: &Value, split: Split, options: &CameraOptions) -> Result<Listing> {
-    let shared = Fields::of(file, None, document)?;
-    let mut pictures = Vec::new();
-    for (index, frame) in shared.list("frames")?.iter().enumerate() {
-        pictures.push(picture(file, shared, Fields::of(file, Some(index), frame)?, split, options)?);
-    }
-    Ok((file.to_owned(), pictures))
+/// Adds the pictures of `file`.
+fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
+    let outline = outline(file)?;
+    let shared = Fields::of(file, None, &outline)?;
+    assembly.begin(file, shared.list("frames")?)?;
+    let split = split_of(file);
+    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
+        assembly.add(picture(file, shared, Fields::of(file, Some(index), frame)?, split, options)?)
+    })
 }
 
 fn picture(file: &Path, shared: Fields<'_>, own: Fields<'_>, split: Split, options: &CameraOptions) -> Result<Picture> {

@@ -1,4 +1,5 @@
 use std::fs;
+use std::io::Cursor;
 
 use proptest::prelude::*;
 
@@ -16,7 +17,7 @@ impl Place {
     fn open(&self, bytes: &[u8]) -> Result<Checkpoint> {
         let path = self.0.path().join("a.pt");
         fs::write(&path, bytes).unwrap();
-        Checkpoint::open(&path)
+        Checkpoint::open(&path, ReadLimit::NONE)
     }
 
     fn path(&self) -> PathBuf {
@@ -26,7 +27,7 @@ impl Place {
     fn left(&self, from: &Checkpoint, kept: &[u32], rows: &[Rows]) -> Result<Checkpoint> {
         let path = self.path();
         write_like(from, kept, rows, &path)?;
-        Checkpoint::open(&path)
+        Checkpoint::open(&path, ReadLimit::NONE)
     }
 }
 

@@ -13,6 +13,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
 use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, Reads, Wanted};
 use crate::stream::{BLOCK, InBlocks, Parts};
@@ -96,21 +97,22 @@ pub struct ModelFolder {
     info: SequenceInfo,
     states: Count,
     notes: Vec<String>,
+    memory: ReadLimit,
 }
 
 impl ModelFolder {
-    /// Reads configuration and field of the model at `paths`; `canonical` is its point cloud, of
+    /// Reads configuration and field of the model at `paths` within `memory`; `canonical` is its point cloud, of
     /// `sh_degree`. The sequence has no frames yet.
-    pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize) -> Result<Self> {
+    pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize, memory: ReadLimit) -> Result<Self> {
         let config = ModelConfig::read(&paths.cfg_args)?;
-        let tensors = read_state_dict(&paths.deformation)?;
+        let tensors = read_state_dict(&paths.deformation, memory)?;
         let notes = config.contradicted_by(&tensors);
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let tensor_bytes = (values * size_of::<f32>()) as u64;
         let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
         let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
         let (canonical, field, states) = (Arc::new(canonical.into()), Arc::new(field), Count::default());
-        Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes })
+        Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes, memory })
     }
 
     /// What `cfg_args` and the weights say differently, and which of them is believed.
@@ -127,7 +129,12 @@ impl ModelFolder {
     pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
         let paths = ModelPaths::locate(root, iteration)?;
         let ply = Ply::open_with(&paths.point_cloud, options)?;
-        Self::with_cloud(paths, ply.whole()?, ply.sh_degree())
+        Self::with_cloud(paths, ply.whole()?, ply.sh_degree(), options.memory)
+    }
+
+    /// Memory that reading the files of the model again may take.
+    pub(super) fn memory(&self) -> ReadLimit {
+        self.memory
     }
 
     /// The same field and frames with other Gaussians; of another SH degree only where no head deforms colour.
@@ -143,7 +150,7 @@ impl ModelFolder {
     /// A field that cannot be read any more.
     pub(super) fn rounded(self) -> Result<Self> {
         let (path, degree) = (&self.paths.deformation, self.info.sh_degree);
-        let field = Field::new(&rounded(read_state_dict(path)?), self.config.field(), degree, path)?;
+        let field = Field::new(&rounded(read_state_dict(path, self.memory)?), self.config.field(), degree, path)?;
         Ok(ModelFolder { field: Arc::new(field), ..self })
     }
 

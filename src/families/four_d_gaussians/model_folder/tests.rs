@@ -41,7 +41,7 @@ fn load(name: &str) -> (PathBuf, ModelFolder) {
     let root = shared_model(name);
     let paths = ModelPaths::locate(&root, None).unwrap();
     let cloud = read_cloud(&paths.point_cloud);
-    (root, ModelFolder::with_cloud(paths, cloud, 3).unwrap())
+    (root, ModelFolder::with_cloud(paths, cloud, 3, ReadLimit::NONE).unwrap())
 }
 
 /// Every array of an npz as f64.

@@ -1,0 +1,36 @@
+//! Readers of bytes in memory, for the fuzz targets: no file is written for any of the millions of inputs.
+
+use std::path::Path;
+
+use super::json::lists::{Ask, each_in};
+use super::json::small::{Keep, MAX_ELEMENTS};
+use super::json::{Stopped, read_from};
+use super::pickle::Pickle;
+use crate::error::Result;
+
+/// Reads a pickle within `memory` bytes, and describes each of its values; returns how many there are.
+pub fn pickle(bytes: &[u8], memory: u64) -> Option<usize> {
+    let pickle = Pickle::read(bytes, memory).ok()?;
+    let described: usize = pickle.ids().map(|id| pickle.describe(id).len().min(1)).sum();
+    let _ = (pickle.items(pickle.root()).map(Iterator::count), pickle.call(pickle.root()));
+    Some(described)
+}
+
+/// Reads JSON as a camera file is read: what lies around its pictures, and each of these; returns how many there are.
+///
+/// # Errors
+/// What is no JSON, or beyond the limits.
+pub fn cameras_json(bytes: &[u8]) -> Result<usize> {
+    let path = Path::new("cameras.json");
+    let keep = Keep { wanted: &["frames", "w2c", "transform_matrix"], elements: MAX_ELEMENTS };
+    let outline = read_from(bytes, path, &Stopped::default(), keep)?;
+    let mut found = outline.describe().len().min(1);
+    let wanted = &["w2c", "transform_matrix", "time"];
+    for (keys, nested) in [(&[][..], false), (&["frames"][..], false), (&["k", "w2c"][..], true)] {
+        each_in(bytes, path, Ask { keys, nested, wanted }, |_, value| {
+            found += value.describe().len().min(1);
+            Ok(())
+        })?;
+    }
+    Ok(found)
+}

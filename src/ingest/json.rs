@@ -1,0 +1,170 @@
+//! JSON files, read as streams.
+//!
+//! Input: the path of a file of any length. Output: what a [`DeserializeSeed`] makes of it. Memory: a buffer of 64 KiB, one
+//! text, and what the seed keeps. A text, a number or a nesting that no camera file has is refused before the parser sees
+//! it, since the parser keeps the text that it reads in memory.
+
+mod checked;
+pub(crate) mod lists;
+pub(crate) mod small;
+
+use std::cell::RefCell;
+use std::io::Read;
+use std::marker::PhantomData;
+use std::path::Path;
+
+use serde::de::DeserializeSeed;
+use serde_json::Value;
+use serde_json::error::Category;
+
+use super::open::open_file;
+use crate::error::{Error, Result};
+use checked::Checked;
+
+/// Holds the error of a seed while the parser unwinds: the parser's own error has no room for it.
+#[derive(Debug, Default)]
+pub(crate) struct Stopped(RefCell<Option<Error>>);
+
+impl Stopped {
+    /// Keeps `error`, and returns the parser's error that ends the reading.
+    pub(crate) fn by<E: serde::de::Error>(&self, error: Error) -> E {
+        *self.0.borrow_mut() = Some(error);
+        E::custom("stopped")
+    }
+}
+
+/// Reads the JSON document in the file at `path` with `seed`, whose own errors are left in `stopped`.
+///
+/// # Errors
+/// Those of the seed; a file that cannot be read; text that is no UTF-8 or no JSON, with the place; texts, numbers or
+/// nesting beyond the limits.
+pub(crate) fn read<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
+    path: &Path,
+    stopped: &Stopped,
+    seed: S,
+) -> Result<T> {
+    read_from(open_file(path)?, path, stopped, seed)
+}
+
+/// Reads the JSON document that `file` holds, called `path` in messages, as [`read`] does.
+///
+/// # Errors
+/// Those of [`read`].
+pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
+    file: impl Read,
+    path: &Path,
+    stopped: &Stopped,
+    seed: S,
+) -> Result<T> {
+    let mut text = Checked::new(file, path);
+    let mut parser = serde_json::Deserializer::from_reader(&mut text);
+    let read = seed.deserialize(&mut parser).and_then(|value| parser.end().map(|()| value));
+    read.map_err(|error| {
+        if let Some(error) = stopped.0.borrow_mut().take().or_else(|| text.refusal()) {
+            return error;
+        }
+        let (line, column) = (error.line(), error.column());
+        let place = format!("line {line}, column {column}");
+        if error.classify() == Category::Eof {
+            let found = if text.is_blank() { "an empty file" } else { "the end of the file within it" };
+            return Error::input(path, place, "JSON", found)
+                .hint("it was cut short when it was written or copied: write or copy it again");
+        }
+        let whole = error.to_string();
+        let found = whole.strip_suffix(&format!(" at line {line} column {column}")).unwrap_or(&whole);
+        let refused = Error::input(path, place, "JSON", found);
+        let around = text.around();
+        let is_number = ["NaN", "Infinity", "nan", "inf"]
+            .iter()
+            .any(|word| (0..3).any(|at| around.get(at..).is_some_and(|rest| rest.starts_with(word.as_bytes()))));
+        match is_number {
+            true => {
+                refused.hint("NaN and Infinity are no JSON: if a pose holds them, take the picture out of the file")
+            }
+            false => refused,
+        }
+    })
+}
+
+/// Reads the whole JSON document in the file at `path`, which must hold at most `most_bytes`.
+///
+/// # Errors
+/// A larger file; those of [`read`].
+pub(crate) fn read_json(path: &Path, most_bytes: u64) -> Result<Value> {
+    let file = open_file(path)?;
+    let bytes = file.metadata().map_err(Error::io("read the size of", path))?.len();
+    if bytes > most_bytes {
+        return Err(Error::input(path, "", format!("at most {most_bytes} bytes of JSON"), format!("{bytes} bytes")));
+    }
+    read_from(file.take(most_bytes), path, &Stopped::default(), PhantomData::<Value>)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde::de::IgnoredAny;
+
+    use super::*;
+
+    fn refused(bytes: &[u8]) -> String {
+        read_from(bytes, Path::new("a.json"), &Stopped::default(), PhantomData::<Value>).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn hints_fit_what_is_wrong() {
+        for (bytes, expected, absent) in [
+            (&b"{\"frames\": [{\"a"[..], "cut short", "NaN"),
+            (b"", "an empty file", "NaN"),
+            (b" \n", "an empty file", "NaN"),
+            (b"{\"a\": NaN}", "NaN and Infinity are no JSON", "cut short"),
+            (b"{\"a\": NaN}", "line 1, column 7", "cut short"),
+            (b"{\"a\": -Infinity}", "line 1, column 8", "cut short"),
+            (b"{\"a\": \"caf\xe9\"}", "Latin-1", "NaN"),
+            (b"\xff\xfe{\0}\0", "UTF-16", "Latin-1"),
+            (b"{\"a\": 1,}", "line 1, column 9", "NaN"),
+            (b"{\"a\"; 1}", "expected `:`", "NaN"),
+            (b"[1] 2", "trailing characters", "NaN"),
+        ] {
+            let message = refused(bytes);
+            assert!(message.contains(expected), "{expected:?} is not in {message:?}");
+            assert!(!message.contains(absent) && !message.contains("at line"), "{absent:?} is in {message:?}");
+        }
+    }
+
+    #[test]
+    fn a_byte_order_mark_of_utf_8_is_passed_over() {
+        let read = |bytes: &[u8]| read_from(bytes, Path::new("a"), &Stopped::default(), PhantomData::<Value>);
+        assert_eq!(read(b"\xef\xbb\xbf{\"a\": 1}").unwrap()["a"], 1);
+        assert!(refused(b"\xef\xbb\xbf\"\xe9").contains("byte 4"));
+    }
+
+    #[test]
+    fn values_are_those_of_a_parser_of_whole_texts() {
+        let text = r#" {"a\n\u00e9\ud83d\ude00": [1, -2.5e3, true, null, "\"[{\\", {}], "größe": [[[]]], "b": 18446744073709551615} "#;
+        let read = read_from(text.as_bytes(), Path::new("a"), &Stopped::default(), PhantomData::<Value>).unwrap();
+        assert_eq!(read, serde_json::from_str::<Value>(text).unwrap());
+    }
+
+    #[test]
+    fn long_texts_numbers_and_deep_nesting_are_refused_even_where_they_are_ignored() {
+        let text = format!("{{\"a\": \"{}\"}}", "x".repeat(2 << 20));
+        let escapes = format!("\"{}\"", "\\\"".repeat(1 << 20));
+        let key = format!("{{\"{}\": 1}}", "k".repeat(2 << 20));
+        let number = format!("[{}]", "7".repeat(5000));
+        let fraction = format!("[0.{}]", "0".repeat(5000));
+        let deep = "[".repeat(100_000);
+        for (text, expected) in [
+            (&text, "a text of at most"),
+            (&escapes, "a text of at most"),
+            (&key, "a text of at most"),
+            (&number, "a number of at most"),
+            (&fraction, "a number of at most"),
+            (&deep, "nested at most"),
+        ] {
+            let ignored =
+                read_from(text.as_bytes(), Path::new("a.json"), &Stopped::default(), PhantomData::<IgnoredAny>);
+            for message in [refused(text.as_bytes()), ignored.unwrap_err().to_string()] {
+                assert!(message.contains(expected) && message.contains("byte"), "{expected:?} is not in {message:?}");
+            }
+        }
+    }
+}

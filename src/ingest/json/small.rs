@@ -1,0 +1,324 @@
+//! JSON values of which no more is kept than a camera file can need.
+
+use std::fmt;
+
+use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde_json::{Map, Number, Value};
+
+/// Bytes of the longest text that is kept: no system has longer paths.
+const MAX_TEXT: usize = 4096;
+/// Bytes of the longest key that is kept.
+const MAX_KEY: usize = 64;
+/// Maximum number of keys kept of an object, beside those that are wanted.
+const MAX_KEYS: usize = 8;
+/// Maximum number of elements kept of a list, unless fewer are asked for.
+pub(crate) const MAX_ELEMENTS: usize = 16;
+/// Maximum number of values kept of one entry: a 4 × 4 matrix has 21.
+const MAX_VALUES: usize = 64;
+
+/// A JSON value, or the part of it that is kept.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Small {
+    Null,
+    Bool(bool),
+    Number(Number),
+    Text(Box<str>),
+    /// The first elements of a list, and how many it has.
+    List(Vec<Small>, usize),
+    Object(Object),
+    /// A value that no camera file has: what it is, for messages.
+    Large(Box<str>),
+}
+
+/// Entries of a JSON object: those that are wanted, and a few others by which a person knows it again.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Object {
+    entries: Vec<(Box<str>, Small)>,
+    others: usize,
+}
+
+impl Object {
+    /// Value under `key`; of repeated keys the last one.
+    pub(crate) fn get(&self, key: &str) -> Option<&Small> {
+        self.entries.iter().find(|(name, _)| **name == *key).map(|(_, value)| value)
+    }
+
+    fn set(&mut self, key: &str, value: Small) {
+        match self.entries.iter_mut().find(|(name, _)| **name == *key) {
+            Some(entry) => entry.1 = value,
+            None => self.entries.push((key.into(), value)),
+        }
+    }
+}
+
+impl Small {
+    /// An object with one entry.
+    pub(crate) fn of_entry(key: &str, value: Small) -> Small {
+        Small::Object(Object { entries: vec![(key.into(), value)], others: 0 })
+    }
+
+    /// Elements of a list of which all were kept.
+    pub(crate) fn elements(&self) -> Option<&[Small]> {
+        match self {
+            Small::List(kept, total) if kept.len() == *total => Some(kept),
+            _ => None,
+        }
+    }
+
+    /// The number, as the nearest f64.
+    pub(crate) fn as_f64(&self) -> Option<f64> {
+        match self {
+            Small::Number(number) => number.as_f64(),
+            _ => None,
+        }
+    }
+
+    /// The whole number, if it is not negative.
+    pub(crate) fn as_u64(&self) -> Option<u64> {
+        match self {
+            Small::Number(number) => number.as_u64(),
+            _ => None,
+        }
+    }
+
+    /// Value under `key` of an object.
+    pub(crate) fn get(&self, key: &str) -> Option<&Small> {
+        match self {
+            Small::Object(object) => object.get(key),
+            _ => None,
+        }
+    }
+
+    /// Describes the value for a message.
+    pub(crate) fn describe(&self) -> String {
+        const LONGEST: usize = 120;
+        match self {
+            Small::List(_, 0) => "an empty list".to_owned(),
+            Small::List(kept, total) if kept.len() < *total => format!("a list of {total}"),
+            Small::Large(what) => what.to_string(),
+            Small::Object(object) if object.entries.len() > 4 => {
+                let mut keys: Vec<&str> = object.entries.iter().map(|(key, _)| &**key).collect();
+                keys.sort_unstable();
+                keys.truncate(MAX_KEYS);
+                format!("an object with the keys {}", keys.join(", "))
+            }
+            other => {
+                let text = other.value().to_string();
+                match text.char_indices().nth(LONGEST) {
+                    Some((end, _)) => format!("{}…", &text[..end]),
+                    None => text,
+                }
+            }
+        }
+    }
+
+    fn value(&self) -> Value {
+        match self {
+            Small::Null => Value::Null,
+            Small::Bool(value) => Value::Bool(*value),
+            Small::Number(number) => Value::Number(number.clone()),
+            Small::Text(text) => Value::String(text.to_string()),
+            Small::List(kept, _) => Value::Array(kept.iter().map(Small::value).collect()),
+            Small::Object(object) => {
+                let entries = object.entries.iter().map(|(key, value)| (key.to_string(), value.value()));
+                Value::Object(entries.collect::<Map<_, _>>())
+            }
+            Small::Large(what) => Value::String(format!("({what})")),
+        }
+    }
+}
+
+/// Reads any value as [`Small`].
+#[derive(Debug)]
+pub(crate) struct Keep<'a> {
+    /// Keys of objects that are kept however many there are.
+    pub(crate) wanted: &'a [&'a str],
+    /// Maximum number of elements kept of a list.
+    pub(crate) elements: usize,
+}
+
+impl<'de> DeserializeSeed<'de> for Keep<'_> {
+    type Value = Small;
+
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
+        from.deserialize_any(Inner { keep: &self, left: &mut MAX_VALUES.clone(), depth: 0 })
+    }
+}
+
+/// Reads a value within another one.
+struct Inner<'a> {
+    keep: &'a Keep<'a>,
+    /// Number of values that may still be kept of the entry.
+    left: &'a mut usize,
+    depth: usize,
+}
+
+impl<'a> Inner<'a> {
+    fn inner(&mut self) -> Inner<'_> {
+        Inner { keep: self.keep, left: self.left, depth: self.depth + 1 }
+    }
+}
+
+impl<'de> DeserializeSeed<'de> for Inner<'_> {
+    type Value = Small;
+
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<Small, D::Error> {
+        match self.left.checked_sub(1) {
+            Some(left) => {
+                *self.left = left;
+                from.deserialize_any(self)
+            }
+            None => IgnoredAny.deserialize_ignored(from).map(|()| Small::Large("a value of many parts".into())),
+        }
+    }
+}
+
+/// Passes over a value.
+trait Ignore {
+    fn deserialize_ignored<'de, D: Deserializer<'de>>(self, from: D) -> Result<(), D::Error>;
+}
+
+impl Ignore for IgnoredAny {
+    fn deserialize_ignored<'de, D: Deserializer<'de>>(self, from: D) -> Result<(), D::Error> {
+        from.deserialize_ignored_any(self).map(drop)
+    }
+}
+
+impl<'de> Visitor<'de> for Inner<'_> {
+    type Value = Small;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON value")
+    }
+
+    fn visit_unit<E>(self) -> Result<Small, E> {
+        Ok(Small::Null)
+    }
+
+    fn visit_bool<E>(self, value: bool) -> Result<Small, E> {
+        Ok(Small::Bool(value))
+    }
+
+    fn visit_i64<E>(self, value: i64) -> Result<Small, E> {
+        Ok(Small::Number(value.into()))
+    }
+
+    fn visit_u64<E>(self, value: u64) -> Result<Small, E> {
+        Ok(Small::Number(value.into()))
+    }
+
+    fn visit_f64<E>(self, value: f64) -> Result<Small, E> {
+        Ok(Number::from_f64(value).map_or(Small::Null, Small::Number))
+    }
+
+    fn visit_str<E>(self, text: &str) -> Result<Small, E> {
+        Ok(match text.len() <= MAX_TEXT {
+            true => Small::Text(text.into()),
+            false => Small::Large(format!("a text of {} bytes", text.len()).into()),
+        })
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(mut self, mut list: A) -> Result<Small, A::Error> {
+        let (mut kept, mut total) = (Vec::new(), 0);
+        let most = self.keep.elements;
+        while kept.len() < most {
+            let Some(element) = list.next_element_seed(self.inner())? else { break };
+            kept.push(element);
+            total += 1;
+        }
+        if kept.len() == most {
+            while list.next_element::<IgnoredAny>()?.is_some() {
+                total += 1;
+            }
+        }
+        Ok(Small::List(kept, total))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(mut self, mut map: A) -> Result<Small, A::Error> {
+        let mut object = Object::default();
+        while let Some(key) = map.next_key_seed(Key)? {
+            let is_wanted = self.keep.wanted.contains(&&*key);
+            let is_known = object.get(&key).is_some();
+            if !is_wanted && !is_known {
+                if object.others == MAX_KEYS {
+                    map.next_value::<IgnoredAny>()?;
+                    continue;
+                }
+                object.others += 1;
+            }
+            // Each entry of the document itself has room of its own, so that none takes that of a wanted one.
+            let value = match self.depth {
+                0 => map.next_value_seed(Inner { keep: self.keep, left: &mut MAX_VALUES.clone(), depth: 1 })?,
+                _ => map.next_value_seed(self.inner())?,
+            };
+            object.set(&key, value);
+        }
+        Ok(Small::Object(object))
+    }
+}
+
+/// Reads a key, of which the first bytes are kept.
+#[derive(Debug)]
+pub(crate) struct Key;
+
+impl<'de> DeserializeSeed<'de> for Key {
+    type Value = String;
+
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<String, D::Error> {
+        from.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for Key {
+    type Value = String;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a key")
+    }
+
+    fn visit_str<E>(self, key: &str) -> Result<String, E> {
+        let end = (0..=key.len().min(MAX_KEY)).rev().find(|&end| key.is_char_boundary(end)).unwrap_or(0);
+        // A key that is cut must not be taken for a wanted one.
+        Ok(if end < key.len() { format!("{}…", &key[..end]) } else { key.to_owned() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::{Stopped, read_from};
+    use super::*;
+
+    fn kept(text: &str) -> Small {
+        let keep = Keep { wanted: &["frames", "w2c"], elements: MAX_ELEMENTS };
+        read_from(text.as_bytes(), Path::new("a"), &Stopped::default(), keep).unwrap()
+    }
+
+    #[test]
+    fn small_values_are_kept_whole() {
+        for text in ["null", "[1,-2,2.5,\"é\",[[true]],{\"a\":{\"b\":[]}}]", "{\"a\":1}", "18446744073709551615"] {
+            assert_eq!(kept(text).value(), serde_json::from_str::<Value>(text).unwrap());
+        }
+        assert_eq!(kept("[]").describe(), "an empty list");
+        assert_eq!(kept("{\"a\": [1, 2]}").describe(), "{\"a\":[1,2]}");
+        assert_eq!(kept("{\"a\": 1, \"a\": 2}").get("a").unwrap().as_u64(), Some(2));
+    }
+
+    #[test]
+    fn large_values_are_described_and_not_kept() {
+        let many = format!("[{}0]", "0,".repeat(99_999));
+        assert_eq!(kept(&many).describe(), "a list of 100000");
+        assert_eq!(kept(&many).elements(), None);
+        let nested = format!("[{}0]", "[[1,2],[3,4]],".repeat(15));
+        let Small::List(elements, 16) = kept(&nested) else { panic!("a list of 16") };
+        assert!(elements.contains(&Small::Large("a value of many parts".into())));
+        assert_eq!(kept(&format!("\"{}\"", "x".repeat(5000))).describe(), "a text of 5000 bytes");
+        let keys: Vec<String> = (0..1000).map(|k| format!("\"k{k}\": [1, 2, 3]")).collect();
+        let object = kept(&format!("{{{}, \"w2c\": 7}}", keys.join(", ")));
+        assert_eq!(object.get("w2c").and_then(Small::as_u64), Some(7), "a wanted key behind many others");
+        assert!(object.describe().starts_with("an object with the keys k0, k1"));
+        let long = kept(&format!("{{\"{}\": 1}}", "k".repeat(1000)));
+        assert!(long.describe().len() < 100, "{long:?}");
+    }
+}

@@ -1,0 +1,439 @@
+//! Runs the instructions of a pickle within limits of their number, of nesting and of memory.
+
+use std::ops::Range;
+
+use hashbrown::HashMap;
+
+use super::{MAX_DEPTH, Node, NodeId, Pickle, Wrong};
+
+/// Maximum number of instructions. One tensor takes about 35, so this is enough for 50,000 tensors.
+const MAX_INSTRUCTIONS: u32 = 1 << 21;
+/// Bytes that the allocator adds to an allocation, rounded up.
+const ALLOCATION: usize = 32;
+/// Bytes of one entry of the memo, counted while the table grows.
+const MEMO_ENTRY: usize = 32;
+
+/// Counts the bytes that are allocated, and refuses those beyond the limit before they are.
+#[derive(Debug)]
+struct Meter {
+    limit: u64,
+    taken: u64,
+}
+
+impl Meter {
+    /// Counts `bytes` that are about to be allocated; `at` is the byte of the pickle that asks for them.
+    fn take(&mut self, bytes: usize, at: usize) -> Result<(), Wrong> {
+        let taken = self.taken.saturating_add(bytes as u64);
+        if taken > self.limit {
+            return Err(Wrong::Memory(at, taken));
+        }
+        self.taken = taken;
+        Ok(())
+    }
+
+    /// Makes room for `more` elements in `list`. Old and new buffer are counted while one is copied to the other.
+    fn reserve<T>(&mut self, list: &mut Vec<T>, more: usize, at: usize) -> Result<(), Wrong> {
+        let (needed, old) = (list.len() + more, list.capacity());
+        if needed > old {
+            let capacity = needed.max(2 * old).max(4);
+            self.take(ALLOCATION + capacity * size_of::<T>(), at)?;
+            list.reserve_exact(capacity - list.len());
+            if old > 0 {
+                self.taken -= (ALLOCATION + old * size_of::<T>()) as u64;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The machine that builds nodes by the instructions of a pickle.
+pub(super) struct Reader<'a> {
+    bytes: &'a [u8],
+    at: usize,
+    instructions: u32,
+    meter: Meter,
+    nodes: Vec<Node>,
+    /// Nesting depth of each node when it was last changed; 0 for a scalar. A container that grows later does not deepen
+    /// the nodes around it: the limit is for those who would follow the nodes, and these count again.
+    depths: Vec<u8>,
+    frames: Vec<Range<usize>>,
+    stack: Vec<NodeId>,
+    marks: Vec<usize>,
+    memo: HashMap<u32, NodeId>,
+}
+
+impl<'a> Reader<'a> {
+    pub(super) fn new(bytes: &'a [u8], memory: u64) -> Reader<'a> {
+        Reader {
+            bytes,
+            at: 0,
+            instructions: 0,
+            meter: Meter { limit: memory, taken: 0 },
+            nodes: Vec::new(),
+            depths: Vec::new(),
+            frames: Vec::new(),
+            stack: Vec::new(),
+            marks: Vec::new(),
+            memo: HashMap::new(),
+        }
+    }
+
+    /// Runs all instructions.
+    pub(super) fn read(mut self) -> Result<Pickle, Wrong> {
+        loop {
+            if let Some(root) = self.step()? {
+                return Ok(Pickle { nodes: self.nodes, root, frames: self.frames });
+            }
+        }
+    }
+
+    /// Runs one instruction; returns the root after the last one.
+    fn step(&mut self) -> Result<Option<NodeId>, Wrong> {
+        let start = self.at;
+        self.instructions += 1;
+        if self.instructions > MAX_INSTRUCTIONS {
+            return Err(Wrong::TooMuch(start, format!("at most {MAX_INSTRUCTIONS} instructions"), "more".into()));
+        }
+        let [instruction] = self.take()?;
+        match instruction {
+            // PROTO, FRAME: nothing to do.
+            0x80 => drop(self.take::<1>()?),
+            0x95 => {
+                self.take::<8>()?;
+                self.meter.reserve(&mut self.frames, 1, start)?;
+                self.frames.push(start..self.at);
+            }
+            b'.' => return self.pop().map(Some),
+            b'(' => self.mark(start)?,
+            b'0' => drop(self.pop()?),
+            b'1' => {
+                let first = self.unmark()?;
+                self.stack.truncate(first);
+            }
+            b'N' => self.push(Node::None, 0)?,
+            0x88 => self.push(Node::Bool(true), 0)?,
+            0x89 => self.push(Node::Bool(false), 0)?,
+            b'K' => {
+                let [value] = self.take()?;
+                self.push_int(value.into(), start)?;
+            }
+            b'M' => {
+                let value = u16::from_le_bytes(self.take()?);
+                self.push_int(value.into(), start)?;
+            }
+            b'J' => {
+                let value = i32::from_le_bytes(self.take()?);
+                self.push_int(value.into(), start)?;
+            }
+            0x8a => self.long(1, start)?,
+            0x8b => self.long(4, start)?,
+            b'G' => {
+                let value = f64::from_be_bytes(self.take()?);
+                self.push(Node::Float(value), 0)?;
+            }
+            b'X' => self.text(4)?,
+            0x8c => self.text(1)?,
+            0x8d => self.text(8)?,
+            b'B' | b'T' => self.blob(4)?,
+            b'C' | b'U' => self.blob(1)?,
+            0x8e | 0x96 => self.blob(8)?,
+            b'c' => self.global(start)?,
+            0x93 => self.stack_global(start)?,
+            b')' => self.push(Node::Tuple(Vec::new()), 1)?,
+            b']' | 0x8f => self.push(Node::List(Vec::new()), 1)?,
+            b'}' => self.push(Node::Dict(Vec::new()), 1)?,
+            b't' => {
+                let first = self.unmark()?;
+                self.collect(first, Node::Tuple)?;
+            }
+            0x85..=0x87 => {
+                let first = self.stack.len().checked_sub(usize::from(instruction - 0x84));
+                let first = first.filter(|&first| first >= self.floor());
+                self.collect(first.ok_or(Wrong::at(start, "a tuple of more than there is"))?, Node::Tuple)?;
+            }
+            b'l' | 0x91 => {
+                let first = self.unmark()?;
+                self.collect(first, Node::List)?;
+            }
+            b'd' => {
+                let first = self.unmark()?;
+                self.push_below(Node::Dict(Vec::new()), first)?;
+                self.set(start, first + 1)?;
+            }
+            b'a' => {
+                let first = self.beyond_top(1)?;
+                self.extend(start, first)?;
+            }
+            b'e' | 0x90 => {
+                let first = self.unmark()?;
+                self.extend(start, first)?;
+            }
+            b's' => {
+                let first = self.beyond_top(2)?;
+                self.set(start, first)?;
+            }
+            b'u' => {
+                let first = self.unmark()?;
+                self.set(start, first)?;
+            }
+            b'R' | 0x81 => {
+                let (arguments, callee) = (self.pop()?, self.pop()?);
+                let depth = self.deeper([arguments, callee])?;
+                self.push(Node::Called { callee, arguments, items: Vec::new() }, depth)?;
+            }
+            // BUILD: attributes of an object beside its items are not needed.
+            b'b' => drop(self.pop()?),
+            b'Q' => {
+                let what = self.pop()?;
+                let depth = self.deeper([what])?;
+                self.push(Node::Outside(what), depth)?;
+            }
+            b'q' => {
+                let [key] = self.take()?;
+                self.remember(key.into())?;
+            }
+            b'r' => {
+                let key = u32::from_le_bytes(self.take()?);
+                self.remember(key)?;
+            }
+            0x94 => self.remember(self.memo.len() as u32)?,
+            b'h' => {
+                let [key] = self.take()?;
+                self.recall(start, key.into())?;
+            }
+            b'j' => {
+                let key = u32::from_le_bytes(self.take()?);
+                self.recall(start, key)?;
+            }
+            other => return Err(Wrong::at(start, format!("instruction {other:#04x}"))),
+        }
+        Ok(None)
+    }
+
+    /// Adds a node and puts it on the stack.
+    fn push(&mut self, node: Node, depth: u8) -> Result<(), Wrong> {
+        self.meter.reserve(&mut self.nodes, 1, self.at)?;
+        self.meter.reserve(&mut self.depths, 1, self.at)?;
+        self.meter.reserve(&mut self.stack, 1, self.at)?;
+        self.stack.push(self.nodes.len() as NodeId);
+        self.nodes.push(node);
+        self.depths.push(depth);
+        Ok(())
+    }
+
+    /// Adds a node and inserts it into the stack at `place`.
+    fn push_below(&mut self, node: Node, place: usize) -> Result<(), Wrong> {
+        self.push(node, 1)?;
+        self.stack[place..].rotate_right(1);
+        Ok(())
+    }
+
+    fn push_int(&mut self, value: i64, start: usize) -> Result<(), Wrong> {
+        self.push(Node::Int(value, start as u32..self.at as u32), 0)
+    }
+
+    /// Depth of a container of these nodes.
+    fn deeper(&self, nodes: impl IntoIterator<Item = NodeId>) -> Result<u8, Wrong> {
+        let deepest = nodes.into_iter().map(|id| self.depths[id as usize]).max().unwrap_or(0);
+        match deepest < MAX_DEPTH {
+            true => Ok(deepest + 1),
+            false => Err(self.too_deep()),
+        }
+    }
+
+    fn too_deep(&self) -> Wrong {
+        Wrong::TooMuch(self.at, format!("containers nested at most {MAX_DEPTH} deep"), "deeper ones".into())
+    }
+
+    fn mark(&mut self, start: usize) -> Result<(), Wrong> {
+        if self.marks.len() >= usize::from(MAX_DEPTH) {
+            return Err(self.too_deep());
+        }
+        self.meter.reserve(&mut self.marks, 1, start)?;
+        self.marks.push(self.stack.len());
+        Ok(())
+    }
+
+    /// Start of the part of the stack that the innermost open container may use.
+    fn floor(&self) -> usize {
+        self.marks.last().copied().unwrap_or(0)
+    }
+
+    fn missing(&self) -> Wrong {
+        Wrong::at(self.at, "a value that was never given")
+    }
+
+    fn pop(&mut self) -> Result<NodeId, Wrong> {
+        match self.stack.len() > self.floor() {
+            true => Ok(self.stack.pop().expect("there is one")),
+            false => Err(self.missing()),
+        }
+    }
+
+    /// Place on the stack of the last `count` values, below which there is another one.
+    fn beyond_top(&self, count: usize) -> Result<usize, Wrong> {
+        self.stack.len().checked_sub(count).filter(|&first| first > self.floor()).ok_or_else(|| self.missing())
+    }
+
+    /// Closes the innermost open container; returns the place on the stack where its elements begin.
+    fn unmark(&mut self) -> Result<usize, Wrong> {
+        let mark = self.marks.pop().ok_or(Wrong::at(self.at, "the end of what was never begun"))?;
+        Ok(mark.min(self.stack.len()))
+    }
+
+    /// Replaces the values from `first` on by one container of them.
+    fn collect(&mut self, first: usize, make: fn(Vec<NodeId>) -> Node) -> Result<(), Wrong> {
+        let depth = self.deeper(self.stack[first..].iter().copied())?;
+        let mut elements = Vec::new();
+        if first < self.stack.len() {
+            let count = self.stack.len() - first;
+            self.meter.take(ALLOCATION + count * size_of::<NodeId>(), self.at)?;
+            elements.reserve_exact(count);
+            elements.extend(self.stack.drain(first..));
+        }
+        self.push(make(elements), depth)
+    }
+
+    /// The container below `first` on the stack, with a depth beyond that of the values from there on.
+    fn container(&mut self, first: usize) -> Result<usize, Wrong> {
+        let below = first.checked_sub(1).filter(|&below| below >= self.floor());
+        let top = self.stack[below.ok_or_else(|| self.missing())?] as usize;
+        let depth = self.deeper(self.stack[first..].iter().copied())?;
+        self.depths[top] = self.depths[top].max(depth);
+        Ok(top)
+    }
+
+    /// Adds the values from `first` on to the list below them.
+    fn extend(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
+        let top = self.container(first)?;
+        match &mut self.nodes[top] {
+            Node::List(list) => {
+                self.meter.reserve(list, self.stack.len() - first, start)?;
+                list.extend(self.stack.drain(first..));
+            }
+            // An object that is filled like a list.
+            Node::Called { .. } => self.stack.truncate(first),
+            _ => return Err(Wrong::at(start, "an element of what is no list")),
+        }
+        Ok(())
+    }
+
+    /// Adds the keys and values from `first` on to the dict below them.
+    fn set(&mut self, start: usize, first: usize) -> Result<(), Wrong> {
+        let top = self.container(first)?;
+        let (pairs, rest) = self.stack[first..].as_chunks::<2>();
+        if !rest.is_empty() {
+            return Err(Wrong::at(start, "a key without a value"));
+        }
+        match &mut self.nodes[top] {
+            Node::Dict(items) | Node::Called { items, .. } => {
+                self.meter.reserve(items, pairs.len(), start)?;
+                items.extend(pairs.iter().map(|&[key, value]| (key, value)));
+            }
+            _ => return Err(Wrong::at(start, "an item of what is no dict")),
+        }
+        self.stack.truncate(first);
+        Ok(())
+    }
+
+    fn remember(&mut self, key: u32) -> Result<(), Wrong> {
+        let top = self.stack.last().copied().filter(|_| self.stack.len() > self.floor());
+        let top = top.ok_or_else(|| self.missing())?;
+        self.meter.take(MEMO_ENTRY, self.at)?;
+        self.memo.insert(key, top);
+        Ok(())
+    }
+
+    fn recall(&mut self, start: usize, key: u32) -> Result<(), Wrong> {
+        let known = self.memo.get(&key).copied();
+        let known = known.ok_or_else(|| Wrong::at(start, format!("what was never remembered, {key}")))?;
+        self.meter.reserve(&mut self.stack, 1, start)?;
+        self.stack.push(known);
+        Ok(())
+    }
+
+    fn take<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
+        let taken = self.some(N as u64)?;
+        Ok(taken.try_into().expect("as many"))
+    }
+
+    fn some(&mut self, count: u64) -> Result<&[u8], Wrong> {
+        let left = self.bytes.len() - self.at;
+        let count = usize::try_from(count).ok().filter(|&count| count <= left);
+        let count = count.ok_or(Wrong::at(self.at, "the end of the pickle"))?;
+        self.at += count;
+        Ok(&self.bytes[self.at - count..self.at])
+    }
+
+    /// A whole number of as many bytes as those before it say.
+    fn long(&mut self, length_bytes: usize, start: usize) -> Result<(), Wrong> {
+        let length = self.length(length_bytes)?;
+        let digits = self.some(length)?;
+        // Nine where the highest bit of eight would be taken for a sign.
+        let digits = match digits {
+            [eight @ .., 0] if eight.len() == 8 && eight[7] < 0x80 => eight,
+            digits => digits,
+        };
+        if digits.len() > 8 {
+            return self.push(Node::Opaque, 0);
+        }
+        let negative = digits.last().is_some_and(|last| last & 0x80 != 0);
+        let mut wide = [if negative { 0xff } else { 0 }; 8];
+        wide[..digits.len()].copy_from_slice(digits);
+        self.push_int(i64::from_le_bytes(wide), start)
+    }
+
+    /// A length of so many bytes.
+    fn length(&mut self, bytes: usize) -> Result<u64, Wrong> {
+        let mut wide = [0; 8];
+        wide[..bytes].copy_from_slice(self.some(bytes as u64)?);
+        Ok(u64::from_le_bytes(wide))
+    }
+
+    fn text(&mut self, length_bytes: usize) -> Result<(), Wrong> {
+        let length = self.length(length_bytes)?;
+        let start = self.at;
+        self.some(length)?;
+        self.meter.take(ALLOCATION + (self.at - start), start)?;
+        let text = std::str::from_utf8(&self.bytes[start..self.at]);
+        let text = text.map_err(|_| Wrong::at(start, "a text that is not UTF-8"))?;
+        self.push(Node::Text(text.into()), 0)
+    }
+
+    fn blob(&mut self, length_bytes: usize) -> Result<(), Wrong> {
+        let length = self.length(length_bytes)?;
+        self.some(length)?;
+        self.push(Node::Opaque, 0)
+    }
+
+    /// GLOBAL: module and name as two lines.
+    fn global(&mut self, start: usize) -> Result<(), Wrong> {
+        let (module, name) = (self.line()?, self.line()?);
+        self.meter.take(ALLOCATION + module.len() + 1 + name.len(), start)?;
+        let text = |line: Range<usize>| {
+            std::str::from_utf8(&self.bytes[line.clone()])
+                .map_err(|_| Wrong::at(line.start, "a name that is not UTF-8"))
+        };
+        let global = [text(module)?, ".", text(name)?].concat();
+        self.push(Node::Global(global.into()), 0)
+    }
+
+    /// STACK_GLOBAL: module and name as two texts on the stack. They may be shared, so that a long one is copied often.
+    fn stack_global(&mut self, start: usize) -> Result<(), Wrong> {
+        let (name, module) = (self.pop()?, self.pop()?);
+        let (Node::Text(module), Node::Text(name)) = (&self.nodes[module as usize], &self.nodes[name as usize]) else {
+            return Err(Wrong::at(start, "something of a module without its name"));
+        };
+        self.meter.take(ALLOCATION + module.len() + 1 + name.len(), start)?;
+        let global = [module, ".", name].concat();
+        self.push(Node::Global(global.into()), 0)
+    }
+
+    /// Place of a line without its end.
+    fn line(&mut self) -> Result<Range<usize>, Wrong> {
+        let start = self.at;
+        let end = self.bytes[start..].iter().position(|&byte| byte == b'\n');
+        self.some(end.map_or(u64::MAX, |end| end as u64 + 1))?;
+        Ok(start..self.at - 1)
+    }
+}
