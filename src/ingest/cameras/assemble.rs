@@ -187,7 +187,7 @@ impl Assembly {
                 let Some(own) = key(at) else { continue };
                 let hash = self.hasher.hash_one(own);
                 if let Some(&before) = taken.find(hash, |&other| key(other as usize) == Some(own)) {
-                    let (view, time) = (own.0, shots[at].time.unwrap_or(0.0));
+                    let (view, time) = (own.0, f64::from_bits(own.2));
                     return Err(Error::input(
                         path,
                         place(Some(at - first)),

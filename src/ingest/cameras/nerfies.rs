@@ -102,11 +102,11 @@ fn warps(file: &Path, ids: &[Box<str>], gauge: &mut Gauge) -> Result<Vec<u32>> {
         }
         Ok(())
     })?;
-    let warp = |id: &Box<str>| {
-        let warp = places.get(&**id).and_then(|&place| found[place as usize]);
+    let warp = |id: &str| {
+        let warp = places.get(id).and_then(|&place| found[place as usize]);
         warp.ok_or_else(|| Error::input(file, "", format!("the picture {}", quoted(id)), "none of this name"))
     };
-    ids.iter().map(warp).collect()
+    ids.iter().map(|id| warp(id)).collect()
 }
 
 /// The splits of every picture, mostly one; of some none.
@@ -123,11 +123,11 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
     }
     let set = |names: &'_ [Box<str>]| -> HashSet<Box<str>> { names.iter().cloned().collect() };
     let (train, val) = (set(train), set(val));
-    let split = |id: &Box<str>| {
+    let split = |id: &str| {
         let is_in = [(Split::Train, train.contains(id)), (Split::Test, val.contains(id))];
         is_in.into_iter().filter(|(_, is_in)| *is_in).map(|(split, _)| split).collect()
     };
-    ids.iter().map(split).collect()
+    ids.iter().map(|id| split(id)).collect()
 }
 
 fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<Picture> {

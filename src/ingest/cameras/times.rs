@@ -67,14 +67,14 @@ pub(super) fn give(
         Times::None => none(),
         Times::Table(table) => {
             let known = read_table(table, gauge)?;
-            let time = |name: &Box<str>| {
+            let time = |name: &str| {
                 let time = keys(name).find_map(|key| known.get(key)).copied();
                 time.map(Some).ok_or_else(|| {
                     Error::input(table, "", format!("a line for the picture {}", quoted(name)), "none")
                         .hint(format!("the names are those of {}", file.display()))
                 })
             };
-            let given = names.iter().map(time).collect::<Result<Vec<_>>>()?;
+            let given = names.iter().map(|name| time(name)).collect::<Result<Vec<_>>>()?;
             Ok((given, format!("times from {}", table.display())))
         }
         Times::Own | Times::Names => {
