@@ -303,22 +303,25 @@ fn a_folder_does_not_replace_a_device() {
 #[test]
 fn of_parallel_runs_without_flags_exactly_one_succeeds() {
     let folder = folder_with_input();
-    let runs: Vec<_> = (0..4).map(|run| folder.attack(&compress("small.ply", 10 + run)).start()).collect();
-    let outcomes: Vec<Outcome> = runs.into_iter().map(|run| run.wait().ended()).collect();
-    let codes: Vec<_> = outcomes.iter().map(|outcome| outcome.code).collect();
-    assert_eq!(codes.iter().filter(|code| **code == Some(0)).count(), 1, "{codes:?}");
-    for outcome in outcomes.iter().filter(|outcome| outcome.code != Some(0)) {
-        assert!(outcome.code == Some(2) && outcome.stderr.contains("exists already"), "{}", outcome.stderr);
+    for round in 0..10 {
+        let output = format!("{round}.ply");
+        let runs: Vec<_> = (0..3).map(|run| folder.attack(&compress(&output, 10 + run)).start()).collect();
+        let outcomes: Vec<Outcome> = runs.into_iter().map(|run| run.wait().ended()).collect();
+        let codes: Vec<_> = outcomes.iter().map(|outcome| outcome.code).collect();
+        assert_eq!(codes.iter().filter(|code| **code == Some(0)).count(), 1, "{codes:?}");
+        for outcome in outcomes.iter().filter(|outcome| outcome.code != Some(0)) {
+            assert!(outcome.code == Some(2) && outcome.stderr.contains("exists already"), "{}", outcome.stderr);
+        }
+        check_set(&folder, &output);
     }
-    check_set(&folder, "small.ply");
     check_no_leftovers(&folder, &[]);
 }
 
 #[test]
 fn parallel_overwriting_runs_do_not_mix_their_files() {
     let folder = folder_with_input();
-    for round in 0..3 {
-        let line = |run: u64| compress("small.ply", 10 + 4 * round + run) + " --overwrite";
+    for round in 0..15 {
+        let line = |run: u64| compress("small.ply", 5 + 2 * round + run) + " --overwrite";
         let runs: Vec<_> = (0..3).map(|run| folder.attack(&line(run)).start()).collect();
         runs.into_iter().for_each(|run| _ = run.wait().succeeded());
         check_set(&folder, "small.ply");
