@@ -52,6 +52,20 @@ impl Handle {
         }
     }
 
+    /// Creates the file `name`; an entry of that name is an error.
+    pub(super) fn create_file(&self, name: &str) -> io::Result<File> {
+        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
+        Ok(File::from(rustix::fs::openat(&self.0, name, flags, Mode::RUSR | Mode::WUSR)?))
+    }
+
+    /// Whether the entry `name` is the open file `file`.
+    pub(super) fn names_file(&self, name: &str, file: &File) -> bool {
+        // Opening the file once more could release a lock on it, on network file systems.
+        let named = rustix::fs::statat(&self.0, name, AtFlags::SYMLINK_NOFOLLOW);
+        let open = rustix::fs::fstat(file);
+        named.is_ok_and(|named| open.is_ok_and(|open| (named.st_dev, named.st_ino) == (open.st_dev, open.st_ino)))
+    }
+
     pub(super) fn status(&self) -> io::Result<Status> {
         let found = File::from(self.0.try_clone()?).metadata()?;
         Ok(Status { identity: (found.dev(), found.ino()), owner: found.uid(), is_private: found.mode() & 0o077 == 0 })

@@ -11,7 +11,7 @@
 
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -218,23 +218,28 @@ pub fn withdraw_all() -> Withdrawn {
 
 /// Locks and marks the new workspace `folder`; `None` if another run took it for a leftover and removes it.
 fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
-    let path = folder.join(LOCK);
-    let mut file = match OpenOptions::new().read(true).write(true).create_new(true).open(&path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        opened => opened?,
+    let lost = |error: io::Error| match error.kind() {
+        io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),
+        _ => Err(error),
+    };
+    let handle = match Handle::open(folder) {
+        Ok(handle) => handle,
+        Err(error) => return lost(error),
+    };
+    let mut file = match handle.create_file(LOCK) {
+        Ok(file) => file,
+        Err(error) => return lost(error),
     };
     let lock = match FileExt::try_lock(&file) {
         Err(TryLockError::WouldBlock) => return Ok(None),
-        // Whoever removes a folder holds its lock: a lock file that still has its name stays.
-        Ok(()) if present(&path) => true,
+        // Whoever removes a workspace unlinks its lock file before releasing the lock. A lock file that still has its name
+        // stays, and its folder with it.
+        Ok(()) if handle.names_file(LOCK, &file) => true,
         Ok(()) => return Ok(None),
         Err(TryLockError::Error(_)) => false,
     };
     file.write_all(LOCK_LINE.as_bytes())?;
-    let identity = match Handle::open(folder) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        opened => opened?.status()?.identity,
-    };
+    let identity = handle.status()?.identity;
     Ok(Some(Workspace { folder: folder.to_owned(), identity, lock: lock.then_some(file) }))
 }
 
@@ -308,15 +313,14 @@ fn dismantle(folder: &Path, identity: Identity, lock: Option<File>) {
     }
 }
 
-/// Removes everything in a workspace, its lock last.
+/// Removes everything in a workspace, its lock file last and before the lock is released: a run that gets the lock
+/// afterwards sees that its file is gone.
 fn empty(folder: &Handle, lock: Option<File>) {
     for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
         let _ = folder.remove(entry);
     }
-    // Network file systems keep an open file under another name.
-    drop(lock);
-    let is_empty = folder.entries().is_ok_and(|entries| entries.iter().all(|entry| entry == LOCK));
-    if is_empty {
+    if folder.entries().is_ok_and(|entries| entries.iter().all(|entry| entry == LOCK)) {
         let _ = folder.remove(LOCK);
     }
+    drop(lock);
 }
