@@ -14,8 +14,8 @@ use super::as_toml::AsToml;
 use super::bounds;
 use super::journal::Journal;
 use super::near::{
-    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, measurable,
-    pictures,
+    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, check_met,
+    measurable, pictures,
 };
 use super::summary::ArchiveSummary;
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
@@ -169,6 +169,7 @@ impl Archive {
                 best.map_or_else(|| looked_at(encoded(ADDED[0])?), Ok)?
             }
         };
+        check_met(aim, asked, psnr)?;
         let (parts, bits) = (encoded.parts, encoded.bits.clone());
         Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts: Some(parts), bounds: None, bits, measured }))
     }

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use super::near::{
-    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, ROUNDS, balanced, bisected, measurable,
+    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, ROUNDS, balanced, bisected, check_met, measurable,
 };
 use super::summary::ArchiveSummary;
 use crate::budget::{Part, Workload};
@@ -112,6 +112,7 @@ pub(super) fn find(
             best.map_or_else(|| looked_at(wider(&widths, ADDED[0])), Ok)?
         }
     };
+    check_met(aim, asked, psnr)?;
     let names = Columns::all().iter().map(|column| column.name().to_owned());
     let bounds = names.zip(widths).collect();
     let bits = BTreeMap::new();

@@ -145,20 +145,21 @@ fn reduce(
         Some(Goal::Bytes(most)) => Some(Space { emit: &emit, most, recipe: recipe.len() as u64 }),
         _ => None,
     };
+    if let Some(search) = &job.search {
+        search.check(scene)?;
+    }
+    let scored = job.measure.run(scene, arrived, &mut journal)?;
     let outlook = Outlook::of(scene);
     let (mut job, fits) = match &space {
         Some(space) => {
             // A field that is to stay exact takes its room at the end.
             let field = if job.field.is_some() { Precision::Half } else { Precision::Exact };
-            let fits = space.fits(scene, &Reduction { field, ..like.clone() }, job.degree.is_some(), &mut journal)?;
+            let like = Reduction { field, ..like.clone() };
+            let fits = space.fits(scene, &scored.present(), &like, job.degree.is_some(), &mut journal)?;
             (job.again(request, outlook, fits[0].gaussians)?, fits)
         }
         None => (job.clone(), Vec::new()),
     };
-    if let Some(search) = &job.search {
-        search.check(scene)?;
-    }
-    let scored = job.measure.run(scene, arrived, &mut journal)?;
     let mut ranked = scored.ranked();
     if let Some(rounds) = &job.rounds {
         let fewest = job.prune.target.unwrap_or(scored.selection.counts.kept);

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::metrics::psnr;
+use crate::metrics::{decibels_text, psnr};
 use crate::model::Picture;
 use crate::render::{Image, render};
 use crate::scene::Scene;
@@ -23,6 +23,8 @@ const ENOUGH: f64 = 50.0;
 /// What a search for a quality leaves for the archive, dB: a third of the pruning's squared error. Where both are traded
 /// off best, errors go by how fast bytes fall with them: about three times as fast with the number of Gaussians.
 pub(super) const LEFT_BY_SEARCH: f64 = 1.2;
+/// An archive may miss what it is asked for by less than this, dB.
+const SHORT: f64 = 10.0;
 /// Bytes of a pixel.
 pub(super) const PIXEL: u64 = 3 * size_of::<f32>() as u64;
 /// Times that errors and bits are measured.
@@ -154,6 +156,23 @@ pub(super) fn measurable(psnr: f64) -> Result<f64> {
         ));
     }
     Ok(psnr)
+}
+
+/// Confirms that an archive has about the PSNR against the result's pictures that it is `asked` for, dB; one that is to have
+/// no more than so many bytes has what fits.
+///
+/// # Errors
+/// One that has [`SHORT`] less than that or than [`ENOUGH`]: there are values that its grids cannot hold beside the others.
+pub(super) fn check_met(aim: Aim, asked: f64, found: f64) -> Result<()> {
+    let is_met = matches!(aim, Aim::Bytes(_)) || found >= asked.min(ENOUGH) - SHORT;
+    match is_met {
+        true => Ok(()),
+        false => Err(Error::usage(format!(
+            "an archive's pictures cannot come as close to the result's as asked for: expected {asked:.1} dB, found {}\n  \
+             some values may be far larger than all others: drop their Gaussians (--drop-ids), or write a .gseq",
+            decibels_text(found, 1)
+        ))),
+    }
 }
 
 /// What `of` finds at the largest number between two, as far as halving their distance so often tells, that it finds

@@ -261,6 +261,11 @@ impl Scored {
         self.protected.binary_search(&id).is_ok()
     }
 
+    /// Returns the ids of all Gaussians that are not [absent](Scored::absent), increasing.
+    pub fn present(&self) -> Vec<u32> {
+        (0..self.count() as u32).filter(|id| self.absent.binary_search(id).is_err()).collect()
+    }
+
     /// Statistics of every Gaussian.
     ///
     /// # Errors

@@ -42,21 +42,28 @@ pub(super) struct Fit {
 }
 
 impl Space<'_> {
-    /// [`Space::count`] for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
+    /// [`Space::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
     ///
     /// # Errors
     /// Those of [`Space::count`].
-    pub(super) fn fits(&self, scene: &Scene, like: &Reduction, drops: bool, journal: &mut Journal) -> Result<Vec<Fit>> {
+    pub(super) fn fits(
+        &self,
+        scene: &Scene,
+        ids: &[u32],
+        like: &Reduction,
+        drops: bool,
+        journal: &mut Journal,
+    ) -> Result<Vec<Fit>> {
         let info = scene.source().info();
         let highest = like.sh_degree.min(info.sh_degree);
         let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
         let mut fits: Vec<Fit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
-            if fits.last().is_some_and(|fit| fit.gaussians == info.count) {
+            if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
                 break;
             }
             let like = Reduction { sh_degree, ..like.clone() };
-            fits.push(Fit { sh_degree, gaussians: self.count(scene, &like, journal)? });
+            fits.push(Fit { sh_degree, gaussians: self.count(scene, ids, &like, journal)? });
         }
         Ok(fits)
     }
@@ -66,15 +73,15 @@ impl Space<'_> {
         scene.work.key(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
     }
 
-    /// As many of all Gaussians as fit, of any of them, with the rule and the field of `like`.
+    /// As many of the Gaussians `ids` as fit, of any of them, with the rule and the field of `like`.
     ///
     /// # Errors
     /// Not even one fits; frames that cannot be read, a failed write.
-    fn count(&self, scene: &Scene, like: &Reduction, journal: &mut Journal) -> Result<usize> {
-        let (all, most) = (scene.source().info().count, self.most);
+    fn count(&self, scene: &Scene, ids: &[u32], like: &Reduction, journal: &mut Journal) -> Result<usize> {
+        let (all, most) = (ids.len(), self.most);
         journal.kept_stage(NAME, all, scene, self.key(scene, like), |_| {
             let bytes = |count: usize| {
-                let kept = (0..count).map(|k| (k * all / count) as u32).collect();
+                let kept = (0..count).map(|k| ids[k * all / count]).collect();
                 let some = like.with(kept);
                 match self.emit.kind {
                     // What lies beside it is neither stored nor sent.

@@ -5,7 +5,8 @@
 
 use std::path::Path;
 
-use super::splatv::{seen_whole, words, write};
+use super::accuracy::Accuracy;
+use super::splatv::{measure, seen_whole, words, write};
 use crate::error::Result;
 use crate::fit::{Curve, Misfit, Tolerance, curved};
 use crate::ingest::splatv::Row;
@@ -27,8 +28,13 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path) -> Result<String> {
         (curved(track, &tolerance, &mut misfit), misfit)
     })?;
     let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
-    let rows: Vec<_> = found.iter().flat_map(|(curves, _)| curves).map(|curve| words(&row(curve))).collect();
+    let rows: Vec<Row> = found.iter().flat_map(|(curves, _)| curves).map(row).collect();
     let first = gather_all(source, 0, Columns::POSITION)?;
+    let mut accuracy = Accuracy::new(&first.position);
+    let of_rows = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
+    of_rows.zip(&rows).for_each(|(id, row)| measure(row, id, &mut accuracy));
+    accuracy.check("a .splatv")?;
+    let rows: Vec<_> = rows.iter().map(words).collect();
     write(path, rows.len(), rows.iter().copied(), &seen_whole(&first.position))?;
     let bands = if info.sh_degree > 0 { ", in colours that do not change with direction" } else { "" };
     Ok(format!(

@@ -9,10 +9,11 @@ use std::path::Path;
 use fourdgs::quantization::{Bounds, SH_QUANT_HI, SH_QUANT_LO, Steps, life_class, motion_step, support_k};
 use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 
+use super::accuracy::{Accuracy, Drawn};
 use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::fit::{Misfit, Piece, Tolerance, straight};
-use crate::model::colour;
+use crate::model::{Column, colour};
 use crate::source::FrameSource;
 use crate::stream::{Progress, tracks};
 
@@ -44,7 +45,10 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path) -> Result<String> {
     }
     let pieces = set.count();
     let options = WriteOptions { library: TOOL.to_owned(), ..WriteOptions::default() };
+    let wanted = set.positions.clone();
     on_grid(&mut set, &options);
+    let ids = found.iter().enumerate().flat_map(|(id, (pieces, _))| pieces.iter().map(move |_| id));
+    check_positions(&set, &wanted, ids)?;
     let refused = |error: fourdgs::Error| Error::usage(format!("{}: no .4dgs can hold this: {error}", path.display()));
     let bytes = write_to_vec(&set, starts[info.times.len()], &options, &SceneExtras::default()).map_err(refused)?;
     std::fs::write(path, bytes).map_err(Error::io("write", path))?;
@@ -81,6 +85,20 @@ fn on_grid(set: &mut GaussianSet, options: &WriteOptions) {
         let class = life_class(0, steps.sigma_log, true, window, support_k(options.cutoff));
         motion.iter_mut().for_each(|value| snap(value, 0.0, motion_step(class, steps.motion)));
     }
+}
+
+/// Confirms that the grid leaves the Gaussians `ids`, piece by piece, about where they are `wanted`.
+fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = usize>) -> Result<()> {
+    let planes = (0..3).flat_map(|axis| wanted.iter().skip(axis).step_by(3).copied()).collect();
+    let mut accuracy = Accuracy::new(&Column::from_planes(3, planes));
+    for (k, id) in ids.enumerate() {
+        let three = |of: &[f32]| [0, 1, 2].map(|axis| f64::from(of[3 * k + axis]));
+        let opacity = f64::from(set.colors[4 * k + 3]);
+        let drawn =
+            |place: &[f32]| Drawn { position: three(place), scale: three(&set.scales), opacity, color: [0.0; 3] };
+        accuracy.add(id, &drawn(wanted), &drawn(&set.positions));
+    }
+    accuracy.check("a .4dgs")
 }
 
 /// Adds `piece`; `starts`: when each frame begins, and the last one ends.

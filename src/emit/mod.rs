@@ -3,6 +3,7 @@
 //! Writers create the file they are given; [`atomic`] hands out the temporary names to give them and
 //! moves what was written to where the user asked for it.
 
+pub mod accuracy;
 pub mod atomic;
 pub mod bounds;
 pub(crate) mod checkpoint;

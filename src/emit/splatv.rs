@@ -9,6 +9,7 @@ use std::path::Path;
 use half::f16;
 use serde_json::{Value, json};
 
+use super::accuracy::{Accuracy, Drawn};
 use crate::error::{Error, Result};
 use crate::ingest::cameras::virtual_rig;
 use crate::ingest::splatv::{MAGIC, ROW_BYTES, Row, TEXELS, WORDS};
@@ -17,6 +18,8 @@ use crate::stats::RobustBox;
 
 /// Of the cameras around a scene one that is neither at its top nor at its bottom.
 const WELL_PLACED: usize = 4;
+/// Widths of a window in time after which an opacity of 1 has fallen to 1/255.
+const SEEN_WIDTHS: f64 = 2.36;
 /// Texels of a Gaussian.
 const TEXELS_EACH: usize = 4;
 
@@ -51,6 +54,25 @@ pub fn words(row: &Row) -> [u32; WORDS] {
         pair(o[2], o[3]),
         pair(centre, width),
     ]
+}
+
+/// Measures what a viewer reads of `row` against `row` itself, as Gaussian `id`. Rounding of its path counts as far from its
+/// center as it is seen.
+pub fn measure(row: &Row, id: usize, to: &mut Accuracy) {
+    let held = Row::of_words(&words(row));
+    let drawn = |of: &Row| Drawn {
+        position: of.position.map(f64::from),
+        scale: of.scale.map(f64::from),
+        opacity: of.opacity,
+        color: of.rgb,
+    };
+    let (wanted, mut found) = (drawn(row), drawn(&held));
+    let time = (SEEN_WIDTHS * f64::from(row.width)).min(1.0);
+    for axis in 0..3 {
+        let off = |k: usize| f64::from(row.motion[3 * k + axis] - held.motion[3 * k + axis]) * time.powi(k as i32 + 1);
+        found.position[axis] += (0..3).map(off).map(f64::abs).sum::<f64>();
+    }
+    to.add(id, &wanted, &found);
 }
 
 /// A camera as the file lists it: `rotation` has the rows of camera to world.

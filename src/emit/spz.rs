@@ -18,8 +18,9 @@ use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
 
+use super::accuracy::{Accuracy, Drawn};
 use crate::error::{Error, Result};
-use crate::model::{Gaussians, opacity};
+use crate::model::{Gaussians, colour, opacity};
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
@@ -30,10 +31,11 @@ const MOST_BITS: i32 = 20;
 /// Signs of the harmonics above degree 0 once y and z point the other way.
 const TURNED: [f32; 15] = [-1., -1., 1., -1., 1., 1., -1., 1., -1., 1., -1., -1., 1., -1., 1.];
 
-/// Writes `state`; how far positions are off at most, in scene units.
+/// Writes `state`; returns the largest error of a position in the file, in scene units.
 ///
 /// # Errors
-/// A position that is not finite; more Gaussians than the format counts; a failed write.
+/// A position that is not finite; values that the file holds only with errors beyond the bounds of
+/// [`accuracy`](super::accuracy); more Gaussians than the format counts; a failed write.
 pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
     if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
@@ -44,6 +46,7 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
         .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.display(), state.len())))?;
     let bits = (MOST / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MOST_BITS)) as i32;
     let unit = 0.5f64.powi(bits);
+    let off = measured(state, unit)?;
     let file = File::create(path).map_err(Error::io("create", path))?;
     // No time and no name: the same scene gives the same bytes.
     let mut out = GzBuilder::new().write(BufWriter::new(file), Compression::best());
@@ -56,18 +59,18 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
         for row in rows.clone() {
             let [x, y, z] = state.position.row::<3>(row).map(f64::from);
             for value in [x, -y, -z] {
-                let fixed = (value / unit).round().clamp(-MOST, MOST) as i32;
+                let fixed = fixed(value, unit);
                 out.write_all(&fixed.to_le_bytes()[..3])?;
             }
         }
         for row in rows.clone() {
-            out.write_all(&[byte(255.0 * opacity(state.opacity_logit.row::<1>(row)[0]))])?;
+            out.write_all(&[opacity_byte(state.opacity_logit.row::<1>(row)[0])])?;
         }
         for row in rows.clone() {
-            out.write_all(&state.sh.row::<3>(row).map(|dc| byte(255.0 * (0.15 * f64::from(dc) + 0.5))))?;
+            out.write_all(&state.sh.row::<3>(row).map(color_byte))?;
         }
         for row in rows.clone() {
-            out.write_all(&state.log_scale.row::<3>(row).map(|scale| byte(16.0 * (f64::from(scale) + 10.0))))?;
+            out.write_all(&state.log_scale.row::<3>(row).map(scale_byte))?;
         }
         for row in rows.clone() {
             let q = state.rotation.row::<4>(row).map(f64::from);
@@ -77,11 +80,8 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
         }
         for row in rows {
             for (k, turned) in (1..state.sh.width() / 3).zip(TURNED) {
-                let step = if k < 4 { 8.0 } else { 16.0 };
                 for c in 0..3 {
-                    let value = f64::from(turned * state.sh.plane(3 * k + c)[row]);
-                    let nearest = ((128.0 * value).round() + 128.0 + step / 2.0) / step;
-                    out.write_all(&[byte(nearest.floor() * step)])?;
+                    out.write_all(&[harmonic_byte(k, turned * state.sh.plane(3 * k + c)[row])])?;
                 }
             }
         }
@@ -89,7 +89,60 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
         out.get_mut().flush()
     };
     write().map_err(Error::io("write", path))?;
-    Ok(unit / 2.0)
+    Ok(off)
+}
+
+/// Measures what a file with positions in units of `unit` holds of `state`; returns the largest error of a position.
+///
+/// # Errors
+/// One that is beyond its bound.
+fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
+    let mut accuracy = Accuracy::new(&state.position);
+    for row in 0..state.len() {
+        let wanted = Drawn::of_state(state, row);
+        let color = |dc: f32| colour(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
+        let found = Drawn {
+            position: wanted.position.map(|x| f64::from(fixed(x, unit)) * unit),
+            scale: state.log_scale.row::<3>(row).map(|scale| (f64::from(scale_byte(scale)) / 16.0 - 10.0).exp()),
+            opacity: f64::from(opacity_byte(state.opacity_logit.row::<1>(row)[0])) / 255.0,
+            color: state.sh.row::<3>(row).map(color),
+        };
+        accuracy.add(row, &wanted, &found);
+        if wanted.color.iter().any(|c| !c.is_finite()) {
+            accuracy.add_harmonic(row, f64::INFINITY);
+        }
+        for (k, c) in (1..state.sh.width() / 3).flat_map(|k| (0..3).map(move |c| (k, c))) {
+            let value = state.sh.plane(3 * k + c)[row];
+            let held = (f64::from(harmonic_byte(k, value)) - 128.0) / 128.0;
+            accuracy.add_harmonic(row, (f64::from(value) - held).abs());
+        }
+    }
+    accuracy.check("a .spz")?;
+    Ok(accuracy.position())
+}
+
+/// A coordinate as 24 bits, in units of `unit`.
+fn fixed(value: f64, unit: f64) -> i32 {
+    (value / unit).round().clamp(-MOST, MOST) as i32
+}
+
+fn opacity_byte(logit: f32) -> u8 {
+    byte(255.0 * opacity(logit))
+}
+
+fn color_byte(dc: f32) -> u8 {
+    byte(255.0 * (0.15 * f64::from(dc) + 0.5))
+}
+
+fn scale_byte(log_scale: f32) -> u8 {
+    byte(16.0 * (f64::from(log_scale) + 10.0))
+}
+
+/// Coefficient `k`, from 1, of a channel's harmonics: to the nearest of 5 bits in the first band, of 4 in the others.
+fn harmonic_byte(k: usize, value: f32) -> u8 {
+    let step = if k < 4 { 8.0 } else { 16.0 };
+    let nearest = ((128.0 * f64::from(value)).round() + 128.0 + step / 2.0) / step;
+    byte(nearest.floor() * step)
 }
 
 /// A unit quaternion xyzw without its largest component, which is positive of it or of its negative.

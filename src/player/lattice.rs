@@ -7,6 +7,8 @@ use std::ops::Range;
 
 use serde::Serialize;
 
+use crate::emit::accuracy::{Accuracy, Drawn};
+use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, opacity, sh_coefficients};
 
 /// Distances between lattice points; a value is off by half of its own at most.
@@ -107,6 +109,22 @@ pub fn write_points(state: &Gaussians, which: Columns, steps: &Steps, points: &m
         }
     }
     unseen
+}
+
+/// Confirms that the positions of `points`, written of all columns of `state` with harmonics up to `sh_degree`, are about those of the state.
+///
+/// # Errors
+/// A Gaussian that is seen, further from where it was than [`accuracy`](crate::emit::accuracy) allows.
+pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, points: &[i32]) -> Result<()> {
+    let count = state.len();
+    let mut accuracy = Accuracy::new(&state.position);
+    let opacities = components(Columns::OPACITY, sh_degree).start * count;
+    for row in (0..count).filter(|row| points[opacities + row] > 0) {
+        let wanted = Drawn { color: [0.0; 3], ..Drawn::of_state(state, row) };
+        let position = [0, 1, 2].map(|axis| f64::from(points[axis * count + row]) * steps.position);
+        accuracy.add(row, &wanted, &Drawn { position, ..wanted });
+    }
+    accuracy.check("a page")
 }
 
 /// The number of the lattice point nearest to `value`; 0 of NaN.

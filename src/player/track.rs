@@ -18,7 +18,7 @@ use flate2::write::ZlibEncoder;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::lattice::{Steps, components, width, write_points};
+use super::lattice::{Steps, check_positions, components, width, write_points};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::source::{FrameSource, Wanted};
@@ -114,6 +114,9 @@ pub fn encode(
             unseen += write_points(&shown, which, &track.steps, points);
         } else {
             unseen += write_points(state, which, &track.steps, points);
+        }
+        if which == Columns::all() {
+            check_positions(state, degree, &track.steps, points)?;
         }
         track.unseen = track.unseen.max(unseen);
         progress.advance(1);

@@ -11,8 +11,9 @@ use super::common::{check_kind, residence};
 use super::decoder::Act;
 use super::law::{CENTRE, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
 use super::proxies;
+use crate::emit::accuracy::Accuracy;
 use crate::emit::kind::OutputKind;
-use crate::emit::splatv::{seen_whole, words, write as write_file};
+use crate::emit::splatv::{measure, seen_whole, words, write as write_file};
 use crate::error::{Error, Result};
 use crate::families::family::{Entry, Family, Residence, Timing};
 use crate::families::law::window::MOST;
@@ -115,11 +116,14 @@ pub(super) fn write(
     let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
     let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());
     let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
-    let words_of = |i: usize| {
+    let row_of = |i: usize| {
         let row = row(raw, i);
-        words(&Row { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row })
+        Row { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
     };
-    write_file(path, raw.len(), (0..raw.len()).map(words_of), &cameras)
+    let mut accuracy = Accuracy::new(&raw.gaussians.position);
+    (0..raw.len()).for_each(|i| measure(&row_of(i), i, &mut accuracy));
+    accuracy.check("a .splatv")?;
+    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&row_of(i))), &cameras)
 }
 
 impl Family for File {
@@ -207,6 +211,10 @@ impl Family for File {
             let (now, before) = (row(&raw, i), row(&unchanged, i));
             if now == before { self.file.words(reduction.kept[i] as usize) } else { words(&now) }
         };
+        let mut accuracy = Accuracy::new(&raw.gaussians.position);
+        let changed = |&i: &usize| row(&raw, i) != row(&unchanged, i);
+        (0..raw.len()).filter(changed).for_each(|i| measure(&row(&raw, i), i, &mut accuracy));
+        accuracy.check("a .splatv")?;
         write_file(path, raw.len(), (0..raw.len()).map(words_of), self.file.cameras())?;
         Ok(Vec::new())
     }

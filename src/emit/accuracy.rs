@@ -1,0 +1,229 @@
+//! How far the values in a lossy file are from those that were to be written, measured on what the file holds.
+//!
+//! In: pairs of what each Gaussian is drawn with, before and after. Out: the largest errors, or an error that names the
+//! Gaussian whose error is the furthest beyond its bound. What is never seen, by an opacity below 1/255, has no error.
+//!
+//! | quantity | bound |
+//! |---|---|
+//! | position | half of the Gaussian's own middle scale, or 1/100 of the scene's size |
+//! | scale | a tenth, or 1/100 of the scene's size |
+//! | opacity, base color | 1/50 |
+//! | coefficients of harmonics above degree 0 | 1 |
+//!
+//! The size of the scene is the median distance of its Gaussians from their median: one that is far away does not change it.
+
+use crate::error::{Error, Result};
+use crate::model::{Column, Gaussians, colour, opacity};
+
+/// Part of a Gaussian's own middle scale by which its position may be off.
+const OF_SCALE: f64 = 0.5;
+/// Part of the scene's size by which positions and scales may be off.
+const OF_SCENE: f64 = 0.01;
+/// Part of itself by which a scale may be off.
+const OF_ITSELF: f64 = 0.1;
+/// Bound of opacities and base colors, which are from 0 to 1.
+const OF_ONE: f64 = 0.02;
+/// Bound of coefficients of harmonics above degree 0, whose sum is a color.
+const OF_HARMONIC: f64 = 1.0;
+/// Opacities below this are not drawn.
+const UNSEEN: f64 = 1.0 / 255.0;
+
+/// What a Gaussian is drawn with.
+#[derive(Debug, Clone, Copy)]
+pub struct Drawn {
+    /// Scene units.
+    pub position: [f64; 3],
+    /// Standard deviations, scene units.
+    pub scale: [f64; 3],
+    /// From 0 to 1.
+    pub opacity: f64,
+    /// Base color, red, green, blue.
+    pub color: [f64; 3],
+}
+
+impl Drawn {
+    /// Returns what row `row` of `state` is drawn with.
+    pub fn of_state(state: &Gaussians, row: usize) -> Drawn {
+        Drawn {
+            position: state.position.row::<3>(row).map(f64::from),
+            scale: state.log_scale.row::<3>(row).map(|scale| f64::from(scale).exp()),
+            opacity: opacity(state.opacity_logit.row::<1>(row)[0]),
+            color: state.sh.row::<3>(row).map(colour),
+        }
+    }
+
+    fn middle_scale(&self) -> f64 {
+        let mut scale = self.scale;
+        scale.sort_unstable_by(f64::total_cmp);
+        scale[1]
+    }
+}
+
+/// Error of one quantity of one Gaussian.
+#[derive(Debug, Clone, Copy)]
+struct Excess {
+    id: usize,
+    quantity: &'static str,
+    error: f64,
+    bound: f64,
+}
+
+/// The errors of a file so far.
+#[derive(Debug)]
+pub struct Accuracy {
+    /// Median distance of the Gaussians from their median, scene units.
+    scene: f64,
+    /// Gaussian that is furthest from the median.
+    furthest: usize,
+    /// Largest error of a position, scene units.
+    position: f64,
+    worst: Option<Excess>,
+}
+
+impl Accuracy {
+    /// No errors yet of Gaussians at `positions`.
+    pub fn new(positions: &Column) -> Accuracy {
+        let count = positions.len();
+        let axis = |axis: usize| positions.plane(axis).iter().map(|&x| f64::from(x));
+        let middle = [0, 1, 2].map(|k| median(axis(k).collect()));
+        let distance = |i: usize| {
+            let place = positions.row::<3>(i).map(f64::from);
+            (0..3).map(|k| (place[k] - middle[k]).abs()).fold(0.0, f64::max)
+        };
+        let distances: Vec<f64> = (0..count).map(distance).collect();
+        let furthest = (0..count).max_by(|&a, &b| distances[a].total_cmp(&distances[b])).unwrap_or(0);
+        Accuracy { scene: median(distances), furthest, position: 0.0, worst: None }
+    }
+
+    /// Returns the largest error of a position so far, scene units.
+    pub fn position(&self) -> f64 {
+        self.position
+    }
+
+    /// Adds Gaussian `id`, which was to be drawn with `wanted` and is with `found`.
+    pub fn add(&mut self, id: usize, wanted: &Drawn, found: &Drawn) {
+        if wanted.opacity < UNSEEN && found.opacity < UNSEEN {
+            return;
+        }
+        let room = OF_SCENE * self.scene;
+        let largest = |errors: [f64; 3]| {
+            errors.into_iter().fold(0.0, |most: f64, x| if x > most || x.is_nan() { x } else { most })
+        };
+        let apart = |a: [f64; 3], b: [f64; 3]| largest([0, 1, 2].map(|k| (a[k] - b[k]).abs()));
+        let of_position = apart(wanted.position, found.position);
+        self.position = largest([self.position, of_position, 0.0]);
+        let scales = [0, 1, 2].map(|k| (wanted.scale[k], (wanted.scale[k] - found.scale[k]).abs()));
+        // A screen shows no more.
+        let [before, after] = [wanted, found].map(|of| of.color.map(|c| c.clamp(0.0, 1.0)));
+        self.judge(id, "position", of_position, room.max(OF_SCALE * wanted.middle_scale()));
+        scales.into_iter().for_each(|(scale, error)| self.judge(id, "scale", error, room.max(OF_ITSELF * scale)));
+        self.judge(id, "opacity", (wanted.opacity - found.opacity).abs(), OF_ONE);
+        self.judge(id, "color", apart(before, after), OF_ONE);
+    }
+
+    /// Adds the error of a coefficient of a harmonic above degree 0 of Gaussian `id`.
+    pub fn add_harmonic(&mut self, id: usize, error: f64) {
+        self.judge(id, "harmonics", error, OF_HARMONIC);
+    }
+
+    fn judge(&mut self, id: usize, quantity: &'static str, error: f64, bound: f64) {
+        let excess = |of: &Excess| if of.error.is_nan() { f64::INFINITY } else { of.error / of.bound };
+        let now = Excess { id, quantity, error, bound };
+        // Not: greater. NaN is beyond every bound.
+        let is_within = error <= bound;
+        if !is_within && self.worst.is_none_or(|worst| excess(&now) > excess(&worst)) {
+            self.worst = Some(now);
+        }
+    }
+
+    /// Confirms that all errors are within their bounds in a file that is named by `kind`, for example "a .spz".
+    ///
+    /// # Errors
+    /// One that is not: which Gaussian, by how much, and what to do.
+    pub fn check(&self, kind: &str) -> Result<()> {
+        let Some(Excess { id, quantity, error, bound }) = self.worst else { return Ok(()) };
+        let unit = if matches!(quantity, "position" | "scale") { " scene units" } else { "" };
+        let why = match quantity {
+            "position" => format!(
+                "\n  Gaussian {} is the furthest from the others: drop it (compress --drop-ids), or write a .ply or .gseq",
+                self.furthest
+            ),
+            _ => "\n  drop it (compress --drop-ids), or write a .ply or .gseq".to_owned(),
+        };
+        Err(Error::usage(format!(
+            "{kind} cannot hold the {quantity} of Gaussian {id} of what is written: expected an error of at most \
+             {bound:.2e}{unit}, found {error:.2e}{why}"
+        )))
+    }
+}
+
+/// Median of the finite values; 0 of none.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.retain(|value| value.is_finite());
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = (values.len() - 1) / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn drawn(x: f64, scale: f64) -> Drawn {
+        Drawn { position: [x, 0.0, 0.0], scale: [scale; 3], opacity: 0.5, color: [0.5; 3] }
+    }
+
+    /// Five Gaussians two apart from one another, and one far away: a median distance of 2.
+    fn accuracy() -> Accuracy {
+        let mut positions = Column::zeros(3, 6);
+        positions.plane_mut(0).copy_from_slice(&[0.0, 2.0, 4.0, 6.0, 8.0, 1e7]);
+        Accuracy::new(&positions)
+    }
+
+    #[test]
+    fn one_that_is_far_away_does_not_widen_the_bound() {
+        let mut found = accuracy();
+        found.add(1, &drawn(2.0, 1e-3), &drawn(2.019, 1e-3));
+        found.check("a file").unwrap();
+        assert!((found.position() - 0.019).abs() < 1e-12);
+        found.add(2, &drawn(4.0, 1e-3), &drawn(4.5, 1e-3));
+        let message = found.check("a file").unwrap_err().to_string();
+        let parts =
+            ["position of Gaussian 2", "at most 2.00e-2 scene units", "found 5.00e-1", "Gaussian 5 is the furthest"];
+        assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+    }
+
+    #[test]
+    fn large_gaussians_may_move_by_half_of_their_scale() {
+        let mut found = accuracy();
+        found.add(0, &drawn(0.0, 3.0), &drawn(1.5, 3.0));
+        found.check("a file").unwrap();
+        found.add(0, &drawn(0.0, 3.0), &drawn(1.51, 3.0));
+        found.check("a file").unwrap_err();
+    }
+
+    #[test]
+    fn scales_opacities_colors_and_nan_have_bounds() {
+        let wanted = drawn(0.0, 1.0);
+        for (found, quantity) in [
+            (Drawn { scale: [1.0, 1.0, 1.11], ..wanted }, "scale"),
+            (Drawn { opacity: 0.53, ..wanted }, "opacity"),
+            (Drawn { color: [0.5, 0.53, 0.5], ..wanted }, "color"),
+            (Drawn { position: [0.0, f64::NAN, 0.0], ..wanted }, "position"),
+            (Drawn { opacity: f64::NAN, ..wanted }, "opacity"),
+        ] {
+            let mut accuracy = accuracy();
+            accuracy.add(3, &wanted, &found);
+            let message = accuracy.check("a file").unwrap_err().to_string();
+            assert!(message.contains(&format!("the {quantity} of Gaussian 3")), "{message}");
+        }
+        let mut accuracy = accuracy();
+        let color = |value: f64| Drawn { color: [value; 3], ..wanted };
+        accuracy.add(0, &color(7.0), &color(1.0));
+        let unseen = Drawn { opacity: 0.0, ..wanted };
+        accuracy.add(0, &unseen, &Drawn { position: [9.0; 3], ..unseen });
+        accuracy.check("a file").unwrap();
+    }
+}
