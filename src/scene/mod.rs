@@ -2,6 +2,7 @@
 
 mod absent;
 pub mod between;
+mod frames;
 mod input;
 mod open;
 pub mod path;

@@ -1,0 +1,92 @@
+//! A scene as a source of frames: those of its input without the absent Gaussians.
+
+use super::Scene;
+use crate::error::Result;
+use crate::model::SequenceInfo;
+use crate::source::{Ahead, BlockReader, Decoder, Deformation, FrameSource, Ids, Reads, Wanted};
+
+impl Scene {
+    /// Hides the Gaussians `ids`, in increasing order, from everything that reads the scene's frames from now on, and shows
+    /// those hidden before. Keys of results in the work folder follow from the ids.
+    pub fn set_absent(&self, ids: &[u32]) {
+        self.work.set_absent(ids);
+        self.absent.set(ids);
+    }
+
+    /// Returns the scene's frames, without the absent Gaussians.
+    pub fn source(&self) -> &dyn FrameSource {
+        if self.absent.is_empty() { self.input.source() } else { self }
+    }
+}
+
+impl FrameSource for Scene {
+    fn info(&self) -> &SequenceInfo {
+        self.input.source().info()
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        Ok(self.absent.hiding(self.input.source().open(ids.clone())?, &ids))
+    }
+
+    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        let opened = self.input.source().open_all(wanted)?;
+        Some(opened.map(|reader| self.absent.hiding(reader, &Ids::Range(0..self.info().count))))
+    }
+
+    fn deformation(&self) -> Option<&dyn Deformation> {
+        self.input.source().deformation()
+    }
+
+    fn decoder(&self) -> Option<&dyn Decoder> {
+        self.input.source().decoder()
+    }
+
+    fn reads(&self) -> Reads {
+        self.input.source().reads()
+    }
+
+    fn ahead(&self) -> Option<&dyn Ahead> {
+        self.input.source().ahead()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compress::tests::scene;
+    use crate::model::{Columns, Gaussians};
+    use crate::render::render;
+    use crate::stats::RobustBox;
+    use crate::stream::gather_all;
+
+    #[test]
+    fn renders_and_boxes_are_those_of_the_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let absent = [3, 4, 700, 1499];
+        let whole = gather_all(scene.source(), 2, Columns::all()).unwrap();
+        let others: Vec<u32> = (0..1500).filter(|id| !absent.contains(id)).collect();
+        scene.set_absent(&absent);
+        let hidden = gather_all(scene.source(), 2, Columns::all()).unwrap();
+        let expected = whole.pick(&others);
+        assert!(hidden.pick(&others) == expected);
+        let camera = &scene.schedule.cameras[0];
+        assert_eq!(render(&hidden, camera, [0.2; 3]).data, render(&expected, camera, [0.2; 3]).data);
+        let [found, expected] = [&hidden, &expected].map(|state| RobustBox::of(&state.position));
+        assert_eq!((found.low, found.high), (expected.low, expected.high));
+        scene.set_absent(&[]);
+        assert!(gather_all(scene.source(), 2, Columns::all()).unwrap() == whole);
+    }
+
+    #[test]
+    fn lists_of_ids_hide_the_same_gaussians() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        scene.set_absent(&[7]);
+        let mut state = Gaussians::zeros(0, scene.info().sh_degree);
+        scene.source().open(Ids::List(&[9, 7, 3])).unwrap().read(0, Columns::all(), &mut state).unwrap();
+        let is_absent = |row: usize| state.opacity_logit.row::<1>(row) == [f32::NEG_INFINITY];
+        assert_eq!([0, 1, 2].map(is_absent), [false, true, false]);
+        assert!(state.position.row::<3>(1)[0].is_nan() && state.rotation.row::<4>(1) == [1.0, 0.0, 0.0, 0.0]);
+    }
+}
