@@ -389,7 +389,7 @@ impl Plan {
         let plan = Self::closest(work, budget.limit(), needs);
         let fits = plan.excess() == 0;
         match budget.tell {
-            Tell::Plan => eprint!("budget: {}\n{}", budget.named(), plan.text()),
+            Tell::Plan => crate::stream::tell(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()),
             Tell::Time | Tell::Nothing => (),
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
@@ -547,7 +547,11 @@ impl Plan {
             let stages = seconds(&self.work, &self.needs);
             let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
             let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds)));
-            eprintln!("time: about {} ({})", duration(whole), named.collect::<Vec<_>>().join(" + "));
+            crate::stream::tell(&format!(
+                "time: about {} ({})",
+                duration(whole),
+                named.collect::<Vec<_>>().join(" + ")
+            ));
         }
     }
 }

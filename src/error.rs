@@ -4,7 +4,7 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
-pub use gseq::quoted;
+pub use gseq::{ShowPath, printable, quoted};
 
 /// Result of anything that can fail here.
 pub type Result<T> = std::result::Result<T, Error>;
@@ -16,7 +16,7 @@ pub enum Error {
     #[error("{0}")]
     Input(Box<InputError>),
     /// The operating system refused: check the path, the permissions, the space left.
-    #[error("cannot {action} {path}: {source}{advice}", path = path.display(), advice = advice(source))]
+    #[error("cannot {action} {path}: {source}{advice}", path = path.shown(), advice = advice(source))]
     Io {
         /// What was being done, as a verb: "open", "create", "rename".
         action: &'static str,
@@ -56,7 +56,7 @@ pub struct InputError {
 
 impl fmt::Display for InputError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.path.display())?;
+        write!(f, "{}", self.path.shown())?;
         if !self.place.is_empty() {
             write!(f, ", {}", self.place)?;
         }

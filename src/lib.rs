@@ -13,6 +13,8 @@
 //!
 //! [`method`] derives what is computed.
 
+#![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
+
 /// Program and version, by which results name what made them.
 pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
 

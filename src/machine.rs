@@ -6,6 +6,8 @@
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
+use crate::error::ShowPath;
+
 /// No memory is as large; version 1 groups without a limit name some such number.
 const UNLIMITED: u64 = 1 << 62;
 
@@ -55,7 +57,7 @@ fn of_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<(u64, Str
             for folder in mount.folder_of(path).ancestors().take_while(|folder| folder.starts_with(&mount.point)) {
                 for file in files.iter().map(|file| folder.join(file)) {
                     let bytes = read(&file).and_then(|text| text.trim().parse().ok());
-                    limits.extend(bytes.map(|bytes| (bytes, format!("the control group's {}", file.display()))));
+                    limits.extend(bytes.map(|bytes| (bytes, format!("the control group's {}", file.shown()))));
                 }
             }
         }

@@ -326,3 +326,38 @@ fn every_family_can_be_viewed_and_compress_writes_the_page_beside_its_result() {
     let stream = at.run("compress - -o other.gseq --view");
     assert!(stream.code == 2 && stream.stderr.contains("--view"), "{}", stream.stderr);
 }
+
+#[test]
+#[ignore = "needs a browser"]
+fn pages_of_hostile_names_break_no_policy_in_a_browser() {
+    let program = browser::installed();
+    let at = Workplace::new();
+    at.done("unpack {tiny} --cameras {tiny} -o frames --frames 2");
+    let name = "<script>window.ran=1<img src=x onerror=window.ran=2>'\"&";
+    fs::rename(at.path("frames"), at.path(name)).unwrap();
+    for output in ["page.html", "pages"] {
+        let run = at.run_words(["view", name, "-o", output]);
+        assert_eq!(run.code, 0, "{}", run.stderr);
+    }
+    let run = at.run_words(["report", name, name, "--max-frames", "1", "-o", "report"]);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    for file in ["page.html", "pages/index.html", "report/report.html"] {
+        let mut page = Browser::start_drawing(&program);
+        page.open(&at.path(file));
+        if !file.starts_with("report") {
+            go(&mut page, "frame=1&paused");
+        }
+        assert_eq!(page.value("typeof window.ran"), json!("undefined"), "{file}: a name ran");
+        assert_eq!(complaints(&page, Some(&at.path("pages"))), Vec::<String>::new(), "{file}");
+        // Were a text not escaped, the policy would still keep it from running.
+        let text = fs::read_to_string(at.path(file)).unwrap();
+        let broken = text.replace("</main>", "<script>window.ran=1</script><img src=x onerror=window.ran=2></main>");
+        let beside = at.path(file).with_file_name("broken.html");
+        fs::write(&beside, broken).unwrap();
+        let mut page = Browser::start_drawing(&program);
+        page.open(&beside);
+        assert_eq!(page.value("typeof window.ran"), json!("undefined"), "{file}: the policy lets scripts run");
+        let refused = complaints(&page, None).iter().any(|text| text.contains("Content Security Policy"));
+        assert!(refused, "{file}: nothing was refused");
+    }
+}

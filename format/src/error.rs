@@ -4,6 +4,9 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::text::ShowPath;
+pub(crate) use crate::text::quoted;
+
 /// Result of anything that can fail here.
 pub type Result<T> = std::result::Result<T, Error>;
 
@@ -11,7 +14,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file is not what SPEC.md describes: fetch it again, or save what is left with [`crate::recover`].
-    #[error("{path}, byte {offset}: expected {expected}, found {found}{advice}", path = path.display(), advice = Advice(hint))]
+    #[error("{path}, byte {offset}: expected {expected}, found {found}{advice}", path = path.shown(), advice = Advice(hint))]
     Malformed {
         /// The file that was read.
         path: PathBuf,
@@ -25,7 +28,7 @@ pub enum Error {
         hint: &'static str,
     },
     /// The operating system refused: check the path, the permissions, the space left.
-    #[error("cannot {action} {path}: {source}", path = path.display())]
+    #[error("cannot {action} {path}: {source}", path = path.shown())]
     Io {
         /// What was being done, as a verb: "open", "create", "rename".
         action: &'static str,
@@ -45,29 +48,6 @@ impl fmt::Display for Advice<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.0.is_empty() { Ok(()) } else { write!(f, "\n  {}", self.0) }
     }
-}
-
-/// `text` in quotation marks as a message shows it: what cannot be printed by its code, as in `<U+FEFF>`; at most 120
-/// characters.
-pub fn quoted(text: &str) -> String {
-    const LONGEST: usize = 120;
-    let unprinted = |c: char| {
-        c.is_control()
-            || matches!(c, '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}' | '\u{feff}')
-    };
-    let mut out = String::from("\"");
-    for (place, c) in text.chars().enumerate() {
-        match c {
-            _ if place == LONGEST => {
-                out.push('…');
-                break;
-            }
-            c if unprinted(c) => out += &format!("<U+{:04X}>", c as u32),
-            c => out.push(c),
-        }
-    }
-    out.push('"');
-    out
 }
 
 impl Error {

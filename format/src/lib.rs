@@ -36,6 +36,8 @@
 //!
 //! The bytes are specified in `SPEC.md`; [`recover`] saves what a killed writer left behind.
 
+#![cfg_attr(not(test), deny(clippy::print_stderr, clippy::print_stdout, clippy::disallowed_methods))]
+
 mod bounded;
 mod codec;
 mod error;
@@ -45,14 +47,16 @@ mod layout;
 mod reader;
 mod record;
 mod recover;
+mod text;
 mod verify;
 mod waiting;
 mod writer;
 
 pub use codec::{Compression, EncodedTile, Encoding, Stats, encode_tile};
-pub use error::{Error, Result, quoted};
+pub use error::{Error, Result};
 pub use layout::{ColumnSpec, Layout, MAGIC, MAX_TILE_BYTES, TileId};
 pub use reader::{Reader, Tile, TileBuffer, TileFrames, TileInfo, TilesRead, Touched};
 pub use recover::{RecoverReport, recover, recover_within};
+pub use text::{ShowPath, ShownPath, printable, quoted};
 pub use verify::VerifyReport;
 pub use writer::Writer;

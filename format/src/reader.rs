@@ -13,6 +13,7 @@ use crate::file::MappedFile;
 use crate::index::{Index, check_memory};
 use crate::layout::{FIXED_HEADER, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD, Record, TRAILER, TileRecord, align, trailer_from_bytes};
+use crate::text::ShowPath;
 use crate::writer::check_times;
 
 /// Tiles closer than this are expected and released together.
@@ -551,7 +552,7 @@ impl Reader {
     fn record(&self, at: TileId) -> Result<(usize, TileRecord)> {
         let index = self.layout.index_of(at).filter(|&index| index < self.index.tiles).ok_or_else(|| {
             let frames = self.frames();
-            Error::usage(format!("{}: there is nothing such as {at} in {frames} frames", self.file.path().display()))
+            Error::usage(format!("{}: there is nothing such as {at} in {frames} frames", self.file.path().shown()))
         })?;
         Ok((index as usize, self.index.record(&self.file, &self.layout, index)?))
     }

@@ -12,6 +12,7 @@ use crate::error::{Error, Result};
 use crate::file::PIECE;
 use crate::layout::{ColumnSpec, Layout, TileId};
 use crate::record::{Digest, FooterRecord, RECORD, Record, TileRecord, TimesRecord, align, trailer_to_bytes};
+use crate::text::ShowPath;
 
 /// Writes a container: time stamps of a frame block, then its tiles, and so on, then [`Writer::finish`].
 ///
@@ -342,7 +343,7 @@ pub(crate) fn check_times(before: Option<f64>, times: &[f64]) -> std::result::Re
 fn create_beside(path: &Path) -> Result<(PathBuf, File)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
-        return Err(Error::usage(format!("{} names no file", path.display())));
+        return Err(Error::usage(format!("{} names no file", path.shown())));
     };
     loop {
         let number = COUNTER.fetch_add(1, Ordering::Relaxed);

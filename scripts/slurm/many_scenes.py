@@ -37,7 +37,9 @@ COLUMNS = ["scene", "state", "input", "output", "gaussians_in", "gaussians_out",
 COLUMNS += ["seconds", "peak_mib", "starts", "quality", "message", "command"]
 
 PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{title}</title>
+<html lang="en"><meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'">
+<title>{title}</title>
 <style>
 :root {{ color-scheme: light dark }}
 body {{ font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 80em; padding: 0 1em }}
@@ -212,7 +214,7 @@ def summarise(folder):
     with open(folder / "summary.csv", "w", newline="") as file:
         table = csv.DictWriter(file, COLUMNS)
         table.writeheader()
-        table.writerows(rows)
+        table.writerows({key: without_formula(value) for key, value in row.items()} for row in rows)
     failed = [row for row in rows if row["state"] == "failed"]
     title = f"{len(rows) - len(failed)} of {len(rows)} scenes done"
     (folder / "summary.html").write_text(page(title, rows, failed))
@@ -220,6 +222,12 @@ def summarise(folder):
     for row in failed:
         print(f"\n{row['scene']} failed: {row['message']}\n  {row['command']}")
     return not failed
+
+
+def without_formula(value):
+    """`value` so that no spreadsheet runs it: texts that begin as formulas do get an apostrophe in front."""
+    is_formula = isinstance(value, str) and value.lstrip(" ").startswith(tuple("=+-@\t\r\n＝＋－＠"))
+    return f"'{value}" if is_formula else value
 
 
 def page(title, rows, failed):

@@ -1,11 +1,16 @@
 //! Help: what the tool and each verb is, examples, then options in groups; and the same as manual pages.
 
+use std::fs;
 use std::path::Path;
 
 use clap::{Command, CommandFactory};
 
 use super::args::Cli;
-use crate::error::{Error, Result};
+use crate::emit::atomic::{Kind, Replace, StagedFile, StagedFolder, check_target};
+use crate::error::{Error, Result, ShowPath};
+
+/// Text that every manual page of this program holds: its title.
+const PAGE: &str = ".TH splatsieve";
 
 /// What it is comes first, then how it is used.
 const TEMPLATE: &str = "{about-section}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
@@ -126,31 +131,73 @@ pub(super) fn command() -> Command {
     })
 }
 
-/// Writes a manual page of the program and one of each verb into `folder`; gives their number.
+/// Writes a manual page of the program and one of each command into `folder`, all or none; returns their number. Other files
+/// in the folder stay, and earlier pages are replaced.
 ///
 /// # Errors
-/// A folder that cannot be made or written to.
+/// A folder that cannot be made or written to; a file with the name of a page that is no page of this program.
 pub(super) fn write_pages(folder: &Path) -> Result<usize> {
-    std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    let pages = pages()?;
+    let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+    let made: Vec<&Path> = folder.ancestors().skip(1).take_while(is_missing).collect();
+    let parent = made.first().copied().unwrap_or(Path::new("."));
+    fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
+    let written = if folder.exists() { write_beside(&pages, folder) } else { write_folder(&pages, folder) };
+    if written.is_err() {
+        // Whatever else is in them meanwhile keeps them.
+        made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
+    }
+    written.map(|()| pages.len())
+}
+
+/// File name and text of every page.
+fn pages() -> Result<Vec<(String, Vec<u8>)>> {
     let mut command = command().disable_help_subcommand(true);
     command.build();
     let of_verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
-    let pages = std::iter::once(&command).chain(of_verbs);
-    let mut count = 0;
-    for page in pages {
+    let page = |page: &Command| {
         let name = page.get_display_name().unwrap_or(page.get_name()).to_owned();
-        let path = folder.join(format!("{name}.1"));
+        let file = format!("{name}.1");
         let mut text = Vec::new();
         // Manual pages have examples at their end, and one line each.
         let examples = page.get_before_help().map(ToString::to_string).unwrap_or_default();
         let page = page.clone().name(name).before_help("");
-        clap_mangen::Man::new(page).render(&mut text).map_err(Error::io("write", &path))?;
+        clap_mangen::Man::new(page).render(&mut text).map_err(Error::io("make", Path::new(&file)))?;
         let lines = examples.lines().skip(1).map(|line| format!("{}\n", line.trim().replace('-', "\\-")));
         text.extend(format!(".SH EXAMPLES\n.nf\n{}.fi\n", lines.collect::<String>()).bytes());
-        std::fs::write(&path, text).map_err(Error::io("write", &path))?;
-        count += 1;
+        Ok((file, text))
+    };
+    std::iter::once(&command).chain(of_verbs).map(page).collect()
+}
+
+/// Writes pages into a folder that is not there yet.
+fn write_folder(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
+    check_target(folder, Kind::Folder, &[], Replace::Never)?;
+    let staged = StagedFolder::new(folder, Replace::Never)?;
+    for (name, text) in pages {
+        let path = staged.path().join(name);
+        fs::write(&path, text).map_err(Error::io("write", &path))?;
     }
-    Ok(count)
+    staged.commit()
+}
+
+/// Writes pages into a folder with whatever else is in it.
+fn write_beside(pages: &[(String, Vec<u8>)], folder: &Path) -> Result<()> {
+    let mut staged = Vec::new();
+    for (name, text) in pages {
+        let path = folder.join(name);
+        let is_page = |text: Vec<u8>| text.windows(PAGE.len()).any(|part| part == PAGE.as_bytes());
+        if path.exists() && !fs::read(&path).is_ok_and(is_page) {
+            return Err(Error::usage(format!(
+                "{}: expected a manual page of splatsieve, found something else\n  move it away or name another folder",
+                path.shown()
+            )));
+        }
+        let file = StagedFile::new(&path, Replace::Any)?;
+        fs::write(file.path(), text).map_err(Error::io("write", file.path()))?;
+        staged.push(file);
+    }
+    staged.into_iter().try_for_each(StagedFile::commit)
 }
 
 #[cfg(test)]

@@ -4,11 +4,12 @@
 mod args;
 mod cut_short;
 mod help;
+mod output;
 mod recipe_flags;
 mod signals;
 mod words;
 
-use std::io::{self, IsTerminal, Write};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -18,10 +19,10 @@ use gseq::Compression;
 use crate::budget::{self, Budget, Tell};
 use crate::compress::summary::Detail;
 use crate::compress::{Only, Request, Run, Target, compress, divided_stages, foresee};
-use crate::emit::atomic::{Replace, as_named, is_standard_output_used, take_warnings};
+use crate::emit::atomic::{Replace, as_named, take_warnings};
 use crate::emit::image::ImageFormat;
 use crate::emit::kind::OutputKind;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::{Conventions, Link};
 use crate::ingest::cameras::Times;
 use crate::model::Split;
@@ -30,7 +31,7 @@ use crate::report::{self, ReportOptions, trade_off};
 use crate::scene::pictures::PictureSet;
 use crate::scene::{InputOptions, scratch_beside};
 use crate::selfcheck;
-use crate::stream::{Mode, Progress};
+use crate::stream::{Mode, Progress, tell};
 use crate::verbs::container::Storing;
 use crate::verbs::demo::DemoOptions;
 use crate::verbs::evaluate::EvaluateOptions;
@@ -46,17 +47,19 @@ use args::{
     CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, Rot4d, SideBySide,
     SplitArg, Sweep, Trained, Verb, View,
 };
+use output::{print, print_as};
 
 /// Runs the program on the arguments of this process.
 pub fn main() -> ExitCode {
-    let command = help::command();
-    let words = words::regular(std::env::args_os(), &command);
-    let cli = match command.try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found)) {
+    let cli = match parse(std::env::args_os()) {
         Ok(cli) => cli,
         Err(error) => {
+            // Messages quote arguments, which may be names of files: as they are shown.
+            let shown = std::env::args_os().map(|word| word.shown().to_string().into());
+            let error = parse(shown).err().unwrap_or(error);
             // `--help` and `--version` arrive here too, with exit code 0.
-            let _ = error.print();
-            return ExitCode::from(error.exit_code() as u8);
+            let code = error.exit_code() as u8;
+            return output::print_clap(&error).map_or_else(ended_by, |()| ExitCode::from(code));
         }
     };
     // Before anything is begun.
@@ -76,19 +79,26 @@ pub fn main() -> ExitCode {
             }
             ExitCode::SUCCESS
         }
-        // Whoever read our output has seen enough.
-        Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
-        // What it was asked for is done.
-        Err(Error::Stopped(what)) => {
-            let _ = print(&format!("{what}\n"));
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            let error = as_named(error);
-            tell(&format!("splatsieve: {error}"));
-            ExitCode::from(code_of(&error))
-        }
+        // The part of the work that was asked for is done.
+        Err(Error::Stopped(what)) => print(&format!("{what}\n")).map_or_else(ended_by, |()| ExitCode::SUCCESS),
+        Err(error) => ended_by(error),
     }
+}
+
+fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap::Error> {
+    let command = help::command();
+    let words = words::regular(words, &command);
+    command.try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found))
+}
+
+/// Tells why a run failed and returns its exit code. A reader of standard output that has seen enough is no failure.
+fn ended_by(error: Error) -> ExitCode {
+    if output::has_no_reader(&error) {
+        return ExitCode::SUCCESS;
+    }
+    let error = as_named(error);
+    tell(&format!("splatsieve: {error}"));
+    ExitCode::from(code_of(&error))
 }
 
 fn code_of(error: &Error) -> u8 {
@@ -113,20 +123,20 @@ fn run(cli: Cli) -> Result<()> {
             }
             if dry_run {
                 let foreseen = foresee(&request)?;
-                return print(&if json { foreseen.json() } else { foreseen.text() });
+                return print_as(json, &if json { foreseen.json() } else { foreseen.text() });
             }
             let page = view_output.map(|output| view_of_result(&request, output)).transpose()?;
             let summary = compress(&request)?;
-            print(&if json { summary.json() } else { summary.text(detail) })?;
-            // The summary is what stdout is for.
+            let printed = print_as(json, &if json { summary.json() } else { summary.text(detail) });
+            // The page was asked for, whether or not somebody reads the summary. That is what stdout is for.
             if let Some(page) = page {
                 let shown = viewed(&page);
                 if shown.is_err() {
-                    tell(&format!("{} is complete and in place; its page is not:", request.output.display()));
+                    tell(&format!("{} is complete and in place; its page is not:", request.output.shown()));
                 }
                 tell(&shown?);
             }
-            Ok(())
+            printed
         }
         Verb::Score(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
@@ -134,7 +144,7 @@ fn run(cli: Cli) -> Result<()> {
             notes(&report.notes);
             print(&format!(
                 "{}: {} Gaussians, of which the recipe keeps {} before merging\n",
-                report.output.display(),
+                report.output.shown(),
                 report.gaussians,
                 report.kept
             ))
@@ -147,7 +157,7 @@ fn run(cli: Cli) -> Result<()> {
             let rendered = render::render(&options)?;
             notes(&rendered.notes);
             let plural = if rendered.pictures == 1 { "" } else { "s" };
-            print(&format!("{}: {} picture{plural}\n", options.output.display(), rendered.pictures))
+            print(&format!("{}: {} picture{plural}\n", options.output.shown(), rendered.pictures))
         }
         Verb::Evaluate(args) => {
             let as_json = args.json;
@@ -156,17 +166,17 @@ fn run(cli: Cli) -> Result<()> {
             options.original.work = work_of(args.kept);
             let found = evaluate::evaluate(&options)?;
             notes(&found.work_notes);
-            print(&if as_json { json(&found) } else { found.text() })
+            print_as(as_json, &if as_json { json(&found) } else { found.text() })
         }
         Verb::Sweep(args) => {
             let (as_json, page) = (args.json, args.output.join(trade_off::PAGE));
             let found = sweep::sweep(&sweep_options(args))?;
-            print(&if as_json { found.json() } else { format!("{}{}\n", found.text(), page.display()) })
+            print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
         }
         Verb::Precision(args) => {
             let (as_json, page) = (args.json, args.output.join(report::precision::PAGE));
             let found = precision::precision(&precision_options(args)?)?;
-            print(&if as_json { found.json() } else { format!("{}{}\n", found.text(), page.display()) })
+            print_as(as_json, &if as_json { found.json() } else { format!("{}{}\n", found.text(), page.shown()) })
         }
         Verb::Report(args) => {
             let page = args.output.join(report::PAGE);
@@ -181,19 +191,19 @@ fn run(cli: Cli) -> Result<()> {
             })?;
             notes(&found.work_notes);
             notes(&found.notes);
-            print(&format!("{}\n{}\n", found.verdict, page.display()))
+            print(&format!("{}\n{}\n", found.verdict, page.shown()))
         }
         Verb::View(args) => print(&(viewed(&view_options(args))? + "\n")),
         Verb::Convert(args) => {
             let input = input_options(args.input, Some(args.cameras), Some(&args.output));
             let done = convert::convert(&input, &args.output, args.kind.map(kind_of), args.earlier.replace())?;
             if args.json {
-                return print(&json(&done));
+                return print_as(true, &json(&done));
             }
             notes(&done.notes);
             print(&format!(
                 "{}: {} Gaussians x {} frames in {} bytes\n",
-                done.path.display(),
+                done.path.shown(),
                 done.gaussians,
                 done.frames,
                 done.bytes
@@ -211,7 +221,7 @@ fn run(cli: Cli) -> Result<()> {
             notes(&packed.notes);
             print(&format!(
                 "{}: {} Gaussians x {} frames in {} bytes\n{}",
-                args.output.display(),
+                args.output.shown(),
                 packed.gaussians,
                 packed.frames,
                 packed.bytes,
@@ -220,29 +230,30 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Info(args) => {
             let info = container::info(&input_options(args.input, None, None))?;
-            print(&if args.json { json(&info) } else { info.text() })
+            print_as(args.json, &if args.json { json(&info) } else { info.text() })
         }
         Verb::Verify(args) => {
             let report = container::verify(&args.input)?;
-            let (path, frames, tiles) = (args.input.display(), report.frames, report.tiles);
+            let (frames, tiles) = (report.frames, report.tiles);
             let (stored, decoded) = (report.stored_bytes, report.decoded_bytes);
-            print(&if args.json {
+            let text = if args.json {
                 json(&serde_json::json!({
-                    "path": path.to_string(), "frames": frames, "tiles": tiles,
+                    "path": args.input.to_string_lossy(), "frames": frames, "tiles": tiles,
                     "stored_bytes": stored, "decoded_bytes": decoded,
                 }))
             } else {
+                let path = args.input.shown();
                 format!("{path}: sound; {frames} frames, {tiles} tiles, {stored} bytes that decode to {decoded}\n")
-            })
+            };
+            print_as(args.json, &text)
         }
         Verb::Unpack(args) => {
             let input = input_options(args.input, Some(args.cameras), args.output.as_deref());
             let Some(output) = args.output else {
-                let stdout = io::stdout().lock();
-                if stdout.is_terminal() {
+                if output::is_terminal() {
                     return Err(Error::usage("a frame stream is not for a terminal; pipe it into a program or a file"));
                 }
-                notes(&container::unpack_stream(&input, stdout)?.notes);
+                notes(&container::unpack_stream(&input, output::stdout().lock())?.notes);
                 return Ok(());
             };
             if !input.is_stream() && archive::is_archive(&input.path)? {
@@ -250,7 +261,7 @@ fn run(cli: Cli) -> Result<()> {
                     archive::unpack_archive(&input.path, &output, args.earlier.replace(), input.memory.read_limit())?;
                 return print(&format!(
                     "{}: {} Gaussians, {} bytes of values from {}\n",
-                    output.display(),
+                    output.shown(),
                     unpacked.gaussians,
                     unpacked.bytes,
                     unpacked.parts.total()
@@ -259,13 +270,13 @@ fn run(cli: Cli) -> Result<()> {
             let opened = container::unpack(&input, &output, args.earlier.replace())?;
             notes(&opened.notes);
             let frames = opened.input.source().info().times.len();
-            print(&format!("{}: {frames} PLY files\n", output.display()))
+            print(&format!("{}: {frames} PLY files\n", output.shown()))
         }
         Verb::Recover(args) => {
             let report = container::recover(&args.input, &args.output, args.earlier.replace())?;
             print(&format!(
                 "{}: {} complete frames of {} seen, {} tiles\n",
-                args.output.display(),
+                args.output.shown(),
                 report.frames,
                 report.frames_seen,
                 report.tiles_saved
@@ -274,10 +285,10 @@ fn run(cli: Cli) -> Result<()> {
         Verb::Work(args) => {
             if args.clean {
                 let (files, bytes) = work::clean(&args.folder)?;
-                return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.display()));
+                return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
             }
             let listed = work::list(&args.folder)?;
-            print(&if args.json { json(&listed) } else { work::text(&listed) })
+            print_as(args.json, &if args.json { json(&listed) } else { work::text(&listed) })
         }
         Verb::Demo(args) => {
             let options = DemoOptions {
@@ -291,7 +302,7 @@ fn run(cli: Cli) -> Result<()> {
             };
             print(&demo::run(&options)?.text())?;
             if let Some(folder) = options.output {
-                tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.display()));
+                tell(&format!("kept in {}: scene.gseq, cameras.json, compressed.gseq", folder.shown()));
             }
             Ok(())
         }
@@ -299,18 +310,19 @@ fn run(cli: Cli) -> Result<()> {
             // What it makes up is nobody's progress.
             Progress::set_mode(Mode::Quiet);
             let found = selfcheck::run();
-            print(&if args.json { json(&found) } else { found.text() })?;
-            found.verdict()
+            let printed = print_as(args.json, &if args.json { json(&found) } else { found.text() });
+            found.verdict()?;
+            printed
         }
         Verb::Recipe(args) => print(preset_text(&args.preset)?),
         Verb::Completions(args) => {
             let mut script = Vec::new();
             clap_complete::generate(args.shell, &mut help::command(), "splatsieve", &mut script);
-            write_stdout(&script)
+            output::write(&script)
         }
         Verb::Man(args) => {
             let pages = help::write_pages(&args.folder)?;
-            print(&format!("{}: {pages} pages\n", args.folder.display()))
+            print(&format!("{}: {pages} pages\n", args.folder.shown()))
         }
     }
 }
@@ -349,10 +361,16 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
             if !has_cameras {
                 input.frames = input.frames.or(run.frames);
             }
-            input.cameras = input.cameras.or_else(|| run.cameras.clone());
+            if let (None, Some(cameras)) = (&input.cameras, &run.cameras) {
+                args.recipe.check_named("cameras", cameras)?;
+                input.cameras = Some(cameras.clone());
+            }
             input.size = input.size.or(run.size);
             if let (Times::Own, Some(times)) = (&input.times, &run.times) {
                 input.times = Times::named(times);
+                if let Times::Table(table) = &input.times {
+                    args.recipe.check_named("times", table)?;
+                }
             }
             input.iteration = input.iteration.or(run.iteration);
             let said = &mut input.conventions;
@@ -369,6 +387,9 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     let asked = Run { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth, ..Run::default() };
     // One of them, of the command line if it names one.
     let of = if asked == Run::default() { &run } else { &asked };
+    if let (true, Some(photographs)) = (asked == Run::default(), &run.ground_truth) {
+        args.recipe.check_named("ground-truth", photographs)?;
+    }
     let (target, goal) = (of.target(), of.goal().map_err(Error::usage)?);
     Ok(Request {
         input,
@@ -441,7 +462,7 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
     };
     let filmed = video(&options)?;
     notes(&filmed.notes);
-    let (path, (width, height), fps) = (options.output.display(), filmed.size, options.fps);
+    let (path, (width, height), fps) = (options.output.shown(), filmed.size, options.fps);
     let places = options.beside.as_deref().map(|right| format!("  {}\n", places(&options.input.path, right)));
     let places = places.unwrap_or_default();
     print(&format!("{path}: {} frames of {width}x{height}, {fps} a second\n{places}", filmed.frames))
@@ -517,7 +538,7 @@ fn viewed(options: &ViewOptions) -> Result<String> {
     let found = view::view(options)?;
     notes(&found.notes);
     let files = if found.files == 1 { String::new() } else { format!(" in {} files", found.files) };
-    Ok(format!("{}: {} frames, {} bytes{files}", found.page.display(), found.frames, found.bytes))
+    Ok(format!("{}: {} frames, {} bytes{files}", found.page.shown(), found.frames, found.bytes))
 }
 
 fn sweep_options(args: Sweep) -> SweepOptions {
@@ -610,29 +631,10 @@ fn notes(notes: &[String]) {
     }
 }
 
-/// Says something on stderr; nobody listening is no failure.
-fn tell(message: &str) {
-    let _ = writeln!(io::stderr(), "{message}");
-}
-
 fn json(value: &impl serde::Serialize) -> String {
     let mut text = serde_json::to_string_pretty(value).expect("plain data");
     text.push('\n');
     text
-}
-
-fn print(text: &str) -> Result<()> {
-    write_stdout(text.as_bytes())
-}
-
-fn write_stdout(bytes: &[u8]) -> Result<()> {
-    // The result itself went there: a report behind it would corrupt it.
-    if is_standard_output_used() {
-        let _ = io::stderr().write_all(bytes);
-        return Ok(());
-    }
-    let mut out = io::stdout().lock();
-    out.write_all(bytes).and_then(|()| out.flush()).map_err(Error::io("write", "standard output".as_ref()))
 }
 
 #[cfg(test)]

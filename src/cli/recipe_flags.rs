@@ -1,11 +1,11 @@
 //! One flag per hyper-parameter, made from the list in `recipe`, so that none can be forgotten.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use crate::compress::Record;
-use crate::error::{Error, Result, quoted};
+use crate::error::{Error, Result, ShowPath, quoted};
 use crate::ingest::text::read_text;
 use crate::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
@@ -31,7 +31,25 @@ impl RecipeFlags {
     pub(super) fn record(&self) -> Result<Record> {
         let Some(path) = &self.file else { return Ok(Record::default()) };
         let text = read_text(path, MAX_RECIPE)?;
-        Record::read(&text).map_err(|message| Error::usage(format!("{}: {message}", path.display())))
+        let folder = path.parent().unwrap_or(Path::new(""));
+        Record::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
+    }
+
+    /// Confirms that what the recipe file names for `option` is there.
+    ///
+    /// # Errors
+    /// A path where nothing is.
+    pub(super) fn check_named(&self, option: &str, path: &Path) -> Result<()> {
+        if path.exists() {
+            return Ok(());
+        }
+        let recipe = self.file.as_deref().unwrap_or(Path::new("")).shown();
+        Err(Error::usage(format!(
+            "{recipe}: [run] {}: expected a file or folder, found nothing at {}\n  \
+             paths in a recipe are seen from its own folder; name another with --{option}",
+            option.replace('-', "_"),
+            path.shown()
+        )))
     }
 
     /// The effective recipe.
@@ -42,7 +60,7 @@ impl RecipeFlags {
             Some(path) => {
                 let text = read_text(path, MAX_RECIPE)?;
                 Recipe::from_toml(&text, fallback)
-                    .map_err(|message| Error::usage(format!("{}: {message}", path.display())))?
+                    .map_err(|message| Error::usage(format!("{}: {message}", path.shown())))?
             }
         };
         if let Some(effort) = Effort::ALL.into_iter().find(|effort| self.effort.as_deref() == Some(effort.name())) {

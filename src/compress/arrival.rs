@@ -84,7 +84,7 @@ fn foretell(
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
     if tell != Tell::Nothing && !is_part {
         let forecast = measured(scene, plan, stages, done)?;
-        eprint!("{}", forecast.text(tell));
+        crate::stream::tell(forecast.text(tell).trim_end());
         journal.forecast = Some(forecast);
     }
     Ok(())
@@ -120,7 +120,10 @@ fn receive_measured<S: Stages>(
     let measures = fit(Tell::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
     if options.memory.tell == Tell::Time {
-        eprintln!("memory: at most {}; nobody knows how many frames will arrive", size(memory.peak()));
+        crate::stream::tell(&format!(
+            "memory: at most {}; nobody knows how many frames will arrive",
+            size(memory.peak())
+        ));
     }
     let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
         let limits = memory.limits;
@@ -132,7 +135,10 @@ fn receive_measured<S: Stages>(
     });
     let to_measure = Room::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
     if options.memory.tell == Tell::Plan {
-        eprintln!("frames: there is memory for {}, for {to_measure} to be measured as they arrive", room.most);
+        crate::stream::tell(&format!(
+            "frames: there is memory for {}, for {to_measure} to be measured as they arrive",
+            room.most
+        ));
     }
     // Without cameras the rig stands around the first frame, and everything else around the rig.
     let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());

@@ -59,7 +59,7 @@ pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
 pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
     [RECIPE, INDEX_MAP, MARKER]
         .into_iter()
-        .map(move |name| beside(output, kind.is_folder(), name).display().to_string())
+        .map(move |name| beside(output, kind.is_folder(), name).to_string_lossy().into_owned())
 }
 
 /// The writing of a run.
@@ -94,6 +94,14 @@ impl Emit {
     /// Paths of the files beside a result that is a file.
     fn companions(&self) -> [PathBuf; 3] {
         [MARKER, RECIPE, INDEX_MAP].map(|name| beside(&self.output, false, name))
+    }
+
+    /// Folder in which the recipe of the result will lie.
+    pub fn recipe_folder(&self) -> PathBuf {
+        if self.kind.is_folder() {
+            return self.output.clone();
+        }
+        self.output.parent().map(Path::to_owned).unwrap_or_default()
     }
 
     /// What is left, a part `left` of the Gaussians, and buffers of what is written.

@@ -1,6 +1,7 @@
 //! A dry run: what a run would do, take and write, found by opening the input and by a calibration alone.
 
 use std::fmt::Write as _;
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +16,7 @@ use super::summary::{CameraSummary, LeftOut};
 use crate::TOOL;
 use crate::budget::{Budget, Plan, Tell, Workload};
 use crate::emit::kind::OutputKind;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::scene::{InputOptions, open_scene};
 
 /// What a run would do.
@@ -83,11 +84,11 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     job.write_down(request, &scene.workload(), &scene.limits, &mut journal);
     let info = scene.source().info();
     let gaussians = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
-    let output = request.output.display().to_string();
+    let output = request.output.to_string_lossy().into_owned();
     Ok(Foreseen {
         tool: TOOL.to_owned(),
         dry_run: true,
-        path: scene.path.display().to_string(),
+        path: scene.path.to_string_lossy().into_owned(),
         kind: scene.input.kind().to_owned(),
         gaussians_in: info.count,
         frames: info.times.len(),
@@ -131,7 +132,11 @@ impl Foreseen {
         let _ = writeln!(
             out,
             "{}: {}, {} Gaussians x {} frames, SH degree {}",
-            self.path, self.kind, self.gaussians_in, self.frames, self.sh_degree
+            Path::new(&self.path).shown(),
+            self.kind,
+            self.gaussians_in,
+            self.frames,
+            self.sh_degree
         );
         let CameraSummary { origin, cameras, pairs } = &self.cameras;
         let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} pictures)");
@@ -154,7 +159,9 @@ impl Foreseen {
             let _ = writeln!(out, "  note: {note}");
         }
         out += &self.forecast.text(Tell::Time);
-        let _ = writeln!(out, "would write {}", self.would_write.join(", "));
+        let would_write: Vec<String> =
+            self.would_write.iter().map(|path| Path::new(path).shown().to_string()).collect();
+        let _ = writeln!(out, "would write {}", would_write.join(", "));
         out.push_str("nothing was written (--dry-run)\n");
         out
     }

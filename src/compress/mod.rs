@@ -42,6 +42,7 @@ use crate::TOOL;
 use crate::budget::{Budget, Tell, Workload, seconds};
 use crate::error::{Error, Result};
 use crate::families::Size;
+use crate::ingest::names::name_of;
 use crate::model::ALL_HARMONICS;
 use crate::recipe::{Precision, Recipe, WhichBands};
 use crate::reduction::Reduction;
@@ -128,12 +129,13 @@ fn reduce(
     let stages = seconds(&work, &job.needs(&work, &scene.limits));
     // What was measured on arrival is not done again.
     let _numbered = begin_run(stages[measured_already(&arrived)..].to_vec());
-    let input = InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?;
+    let input = InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?.without_folders();
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
     }
-    let recipe = Record::of(request, &job.measure.score.user, input.digest.clone()).text(request);
+    let recipe = Record::of(request, &job.measure.score.user, input.digest.clone());
+    let recipe = recipe.text(request, &job.emit.recipe_folder());
 
     let sh_degree = match request.recipe.bands.bands {
         WhichBands::UpTo(degree) => bands::highest(scene, degree, &mut journal),
@@ -227,7 +229,7 @@ fn reduce(
         files: Vec::new(),
         tool: TOOL.to_owned(),
         cameras: CameraSummary::of(scene),
-        output: request.output.display().to_string(),
+        output: name_of(&request.output),
         gaussians: reduction.len(),
         output_bytes: Some(output.whole()),
         output_size: Some(output),
@@ -248,7 +250,11 @@ fn reduce(
         input,
     };
     scene.work.not_divided("writing")?;
-    Ok((job.emit.run(scene, &reduction, (&map, archived.as_ref()), &recipe, journal, summarise)?, map))
+    let mut summary = job.emit.run(scene, &reduction, (&map, archived.as_ref()), &recipe, journal, summarise)?;
+    // The file has names alone, for it is published; whoever asked for the run sees the paths as they were given.
+    summary.input.path = scene.path.to_string_lossy().into_owned();
+    summary.output = request.output.to_string_lossy().into_owned();
+    Ok((summary, map))
 }
 
 /// That no Gaussian is left: nothing renders such a result.

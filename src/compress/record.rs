@@ -3,7 +3,7 @@
 //! The file: `[provenance]`, the tool and the digest of the input; `[run]`, everything beside the hyper-parameters that
 //! decides a byte of the result; then every hyper-parameter.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -12,6 +12,8 @@ use super::score::UserOverrides;
 use crate::TOOL;
 use crate::emit::kind::OutputKind;
 use crate::families::Link;
+use crate::ingest::cameras::Times;
+use crate::ingest::names::from_folder;
 use crate::model::{Split, ranges};
 
 /// Where a recipe comes from.
@@ -37,7 +39,7 @@ pub struct Run {
     pub min_psnr: Option<f64>,
     /// Most loss of PSNR against photographs, dB.
     pub max_loss: Option<f64>,
-    /// Folder of these photographs.
+    /// Folder of these photographs; in a file, seen from the folder of the recipe.
     pub ground_truth: Option<PathBuf>,
     /// Most bytes of everything that is written.
     pub target_size: Option<u64>,
@@ -59,7 +61,7 @@ pub struct Run {
     /// Whether `--rot4d unflipped` was said of it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub rot4d_unflipped: bool,
-    /// File or folder of the cameras.
+    /// File or folder of the cameras; in a file, seen from the folder of the recipe.
     pub cameras: Option<PathBuf>,
     /// Part of their pictures that was scored; none: all.
     pub split: Option<Split>,
@@ -67,7 +69,8 @@ pub struct Run {
     pub frames: Option<usize>,
     /// Picture size where the cameras name none.
     pub size: Option<(u32, u32)>,
-    /// Where the times of pictures came from, as `--times` says it; none: their own.
+    /// Where the times of pictures came from, as `--times` says it; none: their own. A table is seen from the folder of
+    /// the recipe.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
     /// Whether frames were linked, where that was not left to them.
@@ -115,6 +118,19 @@ impl Run {
     }
 }
 
+impl Run {
+    /// Replaces every path by what `path` makes of it.
+    fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> Run {
+        self.cameras = self.cameras.as_deref().map(&path);
+        self.ground_truth = self.ground_truth.as_deref().map(&path);
+        self.times = self.times.as_deref().map(|times| match Times::named(times) {
+            Times::Table(table) => path(&table).to_string_lossy().into_owned(),
+            _ => times.to_owned(),
+        });
+        self
+    }
+}
+
 impl Record {
     /// Of `request`, whose ids are those of `user`.
     pub(super) fn of(request: &Request, user: &UserOverrides, input_digest: String) -> Record {
@@ -158,19 +174,26 @@ impl Record {
         Record { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
     }
 
-    /// What the text of a recipe file says beside its hyper-parameters.
+    /// Parses what the text of a recipe file in `folder` says beside its hyper-parameters. Files that it names by relative
+    /// paths are those that `folder` leads to.
     ///
     /// # Errors
     /// A table that is not as [`Run`] has it, in words.
-    pub fn read(text: &str) -> std::result::Result<Record, String> {
-        toml::from_str(text).map_err(|error| error.to_string())
+    pub fn read(text: &str, folder: &Path) -> std::result::Result<Record, String> {
+        let record: Record = toml::from_str(text).map_err(|error| error.to_string())?;
+        Ok(Record { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
     }
 
-    /// Text of `recipe.toml`.
-    pub(super) fn text(&self, request: &Request) -> String {
+    /// Returns the record for a recipe file in `folder`: with paths seen from there, without those of this machine.
+    fn seen_from(&self, folder: &Path) -> Record {
+        Record { run: self.run.clone().map(|run| run.with_paths(|path| from_folder(path, folder))), ..self.clone() }
+    }
+
+    /// Returns the text of `recipe.toml` in `folder`.
+    pub(super) fn text(&self, request: &Request, folder: &Path) -> String {
         format!(
             "# What this result was made with; give it to --recipe to repeat the run.\n{}\n{}",
-            toml::to_string(self).expect("a record is plain data"),
+            toml::to_string(&self.seen_from(folder)).expect("a record is plain data"),
             request.recipe.to_toml()
         )
     }
@@ -198,15 +221,43 @@ mod tests {
         (request.keep_box, request.kind) = (Some([-1.0, 0.0, 0.5, 1.0, 2.0, 1e9]), Some(OutputKind::PlySequence));
         let user = UserOverrides { keep: vec![1, 2, 3, 9], drop: Vec::new(), keep_box: request.keep_box };
         let record = Record::of(&request, &user, "00ff".to_owned());
-        let text = record.text(&request);
-        assert_eq!(Record::read(&text).unwrap(), record, "{text}");
+        let folder = Path::new("/somewhere/else");
+        let text = record.text(&request, folder);
+        // The folder is far from the working directory, so that the cameras keep their name alone.
+        let read = Record::read(&text, folder).unwrap();
+        assert_eq!(read.run.as_ref().unwrap().cameras.as_deref(), Some(&*folder.join("data, \"odd\" name")), "{text}");
+        let cameras = record.run.as_ref().unwrap().cameras.clone();
+        let run = read.run.map(|run| Run { cameras, ..run });
+        assert_eq!(Record { run, ..read }, record, "{text}");
         assert_eq!(Recipe::from_toml(&text, "default").unwrap(), request.recipe, "{text}");
         assert_eq!(record.run.unwrap().keep_ids.as_deref(), Some("1-3,9"));
     }
 
     #[test]
+    fn a_recipe_names_files_seen_from_its_folder() {
+        let here = std::env::current_dir().unwrap();
+        let run = Run {
+            cameras: Some(here.join("data/cameras.json")),
+            ground_truth: Some("photos".into()),
+            times: Some("table.csv".to_owned()),
+            ..Run::default()
+        };
+        let record = Record { run: Some(run), ..Record::default() };
+        let seen = record.seen_from(&here.join("out/small")).run.unwrap();
+        assert_eq!(seen.cameras.as_deref(), Some(Path::new("../../data/cameras.json")));
+        assert_eq!(seen.ground_truth.as_deref(), Some(Path::new("../../photos")));
+        assert_eq!(seen.times.as_deref(), Some("../../table.csv"));
+        let text = toml::to_string(&Record { run: Some(seen), ..Record::default() }).unwrap();
+        let read = Record::read(&text, &here.join("out/small")).unwrap().run.unwrap();
+        assert_eq!(read.cameras, Some(here.join("out/small/../../data/cameras.json")));
+        let named =
+            Record { run: Some(Run { times: Some("names".to_owned()), ..Run::default() }), ..Record::default() };
+        assert_eq!(named.seen_from(Path::new("/x/y/z")).run.unwrap().times.as_deref(), Some("names"));
+    }
+
+    #[test]
     fn a_misspelt_option_of_a_run_is_named() {
-        let message = Record::read("[run]\ntarget_rato = 0.3\n").unwrap_err();
+        let message = Record::read("[run]\ntarget_rato = 0.3\n", Path::new("")).unwrap_err();
         assert!(message.contains("target_rato"), "{message}");
     }
 

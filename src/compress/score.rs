@@ -9,7 +9,7 @@ use super::journal::Journal;
 use super::statistics::Statistics;
 use super::summary::{FlagSummary, Saved, TermSummary};
 use crate::budget::{Need, Part, Workload};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::trajectories::state_bytes;
 use crate::limits::Limits;
 use crate::model::{Columns, Flags, Gaussians, Rows};
@@ -235,7 +235,7 @@ fn check_views(scene: &Scene, rows: &Rows) -> Result<()> {
             "{}: none of the {alive} living Gaussians of {} is in any of its {} pictures\n  \
              give the cameras of this scene",
             scene.rig.origin,
-            scene.path.display(),
+            scene.path.shown(),
             scene.schedule.pairs()
         )));
     }

@@ -13,8 +13,9 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::forecast::Forecast;
 use crate::archive::Parts;
-use crate::error::Result;
+use crate::error::{Result, ShowPath};
 use crate::families::{Family, Size};
+use crate::ingest::names::name_of;
 use crate::merge::PassCounts;
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
 use crate::recipe::ProxyOpacity;
@@ -149,7 +150,7 @@ pub struct ArchiveSummary {
 /// The input, as the summary names it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct InputSummary {
-    /// Path as given.
+    /// Last name of its path in files; the path as given on standard output.
     pub path: String,
     /// "4DGaussians model", "PLY sequence", ...
     pub kind: String,
@@ -178,7 +179,7 @@ impl InputSummary {
     pub fn of(input: &dyn Family, path: &Path, digest: String) -> Result<InputSummary> {
         let info = input.source().info();
         Ok(InputSummary {
-            path: path.display().to_string(),
+            path: path.to_string_lossy().into_owned(),
             kind: input.kind().to_owned(),
             digest,
             gaussians: info.count,
@@ -188,6 +189,13 @@ impl InputSummary {
             bytes: input.bytes()?,
             size: Some(input.size()?),
         })
+    }
+}
+
+impl InputSummary {
+    /// Returns the summary with the last name of the input's path alone, for a file.
+    pub fn without_folders(self) -> InputSummary {
+        InputSummary { path: name_of(Path::new(&self.path)), ..self }
     }
 }
 
@@ -389,7 +397,7 @@ pub struct Summary {
     pub input: InputSummary,
     /// From where it was looked at.
     pub cameras: CameraSummary,
-    /// Path of the output as given.
+    /// Last name of the output in files; its path as given on standard output.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
     /// Gaussians in the output.
@@ -470,7 +478,7 @@ impl Summary {
         writeln!(
             out,
             "{}: {}, {} Gaussians x {} frames, SH degree {}",
-            input.path,
+            Path::new(&input.path).shown(),
             input.kind,
             input.gaussians,
             input.frames.unwrap_or(0),
@@ -536,7 +544,7 @@ impl Summary {
         let memory = peak.map_or(String::new(), |bytes| format!(", at most {} MiB of memory", bytes >> 20));
         writeln!(out, "took    {}{memory}", duration(seconds))?;
         if !self.output.is_empty() {
-            writeln!(out, "lies in {}", self.output)?;
+            writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
         }
         let shown = match detail {
             Detail::All => self.notes.len(),

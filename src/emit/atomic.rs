@@ -21,7 +21,7 @@ mod workspace;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use destination::{Destination, check_replace, destination, real_parent};
 pub use destination::{Kind, Replace};
 pub use leftovers::remove_leftovers;
@@ -44,7 +44,7 @@ pub use workspace::{Withdrawn, withdraw_all};
 /// # Errors
 /// Each of these, as [`Error::Usage`]; a failure of the system.
 pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replace) -> Result<()> {
-    let shown = target.display();
+    let shown = target.shown();
     let real_parent = real_parent(target)?;
     let (_, name) = parts(target)?;
     // The entry itself and what it leads to: renaming over a link replaces only the link, but a user who names the
@@ -57,12 +57,12 @@ pub fn check_target(target: &Path, kind: Kind, inputs: &[&Path], replace: Replac
             return Err(Error::usage(format!("{shown} is the input itself; give another output")));
         }
         if real.starts_with(&named) || real.starts_with(&meant) {
-            let input = input.display();
+            let input = input.shown();
             return Err(Error::usage(format!("{shown} contains the input {input}; give another output")));
         }
         // A PLY among frames would be another frame, a folder in a model another iteration.
         if named.starts_with(&real) || meant.starts_with(&real) {
-            let input = input.display();
+            let input = input.shown();
             return Err(Error::usage(format!("{shown} lies inside the input {input}; give another output")));
         }
     }
@@ -83,7 +83,7 @@ pub fn check_targets(target: &Path, companions: &[PathBuf], inputs: &[&Path], re
         if destination(path)? == Destination::Stream {
             return Err(Error::usage(format!(
                 "{} is a device or FIFO, and the result is several files; give the name of a file",
-                path.display()
+                path.shown()
             )));
         }
     }

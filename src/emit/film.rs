@@ -10,7 +10,7 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
 
 use super::image::{of_png, rgb};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::render::Image;
 
 /// Program that encodes what this one does not.
@@ -55,7 +55,7 @@ impl FilmFormat {
             _ => {
                 return Err(Error::usage(format!(
                     "{}: expected a name that ends in .png, .apng, .gif, .mp4 or .webm",
-                    path.display()
+                    path.shown()
                 )));
             }
         };
@@ -66,7 +66,7 @@ impl FilmFormat {
             Error::usage(format!(
                 "{}: {ENCODER}, which makes .{extension}, is in no folder of PATH\n  install it (Debian: apt-get install \
                  {ENCODER}), or give a name that ends in .png (every bit, large) or .gif (256 colours a frame)",
-                path.display()
+                path.shown()
             ))
         })
     }
@@ -219,7 +219,7 @@ impl Encoder {
         command.arg(path).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
         let mut child = command
             .spawn()
-            .map_err(|error| io::Error::new(error.kind(), format!("cannot run {}: {error}", program.display())))?;
+            .map_err(|error| io::Error::new(error.kind(), format!("cannot run {}: {error}", program.shown())))?;
         let to = child.stdin.take();
         let said = child.stderr.take().map(|mut from| {
             std::thread::spawn(move || {

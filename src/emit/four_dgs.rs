@@ -11,7 +11,7 @@ use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 
 use super::accuracy::{Accuracy, Drawn};
 use crate::TOOL;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::fit::{Misfit, Piece, Tolerance, straight};
 use crate::model::{Column, colour};
 use crate::source::FrameSource;
@@ -49,7 +49,7 @@ pub fn write_four_dgs(source: &dyn FrameSource, path: &Path) -> Result<String> {
     on_grid(&mut set, &options);
     let ids = found.iter().enumerate().flat_map(|(id, (pieces, _))| pieces.iter().map(move |_| id));
     check_positions(&set, &wanted, ids)?;
-    let refused = |error: fourdgs::Error| Error::usage(format!("{}: no .4dgs can hold this: {error}", path.display()));
+    let refused = |error: fourdgs::Error| Error::usage(format!("{}: no .4dgs can hold this: {error}", path.shown()));
     let bytes = write_to_vec(&set, starts[info.times.len()], &options, &SceneExtras::default()).map_err(refused)?;
     std::fs::write(path, bytes).map_err(Error::io("write", path))?;
     Ok(format!(

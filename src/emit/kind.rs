@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 
 /// Kinds of result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -52,8 +52,8 @@ impl OutputKind {
              NAME.spz       one frame, for most web viewers\n  \
              a folder       of the input's kind: model folder, or PLY files; its name has no such ending\n  \
              or say outright with --as model|gseq|ply-sequence|ply|archive|splatv|4dgs|spz what {} is to be",
-            path.display(),
-            path.display()
+            path.shown(),
+            path.shown()
         )))
     }
 
@@ -87,7 +87,7 @@ impl OutputKind {
         match self {
             OutputKind::Spz if frames != 1 => Err(Error::usage(format!(
                 "{}: {frames} frames do not fit one .spz\n  write a .splatv, a .4dgs or a .gseq",
-                path.display()
+                path.shown()
             ))),
             _ => Ok(()),
         }
@@ -102,7 +102,7 @@ pub fn check_folder_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path) {
         Some(ending) => Err(Error::usage(format!(
             "{}: {what} writes a folder; expected a name that does not end in .{ending}",
-            path.display()
+            path.shown()
         ))),
         None => Ok(()),
     }
@@ -116,7 +116,7 @@ pub fn check_container_name(path: &Path, what: &str) -> Result<()> {
     match foreign_ending(path).filter(|ending| !ending.eq_ignore_ascii_case("gseq")) {
         Some(ending) => Err(Error::usage(format!(
             "{}: {what} writes a container; expected NAME.gseq, found a name that ends in .{ending}",
-            path.display()
+            path.shown()
         ))),
         None => Ok(()),
     }

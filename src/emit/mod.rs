@@ -17,6 +17,7 @@ pub mod index_map;
 pub mod kind;
 pub(crate) mod npz;
 pub mod ply;
+pub mod policy;
 pub mod rows;
 pub mod splatv;
 pub mod spz;

@@ -8,7 +8,7 @@ use std::io::{self, BufWriter, Write};
 use std::ops::Range;
 use std::path::Path;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::ingest::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, name_without_bands, read_plane};
 use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 use crate::reduction::{Change, Reduction};
@@ -78,7 +78,7 @@ pub(crate) fn write_rows_like(
 ) -> Result<()> {
     template.check_unshrunk()?;
     if let Some(source) = sources.iter().find(|&&source| source as usize >= template.count()) {
-        let (path, count) = (template.path().display(), template.count());
+        let (path, count) = (template.path().shown(), template.count());
         return Err(Error::usage(format!("{path}: Gaussian {source} is to be kept, of {count} from 0")));
     }
     let mut left: Vec<Range<usize>> = Vec::new();
@@ -234,10 +234,7 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Cha
     let planes = template.layout().planes(Columns::SH).len();
     if !proxies.is_empty() && proxies.sh.width() != planes {
         let width = proxies.sh.width();
-        return Err(Error::usage(format!(
-            "proxies have {width} SH planes, {} has {planes}",
-            template.path().display()
-        )));
+        return Err(Error::usage(format!("proxies have {width} SH planes, {} has {planes}", template.path().shown())));
     }
     for row in rows {
         if let Some(proxy) = row.proxy.filter(|&proxy| proxy as usize >= proxies.len()) {

@@ -19,7 +19,7 @@ use std::path::Path;
 use flate2::{Compression, GzBuilder};
 
 use super::accuracy::{Accuracy, Drawn};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::model::{Gaussians, colour, opacity};
 
 const MAGIC: u32 = 0x5053_474e;
@@ -40,10 +40,10 @@ pub fn write_spz(state: &Gaussians, path: &Path) -> Result<f64> {
     let furthest = state.position.planes().iter().fold(0.0f64, |most, x| most.max(f64::from(x.abs())));
     if let Some(at) = state.position.planes().iter().position(|x| !x.is_finite()) {
         let id = at % state.len();
-        return Err(Error::usage(format!("{}: no .spz can hold the position of Gaussian {id}", path.display())));
+        return Err(Error::usage(format!("{}: no .spz can hold the position of Gaussian {id}", path.shown())));
     }
     let count = u32::try_from(state.len())
-        .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.display(), state.len())))?;
+        .map_err(|_| Error::usage(format!("{}: {} Gaussians are too many for a .spz", path.shown(), state.len())))?;
     let bits = (MOST / furthest.max(1e-9)).log2().floor().clamp(0.0, f64::from(MOST_BITS)) as i32;
     let unit = 0.5f64.powi(bits);
     let off = measured(state, unit)?;

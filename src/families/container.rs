@@ -5,7 +5,7 @@ use gseq::{Encoding, Reader, TileId};
 use super::family::{ColumnInfo, Entry, Family, Residence, Timing};
 use super::linked::Linked;
 use super::size::bytes_of;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::ingest::container::Container;
 use crate::source::FrameSource;
 
@@ -69,7 +69,7 @@ impl Family for Container {
     }
 
     fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn Family>> {
-        Err(Error::usage(format!("{}: a container says itself when its frames are", self.path().display())))
+        Err(Error::usage(format!("{}: a container says itself when its frames are", self.path().shown())))
     }
 
     fn columns(&self) -> Result<Vec<ColumnInfo>> {

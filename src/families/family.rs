@@ -9,7 +9,7 @@ use super::trajectories::{NO_ARCHIVE, OWN_OUTPUT, check_output, reduced_trajecto
 use crate::archive::Content;
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::ingest::cameras::Clock;
 use crate::ingest::ply::PlyOptions;
 use crate::limits::{Limits, ReadLimit};
@@ -408,7 +408,7 @@ impl OpenOptions {
     /// Refuses what only model folders take.
     pub(super) fn refuse_for(&self, path: &Path) -> Result<()> {
         match self.iteration {
-            Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.display()))),
+            Some(_) => Err(Error::usage(format!("{}: --iteration is for model folders", path.shown()))),
             None => Ok(()),
         }
     }

@@ -37,7 +37,7 @@ pub use four_d_gaussians::ModelFolder;
 pub use linked::Linked;
 pub use size::Size;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::ingest::open::open_file;
 use family::{Entry, Found};
 
@@ -110,5 +110,5 @@ fn refuse_inside_a_model(path: &Path) -> Result<()> {
     let Some(root) = real.ancestors().nth(below).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
     let option = number.map_or_else(String::new, |number| format!(" --iteration {number}"));
     Err(Error::input(path, "", "a model folder", "a folder inside of one")
-        .hint(format!("give the folder above: {}{option}", root.display())))
+        .hint(format!("give the folder above: {}{option}", root.shown())))
 }

@@ -17,6 +17,7 @@ use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
 use crate::error::Result;
+use crate::ingest::names::shown_name;
 use crate::ingest::ply_frames::PlyFrames;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::limits::Limits;
@@ -76,8 +77,8 @@ enum Order {
 /// are evenly spread.
 fn order(frames: &PlyFrames) -> Result<Order> {
     if let Some(other) = frames.other_count() {
-        let (counts, path) = (frames.counts(), &frames.paths()[other]);
-        return Ok(Order::Lost(format!("{} has {} Gaussians, the first {}", path.display(), counts[other], counts[0])));
+        let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
+        return Ok(Order::Lost(format!("{name} has {} Gaussians, the first {}", counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;
     let mut found = Vec::new();

@@ -13,7 +13,7 @@ use crate::emit::four_dgs::write_four_dgs;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::write_inria;
 use crate::emit::spz::write_spz;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::reduction::{Course, Reduction};
@@ -58,7 +58,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
         )),
         OutputKind::Ply if frames != 1 => Err(Error::usage(format!(
             "{}: {frames} frames do not fit one .ply\n  write a .gseq or --as ply-sequence",
-            path.display()
+            path.shown()
         ))),
         OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
         _ => Ok(()),

@@ -10,6 +10,7 @@ pub mod image;
 pub mod in_memory;
 pub(crate) mod json;
 mod map;
+pub mod names;
 pub(crate) mod npy;
 pub(crate) mod npz;
 pub(crate) mod open;

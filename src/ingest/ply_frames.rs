@@ -14,7 +14,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use super::digest::hash_file;
 use super::ply::{Ply, PlyOptions, Property, TextRows, TextStore};
-use crate::error::{Error, Result, quoted};
+use crate::error::{Error, Result, ShowPath, quoted};
 use crate::limits::ReadLimit;
 
 /// PLY files with the same properties, one per frame.
@@ -191,7 +191,7 @@ fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     let at = steps.iter().position(|&step| step != least)?;
     let width = named[at].3;
     let missing = format!("{before}{:0width$}{after}", named[at].1 + least);
-    let name = |at: usize| file_name(&frames[at]).display().to_string();
+    let name = |at: usize| file_name(&frames[at]).shown().to_string();
     Some((missing, name(at), name(at + 1)))
 }
 
@@ -210,7 +210,7 @@ fn check_properties(ply: &Ply, properties: &[Property], first: &Path) -> Result<
     if ply.properties() == properties {
         return Ok(());
     }
-    let first = first.display();
+    let first = first.shown();
     let differing = (0..).find(|&i| ply.properties().get(i) != properties.get(i)).unwrap_or(0);
     let name = |list: &[Property]| match list.get(differing) {
         Some(property) => format!("{} {}", property.scalar.name(), quoted(&property.name)),

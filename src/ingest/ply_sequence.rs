@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use super::ply::{Ply, PlyOptions, check_ids};
 use super::ply_frames::PlyFrames;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
@@ -45,7 +45,7 @@ impl PlySequence {
     pub fn new(frames: PlyFrames) -> Result<PlySequence> {
         if let Some(other) = frames.other_count() {
             let counts = frames.counts();
-            let expected = format!("{} Gaussians, as in {}", counts[0], frames.paths()[0].display());
+            let expected = format!("{} Gaussians, as in {}", counts[0], frames.paths()[0].shown());
             let found = format!("{} Gaussians", counts[other]);
             return Err(Error::input(&frames.paths()[other], "element vertex", expected, found)
                 .hint("every frame must hold the same Gaussians in the same order, unless they are linked (--link)"));

@@ -16,6 +16,7 @@ use serde::Serialize;
 use super::track::Track;
 use crate::TOOL;
 use crate::emit::atomic::ScratchFolder;
+use crate::emit::policy::{digest_of, policy};
 use crate::error::{Error, Result};
 use crate::model::{Rig, Split};
 
@@ -134,6 +135,8 @@ pub struct Chunks {
     folder: ScratchFolder,
     /// When it is wanted, in parts of the time shown; model; chunk; bytes.
     made: Vec<(f64, usize, usize, u64)>,
+    /// Digests of the scripts, as a policy names them.
+    digests: Vec<String>,
 }
 
 impl Chunks {
@@ -142,7 +145,7 @@ impl Chunks {
     /// # Errors
     /// The system refuses.
     pub fn new(scratch: &Path) -> Result<Chunks> {
-        Ok(Chunks { folder: ScratchFolder::new(scratch)?, made: Vec::new() })
+        Ok(Chunks { folder: ScratchFolder::new(scratch)?, made: Vec::new(), digests: Vec::new() })
     }
 
     /// Takes chunk `chunk` of model `model`, wanted after the part `since` of the time that is shown.
@@ -154,6 +157,7 @@ impl Chunks {
         let script = format!("splatsieve.chunk({model},{chunk},\"{}\");\n", STANDARD.encode(bytes));
         fs::write(&path, &script).map_err(Error::io("write", &path))?;
         self.made.push((since, model, chunk, script.len() as u64));
+        self.digests.push(digest_of(&script));
         Ok(())
     }
 
@@ -180,7 +184,7 @@ impl Chunks {
     pub fn write_page(&self, stage: &Stage, path: &Path) -> Result<u64> {
         let failed = || Error::io("write", path);
         let mut to = BufWriter::new(File::create(path).map_err(failed())?);
-        to.write_all(head(stage).as_bytes()).map_err(failed())?;
+        to.write_all(head(stage, &self.digests).as_bytes()).map_err(failed())?;
         for (model, chunk) in self.ordered() {
             let from = self.path(model, chunk);
             let script = fs::read(&from).map_err(Error::io("read", &from))?;
@@ -201,7 +205,8 @@ impl Chunks {
             let (from, to) = (self.folder.path().join(file), folder.join(file));
             fs::copy(&from, &to).map_err(Error::io("write", &to))?;
         }
-        let page = head(stage) + "</body>\n</html>\n";
+        // Scripts that the page itself adds may run: of files from a disk no browser says where they are from.
+        let page = head(stage, &["'strict-dynamic'".to_owned()]) + "</body>\n</html>\n";
         let path = folder.join(INDEX);
         fs::write(&path, &page).map_err(Error::io("write", &path))?;
         let names = stage.files.iter().cloned().chain([INDEX.to_owned()]).collect();
@@ -213,15 +218,29 @@ fn name(model: usize, chunk: usize) -> String {
     format!("frames_{model}_{chunk:05}.js")
 }
 
-/// The page up to its chunks.
-fn head(stage: &Stage) -> String {
+/// Returns the page up to its chunks; its policy allows its own scripts, and those of `chunks`.
+fn head(stage: &Stage, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
     let json = serde_json::to_value(stage).expect("plain data");
     let mut page = PARTS.iter().fold(PAGE.to_owned(), |page, (mark, text)| page.replace(mark, text));
-    // Last, for names may look like anything.
     page = page.replace("/*tool*/", TOOL).replace("/*shaders*/", &inline(&shaders.into()));
-    page + "<script>splatsieve.begin(" + &inline(&json) + ");</script>\n"
+    // Names may look like anything, and come after all replacements.
+    let begin = format!("splatsieve.begin({});", inline(&json));
+    let own = [between(&page, "<script>", "</script>"), &begin].map(digest_of);
+    let scripts: Vec<String> = own.into_iter().chain(chunks.iter().cloned()).collect();
+    let policy = policy(&[
+        ("style-src", &[digest_of(between(&page, "<style>", "</style>"))]),
+        ("worker-src", &["blob:".to_owned()]),
+        ("script-src", &scripts),
+    ]);
+    page.replace("<!--policy-->", &policy) + "<script>" + &begin + "</script>\n"
+}
+
+/// Returns the text between the first `start` and the next `end`.
+fn between<'a>(page: &'a str, start: &str, end: &str) -> &'a str {
+    let rest = page.split_once(start).map_or("", |(_, rest)| rest);
+    rest.split_once(end).map_or(rest, |(content, _)| content)
 }
 
 /// JSON that may stand in a script.
@@ -258,7 +277,7 @@ mod tests {
 
     #[test]
     fn every_part_has_its_place_and_no_name_leaves_its_own() {
-        let page = head(&stage("</script><script>alert(1)//*page.css*/"));
+        let page = head(&stage("</script><script>alert(1)//*page.css*/"), &[]);
         assert!(!page.contains("<script>alert") && page.contains("\\u003c/script>\\u003cscript>alert(1)//*page.css*/"));
         for (mark, _) in PARTS.iter().chain(&[("/*shaders*/", ""), ("/*tool*/", "")]) {
             assert_eq!(PAGE.matches(mark).count(), 1, "{mark}");

@@ -1,21 +1,30 @@
 //! HTML files that need no network, and their parts.
 //!
-//! Everything that comes from files or paths passes through [`escape`]; the content policy in the head lets a browser
-//! load nothing but what is inside.
+//! Everything that comes from files or paths passes through [`escape`]; the content security policy in the head lets a
+//! browser load nothing but what is inside, and run nothing but the scripts given by their digests.
 
 use super::chart;
 use super::html::escape;
+use crate::emit::policy::{digest_of, policy};
 
 const STYLE: &str = include_str!("page.css");
 
-/// A whole file.
-pub(super) fn document(title: &str, body: &str) -> String {
+/// Returns a whole file; `scripts` run at its end, and must hold no text from files.
+pub(super) fn document(title: &str, body: &str, scripts: &[&str]) -> String {
+    let scripts: Vec<String> = scripts.iter().map(|script| format!("\n{script}")).collect();
+    let digests: Vec<String> = scripts.iter().map(|script| digest_of(script)).collect();
+    let policy = policy(&[
+        ("img-src", &["data:".to_owned()]),
+        // Sizes of pictures are attributes, which no digest allows.
+        ("style-src", &["'unsafe-inline'".to_owned()]),
+        ("script-src", &digests),
+    ]);
+    let scripts: String = scripts.iter().map(|script| format!("<script>{script}</script>\n")).collect();
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; \
-         style-src 'unsafe-inline'; script-src 'unsafe-inline'\">\n\
+         {policy}\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <title>{}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<main>\n{body}</main>\n</body>\n</html>\n",
+         <title>{}</title>\n<style>\n{STYLE}{}</style>\n</head>\n<body>\n<main>\n{body}{scripts}</main>\n</body>\n</html>\n",
         escape(title),
         chart::STYLE,
     )

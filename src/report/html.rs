@@ -1,9 +1,12 @@
 //! Words and numbers as a page shows them.
 
-/// `text` with everything escaped that could end a text or an attribute in quotes.
+use crate::error::printable;
+
+/// Returns `text` with everything escaped that could end a text or an attribute in quotes, and unprintable characters
+/// (marks of direction among them) by their codes.
 pub(super) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
-    for letter in text.chars() {
+    for letter in printable(text).chars() {
         match letter {
             '&' => out.push_str("&amp;"),
             '<' => out.push_str("&lt;"),

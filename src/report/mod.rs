@@ -134,7 +134,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         tool: evaluation.tool.clone(),
         verdict: verdict::verdict(&evaluation, &failure_modes),
         pictures: evaluation.pictures.clone(),
-        evaluation,
+        evaluation: evaluation.without_folders(),
         shown: choices,
         films,
         failure_modes,

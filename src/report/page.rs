@@ -46,8 +46,7 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
             }
         }
     }
-    out += &format!("<script>\n{SCRIPT}</script>\n<script>\n{PLAY}</script>\n");
-    document(&title, &out)
+    document(&title, &out, &[SCRIPT, PLAY])
 }
 
 fn header(report: &Report) -> String {

@@ -43,7 +43,7 @@ pub fn page(found: &Precision) -> String {
         links(&["precision.json", "precision.csv"]),
         escape(&found.tool)
     );
-    document(&title, &body)
+    document(&title, &body, &[])
 }
 
 /// All of it as a part of another page.

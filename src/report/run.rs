@@ -12,6 +12,7 @@ use serde_json::Value;
 use crate::compress::emit::{INDEX_MAP, RECIPE, beside};
 use crate::compress::summary::Summary;
 use crate::emit::atomic::MARKER;
+use crate::ingest::names::shown_name;
 use crate::ingest::npy::header_is_sound;
 use crate::ingest::open::open_file;
 use crate::ingest::text::read_text;
@@ -52,15 +53,15 @@ impl Run {
         let (summary, recipe, map) = (take(MARKER), take(RECIPE), take(INDEX_MAP));
         match read_summary(&summary) {
             Ok(found) => run.summary = Some(found),
-            Err(why) => run.missing.push(format!("{}: {why}", summary.display())),
+            Err(why) => run.missing.push(format!("{}: {why}", shown_name(&summary))),
         }
         match read_recipe(&recipe) {
             Ok(found) => run.recipe = Some(found),
-            Err(why) => run.missing.push(format!("{}: {why}", recipe.display())),
+            Err(why) => run.missing.push(format!("{}: {why}", shown_name(&recipe))),
         }
         match read_fates(&map, original, compressed) {
             Ok(found) => run.fates = Some(found),
-            Err(why) => run.missing.push(format!("{}: {why}", map.display())),
+            Err(why) => run.missing.push(format!("{}: {why}", shown_name(&map))),
         }
         run
     }

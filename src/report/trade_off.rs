@@ -30,7 +30,7 @@ pub fn page(found: &TradeOff) -> String {
         links(&files),
         escape(&found.tool)
     );
-    document(&format!("{} – what quality costs", file_name(&found.path)), &body)
+    document(&format!("{} – what quality costs", file_name(&found.path)), &body, &[])
 }
 
 /// What was swept, the charts and the notes.

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::{self, Conventions, Family, Link, OpenOptions};
 use crate::ingest::cameras::{self, CameraOptions, Clock, Times};
 use crate::model::{Rig, Split};
@@ -76,8 +76,8 @@ impl InputOptions {
             if real.is_ok_and(|real| real.starts_with(&input)) {
                 return Err(Error::usage(format!(
                     "{option} {} lies inside the input {}; give a folder outside it",
-                    folder.display(),
-                    self.path.display()
+                    folder.shown(),
+                    self.path.shown()
                 )));
             }
         }

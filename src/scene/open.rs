@@ -8,7 +8,7 @@ use super::Scene;
 use super::input::{InputOptions, Opened, load_cameras};
 use super::pictures::no_picture;
 use super::stream::open_arriving;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::{self, Family, Timing};
 use crate::ingest::cameras::{self, Clock, Times};
 use crate::model::{Columns, Rig, opacity};
@@ -41,17 +41,14 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
             input.with_times(times)?
         }
         _ if options.frames.is_some() => {
-            return Err(Error::usage(format!(
-                "{}: --frames is for models that are continuous in time",
-                path.display()
-            )));
+            return Err(Error::usage(format!("{}: --frames is for models that are continuous in time", path.shown())));
         }
         Timing::Numbered if !times.is_empty() => {
             let found = input.source().info().times.len();
             if times.len() != found {
                 return Err(Error::usage(format!(
                     "{}: {found} frames, but the cameras of {} have {} distinct times\n  give the cameras of this sequence",
-                    path.display(),
+                    path.shown(),
                     rig.as_ref().map_or("", |rig| rig.origin.as_str()),
                     times.len()
                 )));

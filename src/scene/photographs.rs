@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use hashbrown::HashMap;
 
 use super::work::stamps;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::ingest::image::read_png;
 use crate::model::{Camera, Picture, Rig};
 use crate::render::Image;
@@ -26,7 +26,7 @@ impl Photographs {
             let (picture, file) = found?;
             // The names that a time-stamped rig gives its files are shared by all of its cameras.
             if let Some(other) = takers.insert(file.clone(), picture) {
-                let found = format!("{}, as for frame {}, view {}", file.display(), other.frame, other.view);
+                let found = format!("{}, as for frame {}, view {}", file.shown(), other.frame, other.view);
                 return Err(Error::input(folder, place(picture), "a picture of its own", found)
                     .hint("give the folder that the cameras' file paths start from"));
             }
@@ -53,9 +53,8 @@ impl Photographs {
         let found: Vec<(Picture, PathBuf)> = pictures.iter().copied().filter_map(file).collect();
         if let (true, Some(&picture)) = (found.is_empty(), pictures.first()) {
             let named = rig.image(picture, times).and_then(Path::file_name);
-            let named = named.map_or_else(String::new, |name| format!(", {}", name.display()));
-            let expected =
-                format!("{}.png{named} or {}", picture.name(), in_rig(Path::new("camNN"), picture).display());
+            let named = named.map_or_else(String::new, |name| format!(", {}", name.shown()));
+            let expected = format!("{}.png{named} or {}", picture.name(), in_rig(Path::new("camNN"), picture).shown());
             return Err(Error::input(folder, place(picture), expected, "no such file, nor one of another picture"));
         }
         let pictures = found.iter().map(|(picture, _)| *picture).collect();
@@ -99,7 +98,7 @@ fn place(picture: Picture) -> String {
 
 fn check_folder(folder: &Path) -> Result<()> {
     if !fs::metadata(folder).map_err(Error::io("open", folder))?.is_dir() {
-        return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.display())));
+        return Err(Error::usage(format!("{}: --ground-truth expects a folder of pictures", folder.shown())));
     }
     Ok(())
 }

@@ -7,7 +7,7 @@ use std::time::UNIX_EPOCH;
 use super::Scene;
 use super::input::InputOptions;
 use crate::TOOL;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::Family;
 use crate::render;
 use crate::work::{Key, Work};
@@ -55,7 +55,7 @@ impl Scene {
 pub fn kept_work(options: &InputOptions, input: &dyn Family) -> Result<(Work, Option<String>)> {
     let Some(asked) = &options.work else { return Ok((Work::none(), None)) };
     let instructions = render::instructions();
-    let mut work = Work::open(asked, format!("{} ({TOOL}, {instructions})", options.path.display()))?;
+    let mut work = Work::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
     let digest = known_digest(&work, options, input)?;
     // This program and this machine, the input's content as it was opened; not where it lies.
     let info = input.source().info();

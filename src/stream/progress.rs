@@ -6,13 +6,15 @@
 //! together here, of what there is room for.
 
 use std::fmt::Write as _;
-use std::io::{self, IsTerminal, Write as _};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use console::Term;
 use indicatif::{HumanCount, MultiProgress, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
+
+use super::message::{is_terminal, tell};
+use crate::error::printable;
 
 /// Seconds between two lines of one stage.
 const LINE_EVERY: u64 = 60;
@@ -146,7 +148,7 @@ impl Progress {
             return Progress(Shown::Nothing);
         }
         let name = run().as_mut().map_or_else(|| what.to_owned(), |run| run.enter(what, Instant::now()));
-        if !io::stderr().is_terminal() {
+        if !is_terminal() {
             return Progress(Shown::Lines(Log::new(name, unit, total)));
         }
         let bar = BARS.add(total.map_or_else(ProgressBar::no_length, ProgressBar::new));
@@ -189,9 +191,9 @@ impl Progress {
             return;
         }
         let line = format!("{what}  left out: {why}");
-        match io::stderr().is_terminal() {
+        match is_terminal() {
             // A terminal that cannot be written to shows nothing of the rest either.
-            true => drop(BARS.println(line)),
+            true => drop(BARS.println(printable(&line))),
             false => tell(&line),
         }
     }
@@ -345,11 +347,6 @@ impl Log {
         };
         line
     }
-}
-
-/// Says something on stderr; nobody listening is no failure.
-fn tell(line: &str) {
-    let _ = writeln!(io::stderr(), "{line}");
 }
 
 /// A rate as a person reads it: two digits or three, or how long each takes.

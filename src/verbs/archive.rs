@@ -10,6 +10,7 @@ use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check
 use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
 use crate::families::archive::{is_folder, read_archive, unpack};
+use crate::ingest::names::name_of;
 use crate::ingest::open::open_file;
 use crate::limits::ReadLimit;
 use crate::model::Columns;
@@ -60,7 +61,7 @@ pub fn unpack_archive(path: &Path, output: &Path, overwrite: Replace, memory: Re
     let staged = StagedFolder::new(output, overwrite)?;
     unpack(&content, path, staged.path())?;
     let marker = staged.path().join(MARKER);
-    let text = serde_json::json!({ "tool": TOOL, "input": { "path": path.display().to_string() } });
+    let text = serde_json::json!({ "tool": TOOL, "input": { "path": name_of(path) } });
     fs::write(&marker, format!("{text:#}\n")).map_err(Error::io("write", &marker))?;
     staged.commit()?;
     Ok(unpacked)

@@ -20,7 +20,7 @@ use crate::emit::container::{
 };
 use crate::emit::frame_stream::StreamWriter;
 use crate::emit::kind::{OutputKind, check_container_name, check_folder_name};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::stream::pack_stream;
 use crate::families::trajectories::write_sequence;
 use crate::families::{self, ColumnInfo, Family, Size, Timing};
@@ -183,7 +183,7 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
     let marker = serde_json::json!({
         "tool": TOOL,
-        "input": InputSummary::of(&*opened.input, &input.path, opened.input.digest()?)?,
+        "input": InputSummary::of(&*opened.input, &input.path, opened.input.digest()?)?.without_folders(),
     });
     let path = staged.path().join(MARKER);
     fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
@@ -276,7 +276,7 @@ impl Info {
         let input = &self.input;
         let mut out = format!(
             "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes{}, digest {}\n",
-            input.path,
+            Path::new(&input.path).shown(),
             input.kind,
             input.gaussians,
             input.sh_degree,

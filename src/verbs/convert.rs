@@ -80,7 +80,7 @@ pub fn convert(
         let bytes = write(staged.path())?;
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::of(family, &input.path, family.digest()?)?,
+            "input": InputSummary::of(family, &input.path, family.digest()?)?.without_folders(),
         });
         let path = staged.path().join(MARKER);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;

@@ -1,10 +1,21 @@
 //! Tables as CSV: a line of names, then one line per row; what does not exist is empty.
+//!
+//! Spreadsheets take a field that begins with one of `= + - @`, a tab or a carriage return for a formula and run it. Such a
+//! text gets an apostrophe in front, by which they know it as text; numbers stay as they are.
 
 use std::fmt::Display;
 
 /// A value; what does not exist is empty.
 pub(crate) fn known(value: Option<impl Display>) -> String {
     value.map_or(String::new(), |value| value.to_string())
+}
+
+/// Returns `field` so that no spreadsheet runs it.
+fn without_formula(field: String) -> String {
+    // Spreadsheets skip blanks, and take the wide forms of East Asian input for the plain ones.
+    let first = field.chars().find(|&c| c != ' ');
+    let runs = matches!(first, Some('=' | '+' | '-' | '@' | '\t' | '\r' | '\n' | '＝' | '＋' | '－' | '＠'));
+    if runs && field.parse::<f64>().is_err() { format!("'{field}") } else { field }
 }
 
 /// The text of a table; a field that holds what parts fields is quoted, as RFC 4180 wants it.
@@ -15,7 +26,22 @@ pub(crate) fn table(names: &[impl AsRef<[u8]>], rows: impl IntoIterator<Item = V
     let mut out = csv::Writer::from_writer(Vec::new());
     out.write_record(names).expect("memory takes what is written");
     for row in rows {
-        out.write_record(row).expect("a field for every name");
+        out.write_record(row.into_iter().map(without_formula)).expect("a field for every name");
     }
     String::from_utf8(out.into_inner().expect("memory takes what is written")).expect("made of text")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_are_no_formulas_and_numbers_stay_numbers() {
+        let row =
+            ["=1+1", "+cmd", "-2+3", "@SUM(A1)", "\tx", "\rx", " =1", "＝1", "-1.5", "+3", "-inf", "-1e-7", "a=b", ""];
+        let text = table(&row.map(|_| "n"), [row.map(str::to_owned).to_vec()]);
+        let line = text.split_once('\n').unwrap().1;
+        let expected = "'=1+1,'+cmd,'-2+3,'@SUM(A1),'\tx,\"'\rx\",' =1,'＝1,-1.5,+3,-inf,-1e-7,a=b,\n";
+        assert_eq!(line, expected);
+    }
 }

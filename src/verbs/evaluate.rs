@@ -18,7 +18,7 @@ use crate::TOOL;
 use crate::budget::{Budget, Need, Plan, Workload};
 use crate::compress::summary::CameraSummary;
 use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::families::{self, Family, OpenOptions, Timing};
 use crate::limits::Limits;
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
@@ -246,7 +246,7 @@ impl SideBySide {
         let scores: Vec<PictureScores> = self.pictures.iter().zip(scores).map(of_picture).collect();
         let ground_truth = self.truth_folder.as_deref().and_then(|folder| {
             Some(TruthComparison {
-                folder: folder.display().to_string(),
+                folder: folder.to_string_lossy().into_owned(),
                 of: self.pictures.len(),
                 compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
                 original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
@@ -255,8 +255,8 @@ impl SideBySide {
         let scene = &self.scene;
         let count = |input: &dyn Family| input.source().info().count;
         let path = Both {
-            original: scene.path.display().to_string(),
-            compressed: self.compressed_as.path.display().to_string(),
+            original: scene.path.to_string_lossy().into_owned(),
+            compressed: self.compressed_as.path.to_string_lossy().into_owned(),
         };
         let size = Both { original: scene.input.size()?, compressed: self.compressed.size()? };
         Ok(Evaluation {
@@ -434,7 +434,7 @@ pub(super) fn open_compressed(path: &Path, original: &Scene, options: &InputOpti
         Timing::Numbered | Timing::Stamped => input,
     };
     let found = &input.source().info().times;
-    let expected = |what: String| format!("{what}, as in {}", original.path.display());
+    let expected = |what: String| format!("{what}, as in {}", original.path.shown());
     if found.len() != times.len() {
         let expected = expected(format!("{} frames", times.len()));
         return Err(Error::input(path, "", expected, format!("{} frames", found.len()))

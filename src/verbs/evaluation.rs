@@ -5,13 +5,16 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
 use super::csv::{known, table};
 use crate::compress::summary::CameraSummary;
+use crate::error::ShowPath;
 use crate::families::Size;
 use crate::families::size::of;
+use crate::ingest::names::name_of;
 
 /// One value for the model before compression and one for the model after it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -195,6 +198,15 @@ impl Comparison {
 }
 
 impl Evaluation {
+    /// Returns the evaluation with the last names of all paths alone, for a file.
+    pub fn without_folders(mut self) -> Evaluation {
+        let truth = self.ground_truth.as_mut().map(|truth| &mut truth.folder);
+        for path in [&mut self.path.original, &mut self.path.compressed].into_iter().chain(truth) {
+            *path = name_of(Path::new(path));
+        }
+        self
+    }
+
     /// A few lines for a person.
     pub fn text(&self) -> String {
         let mut out = String::new();
@@ -202,12 +214,17 @@ impl Evaluation {
         let percent = 100.0 * compressed as f64 / original.max(1) as f64;
         // Writing to a String cannot fail.
         let (before, after) = (self.size.original, self.size.compressed);
-        let _ =
-            writeln!(out, "{}: {original} Gaussians; {} bytes: {}", self.path.original, before.whole(), before.parts());
+        let _ = writeln!(
+            out,
+            "{}: {original} Gaussians; {} bytes: {}",
+            Path::new(&self.path.original).shown(),
+            before.whole(),
+            before.parts()
+        );
         let _ = writeln!(
             out,
             "{}: {compressed} Gaussians ({percent:.1}%); bytes: {}: {}",
-            self.path.compressed,
+            Path::new(&self.path.compressed).shown(),
             of(after.whole(), before.whole()),
             after.parts_of(&before)
         );

@@ -12,7 +12,7 @@ use crate::compress::summary::{CameraSummary, InputSummary};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::emit::image::{ImageFormat, image_bytes, write_image};
 use crate::emit::kind::check_folder_name;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture};
 use crate::render::Image;
@@ -119,7 +119,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         };
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?,
+            "input": InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?.without_folders(),
             "cameras": CameraSummary {
                 origin: scene.rig.origin.clone(),
                 cameras: scene.rig.cameras.len(),
@@ -144,7 +144,7 @@ fn format_of(output: &Path) -> Result<ImageFormat> {
     ImageFormat::of(output).ok_or_else(|| {
         Error::usage(format!(
             "{}: expected a name that ends in .png or .npy\n  for every picture into a folder, say --all",
-            output.display()
+            output.shown()
         ))
     })
 }

@@ -9,7 +9,7 @@ use crate::compress::open_to_measure;
 use crate::compress::score::UserOverrides;
 use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::emit::rows::RowTable;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
 
@@ -18,7 +18,7 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     recipe.validate().map_err(Error::usage)?;
     let extension = output.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
     if !matches!(extension.as_str(), "npz" | "csv") {
-        return Err(Error::usage(format!("{}: expected a name that ends in .npz or .csv", output.display())));
+        return Err(Error::usage(format!("{}: expected a name that ends in .npz or .csv", output.shown())));
     }
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let journal = &mut Journal::default();

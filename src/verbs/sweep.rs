@@ -17,6 +17,7 @@ use crate::compress::Target;
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
+use crate::ingest::names::name_of;
 use crate::report::trade_off::{PAGE, page};
 use crate::scene::{InputOptions, open_scene};
 use crate::stream::Progress;
@@ -133,7 +134,7 @@ fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
     let name = result_name(&scene)?;
     let found = TradeOff {
         tool: TOOL.to_owned(),
-        path: scene.path.display().to_string(),
+        path: name_of(&scene.path),
         digest: scene.input.digest()?,
         gaussians: scene.source().info().count,
         bytes: scene.input.bytes()?,

@@ -10,7 +10,7 @@ use super::evaluate::open_compressed;
 use crate::budget::Need;
 use crate::emit::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::emit::film::{Film, FilmFormat};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture, Rig, Shot};
 use crate::render::Image;
@@ -230,5 +230,5 @@ fn side_by_side(mut images: Vec<Image>) -> Image {
 
 /// What stands where in a film of two models.
 pub fn places(left: &Path, right: &Path) -> String {
-    format!("left: {}; right: {}", left.display(), right.display())
+    format!("left: {}; right: {}", left.shown(), right.shown())
 }

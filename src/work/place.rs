@@ -14,7 +14,7 @@ use super::part::MOST_PARTS;
 use super::piece::{ENDING, Name, Piece, names};
 use super::spill::{Spill, Spilling};
 use crate::emit::atomic::remove_leftovers;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 
 /// A work folder that is written to.
 #[derive(Debug)]
@@ -32,7 +32,7 @@ impl Place {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
                 Err(Error::io("create the work folder", folder)(error))
             }
-            _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.display()))),
+            _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.shown()))),
             _ => {
                 remove_leftovers(folder, ENDING);
                 Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about })
@@ -104,7 +104,7 @@ impl Place {
         match Piece::open(&path, &name.key) {
             Ok(Ok(piece)) => Ok(Some(piece)),
             Ok(Err(why)) => {
-                damaged(format!("{} is damaged ({why}): computed again", path.display()));
+                damaged(format!("{} is damaged ({why}): computed again", name.file()));
                 Ok(None)
             }
             // Somebody removed it meanwhile.

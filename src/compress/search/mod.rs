@@ -18,7 +18,7 @@ use super::request::Quality;
 use super::score::{Scored, scored};
 use super::summary::GoalSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, RENDER, Workload};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::limits::Limits;
 use crate::model::{Columns, Picture};
 use crate::reduction::Reduction;
@@ -199,7 +199,7 @@ impl Search {
         let of = pictures(&scene.rig, times, PictureSet::HeldOut)?;
         let found = Photographs::of_some(photographs, &scene.rig, times, of)?;
         if found.0.len() < HELD_EVERY {
-            let (folder, found) = (photographs.display(), found.0.len());
+            let (folder, found) = (photographs.shown(), found.0.len());
             return Err(Error::usage(format!(
                 "--ground-truth {folder}: expected photographs of {HELD_EVERY} or more held-out pictures, found {found}"
             )));

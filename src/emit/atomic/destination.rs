@@ -5,7 +5,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
 use super::named::{MARKER, Owner, entries, is_our_file, parts};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 
 /// Kind of an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,7 +51,7 @@ pub(super) enum Destination {
 /// Sockets, block devices, links to nothing, and links that lead through a system folder to a regular file, as
 /// [`Error::Usage`]: these are neither written nor replaced.
 pub(super) fn destination(target: &Path) -> Result<Destination> {
-    let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.display())));
+    let refuse = |what: &str| Err(Error::usage(format!("{} is {what}; give another output", target.shown())));
     let Ok(named) = fs::symlink_metadata(target) else { return Ok(Destination::Free) };
     let is_link = named.is_symlink();
     let found = match fs::metadata(target) {
@@ -100,7 +100,7 @@ fn leads_through_system_link(target: &Path) -> bool {
 /// # Errors
 /// As [`Error::Usage`]: an entry of another kind, or one that `replace` does not allow to replace.
 pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Result<()> {
-    let shown = target.display();
+    let shown = target.shown();
     let found = destination(target)?;
     match (kind, found) {
         (_, Destination::Free) => Ok(()),
@@ -131,7 +131,7 @@ pub(super) fn check_replace(target: &Path, kind: Kind, replace: Replace) -> Resu
 
 /// Confirms that the folder at `target` is a result of this program that lists its files.
 fn check_folder(target: &Path) -> Result<()> {
-    let shown = target.display();
+    let shown = target.shown();
     match Owner::read(&target.join(MARKER)) {
         Owner::Listed(_) => Ok(()),
         Owner::Unlisted => Err(Error::usage(format!(
@@ -160,12 +160,12 @@ pub(super) fn real_parent(target: &Path) -> Result<PathBuf> {
     let real = fs::canonicalize(&parent).map_err(|_| {
         Error::usage(format!(
             "{}: the folder {} to write it into does not exist; create it first",
-            target.display(),
-            parent.display()
+            target.shown(),
+            parent.shown()
         ))
     })?;
     match real.is_dir() {
         true => Ok(real),
-        false => Err(Error::usage(format!("{}: {} is not a folder", target.display(), parent.display()))),
+        false => Err(Error::usage(format!("{}: {} is not a folder", target.shown(), parent.shown()))),
     }
 }

@@ -15,7 +15,7 @@ use super::workspace::{
     DISCARDED, JOURNAL, Leftover, REPLACED, REPLACED_WHOLE, Refusal, SCRATCH, Workspace, is_unfinished, is_workspace,
     publishing_name, target_name,
 };
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 
 /// Longest wait for another run that is publishing its result under the same name, which takes it milliseconds.
 const LONGEST_WAIT: Duration = Duration::from_secs(60);
@@ -54,7 +54,7 @@ impl PublishLock {
                         format!(
                             "{} has existed for {} s: another run is writing this output, or was killed on a file system \
                              without locks or by another user\n  remove that folder if no other run is going on",
-                            parent.join(&name).display(),
+                            parent.join(&name).shown(),
                             LONGEST_WAIT.as_secs()
                         ),
                     );
@@ -124,7 +124,7 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
         let Some(leftover) = take_unfinished(&parent, entry) else { continue };
         if let Err(error) = settle(&leftover.folder, &parent, target) {
             let _ = if supersedes { leftover.folder.remove(JOURNAL) } else { Ok(()) };
-            warn(format!("an interrupted run that wrote {} could not be repaired: {error}", target.display()));
+            warn(format!("an interrupted run that wrote {} could not be repaired: {error}", target.shown()));
         }
     }
 }
@@ -184,8 +184,8 @@ pub(super) fn settle(folder: &Handle, parent: &Handle, target: &Path) -> Result<
     warn(format!(
         "{} is in place, but files of the earlier folder that are not splatsieve's could not be moved into it ({refused}); \
          they are in {}",
-        target.display(),
-        target.with_file_name(kept).display()
+        target.shown(),
+        target.with_file_name(kept).shown()
     ));
     Ok(())
 }

@@ -10,10 +10,9 @@ use std::io::{self, Read as _};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
-
 use super::handle::Handle;
-use crate::error::{Error, Result, quoted};
+use crate::error::{Error, Result, ShowPath, quoted};
+use serde::Deserialize;
 
 /// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
 /// result's own; [`super::StagedFolder::commit`] and [`super::commit_files`] enter them.
@@ -90,7 +89,7 @@ pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
     let Some(entries) = text.trim_end().strip_suffix('}').filter(|_| found.is_object()) else {
         return Err(Error::usage(format!(
             "{}: expected a JSON object to list files in, found {}",
-            path.display(),
+            path.shown(),
             quoted(&text)
         )));
     };

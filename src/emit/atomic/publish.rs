@@ -10,7 +10,7 @@ use super::leftovers::{Journal, PublishLock, repair, settle};
 use super::named::{parts, present};
 use super::warnings::warn;
 use super::workspace::{JOURNAL, REPLACED, REPLACED_WHOLE, Workspace, live};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 
 /// Gives files in `workspace` the names beside it that go with them, in order; the last one is the output itself, the others
 /// are its companions. The files have been written through to the disk.
@@ -89,7 +89,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
         warn(format!(
             "{} is complete and in place, but the earlier folder could not be dealt with ({error}); the next run with this \
              output tries again",
-            target.display()
+            target.shown()
         ));
     }
     drop(held);
@@ -105,7 +105,7 @@ fn sync_parent(target: &Path) {
         warn(format!(
             "{} is complete and in place, but its name could not be written through to the disk ({error}): a power failure \
              may lose it",
-            target.display()
+            target.shown()
         ));
     }
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::destination::{Destination, destination};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 
 /// Longest wait for a program that opens the other end of a FIFO.
 const LONGEST_WAIT: Duration = Duration::from_secs(10);
@@ -29,10 +29,11 @@ pub(super) fn copy(content: &Path, target: &Path) -> Result<()> {
     let failed = |error| Error::io("write to", target)(error);
     let mut from = File::open(content).map_err(Error::io("read back", content))?;
     if destination(target)? != Destination::Stream {
-        return Err(Error::usage(format!("{} was replaced during the run; give another output", target.display())));
+        return Err(Error::usage(format!("{} was replaced during the run; give another output", target.shown())));
     }
     let mut to = open(target).map_err(failed)?;
     let found = to.metadata().map_err(failed)?;
+    #[expect(clippy::disallowed_methods, reason = "nothing is written to it here")]
     let out = io::stdout().as_fd().try_clone_to_owned().and_then(|out| File::from(out).metadata());
     if out.is_ok_and(|out| (out.dev(), out.ino()) == (found.dev(), found.ino())) {
         IS_STANDARD_OUTPUT_USED.store(true, Ordering::Relaxed);

@@ -187,6 +187,49 @@ pub(in crate::families) fn with_sh_degree(text: &str, degree: usize, path: &Path
     Ok([&text[..place.start], &value, &text[place.end..]].concat())
 }
 
+/// Returns `text`, the content of `path`, for an archive, which is made to be sent: without folders of the machine the
+/// model was trained on. The strings of `source_path` and `model_path`, and all strings that are absolute paths, become
+/// their last names; every other byte stays.
+pub(in crate::families) fn without_folders(text: &str, path: &Path) -> Result<String> {
+    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let (mut out, mut end) = (String::with_capacity(text.len()), 0);
+    for key in &keys {
+        out += &text[end..key.place.start];
+        out += &without_paths(&text[key.place.clone()], ["source_path", "model_path"].contains(&key.name.as_str()));
+        end = key.place.end;
+    }
+    Ok(out + &text[end..])
+}
+
+/// Returns a Python expression whose strings are their last names: `all` of them, else those that are absolute paths.
+fn without_paths(expression: &str, all: bool) -> String {
+    let mut out = String::with_capacity(expression.len());
+    let mut rest = expression;
+    while let Some(start) = rest.find(['\'', '"']) {
+        let quote = rest[start..].chars().next().unwrap_or('"');
+        let content = &rest[start + 1..];
+        let mut is_escaped = false;
+        let end = content.find(|c: char| {
+            let ends = c == quote && !is_escaped;
+            is_escaped = c == '\\' && !is_escaped;
+            ends
+        });
+        // Text that ends within a string is no string.
+        let Some(end) = end else { break };
+        let string = &content[..end];
+        let is_absolute = string.starts_with(['/', '~', '\\']) || string.get(1..2) == Some(":");
+        let last = string.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or_default();
+        out += &rest[..=start];
+        match all || is_absolute {
+            true => out.extend(last.chars().filter(|&c| c != quote)),
+            false => out += string,
+        }
+        out.push(quote);
+        rest = &content[end + 1..];
+    }
+    out + rest
+}
+
 /// One key and its value; `None` stands for a missing key too, and takes the default.
 #[derive(Clone, Copy)]
 pub(in crate::families) struct Key<'a> {
@@ -261,6 +304,19 @@ impl<'a> Key<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn archives_keep_no_folder_of_the_training_machine() {
+        let text = r#"Namespace(sh_degree=3, source_path='/home/eve/secret/data/', model_path="output\\run 1", images='images/2x',
+ extra={'a': ['/home/eve/secret/x', 1]}, posix=PosixPath('/home/eve/it\'s'), w='C:\\secret\\y', eval=True)"#;
+        let expected = r#"Namespace(sh_degree=3, source_path='data', model_path="run 1", images='images/2x',
+ extra={'a': ['x', 1]}, posix=PosixPath('s'), w='y', eval=True)"#;
+        let found = without_folders(text, Path::new("cfg_args")).unwrap();
+        assert_eq!(found, expected);
+        assert_eq!(without_folders(&found, Path::new("cfg_args")).unwrap(), expected);
+        let plain = "Namespace(sh_degree=3, source_path='', eval=True)";
+        assert_eq!(without_folders(plain, Path::new("cfg_args")).unwrap(), plain);
+    }
 
     fn parse(text: &str) -> Result<ModelConfig> {
         ModelConfig::parse(text, Path::new("model/cfg_args"))

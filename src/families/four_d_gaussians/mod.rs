@@ -24,7 +24,7 @@ use crate::deform::{Field, FieldConfig, Tensor, Tensors};
 use crate::emit::container::GAUSSIAN_BLOCK;
 use crate::emit::kind::OutputKind;
 use crate::emit::ply::{out_rows, write_like};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::ingest::ply::Ply;
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
@@ -142,7 +142,7 @@ impl Family for ModelFolder {
         if !self.can_round_field()? {
             return Err(Error::usage(format!(
                 "an archive holds tensors of 32-bit and 16-bit floating-point numbers: {} has others",
-                paths.deformation.display()
+                paths.deformation.shown()
             )));
         }
         let tensors = read_state_dict(&paths.deformation, self.memory())?;
@@ -157,7 +157,7 @@ impl Family for ModelFolder {
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
         let cloud = left(self.stored(), reduction).gaussians;
-        let cfg_args = self.cfg_args(cloud.sh_degree())?;
+        let cfg_args = self.cfg_args_to_send(cloud.sh_degree())?;
         let mut content = Content {
             cloud,
             field: tensors.iter().map(role).collect(),
@@ -229,6 +229,16 @@ impl ModelFolder {
             true => with_sh_degree(&cfg_args::read(path)?, sh_degree, path).map(String::into_bytes),
             false => cfg_args::read(path).map(String::into_bytes),
         }
+    }
+
+    /// Returns `cfg_args` with the SH degree up to `sh_degree`, without folders of the machine the model was trained on.
+    fn cfg_args_to_send(&self, sh_degree: usize) -> Result<Vec<u8>> {
+        let path = &self.paths().cfg_args;
+        let mut text = cfg_args::read(path)?;
+        if sh_degree < self.info().sh_degree {
+            text = with_sh_degree(&text, sh_degree, path)?;
+        }
+        cfg_args::without_folders(&text, path).map(String::into_bytes)
     }
 
     /// Writes the field's state dict.

@@ -9,7 +9,7 @@ use gseq::Compression;
 use super::memory::Sizes;
 use super::steady::{Means, Steady};
 use crate::emit::container::{ContainerWriter, GAUSSIAN_BLOCK, Lives};
-use crate::error::Result;
+use crate::error::{Result, ShowPath};
 use crate::ingest::ply::{Ply, PlyOptions};
 use crate::ingest::ply_frames::PlyFrames;
 use crate::link::{Joiner, Linker, blend};
@@ -97,7 +97,7 @@ impl Found {
             ));
         }
         if let Some(&first) = self.cuts.first() {
-            let name = tracks.frames.paths()[first].file_name().unwrap_or_default().display();
+            let name = tracks.frames.paths()[first].file_name().unwrap_or_default().shown();
             notes.push(match self.cuts.len() {
                 1 => format!("a cut: {name} shows nothing of the frame before, all tracks end there"),
                 cuts => format!("{cuts} cuts, the first at {name}: such a frame shows nothing of the one before, all tracks end there"),

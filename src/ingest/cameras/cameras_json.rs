@@ -27,6 +27,7 @@ use super::pictures::each_picture;
 use super::times::{self, Times};
 use crate::error::Result;
 use crate::ingest::json::small::Small;
+use crate::ingest::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
@@ -48,7 +49,7 @@ pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) 
         assembly.add(per_picture(file, Fields::of(file, Some(index), frame)?)?)
     })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
-    assembly.finish(background, file.display().to_string())
+    assembly.finish(background, shown_name(file))
 }
 
 fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
@@ -83,7 +84,7 @@ fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
 pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
     let mut assembly = Assembly::new(options.memory);
     assembly.begin(file, count)?;
-    let mut origin = file.display().to_string();
+    let mut origin = shown_name(file);
     let mut times = Vec::new();
     if options.times != Times::Own {
         let mut names: Vec<Box<str>> = Vec::new();

@@ -16,7 +16,8 @@ use hashbrown::HashMap;
 
 use super::assemble::{Assembly, Gauge, Picture};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
-use crate::error::{Error, Result, quoted};
+use crate::error::{Error, Result, ShowPath, quoted};
+use crate::ingest::names::shown_name;
 use crate::ingest::open::open_file;
 use crate::ingest::text::Lines;
 use crate::model::{Camera, Rig, Split};
@@ -84,7 +85,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
         };
         let lens = lenses
             .get(&image.camera)
-            .ok_or_else(|| wrong(format!("a camera of {}", cameras.display()), format!("camera {}", image.camera)))?;
+            .ok_or_else(|| wrong(format!("a camera of {}", cameras.shown()), format!("camera {}", image.camera)))?;
         let [w, x, y, z] = image.quaternion;
         let quaternion = DQuat::from_xyzw(x, y, z, w);
         if (quaternion.length() - 1.0).abs().partial_cmp(&UNIT_TOLERANCE).is_none_or(|order| order.is_gt()) {
@@ -114,11 +115,11 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
         if listed.len().saturating_mul(frames) > MAX_PICTURES {
             return Err(Error::usage(format!(
                 "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
-                folder.display(),
+                folder.shown(),
                 listed.len()
             )));
         }
-        let origin = format!("{} (each of {frames} frames)", folder.display());
+        let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
         let pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
         assembly.begin(&images, listed.len() * frames)?;
         frames::repeated(&pictures, &first, frames).try_for_each(|picture| assembly.add(picture))?;
@@ -130,7 +131,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     for (index, image) in listed.iter().enumerate() {
         assembly.add(Picture { time: given.get(index).copied().flatten(), ..picture(image)? })?;
     }
-    let origin = folder.display().to_string();
+    let origin = shown_name(&folder);
     let origin = if said.is_empty() { origin } else { format!("{origin} ({said})") };
     assembly.finish(None, origin)
 }

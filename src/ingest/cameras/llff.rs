@@ -15,7 +15,9 @@ use npyz::{NpyFile, Order, TypeChar};
 
 use super::assemble::{Assembly, Gauge, Picture, check, from_camera_to_world};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
+use crate::error::ShowPath;
 use crate::error::{Error, Result};
+use crate::ingest::names::shown_name;
 use crate::ingest::npy::{HEAD, header_is_sound};
 use crate::ingest::open::open_file;
 use crate::model::{Camera, Rig, Split};
@@ -35,11 +37,11 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
     if frames.saturating_mul(cameras.len()) > MAX_PICTURES {
         return Err(Error::usage(format!(
             "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
-            file.display(),
+            file.shown(),
             cameras.len()
         )));
     }
-    let mut origin = file.display().to_string();
+    let mut origin = shown_name(file);
     if options.frames.is_none() {
         origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
     }

@@ -11,9 +11,11 @@ use glam::{DMat3, DVec3};
 use super::assemble::{Assembly, Picture};
 use super::fields::{Fields, POSE, place};
 use super::pictures::outline;
+use crate::error::ShowPath;
 use crate::error::{Error, Result};
 use crate::ingest::json::lists::{Ask, At, each_element};
 use crate::ingest::json::small::Small;
+use crate::ingest::names::shown_name;
 use crate::limits::ReadLimit;
 use crate::model::{Camera, Rig, Split};
 
@@ -41,12 +43,12 @@ pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<
         if other.is_file() {
             let found = add(&mut assembly, &other, *split)?;
             if found != frames {
-                let expected = format!("{frames} frames, as in {}", file.display());
+                let expected = format!("{frames} frames, as in {}", file.shown());
                 return Err(Error::input(&other, "k", expected, format!("{found} frames")));
             }
         }
     }
-    assembly.finish(None, file.display().to_string())
+    assembly.finish(None, shown_name(file))
 }
 
 /// The values under one key, by frame and camera.

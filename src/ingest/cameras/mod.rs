@@ -32,6 +32,7 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 
+use crate::error::ShowPath;
 use crate::error::{Error, Result};
 use crate::ingest::json::small::Small;
 use crate::limits::ReadLimit;
@@ -111,7 +112,7 @@ pub fn load(path: &Path, options: &CameraOptions) -> Result<Rig> {
     }
     let timed = || match options.times {
         Times::Own => Ok(()),
-        _ => Err(Error::usage(format!("{}: --times is for cameras without times of their own", file.display()))),
+        _ => Err(Error::usage(format!("{}: --times is for cameras without times of their own", file.shown()))),
     };
     if file.ends_with(NERFIES) {
         timed()?;

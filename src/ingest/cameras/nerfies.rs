@@ -19,6 +19,7 @@ use crate::error::{Error, Result, quoted};
 use crate::ingest::image::measure;
 use crate::ingest::json::lists::{Ask, At, each_element, each_entry};
 use crate::ingest::json::small::Small;
+use crate::ingest::names::shown_name;
 use crate::model::{Rig, Split};
 
 /// Keys of a camera's file.
@@ -49,7 +50,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
             assembly.add(Picture { time: Some(time), split, ..picture.clone() })?;
         }
     }
-    assembly.finish(None, folder.display().to_string())
+    assembly.finish(None, shown_name(folder))
 }
 
 /// Keys of the lists of names: all pictures, those held out, those for training.

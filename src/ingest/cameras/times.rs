@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 use hashbrown::HashMap;
 
 use super::assemble::Gauge;
-use crate::error::{Error, Result, quoted};
+use crate::error::{Error, Result, ShowPath, quoted};
+use crate::ingest::names::shown_name;
 use crate::ingest::text::Lines;
 
 /// Bytes of an entry of a table beside its name, while the table grows by being copied to twice its size.
@@ -46,7 +47,7 @@ impl Times {
             Times::Own => None,
             Times::Names => Some("names".to_owned()),
             Times::None => Some("none".to_owned()),
-            Times::Table(table) => Some(table.display().to_string()),
+            Times::Table(table) => Some(table.to_string_lossy().into_owned()),
         }
     }
 }
@@ -71,11 +72,11 @@ pub(super) fn give(
                 let time = keys(name).find_map(|key| known.get(key)).copied();
                 time.map(Some).ok_or_else(|| {
                     Error::input(table, "", format!("a line for the picture {}", quoted(name)), "none")
-                        .hint(format!("the names are those of {}", file.display()))
+                        .hint(format!("the names are those of {}", file.shown()))
                 })
             };
             let given = names.iter().map(|name| time(name)).collect::<Result<Vec<_>>>()?;
-            Ok((given, format!("times from {}", table.display())))
+            Ok((given, format!("times from {}", shown_name(table))))
         }
         Times::Own | Times::Names => {
             let numbers: Vec<Option<u64>> = names.iter().map(|name| number(name)).collect();

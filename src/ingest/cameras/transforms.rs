@@ -18,9 +18,10 @@ use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
 use super::fields::Fields;
 use super::pictures::{each_picture, outline};
 use super::{CameraOptions, Clock};
-use crate::error::Result;
+use crate::error::{Result, ShowPath};
 use crate::ingest::image::measure;
 use crate::ingest::json::small::Small;
+use crate::ingest::names::shown_name;
 use crate::model::{Rig, Split};
 
 /// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
@@ -51,7 +52,7 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
     if latest > 0.0 && options.clock == Clock::Normalised {
         assembly.divide_times(latest);
     }
-    let names: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
+    let names: Vec<String> = files.iter().map(|path| shown_name(path)).collect();
     assembly.finish(None, names.join(" and "))
 }
 
@@ -121,7 +122,7 @@ fn size(shared: Fields<'_>, own: Fields<'_>, image: Option<&Path>, options: &Cam
     }
     // A picture that is missing or unreadable is no error: the size may be given instead.
     image.and_then(measure).or(options.size).ok_or_else(|| {
-        let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.display()));
+        let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.shown()));
         own.wrong("w", format!("the picture size as w and h{tried}"))
             .hint("give --size WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
     })

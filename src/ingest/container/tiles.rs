@@ -5,7 +5,7 @@ use std::ops::Range;
 use gseq::{Encoding, TileFrames, TileId, Touched};
 
 use super::store::{Container, Scratch};
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::model::{Columns, Gaussians};
 use crate::source::{BlockReader, Ids, Wanted};
 
@@ -301,7 +301,7 @@ impl<'a> TileReader<'a> {
     fn check(&self, frame: usize) -> Result<()> {
         match frame < self.source.info.times.len() {
             true => Ok(()),
-            false => Err(Error::usage(format!("{}: there is no frame {frame}", self.source.path.display()))),
+            false => Err(Error::usage(format!("{}: there is no frame {frame}", self.source.path.shown()))),
         }
     }
 }

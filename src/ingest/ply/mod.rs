@@ -27,7 +27,7 @@ pub(crate) use layout::{Layout, Plane, name_without_bands};
 
 use super::map::FileMap;
 use super::open::open_file;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
 use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians};
 use crate::source::Ids;
@@ -344,7 +344,7 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     match beyond {
         None => Ok(()),
         Some(id) => {
-            Err(Error::usage(format!("{}: Gaussian {id} was asked for, of {count} counted from 0", path.display())))
+            Err(Error::usage(format!("{}: Gaussian {id} was asked for, of {count} counted from 0", path.shown())))
         }
     }
 }

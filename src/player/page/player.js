@@ -413,6 +413,7 @@ function listen() {
     });
     handle.addEventListener("pointerup", () => { handle.onpointermove = null; });
 
+    el("controls").onsubmit = () => false;
     el("play").onclick = () => play(!playing);
     el("scrub").oninput = () => { play(false); seek(Number(el("scrub").value)); };
     el("show").onchange = layOut;

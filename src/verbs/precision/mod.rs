@@ -27,7 +27,8 @@ use crate::compress::score::UserOverrides;
 use crate::compress::{Job, Request, Target};
 use crate::emit::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::emit::kind::check_folder_name;
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, ShowPath};
+use crate::ingest::names::name_of;
 use crate::model::{Rows, Schedule};
 use crate::recipe::Recipe;
 use crate::report::precision::{PAGE, page};
@@ -176,7 +177,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     if !scene.has_cameras {
         return Err(Error::usage(format!(
             "{}: precision looks at pictures, and no cameras were found\n  give --cameras",
-            scene.path.display()
+            scene.path.shown()
         )));
     }
     let info = scene.source().info();
@@ -234,7 +235,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     };
     let mut found = Precision {
         tool: TOOL.to_owned(),
-        path: scene.path.display().to_string(),
+        path: name_of(&scene.path),
         digest: scene.input.digest()?,
         gaussians,
         frames,
