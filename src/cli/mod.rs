@@ -603,6 +603,7 @@ fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) 
     options.conventions = conventions(&input.trained);
     options.link = input.link.map_or(Link::Auto, Link::from);
     options.memory = budget_of(input.memory);
+    options.is_scratch_named = input.scratch_dir.is_some();
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
         options.use_cameras(cameras.file);

@@ -36,6 +36,8 @@ pub struct InputOptions {
     /// Folder for scratch files while the run lasts: the packed frames of a stream, what does not fit into
     /// `memory`; none: the system's for such files.
     pub scratch: Option<PathBuf>,
+    /// Whether the user named `scratch`, as opposed to a folder derived from the output.
+    pub is_scratch_named: bool,
     /// Memory that the run may take.
     pub memory: Budget,
     /// Where what stages find is kept; none: nowhere.
@@ -67,8 +69,13 @@ impl InputOptions {
     /// Such a folder, as [`Error::Usage`].
     pub(super) fn check_folders(&self) -> Result<()> {
         let Ok(input) = fs::canonicalize(&self.path) else { return Ok(()) };
+        if !input.is_dir() {
+            return Ok(());
+        }
         let work = self.work.as_ref().map(|asked| asked.folder.as_path());
-        for (option, folder) in [("--work", work), ("--scratch-dir", self.scratch.as_deref())] {
+        // The folder of an output inside the input is refused with the output.
+        let scratch = self.scratch.as_deref().filter(|_| self.is_scratch_named);
+        for (option, folder) in [("--work", work), ("--scratch-dir", scratch)] {
             let Some(folder) = folder else { continue };
             // A work folder may have to be created.
             let parent = folder.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
