@@ -161,7 +161,12 @@ fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
     for (at, name) in [(0, "made/data.pkl"), (2, "made/data/0")] {
         let mut archive = ZipArchive::new(Cursor::new(&bytes[..])).unwrap();
         let file = archive.by_index(at).unwrap();
-        assert!(file.name() == name && file.data_start() % 64 == 0, "{} at {}", file.name(), file.data_start());
+        assert!(
+            file.name() == name && file.data_start().is_multiple_of(64),
+            "{} at {}",
+            file.name(),
+            file.data_start()
+        );
     }
 }
 
