@@ -22,4 +22,3 @@ mod shared_file;
 pub mod splatv;
 pub mod text;
 mod zip_directory;
-pub(crate) mod zip_end;

@@ -17,11 +17,13 @@ use zip::read::ZipFile;
 use super::map::FileMap;
 use super::npy::{HEAD, header_is_sound};
 use super::open::open_file;
-use super::zip_end::check_end;
+use super::zip_directory::{Announced, announced};
 use crate::error::{Error, Result};
 
 /// Most arrays of an archive.
 const MAX_ARRAYS: usize = 4096;
+/// Maximum number of bytes of the list of files at the end of an archive.
+const MAX_LIST: u64 = 4 << 20;
 /// Bytes of decoded arrays that each byte of an archive may stand for, beside [`SCRATCH`]. Trained models have 1 to 2.
 const SCRATCH_PER_BYTE: u64 = 64;
 /// Bytes of decoded arrays that any archive may have.
@@ -261,8 +263,15 @@ impl Npz {
 /// Opens the zip archive at `path`. The inner error says what was found in it.
 fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
     let mut file = open_file(path)?;
-    if let Err(found) = check_end(&mut file).map_err(Error::io("read", path))? {
-        return Ok(Err(found));
+    let directory = match announced(&mut file) {
+        Ok(directory) => directory,
+        Err(error) => return Ok(Err(error.to_string())),
+    };
+    if directory.entries > MAX_ARRAYS as u64 || directory.bytes > MAX_LIST {
+        let Announced { entries, bytes } = directory;
+        return Ok(Err(format!(
+            "{entries} files in a list of {bytes} bytes, where at most {MAX_ARRAYS} files and {MAX_LIST} bytes can be"
+        )));
     }
     Ok(ZipArchive::new(BufReader::new(file)).map_err(|error| error.to_string()))
 }

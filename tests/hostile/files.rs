@@ -323,8 +323,8 @@ fn zip_ends_that_announce_too_many_files_are_refused() {
     };
     for (name, files, list, says) in [
         ("files", 60_000, 0, "60000 files"),
-        ("record", u16::MAX, 0, "64-bit record"),
-        ("list", 1, 1 << 30, "list of files of"),
+        ("most", u16::MAX, 0, "65535 files"),
+        ("list", 1, 1 << 30, "in a list of"),
     ] {
         let path = sparse(&folder, &format!("{name}.npz"), "PK", 1 << 30);
         File::options().append(true).open(path).unwrap().write_all(&end(files, list)).unwrap();
