@@ -378,7 +378,7 @@ fn slow_outputs_of_all_commands_name_no_folder() {
         "convert {m} {o}/scene.4dgs --cameras {m}",
         "unpack {m} --cameras {m} -o {o}/frames",
         "convert {o}/frames/frame_00000.ply {o}/one.spz",
-        "compress {o}/frames/frame_00000.ply --cameras {m} --times none SHORT --archive-psnr 30 -o {o}/one.gsz",
+        "compress {o}/frames/frame_00000.ply SHORT --archive-psnr 30 -o {o}/one.gsz",
         "pack {m} --cameras {m} -o {o}/scene.gseq",
         "pack {o}/frames -o {o}/frames.gseq",
         "recover {o}/scene.gseq -o {o}/recovered.gseq",
