@@ -217,6 +217,21 @@ fn a_run_killed_between_its_renames_does_not_lose_the_old_output() {
 }
 
 #[test]
+fn a_workspace_whose_lock_is_still_empty_is_removed() {
+    let base = tempfile::tempdir().unwrap();
+    let target = base.path().join("out");
+    // As a run leaves it that is killed between creating the lock file and writing its line.
+    let workspace = Workspace::beside(&target).unwrap();
+    File::create(workspace.folder.join("lock")).unwrap();
+    let begun = base.path().join(".out.killed.splatsieve-tmp");
+    fs::rename(&workspace.folder, &begun).unwrap();
+    drop(workspace);
+    assert_eq!(names(base.path()), [".out.killed.splatsieve-tmp"]);
+    drop(StagedFile::new(&target, Replace::Never).unwrap());
+    assert_eq!(names(base.path()), [] as [&str; 0]);
+}
+
+#[test]
 fn a_run_killed_after_its_renames_has_the_new_output_and_does_not_lose_foreign_files() {
     for (aside, is_carried) in [("replaced", true), ("replaced-whole", false), ("discarded", false)] {
         let base = tempfile::tempdir().unwrap();

@@ -13,6 +13,7 @@ use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::io::{self, Read as _, Write as _};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -72,7 +73,12 @@ impl Workspace {
         loop {
             // Held until the folder is listed, so that a signal handler knows of it.
             let mut live = live();
-            let made = tempfile::Builder::new().prefix(&prefix).suffix(ENDING).tempdir_in(&parent);
+            let made = tempfile::Builder::new()
+                .prefix(&prefix)
+                .suffix(ENDING)
+                // Private, by which [`Leftover::take`] knows it even before the line is in its lock file.
+                .permissions(fs::Permissions::from_mode(0o700))
+                .tempdir_in(&parent);
             let made = made.map_err(Error::io("create a folder in", &parent))?;
             let claimed = claim(made.path()).map_err(Error::io("create a lock in", made.path()))?;
             if let Some(workspace) = claimed {
