@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 
 use super::family::{Entry, Family, OpenOptions, Residence, Timing};
 use super::files::copy;
+use super::four_d_gaussians::cfg_args;
 use super::iterations::iteration;
 use super::size::{Size, bytes_below, bytes_of};
 use crate::archive::Content;
 use crate::emit::kind::OutputKind;
 use crate::error::{Error, Result};
-use crate::ingest::open::read_small_text;
 use crate::ingest::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::reduction::Reduction;
@@ -35,7 +35,7 @@ pub(super) const ENTRY: Entry = Entry {
 
 /// Whether a model's folder says that its cloud is deformed, even where the file that does it is missing.
 fn deforms(root: &Path) -> bool {
-    let arguments = read_small_text(&root.join("cfg_args"), "a cfg_args").unwrap_or_default();
+    let arguments = cfg_args::read(&root.join("cfg_args")).unwrap_or_default();
     root.join("deform").exists() || ["kplanes_config", "defor_depth"].iter().any(|name| arguments.contains(name))
 }
 

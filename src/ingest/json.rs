@@ -17,7 +17,7 @@ use serde::de::DeserializeSeed;
 use serde_json::Value;
 use serde_json::error::Category;
 
-use super::open::open_file;
+use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 use checked::Checked;
 
@@ -89,14 +89,10 @@ pub(crate) fn read_from<T, S: for<'de> DeserializeSeed<'de, Value = T>>(
 /// Reads the whole JSON document in the file at `path`, which must hold at most `most_bytes`.
 ///
 /// # Errors
-/// A larger file; those of [`read`].
+/// Those of [`read_small`] and of [`read`].
 pub(crate) fn read_json(path: &Path, most_bytes: u64) -> Result<Value> {
-    let file = open_file(path)?;
-    let bytes = file.metadata().map_err(Error::io("read the size of", path))?.len();
-    if bytes > most_bytes {
-        return Err(Error::input(path, "", format!("at most {most_bytes} bytes of JSON"), format!("{bytes} bytes")));
-    }
-    read_from(file.take(most_bytes), path, &Stopped::default(), PhantomData::<Value>)
+    let bytes = read_small(path, most_bytes, "JSON")?;
+    read_from(&bytes[..], path, &Stopped::default(), PhantomData::<Value>)
 }
 
 #[cfg(test)]

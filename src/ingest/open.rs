@@ -54,18 +54,6 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
     Ok(bytes)
 }
 
-/// Reads the UTF-8 text of a file of at most 1 MiB, such as a configuration.
-///
-/// # Errors
-/// Those of [`read_small`]; bytes that are not UTF-8.
-pub(crate) fn read_small_text(path: &Path, what: &str) -> Result<String> {
-    let bytes = read_small(path, 1 << 20, what)?;
-    String::from_utf8(bytes).map_err(|error| {
-        let at = error.utf8_error().valid_up_to();
-        Error::input(path, format!("byte {at}"), "text in UTF-8", "another byte").hint("save the file as UTF-8")
-    })
-}
-
 /// Refuses a file of another kind than a regular one.
 fn check_regular(path: &Path, kind: FileType) -> Result<()> {
     if kind.is_file() {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::open::{open_file, read_small};
 use crate::error::{Error, Result};
 
-/// The text of a file of at most `most_bytes`, without a byte order mark.
+/// Reads the text of a file of at most `most_bytes`, without a byte order mark.
 ///
 /// # Errors
 /// Those of [`read_small`]; bytes that are no UTF-8, with the place of the first.
@@ -17,8 +17,11 @@ pub fn read_text(path: &Path, most_bytes: u64) -> Result<String> {
     utf_8(path, text, (bytes.len() - text.len()) as u64).map(str::to_owned)
 }
 
-/// `bytes`, the first ones of the file at `path`, without a byte order mark.
-fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
+/// Returns `bytes`, the first ones of the file at `path`, without a byte order mark.
+///
+/// # Errors
+/// The byte order mark of UTF-16.
+pub(super) fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
     if let [0xff, 0xfe, ..] | [0xfe, 0xff, ..] = bytes {
         let found = "the byte order mark of UTF-16";
         return Err(Error::input(path, "byte 0", "text in UTF-8", found).hint("save it as UTF-8"));
@@ -26,17 +29,17 @@ fn without_mark<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a [u8]> {
     Ok(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
 }
 
-/// `bytes` from byte `start` of the file at `path` on as text.
+/// Returns the error for `byte`, which stands at `place` of the file at `path` and does not belong to UTF-8 text.
+pub(super) fn not_utf_8(path: &Path, place: u64, byte: u8) -> Error {
+    Error::input(path, format!("byte {place}"), "text in UTF-8", format!("the byte 0x{byte:02x}"))
+        .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
+}
+
+/// Returns `bytes`, which begin at byte `start` of the file at `path`, as text.
 fn utf_8<'a>(path: &Path, bytes: &'a [u8], start: u64) -> Result<&'a str> {
     str::from_utf8(bytes).map_err(|error| {
         let at = error.valid_up_to();
-        Error::input(
-            path,
-            format!("byte {}", start + at as u64),
-            "text in UTF-8",
-            format!("the byte 0x{:02x}", bytes[at]),
-        )
-        .hint("save it as UTF-8: it may be in Latin-1 or another encoding")
+        not_utf_8(path, start + at as u64, bytes[at])
     })
 }
 

@@ -20,7 +20,7 @@ pub(super) use paths::{has_network, names_of_network};
 
 use super::family::{Family, OpenOptions, Residence, Timing};
 use super::files::copy;
-use super::four_d_gaussians::cfg_args::{read, with_sh_degree};
+use super::four_d_gaussians::cfg_args::read_for_degree;
 use super::law::{Law, Model, solve};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{check_output, state_bytes, write_sequence};
@@ -106,13 +106,9 @@ impl<L: Deforming + 'static> Folder<L> {
         Ok(Box::new(Folder { paths, model, source_path, white_background, tensor_bytes: 4 * values as u64, notes }))
     }
 
-    /// The bytes of `cfg_args`, with the degree of harmonics up to `sh_degree`.
-    fn cfg_args(&self, sh_degree: usize) -> Result<Vec<u8>> {
-        let path = &self.paths.cfg_args;
-        match sh_degree < self.model.info().sh_degree {
-            true => with_sh_degree(&read(path)?, sh_degree, path).map(String::into_bytes),
-            false => read(path).map(String::into_bytes),
-        }
+    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    fn cfg_args(&self, sh_degree: usize) -> Result<String> {
+        read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
     }
 
     /// Writes what is left as a folder at `path`.

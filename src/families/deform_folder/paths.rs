@@ -89,14 +89,14 @@ impl Paths {
     /// # Errors
     /// A file that is no state dict; one of Grid4D.
     pub(super) fn tensors(&self, memory: ReadLimit) -> Result<Tensors> {
-        if is_pair(&self.network, memory) {
-            return Err(Error::input(&self.network, "", "the state dict of one network", "two, as Grid4D saves them")
-                .hint(
-                    "its hash grids are not read here; write what it renders from as a PLY for each time, and give \
-                     the folder of them",
-                ));
-        }
-        read_state_dict(&self.network, memory)
+        let pair = "its hash grids are not read here; write what it renders from as a PLY for each time, and give the folder of \
+                    them";
+        read_state_dict(&self.network, memory).map_err(|error| match is_pair(&self.network, memory) {
+            true => {
+                Error::input(&self.network, "", "the state dict of one network", "two, as Grid4D saves them").hint(pair)
+            }
+            false => error,
+        })
     }
 
     /// xxh3-128 over the bytes of cloud, network and `cfg_args`, as 32 hex digits.

@@ -163,7 +163,7 @@ impl ModelConfig {
     }
 }
 
-/// The text of the `cfg_args` file at `path`.
+/// Returns the text of the `cfg_args` file at `path`.
 pub(in crate::families) fn read(path: &Path) -> Result<String> {
     let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
     String::from_utf8(bytes).map_err(|error| {
@@ -185,6 +185,13 @@ pub(in crate::families) fn with_sh_degree(text: &str, degree: usize, path: &Path
         }
     };
     Ok([&text[..place.start], &value, &text[place.end..]].concat())
+}
+
+/// Returns the text of the `cfg_args` file at `path` of a model with SH degree `own`, for a result with SH degree `degree`:
+/// as it is unless the degree becomes lower.
+pub(in crate::families) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
+    let text = read(path)?;
+    if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }
 }
 
 /// Returns `text`, the content of `path`, for an archive, which is made to be sent: without folders of the machine the

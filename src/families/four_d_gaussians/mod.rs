@@ -31,7 +31,6 @@ use crate::model::{Columns, Gaussians, Jacobian};
 use crate::recipe::{Merge, Precision};
 use crate::reduction::{Cluster, Proxies, Reduction, Reference};
 use crate::source::{Deformation, FrameSource};
-use cfg_args::with_sh_degree;
 pub use model_folder::ModelFolder;
 
 /// A model folder.
@@ -157,7 +156,8 @@ impl Family for ModelFolder {
         let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
         let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
         let cloud = left(self.stored(), reduction).gaussians;
-        let cfg_args = self.cfg_args_to_send(cloud.sh_degree())?;
+        let cfg_args = self.cfg_args(cloud.sh_degree())?;
+        let cfg_args = cfg_args::without_folders(&cfg_args, &paths.cfg_args)?.into_bytes();
         let mut content = Content {
             cloud,
             field: tensors.iter().map(role).collect(),
@@ -222,23 +222,9 @@ impl Family for ModelFolder {
 }
 
 impl ModelFolder {
-    /// The bytes of `cfg_args`, with the degree of harmonics up to `sh_degree`.
-    fn cfg_args(&self, sh_degree: usize) -> Result<Vec<u8>> {
-        let path = &self.paths().cfg_args;
-        match sh_degree < self.info().sh_degree {
-            true => with_sh_degree(&cfg_args::read(path)?, sh_degree, path).map(String::into_bytes),
-            false => cfg_args::read(path).map(String::into_bytes),
-        }
-    }
-
-    /// Returns `cfg_args` with the SH degree up to `sh_degree`, without folders of the machine the model was trained on.
-    fn cfg_args_to_send(&self, sh_degree: usize) -> Result<Vec<u8>> {
-        let path = &self.paths().cfg_args;
-        let mut text = cfg_args::read(path)?;
-        if sh_degree < self.info().sh_degree {
-            text = with_sh_degree(&text, sh_degree, path)?;
-        }
-        cfg_args::without_folders(&text, path).map(String::into_bytes)
+    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    fn cfg_args(&self, sh_degree: usize) -> Result<String> {
+        cfg_args::read_for_degree(&self.paths().cfg_args, self.info().sh_degree, sh_degree)
     }
 
     /// Writes the field's state dict.

@@ -4,9 +4,9 @@
 use std::path::Path;
 
 use crate::error::{Error, Result, quoted};
+use crate::families::four_d_gaussians::cfg_args;
 use crate::families::in_checkpoint::texts_in;
 use crate::families::python_literal::{Literal, parse_call};
-use crate::ingest::open::read_small_text;
 use crate::ingest::text::read_text;
 
 /// What matters of it.
@@ -30,7 +30,7 @@ impl Configuration {
         if !path.is_file() {
             return Ok(found);
         }
-        let text = read_small_text(&path, "a cfg_args")?;
+        let text = cfg_args::read(&path)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(&path, &text))?;
         for argument in arguments {
             match (argument.name.as_str(), argument.value) {

@@ -4,6 +4,7 @@ use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult};
 use std::path::{Path, PathBuf};
 
 use crate::error::Error;
+use crate::ingest::text::{not_utf_8, without_mark};
 
 /// Bytes that are read and checked together.
 const BUFFER: usize = 1 << 16;
@@ -106,13 +107,12 @@ impl<R: Read> Checked<R> {
             self.filled += count;
             if !self.is_begun && (count == 0 || self.filled >= 3) {
                 self.is_begun = true;
-                match self.buffer[..self.filled] {
-                    [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => {
-                        let found = "the byte order mark of UTF-16";
-                        return self.refuse(0, "text in UTF-8", found, "save it as UTF-8");
+                match without_mark(&self.path, &self.buffer[..self.filled]) {
+                    Ok(text) => {
+                        let mark = self.filled - text.len();
+                        (self.taken, self.checked) = (mark, mark);
                     }
-                    [0xef, 0xbb, 0xbf, ..] => (self.taken, self.checked) = (3, 3),
-                    _ => {}
+                    Err(error) => return self.refuse(0, error),
                 }
             }
             if self.is_begun {
@@ -124,9 +124,9 @@ impl<R: Read> Checked<R> {
         }
     }
 
-    fn refuse(&mut self, at: usize, expected: &str, found: &str, hint: &str) -> IoResult<()> {
-        let place = format!("byte {}", self.start + at as u64);
-        self.refusal = Some(Error::input(&self.path, place, expected, found).hint(hint));
+    /// Keeps the error for the byte at `at` of the buffer.
+    fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
+        self.refusal = Some(error);
         // What comes before is still the parser's: it may be wrong earlier.
         match at > self.taken {
             true => Ok(()),
@@ -145,15 +145,16 @@ impl<R: Read> Checked<R> {
         for at in from..valid {
             if let Some(expected) = self.step(self.buffer[at]) {
                 self.checked = at;
-                let (found, hint) = ("more", "check that this is a file of cameras");
-                return self.refuse(at, &expected, found, hint);
+                let place = format!("byte {}", self.start + at as u64);
+                let error = Error::input(&self.path, place, expected, "more");
+                return self.refuse(at, error.hint("check that this is a file of cameras"));
             }
         }
         self.checked = valid;
         match bad {
             Some((at, true)) => {
-                let found = format!("the byte 0x{:02x}", self.buffer[at]);
-                self.refuse(at, "text in UTF-8", &found, "save it as UTF-8: it may be in Latin-1 or another encoding")
+                let error = not_utf_8(&self.path, self.start + at as u64, self.buffer[at]);
+                self.refuse(at, error)
             }
             _ => Ok(()),
         }

@@ -126,13 +126,10 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
     type Value = ();
     ignore_scalars!();
 
-    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<(), A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(self, list: A) -> std::result::Result<(), A::Error> {
         match self.0.ask.keys.is_empty() {
             true => List { lists: self.0, key: 0 }.visit_seq(list),
-            false => {
-                while list.next_element::<IgnoredAny>()?.is_some() {}
-                Ok(())
-            }
+            false => IgnoredAny.visit_seq(list).map(drop),
         }
     }
 
@@ -172,9 +169,8 @@ impl<'de> Visitor<'de> for List<'_, '_> {
         Ok(())
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
-        while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {}
-        Ok(())
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<(), A::Error> {
+        IgnoredAny.visit_map(map).map(drop)
     }
 }
 
@@ -234,9 +230,8 @@ impl<'de> Visitor<'de> for Within<'_, '_> {
         Ok(Small::List(Vec::new(), 0))
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Small, A::Error> {
-        while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {}
-        Ok(Small::Large("an object".into()))
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<Small, A::Error> {
+        IgnoredAny.visit_map(map).map(|IgnoredAny| Small::Large("an object".into()))
     }
 }
 
@@ -252,9 +247,8 @@ impl<'de> Visitor<'de> for Entries<'_> {
     type Value = ();
     ignore_scalars!();
 
-    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<(), A::Error> {
-        while list.next_element::<IgnoredAny>()?.is_some() {}
-        Ok(())
+    fn visit_seq<A: SeqAccess<'de>>(self, list: A) -> std::result::Result<(), A::Error> {
+        IgnoredAny.visit_seq(list).map(drop)
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {

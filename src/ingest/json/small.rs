@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use serde::Deserialize;
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Number, Value};
 
@@ -168,19 +169,8 @@ impl<'de> DeserializeSeed<'de> for Inner<'_> {
                 *self.left = left;
                 from.deserialize_any(self)
             }
-            None => IgnoredAny.deserialize_ignored(from).map(|()| Small::Large("a value of many parts".into())),
+            None => IgnoredAny::deserialize(from).map(|IgnoredAny| Small::Large("a value of many parts".into())),
         }
-    }
-}
-
-/// Passes over a value.
-trait Ignore {
-    fn deserialize_ignored<'de, D: Deserializer<'de>>(self, from: D) -> Result<(), D::Error>;
-}
-
-impl Ignore for IgnoredAny {
-    fn deserialize_ignored<'de, D: Deserializer<'de>>(self, from: D) -> Result<(), D::Error> {
-        from.deserialize_ignored_any(self).map(drop)
     }
 }
 
