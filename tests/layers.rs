@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 
 /// Modules of each layer, from the vocabulary up.
 const LAYERS: [&[&str]; 5] = [
-    &["error", "machine", "model", "limits", "recipe", "reduction", "source"],
-    &["deform", "stats", "score", "select", "merge", "link", "render", "refine", "metrics", "archive", "fit"],
+    &["machine", "limits", "recipe", "reduction", "source"],
+    &["stats", "score", "select", "merge", "link", "refine", "archive", "fit"],
     &["ingest", "stream", "emit", "work", "families", "demo", "player"],
     &["budget", "scene", "compress", "verbs", "report", "selfcheck"],
     &["cli"],

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::case::{Case, Worst};
-use super::made::field::{Noise, plain, tensors};
-use super::oracle::field::{Oracle, Parameters};
+use crate::deform::oracle::{Oracle, Parameters};
+use crate::deform::synthetic::{Noise, plain, tensors};
 use crate::deform::{Deltas, Field, FieldConfig, Scratch};
 use crate::model::{Columns, Gaussians};
 
@@ -28,9 +28,9 @@ pub(super) fn states() -> Case {
                 let mut state = Gaussians::zeros(0, 3);
                 deltas.apply(&raw, Columns::all(), &mut state);
                 for i in 0..raw.len() {
-                    let got = Parameters::of(&state, i).values();
+                    let got = Parameters::from_row(&state, i).values();
                     let oracle = Oracle { tensors: &tensors, config: &config };
-                    let expected = oracle.state(&Parameters::of(&raw, i), time).values();
+                    let expected = oracle.state(&Parameters::from_row(&raw, i), time).values();
                     got.iter().zip(&expected).for_each(|(&got, &x)| worst.near(got, x, 1.0 + x.abs()));
                 }
             }
@@ -53,7 +53,7 @@ pub(super) fn derivative() -> Case {
         for i in 0..raw.len() {
             for by in 0..3 {
                 let [low, high] = [-step, step].map(|step| {
-                    let mut moved = Parameters::of(&raw, i);
+                    let mut moved = Parameters::from_row(&raw, i);
                     moved.position[by] += step;
                     oracle.state(&moved, time).position
                 });

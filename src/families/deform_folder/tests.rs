@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use tempfile::TempDir;
 
-use crate::deform::made_network::{KINDS, Kind, tensors};
+use crate::deform::synthetic::Noise;
+use crate::deform::synthetic::deep::{KINDS, Kind, tensors};
 use crate::deform::{Motion, Network, Tensor, Tensors};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
@@ -16,7 +17,6 @@ use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, opacity};
 use crate::recipe::Recipe;
 use crate::reduction::{Change, Cluster, Reduction, Reference};
-use crate::selfcheck::made::field::Noise;
 use crate::source::FrameSource;
 use crate::stream::gather_all;
 

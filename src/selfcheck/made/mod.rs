@@ -1,4 +1,3 @@
 //! Inputs made from nothing, the same on every run.
 
 pub mod clouds;
-pub(crate) mod field;

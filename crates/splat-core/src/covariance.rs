@@ -1,0 +1,171 @@
+//! Scale and rotation of a covariance that no parameters say.
+//!
+//! Some families give Σ by a formula that is not R S Sᵀ Rᵀ of what they store: a quaternion that is not of unit length, a
+//! slice through four dimensions. Renderers and statistics here want scales and a rotation.
+
+use glam::{DMat3, DQuat, DVec3};
+
+/// Smallest eigenvalue: a scale of 1e-7.
+const LEAST: f64 = 1e-14;
+/// Sweeps over the three pairs; convergence is quadratic, and 6 to 8 are enough from anywhere.
+const MAX_SWEEPS: usize = 12;
+
+/// Scales s and unit rotation R, wxyz, with Σ = R diag(s)² Rᵀ, of `sigma`: xx xy xz yy yz zz, squared scene units.
+///
+/// Axes are named and turned as those of the quaternion `like` (wxyz, of any length but 0; 0 is the identity) are: of the
+/// six orders the one whose axes lie closest to them, each in the direction of its own, but for the furthest where that
+/// would be a reflection; so is the quaternion's sign. Where eigenvalues coincide any axes are right, and those of `like`
+/// are taken if they are among them. The answer depends on nothing else, so that a Gaussian's state at a time is one.
+///
+/// Jacobi's method in f64, from the axes of `like`: Σ is met to about 1e-15 of its largest entry. Eigenvalues are at least
+/// 1e-14, also such as rounding made negative. An entry that is not finite gives NaN scales and `like`.
+pub fn scale_rotation(sigma: [f64; 6], like: [f64; 4]) -> ([f64; 3], [f64; 4]) {
+    let [xx, xy, xz, yy, yz, zz] = sigma;
+    let like = DQuat::from_xyzw(like[1], like[2], like[3], like[0]);
+    let like = if like.length_squared().is_normal() { like.normalize() } else { DQuat::IDENTITY };
+    if sigma.iter().any(|x| !x.is_finite()) {
+        return ([f64::NAN; 3], [like.w, like.x, like.y, like.z]);
+    }
+    let own = DMat3::from_quat(like);
+    let whole = DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz));
+    let turned = own.transpose() * whole * own;
+    let entry = |i: usize, j: usize| 0.5 * (turned.col(j)[i] + turned.col(i)[j]);
+    let entries = [0, 1, 2].map(|i| [0, 1, 2].map(|j| entry(i, j)));
+    let (values, axes) = eigen(entries);
+
+    // Component i of axis j is its product with axis i of `like`.
+    let mut best = ([0, 1, 2], f64::NEG_INFINITY);
+    for order in [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]] {
+        let closeness: f64 = (0..3).map(|i| axes[order[i]][i].abs()).sum();
+        if closeness > best.1 {
+            best = (order, closeness);
+        }
+    }
+    let mut frame = [0, 1, 2].map(|i| axes[best.0[i]] * 1f64.copysign(axes[best.0[i]][i]));
+    if frame[0].cross(frame[1]).dot(frame[2]) < 0.0 {
+        let furthest = (1..3).fold(0, |least, i| if frame[i][i] < frame[least][least] { i } else { least });
+        frame[furthest] = -frame[furthest];
+    }
+    let by = DQuat::from_mat3(&DMat3::from_cols(frame[0], frame[1], frame[2]));
+    let rotation = (like * by).normalize();
+    let rotation = if rotation.dot(like) < 0.0 { -rotation } else { rotation };
+    (best.0.map(|axis| values[axis].max(LEAST).sqrt()), [rotation.w, rotation.x, rotation.y, rotation.z])
+}
+
+/// Eigenvalues and unit eigenvectors of a symmetric matrix.
+fn eigen(mut a: [[f64; 3]; 3]) -> ([f64; 3], [DVec3; 3]) {
+    let mut axes = [DVec3::X, DVec3::Y, DVec3::Z];
+    let scale = a.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
+    for _ in 0..MAX_SWEEPS {
+        // Beneath this an entry changes no digit of the eigenvalues that the largest leaves.
+        if a[0][1].abs().max(a[0][2].abs()).max(a[1][2].abs()) <= 1e-18 * scale {
+            break;
+        }
+        for (p, q, r) in [(0, 1, 2), (0, 2, 1), (1, 2, 0)] {
+            if a[p][q] == 0.0 {
+                continue;
+            }
+            // The smaller of the two angles: axes stay near where they were.
+            let zeta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+            let tangent = 1f64.copysign(zeta) / (zeta.abs() + zeta.hypot(1.0));
+            let cosine = 1.0 / tangent.hypot(1.0);
+            let sine = cosine * tangent;
+            a[p][p] -= tangent * a[p][q];
+            a[q][q] += tangent * a[p][q];
+            (a[p][q], a[q][p]) = (0.0, 0.0);
+            let (pr, qr) = (cosine * a[p][r] - sine * a[q][r], sine * a[p][r] + cosine * a[q][r]);
+            (a[p][r], a[r][p], a[q][r], a[r][q]) = (pr, pr, qr, qr);
+            (axes[p], axes[q]) = (cosine * axes[p] - sine * axes[q], sine * axes[p] + cosine * axes[q]);
+        }
+    }
+    ([a[0][0], a[1][1], a[2][2]], axes)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn quaternion() -> impl Strategy<Value = [f64; 4]> {
+        prop::array::uniform4(-2.0..2.0f64).prop_filter("direction", |q| q.iter().map(|x| x * x).sum::<f64>() > 0.05)
+    }
+
+    /// R diag(s)² Rᵀ of a quaternion of any length, by the formula of unit ones after dividing by its length.
+    fn sigma(scales: [f64; 3], q: [f64; 4]) -> [f64; 6] {
+        let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let [w, x, y, z] = q.map(|c| c / length);
+        let rows = [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ];
+        let entry = |i: usize, j: usize| (0..3).map(|k| rows[i][k] * rows[j][k] * scales[k].powi(2)).sum();
+        [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
+    }
+
+    fn off(got: [f64; 6], expected: [f64; 6]) -> f64 {
+        let most = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
+        got.iter().zip(expected).fold(0.0f64, |off, (a, b)| off.max((a - b).abs())) / most
+    }
+
+    proptest! {
+        #[test]
+        fn factors_make_the_covariance_again(
+            q in quaternion(), like in quaternion(), logs in prop::array::uniform3(-6.0..1.0f64)
+        ) {
+            let expected = sigma(logs.map(f64::exp), q);
+            let (scales, rotation) = scale_rotation(expected, like);
+            let off = off(sigma(scales, rotation), expected);
+            prop_assert!(off < 4e-15, "off by {off:e}: {scales:?} {rotation:?}");
+            prop_assert!((rotation.iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-14);
+            prop_assert!((0..4).map(|c| rotation[c] * like[c]).sum::<f64>() >= 0.0);
+        }
+
+        #[test]
+        fn a_covariance_of_nearby_axes_keeps_their_names(
+            q in quaternion(), by in prop::array::uniform3(-0.1..0.1f64), logs in prop::array::uniform3(-3.0..1.0f64)
+        ) {
+            prop_assume!((0..3).all(|i| (logs[i] - logs[(i + 1) % 3]).abs() > 1e-3));
+            // Nearby: less than a twelfth of a turn in all.
+            let [w, x, y, z] = q;
+            let product = |[a, b, c, d]: [f64; 4]| [
+                w * a - x * b - y * c - z * d,
+                w * b + x * a + y * d - z * c,
+                w * c - x * d + y * a + z * b,
+                w * d + x * c - y * b + z * a,
+            ];
+            let near = product([1.0, by[0], by[1], by[2]]);
+            let (scales, rotation) = scale_rotation(sigma(logs.map(f64::exp), near), q);
+            for i in 0..3 {
+                prop_assert!((scales[i].ln() - logs[i]).abs() < 1e-9, "{scales:?} {logs:?}");
+            }
+            let length = near.iter().map(|x| x * x).sum::<f64>().sqrt();
+            prop_assert!((0..4).all(|c| (rotation[c] - near[c] / length).abs() < 1e-9), "{rotation:?} {near:?}");
+        }
+    }
+
+    #[test]
+    fn a_ball_has_the_axes_it_is_compared_with() {
+        let like = [0.5, -0.5, 0.5, 0.5];
+        let (scales, rotation) = scale_rotation([4.0, 0.0, 0.0, 4.0, 0.0, 4.0], like);
+        assert_eq!((scales, rotation), ([2.0; 3], like));
+    }
+
+    #[test]
+    fn flat_and_tiny_ones_have_small_scales_and_no_nan() {
+        let like = [1.0, 0.0, 0.0, 0.0];
+        // Rank 1, rounded: the two others may come out negative.
+        let v = [0.1f64, 0.7, -0.3];
+        let (scales, rotation) =
+            scale_rotation([v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]], like);
+        assert!(rotation.iter().all(|x| x.is_finite()));
+        let mut sorted = scales;
+        sorted.sort_by(f64::total_cmp);
+        assert!((sorted[2] - 0.59f64.sqrt()).abs() < 1e-15 && sorted[0] == 1e-7 && sorted[1] < 1.1e-7, "{scales:?}");
+        assert_eq!(scale_rotation([0.0; 6], like), ([1e-7; 3], like));
+        assert_eq!(scale_rotation([0.0; 6], [0.0; 4]).1, like);
+        let (scales, rotation) = scale_rotation([f64::INFINITY, 0.0, 0.0, 1.0, 0.0, 1.0], like);
+        assert!(scales.iter().all(|x| x.is_nan()) && rotation == like);
+    }
+}

@@ -1,0 +1,147 @@
+//! What the field changes: state = raw·mask + delta, back, and the derivative.
+
+use splat_core::{Column, Columns, Gaussians, Jacobian};
+
+/// Changes of a block of Gaussians at one time.
+///
+/// For an active column state = raw·mask + delta, except the rotation, which is never masked and is
+/// raw + delta, or raw ⊗ delta normalised when the field multiplies rotations. An inactive column is
+/// raw itself, unmasked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Deltas {
+    /// Deltas in stored encoding; only the `active` columns mean anything.
+    pub delta: Gaussians,
+    /// `[N]`; none: every mask is 1.
+    pub mask: Option<Vec<f32>>,
+    /// Columns the field changes and that were asked for.
+    pub active: Columns,
+    /// The rotation delta is a factor.
+    pub multiply_rotation: bool,
+}
+
+impl Deltas {
+    /// An empty block for a cloud of `sh_degree`, to be filled by [`Field::deltas`](super::Field::deltas).
+    pub fn new(sh_degree: usize) -> Self {
+        Deltas { delta: Gaussians::zeros(0, sh_degree), mask: None, active: Columns::empty(), multiply_rotation: false }
+    }
+
+    pub(super) fn begin(&mut self, rows: usize, active: Columns, multiply_rotation: bool) {
+        for column in active.iter() {
+            self.delta.column_mut(column).resize(rows);
+        }
+        self.active = active;
+        self.multiply_rotation = multiply_rotation;
+    }
+
+    /// The state of `raw` in the columns `want`, into `state`, which is resized in those columns.
+    pub fn apply(&self, raw: &Gaussians, want: Columns, state: &mut Gaussians) {
+        for column in want.iter() {
+            let from = raw.column(column);
+            let to = state.column_mut(column);
+            to.resize(from.len());
+            if !self.active.contains(column) {
+                to.planes_mut().copy_from_slice(from.planes());
+            } else if column == Columns::ROTATION && self.multiply_rotation {
+                for i in 0..from.len() {
+                    to.set_row(i, unit(product(from.row(i), self.delta.rotation.row(i))));
+                }
+            } else {
+                let mask = self.mask.as_deref().filter(|_| column != Columns::ROTATION);
+                let delta = self.delta.column(column);
+                for c in 0..from.width() {
+                    let planes = to.plane_mut(c).iter_mut().zip(from.plane(c)).zip(delta.plane(c));
+                    match mask {
+                        None => planes.for_each(|((to, raw), delta)| *to = raw + delta),
+                        Some(mask) => planes.zip(mask).for_each(|(((to, raw), delta), m)| *to = raw * m + delta),
+                    }
+                }
+            }
+        }
+    }
+
+    /// How the state changes with the raw parameters, deltas and masks held as they are, where it is not by as much; 0
+    /// where that would not be finite. `rotation` is raw.
+    pub(super) fn jacobian(&self, rotation: &Column, out: &mut Jacobian) {
+        for column in self.active.iter() {
+            if column == Columns::ROTATION && self.multiply_rotation {
+                *out.column_mut(column) = Column::zeros(16, rotation.len());
+                for i in 0..rotation.len() {
+                    let (raw, delta) = (rotation.row(i), self.delta.rotation.row(i));
+                    for component in 0..4 {
+                        let by_state = std::array::from_fn(|c| f32::from(u8::from(c == component)));
+                        let by_raw = pull_unit_product(raw, delta, by_state);
+                        for (c, by) in by_raw.into_iter().enumerate() {
+                            out.column_mut(column).plane_mut(4 * component + c)[i] = finite(by);
+                        }
+                    }
+                }
+            } else if let Some(mask) = self.mask.as_ref().filter(|_| column != Columns::ROTATION) {
+                *out.column_mut(column) = Column::from_planes(1, mask.iter().copied().map(finite).collect());
+            }
+        }
+    }
+
+    /// The raw parameters whose state is `state`, in the columns `want`: the inverse of [`Deltas::apply`].
+    /// Exact to rounding; a rotation is recovered up to its length. Where a mask or a rotation delta is
+    /// zero no raw value leads to `state` and the result is not finite.
+    pub fn solve(&self, state: &Gaussians, want: Columns, raw: &mut Gaussians) {
+        for column in want.iter() {
+            let from = state.column(column);
+            let to = raw.column_mut(column);
+            to.resize(from.len());
+            if !self.active.contains(column) {
+                to.planes_mut().copy_from_slice(from.planes());
+            } else if column == Columns::ROTATION && self.multiply_rotation {
+                for i in 0..from.len() {
+                    let delta: [f32; 4] = self.delta.rotation.row(i);
+                    let square: f32 = delta.iter().map(|x| x * x).sum();
+                    let [w, x, y, z] = delta.map(|component| component / square);
+                    to.set_row(i, product(from.row(i), [w, -x, -y, -z]));
+                }
+            } else {
+                let mask = self.mask.as_deref().filter(|_| column != Columns::ROTATION);
+                for c in 0..from.width() {
+                    let delta = self.delta.column(column).plane(c);
+                    for (i, to) in to.plane_mut(c).iter_mut().enumerate() {
+                        *to = (from.plane(c)[i] - delta[i]) / mask.map_or(1.0, |mask| mask[i]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Hamilton product of two wxyz quaternions.
+fn product(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
+    [
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    ]
+}
+
+/// The quaternion at unit length; zero stays zero, for the reader of the state to flag.
+fn unit(q: [f32; 4]) -> [f32; 4] {
+    let length = q.iter().map(|x| x * x).sum::<f32>().sqrt();
+    if length == 0.0 { q } else { q.map(|x| x / length) }
+}
+
+/// `x`, or 0 if it is not finite.
+pub(super) fn finite(x: f32) -> f32 {
+    if x.is_finite() { x } else { 0.0 }
+}
+
+/// Derivative by `a`, given that by the product of `a` and `b` at unit length; none where that is zero.
+fn pull_unit_product(a: [f32; 4], b: [f32; 4], by_unit: [f32; 4]) -> [f32; 4] {
+    let whole = product(a, b);
+    let length = whole.iter().map(|x| x * x).sum::<f32>().sqrt();
+    if length == 0.0 {
+        return [0.0; 4];
+    }
+    let direction = whole.map(|x| x / length);
+    let radial: f32 = direction.iter().zip(by_unit).map(|(x, by)| x * by).sum();
+    let by_product = std::array::from_fn(|c| (by_unit[c] - radial * direction[c]) / length);
+    let [w, x, y, z] = b;
+    product(by_product, [w, -x, -y, -z])
+}

@@ -1,0 +1,269 @@
+//! HexPlane features: six bilinear samples per level, multiplied elementwise.
+//!
+//! Data in: canonical positions `[N, 3]`, a time. Data out: features `[Σ channels, LANES]`.
+//! Memory: 4·Σ channels + 36·levels bytes per prepared Gaussian.
+//! Source: Cao & Johnson, "HexPlane", 2023; Wu et al., "4D Gaussian Splatting", 2024, section 4.2.
+//!
+//! The three spatial samples do not depend on time: their product is prepared once per block. All
+//! Gaussians share the time of a frame, so each time plane is first interpolated along time into a
+//! line; a Gaussian then interpolates between two of its points.
+
+use splat_core::Column;
+use splat_core::error::Result;
+
+use super::linear::{LANES, Lanes};
+use super::tensors::Lookup;
+
+const X: usize = 0;
+const Y: usize = 1;
+const Z: usize = 2;
+/// What the names of all planes begin with in the state dict; level and place follow.
+const GRIDS: &str = "deformation_net.grid.grids.";
+/// Axis pairs of the planes without time, as (place in the state dict, a, b).
+pub(super) const SPATIAL: [(usize, usize, usize); 3] = [(0, X, Y), (1, X, Z), (3, Y, Z)];
+/// Places in the state dict of the planes (x,t), (y,t), (z,t).
+const TEMPORAL: [usize; 3] = [2, 4, 5];
+
+/// A plane over axes (a, b), `[size_b, size_a, channels]`: one sample is contiguous.
+#[derive(Debug, Clone)]
+pub(super) struct Plane {
+    pub(super) size_a: usize,
+    pub(super) size_b: usize,
+    texels: Vec<f32>,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct Level {
+    pub(super) channels: usize,
+    pub(super) spatial: [Plane; 3],
+    pub(super) temporal: [Plane; 3],
+}
+
+/// The time planes of a level at one time, by axis: `[size_a, channels]` each.
+pub(super) type Lines = [Vec<f32>; 3];
+
+/// The box that planes cover.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Box3 {
+    /// Corner mapped to −1, by axis; the model stores the MAX corner here.
+    pub(super) origin: [f32; 3],
+    /// 2 / (other corner − origin).
+    pub(super) factor: [f32; 3],
+}
+
+impl Box3 {
+    /// Between two corners, of the values of `deformation_net.grid.aabb`; none unless they differ along every axis.
+    pub fn new(corners: &[f32]) -> Option<Box3> {
+        let &[x0, y0, z0, x1, y1, z1] = corners else { return None };
+        let origin = [x0, y0, z0];
+        let factor = [x1 - x0, y1 - y0, z1 - z0].map(|size| 2.0 / size);
+        factor.iter().all(|f: &f32| f.is_finite()).then_some(Box3 { origin, factor })
+    }
+
+    /// Where `p` lies, −1 to 1 inside the box.
+    #[inline(always)]
+    pub fn normalised(&self, p: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
+    }
+}
+
+/// The planes of all levels and the box they cover.
+#[derive(Debug, Clone)]
+pub(super) struct Planes {
+    pub(super) space: Box3,
+    pub(super) levels: Vec<Level>,
+}
+
+/// Where a coordinate falls between texels `low` and `high`; `fraction` is the weight of `high`.
+#[derive(Debug, Clone, Copy)]
+pub struct Tap {
+    /// The texel at or below.
+    pub low: u32,
+    /// The one above it, or itself if it is the last.
+    pub high: u32,
+    /// Weight of `high`.
+    pub fraction: f32,
+}
+
+/// What of the features of a block does not depend on time.
+#[derive(Debug, Clone)]
+pub(super) struct PreparedPlanes {
+    /// Product of the spatial samples, `[rows, width]`.
+    product: Vec<f32>,
+    /// Where x, y, z fall on the time lines of each level, `[rows, levels, 3]`.
+    taps: Vec<Tap>,
+}
+
+impl Plane {
+    fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
+        let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
+        let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];
+        let texel_count = size_b * size_a;
+        let mut texels = vec![0.0; tensor.data.len()];
+        for (c, plane) in tensor.data.chunks_exact(texel_count).enumerate() {
+            for (texel, &value) in texels.chunks_exact_mut(channels).zip(plane) {
+                texel[c] = value;
+            }
+        }
+        Ok((Plane { size_a, size_b, texels }, channels))
+    }
+
+    pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
+        let start = (b as usize * self.size_a + a as usize) * channels;
+        &self.texels[start..start + channels]
+    }
+
+    /// Bilinear sample at taps `a`, `b`; one value per channel into `out`.
+    fn sample(&self, a: Tap, b: Tap, out: &mut [f32]) {
+        let channels = out.len();
+        let corner = |ia, ib| self.texel(ia, ib, channels);
+        let [ll, hl] = [corner(a.low, b.low), corner(a.high, b.low)];
+        let [lh, hh] = [corner(a.low, b.high), corner(a.high, b.high)];
+        let weights = [
+            (1.0 - a.fraction) * (1.0 - b.fraction),
+            a.fraction * (1.0 - b.fraction),
+            (1.0 - a.fraction) * b.fraction,
+            a.fraction * b.fraction,
+        ];
+        for c in 0..out.len() {
+            out[c] = ll[c] * weights[0] + hl[c] * weights[1] + lh[c] * weights[2] + hh[c] * weights[3];
+        }
+    }
+}
+
+/// The tap of normalised coordinate `u` on `size` texels: align_corners, border padding.
+/// A NaN coordinate gives a NaN fraction, hence NaN features.
+pub fn tap(u: f32, size: usize) -> Tap {
+    let last = (size - 1) as f32;
+    let x = ((u + 1.0) / 2.0 * last).clamp(0.0, last);
+    let low = x.floor();
+    Tap { low: low as u32, high: (low as u32 + 1).min(size as u32 - 1), fraction: x - low }
+}
+
+/// How many of the first rows, along its third extent, of a tensor of that name and `shape` no time from 0 on reads;
+/// 0 of what is no plane of time. Time is not mapped to [−1, 1], so about half of each such plane is never read.
+pub fn rows_before_zero(name: &str, shape: &[usize]) -> usize {
+    let place = name.strip_prefix(GRIDS).and_then(|rest| rest.split_once('.')?.1.parse().ok());
+    match (place, shape) {
+        (Some(place), &[1, _, rows, _]) if rows > 0 && TEMPORAL.contains(&place) => tap(0.0, rows).low as usize,
+        _ => 0,
+    }
+}
+
+/// The two texels of a line that a tap lies between, and its fraction.
+#[inline(always)]
+pub(super) fn texels(line: &[f32], tap: Tap, channels: usize) -> ([&[f32]; 2], f32) {
+    let texel = |at: u32| &line[at as usize * channels..][..channels];
+    ([texel(tap.low), texel(tap.high)], tap.fraction)
+}
+
+impl Planes {
+    /// Reads `deformation_net.grid.*`.
+    pub(super) fn load(lookup: Lookup<'_>) -> Result<Self> {
+        const AABB: &str = "deformation_net.grid.aabb";
+        let aabb = &lookup.get_shaped(AABB, &[Some(2), Some(3)], "the two corners of the field's box")?.data;
+        let Some(space) = Box3::new(aabb) else {
+            return Err(lookup.mismatch(AABB, "two corners that differ along every axis", format!("{aabb:?}")));
+        };
+        let name = |level: usize, plane: usize| format!("{GRIDS}{level}.{plane}");
+        let mut levels = Vec::new();
+        while levels.is_empty() || lookup.has(&name(levels.len(), 0)) {
+            let level = levels.len();
+            let (xy, channels) = Plane::load(lookup, &name(level, SPATIAL[0].0), None)?;
+            let load = |plane| Plane::load(lookup, &name(level, plane), Some(channels)).map(|(plane, _)| plane);
+            levels.push(Level {
+                channels,
+                spatial: [xy, load(SPATIAL[1].0)?, load(SPATIAL[2].0)?],
+                temporal: [load(TEMPORAL[0])?, load(TEMPORAL[1])?, load(TEMPORAL[2])?],
+            });
+        }
+        Ok(Planes { space, levels })
+    }
+
+    /// Features per Gaussian: the channels of all levels.
+    pub(super) fn width(&self) -> usize {
+        self.levels.iter().map(|level| level.channels).sum()
+    }
+
+    /// Bytes one Gaussian takes in [`PreparedPlanes`].
+    pub(super) fn bytes_per_gaussian(&self) -> usize {
+        4 * self.width() + 3 * self.levels.len() * size_of::<Tap>()
+    }
+
+    /// The box, as (corner mapped to −1, corner mapped to +1).
+    pub(super) fn corners(&self) -> ([f32; 3], [f32; 3]) {
+        let Box3 { origin, factor } = self.space;
+        (origin, std::array::from_fn(|axis| origin[axis] + 2.0 / factor[axis]))
+    }
+
+    pub(super) fn prepare(&self, position: &Column) -> PreparedPlanes {
+        let rows = position.len();
+        let width = self.width();
+        let mut prepared =
+            PreparedPlanes { product: vec![1.0; rows * width], taps: Vec::with_capacity(rows * 3 * self.levels.len()) };
+        let mut sample = vec![0.0; width];
+        for (i, row) in prepared.product.chunks_exact_mut(width).enumerate() {
+            let u = self.space.normalised(position.row(i));
+            let mut rest = row;
+            for level in &self.levels {
+                let out;
+                (out, rest) = rest.split_at_mut(level.channels);
+                for (plane, &(_, a, b)) in level.spatial.iter().zip(&SPATIAL) {
+                    let sample = &mut sample[..level.channels];
+                    plane.sample(tap(u[a], plane.size_a), tap(u[b], plane.size_b), sample);
+                    out.iter_mut().zip(&*sample).for_each(|(out, sample)| *out *= sample);
+                }
+                prepared.taps.extend(level.temporal.iter().zip(u).map(|(plane, u)| tap(u, plane.size_a)));
+            }
+        }
+        prepared
+    }
+
+    /// The time planes of every level interpolated at `time`.
+    pub(super) fn lines(&self, time: f32) -> Vec<Lines> {
+        let line = |level: &Level, plane: &Plane| {
+            let Tap { low, high, fraction } = tap(time, plane.size_b);
+            let row =
+                |b: u32| &plane.texels[b as usize * plane.size_a * level.channels..][..plane.size_a * level.channels];
+            row(low).iter().zip(row(high)).map(|(a, b)| a * (1.0 - fraction) + b * fraction).collect::<Vec<f32>>()
+        };
+        self.levels.iter().map(|level| std::array::from_fn(|axis| line(level, &level.temporal[axis]))).collect()
+    }
+
+    /// The features of `lanes` Gaussians of the prepared block from `start` on into `out` `[width, LANES]`; lanes
+    /// beyond them are 0.
+    #[inline(always)]
+    pub(super) fn features(
+        &self,
+        prepared: &PreparedPlanes,
+        lines: &[Lines],
+        start: usize,
+        lanes: usize,
+        out: &mut Vec<Lanes>,
+    ) {
+        let width = self.width();
+        out.clear();
+        out.resize(width, Lanes([0.0; LANES]));
+        let product = &prepared.product[start * width..][..lanes * width];
+        let taps = &prepared.taps[start * 3 * self.levels.len()..];
+        let rows = product.chunks_exact(width).zip(taps.chunks_exact(3 * self.levels.len()));
+        for (lane, (product, taps)) in rows.enumerate() {
+            let mut first = 0;
+            for ((level, [x, y, z]), taps) in self.levels.iter().zip(lines).zip(taps.chunks_exact(3)) {
+                let n = level.channels;
+                let (out, product) = (&mut out[first..][..n], &product[first..][..n]);
+                let ([x0, x1], x) = texels(x, taps[0], n);
+                let ([y0, y1], y) = texels(y, taps[1], n);
+                let ([z0, z1], z) = texels(z, taps[2], n);
+                // All three in one pass: each on its own would read and write the row again.
+                for c in 0..n {
+                    let along_x = x0[c] * (1.0 - x) + x1[c] * x;
+                    let along_y = y0[c] * (1.0 - y) + y1[c] * y;
+                    let along_z = z0[c] * (1.0 - z) + z1[c] * z;
+                    out[c].0[lane] = product[c] * along_x * along_y * along_z;
+                }
+                first += n;
+            }
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! Deep networks of positions and times with random weights.
+
+use super::Noise;
+use crate::{Tensor, Tensors};
+
+/// Outputs of each hidden layer, which are no multiple of the outputs that are summed together.
+const WIDTH: usize = 22;
+
+/// Inputs of the network for one position: itself, and 10 octaves of sine and cosine.
+const POSITION_INPUTS: usize = 3 + 2 * 3 * 10;
+
+/// Variants of the architecture.
+#[derive(Clone, Copy, Debug)]
+pub struct Kind {
+    /// Whether a network of its own encodes the time.
+    pub time_network: bool,
+    /// Whether positions move by screw motions (rotation and translation) instead of offsets.
+    pub screws: bool,
+    /// Whether opacity and color have heads too.
+    pub all_heads: bool,
+}
+
+/// Examples in which each option is on and off.
+pub const KINDS: [Kind; 3] = [
+    Kind { time_network: true, screws: false, all_heads: false },
+    Kind { time_network: false, screws: true, all_heads: false },
+    Kind { time_network: true, screws: false, all_heads: true },
+];
+
+/// Tensors `network.*` of five layers, of which the fourth joins; outputs are of size 1.
+pub fn tensors(kind: Kind) -> Tensors {
+    let mut noise = Noise(5);
+    let mut tensors = Tensors::new();
+    let mut add = |name: &str, outputs: usize, inputs: usize, size: f32| {
+        let size = size / (inputs as f32).sqrt();
+        let mut made = |shape: &[usize]| Tensor {
+            shape: shape.to_vec(),
+            data: (0..shape.iter().product()).map(|_| 2.0 * size * noise.next()).collect(),
+        };
+        tensors.insert(format!("network.{name}.weight"), made(&[outputs, inputs]));
+        tensors.insert(format!("network.{name}.bias"), made(&[outputs]));
+    };
+    let of_time = if kind.time_network { 5 } else { 21 };
+    if kind.time_network {
+        add("timenet.0", 17, 13, 1.0);
+        add("timenet.2", of_time, 17, 1.0);
+    }
+    let encodings = POSITION_INPUTS + of_time;
+    for (k, inputs) in [encodings, WIDTH, WIDTH, encodings + WIDTH, WIDTH].into_iter().enumerate() {
+        add(&format!("linear.{k}"), WIDTH, inputs, 1.3);
+    }
+    let position: &[&str] = if kind.screws { &["branch_w", "branch_v"] } else { &["gaussian_warp"] };
+    position.iter().for_each(|name| add(name, 3, WIDTH, 1.0));
+    add("gaussian_rotation", 4, WIDTH, 1.0);
+    add("gaussian_scaling", 3, WIDTH, 1.0);
+    if kind.all_heads {
+        add("gaussian_opacity", 1, WIDTH, 1.0);
+        add("gaussian_color", 3, WIDTH, 1.0);
+    }
+    tensors
+}

@@ -1,0 +1,65 @@
+//! Named tensors of a state dict, taken out one by one against an expected shape.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use splat_core::error::{Error, Result};
+
+/// A dense tensor, row-major (last index fastest).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tensor {
+    /// Extents, outermost first; empty for a scalar.
+    pub shape: Vec<usize>,
+    /// Product-of-`shape` values.
+    pub data: Vec<f32>,
+}
+
+/// A state dict: tensors by dotted name.
+pub type Tensors = BTreeMap<String, Tensor>;
+
+/// Looks tensors up in the state dict of `path`; every failure names the tensor.
+#[derive(Clone, Copy)]
+pub(super) struct Lookup<'a> {
+    pub(super) tensors: &'a Tensors,
+    pub(super) path: &'a Path,
+}
+
+impl<'a> Lookup<'a> {
+    /// The tensor `name`, all of whose values must be finite. `why` says what asks for it.
+    pub(super) fn get(&self, name: &str, why: &str) -> Result<&'a Tensor> {
+        let tensor = self.tensors.get(name).ok_or_else(|| {
+            Error::input(self.path, format!("tensor {name}"), format!("a tensor of this name ({why})"), "none")
+                .hint("does cfg_args belong to this file?")
+        })?;
+        if let Some(at) = tensor.data.iter().position(|value| !value.is_finite()) {
+            return Err(self.mismatch(name, "finite values", format!("{} at element {at}", tensor.data[at])));
+        }
+        Ok(tensor)
+    }
+
+    /// The tensor `name`, which must be finite and of `shape`; `None` in `shape` accepts any extent.
+    pub(super) fn get_shaped(&self, name: &str, shape: &[Option<usize>], why: &str) -> Result<&'a Tensor> {
+        let tensor = self.get(name, why)?;
+        let fits = tensor.shape.len() == shape.len()
+            && tensor.shape.iter().zip(shape).all(|(&found, want)| found > 0 && want.is_none_or(|want| want == found));
+        if fits {
+            return Ok(tensor);
+        }
+        let want: Vec<String> = shape.iter().map(|w| w.map_or("any".to_owned(), |w| w.to_string())).collect();
+        Err(self.mismatch(name, format!("shape [{}] ({why})", want.join(", ")), format!("{:?}", tensor.shape)))
+    }
+
+    /// Outputs and inputs of the matrix `name`. `why` says what asks for it.
+    pub(super) fn matrix(&self, name: &str, why: &str) -> Result<[usize; 2]> {
+        let shape = &self.get_shaped(name, &[None, None], why)?.shape;
+        Ok([shape[0], shape[1]])
+    }
+
+    pub(super) fn has(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
+    pub(super) fn mismatch(&self, name: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
+        Error::input(self.path, format!("tensor {name}"), expected, found)
+    }
+}

@@ -1,0 +1,69 @@
+//! The `empty_voxel` mask: a scalar grid over the scene's box, sampled at canonical positions.
+
+use splat_core::Column;
+use splat_core::error::{Error, Result};
+
+use super::tensors::Lookup;
+
+/// A grid `[1, 1, X, Y, Z]` between two corners.
+#[derive(Debug, Clone)]
+pub(super) struct VoxelMask {
+    low: [f32; 3],
+    high: [f32; 3],
+    size: [usize; 3],
+    values: Vec<f32>,
+}
+
+impl VoxelMask {
+    /// Reads `deformation_net.empty_voxel.*`. The corners are buffers that only some versions save;
+    /// without them `corners`, (max, min) of the planes' box, serve: training sets both to the same box.
+    pub(super) fn load(lookup: Lookup<'_>, corners: Option<([f32; 3], [f32; 3])>) -> Result<Self> {
+        let name = |part: &str| format!("deformation_net.empty_voxel.{part}");
+        let grid = lookup.get_shaped(&name("grid"), &[Some(1), Some(1), None, None, None], "empty_voxel=True")?;
+        let corner = |part: &str, fallback: Option<[f32; 3]>| match fallback {
+            Some(corner) if !lookup.has(&name(part)) => Ok::<_, Error>(corner),
+            _ => {
+                let tensor = lookup.get_shaped(&name(part), &[Some(3)], "corner of empty_voxel")?;
+                Ok([tensor.data[0], tensor.data[1], tensor.data[2]])
+            }
+        };
+        let low = corner("xyz_min", corners.map(|(_, low)| low))?;
+        let high = corner("xyz_max", corners.map(|(high, _)| high))?;
+        if (0..3).any(|axis| low[axis] == high[axis]) {
+            return Err(lookup.mismatch(&name("xyz_max"), "a box of positive size", format!("{low:?} to {high:?}")));
+        }
+        Ok(VoxelMask { low, high, size: [grid.shape[2], grid.shape[3], grid.shape[4]], values: grid.data.clone() })
+    }
+
+    /// The mask of every Gaussian: trilinear, corners aligned, zero outside the box.
+    pub(super) fn sample(&self, position: &Column) -> Vec<f32> {
+        (0..position.len()).map(|i| self.sample_one(position.row(i))).collect()
+    }
+
+    fn sample_one(&self, p: [f32; 3]) -> f32 {
+        let at: [f32; 3] = std::array::from_fn(|axis| {
+            let u = (p[axis] - self.low[axis]) / (self.high[axis] - self.low[axis]) * 2.0 - 1.0;
+            (u + 1.0) / 2.0 * (self.size[axis] - 1) as f32
+        });
+        let mut sum = 0.0;
+        for corner in 0..8 {
+            let mut weight = 1.0;
+            let mut index = 0;
+            for ((axis, &at), &size) in at.iter().enumerate().zip(&self.size) {
+                let low = at.floor();
+                let (texel, share) =
+                    if corner >> axis & 1 == 0 { (low, 1.0 - (at - low)) } else { (low + 1.0, at - low) };
+                if texel < 0.0 || texel >= size as f32 {
+                    weight = 0.0;
+                } else {
+                    weight *= share;
+                    index = index * size + texel as usize;
+                }
+            }
+            if weight != 0.0 {
+                sum += weight * self.values[index];
+            }
+        }
+        sum
+    }
+}

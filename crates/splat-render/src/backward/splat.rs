@@ -1,0 +1,330 @@
+//! From what splats take to what the stored values of their Gaussians take: the derivative of the projection.
+//!
+//! Block by block as the projection goes, in f64 where that is. A footprint enters through its whitened axes alone, so
+//! needles and giants lose no digits that the projection kept (method.md, section 8.1). Data in: sums per splat. Data
+//! out: sums per Gaussian. Memory: stack arrays of [`BLOCK`] entries. Source of the projection: Zwicker et al., "EWA
+//! Splatting", 2002.
+
+use std::ops::Range;
+
+use super::super::colour;
+use super::super::convention::BLOCK;
+use super::super::project::{LOGARITHM_LIMIT, Shape, Splat, View, cross, dot, opacity};
+use super::sums::Sums;
+use splat_core::{Columns, Gaussians, GradientSpan, sh_coefficients};
+
+/// Adds what the Gaussians behind `splats` take to `out`, whose splats these are; `sums` is what each splat takes.
+pub(super) fn add(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], view: &View, out: &mut GradientSpan) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
+        #[target_feature(enable = "avx2")]
+        fn add_avx2(
+            gaussians: &Gaussians,
+            splats: &[Splat],
+            sums: &[Sums<f64>],
+            view: &View,
+            out: &mut GradientSpan<'_>,
+        ) {
+            add_blocks(gaussians, splats, sums, view, out);
+        }
+        /// The same for registers twice as wide.
+        #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
+        fn add_avx512(
+            gaussians: &Gaussians,
+            splats: &[Splat],
+            sums: &[Sums<f64>],
+            view: &View,
+            out: &mut GradientSpan<'_>,
+        ) {
+            add_blocks(gaussians, splats, sums, view, out);
+        }
+        if is_x86_feature_detected!("avx512f")
+            && is_x86_feature_detected!("avx512dq")
+            && is_x86_feature_detected!("avx512vl")
+        {
+            // SAFETY: AVX-512 F, DQ and VL were detected on the lines above.
+            return unsafe { add_avx512(gaussians, splats, sums, view, out) };
+        }
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: AVX2 was detected on the line above.
+            return unsafe { add_avx2(gaussians, splats, sums, view, out) };
+        }
+    }
+    add_blocks(gaussians, splats, sums, view, out);
+}
+
+#[inline(always)]
+fn add_blocks(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], view: &View, out: &mut GradientSpan<'_>) {
+    let mut block = Block::default();
+    let (mut splats, mut sums) = (splats, sums);
+    for start in out.ids().step_by(BLOCK) {
+        let ids = start..(start + BLOCK).min(out.ids().end);
+        let of_block = splats[..splats.len().min(BLOCK)].partition_point(|splat| (splat.id as usize) < ids.end);
+        if of_block == 0 {
+            continue;
+        }
+        block.fill(&splats[..of_block], &sums[..of_block], start);
+        (splats, sums) = (&splats[of_block..], &sums[of_block..]);
+        let columns = out.columns();
+        let turns = columns.contains(Columns::POSITION) && colour::coefficients(gaussians) > 1;
+        if turns || columns.contains(Columns::SH) {
+            let directions = Directions::new(gaussians, ids.clone(), view);
+            if columns.contains(Columns::SH) {
+                block.add_harmonics(gaussians, ids.clone(), &directions, out);
+            }
+            if turns {
+                block.add_direction(gaussians, ids.clone(), &directions, out);
+            }
+        }
+        if !Columns::SH.contains(columns) {
+            block.add_shape(gaussians, ids, view, out);
+        }
+    }
+}
+
+/// Of the Gaussians of a block: unit vectors toward them from the centre of view, and one over their distances.
+struct Directions {
+    unit: [[f32; BLOCK]; 3],
+    per_distance: [f32; BLOCK],
+}
+
+impl Directions {
+    #[inline(always)]
+    fn new(gaussians: &Gaussians, ids: Range<usize>, view: &View) -> Self {
+        let n = ids.len().min(BLOCK);
+        let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
+        let mut directions = Directions { unit: [[0.0; BLOCK]; 3], per_distance: [0.0; BLOCK] };
+        let Directions { unit: [x, y, z], per_distance } = &mut directions;
+        for i in 0..n {
+            let (unit, inverse) = colour::direction([position[0][i], position[1][i], position[2][i]], view.center);
+            (x[i], y[i], z[i]) = (unit[0], unit[1], unit[2]);
+            per_distance[i] = inverse as f32;
+        }
+        directions
+    }
+
+    #[inline(always)]
+    fn at(&self, i: usize) -> [f32; 3] {
+        [self.unit[0][i], self.unit[1][i], self.unit[2][i]]
+    }
+}
+
+/// What the Gaussians of a block take, as in [`Sums`]; 0 where they are not visible.
+struct Block {
+    p: [f64; BLOCK],
+    first: [[f64; BLOCK]; 2],
+    second: [[f64; BLOCK]; 3],
+    /// Without channels cut off at 0, which move nothing.
+    colour: [[f32; BLOCK]; 3],
+}
+
+impl Default for Block {
+    fn default() -> Self {
+        let zero = [0.0; BLOCK];
+        Block { p: zero, first: [zero; 2], second: [zero; 3], colour: [[0.0; BLOCK]; 3] }
+    }
+}
+
+impl Block {
+    fn fill(&mut self, splats: &[Splat], sums: &[Sums<f64>], start: usize) {
+        *self = Block::default();
+        for (splat, sums) in splats.iter().zip(sums) {
+            let i = splat.id as usize - start;
+            self.p[i] = sums.p;
+            (0..2).for_each(|k| self.first[k][i] = sums.first[k]);
+            (0..3).for_each(|k| self.second[k][i] = sums.second[k]);
+            (0..3).filter(|&c| splat.colour[c] > 0.0).for_each(|c| self.colour[c][i] = sums.colour[c] as f32);
+        }
+    }
+
+    /// Harmonics: Y_k times what the colour takes.
+    #[inline(always)]
+    fn add_harmonics(
+        &self,
+        gaussians: &Gaussians,
+        ids: Range<usize>,
+        directions: &Directions,
+        out: &mut GradientSpan<'_>,
+    ) {
+        let n = ids.len().min(BLOCK);
+        let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
+        for i in 0..n {
+            for (values, value) in values.iter_mut().zip(colour::basis(directions.at(i))) {
+                values[i] = value;
+            }
+        }
+        for (k, values) in values.iter().enumerate().take(colour::coefficients(gaussians)) {
+            for (c, colour) in self.colour.iter().enumerate() {
+                let parts = values[..n].iter().zip(&colour[..n]).map(|(value, colour)| value * colour);
+                out.add(Columns::SH, 3 * k + c, ids.start, parts);
+            }
+        }
+    }
+
+    /// Position, through the colour's change with the direction of view.
+    #[inline(always)]
+    fn add_direction(
+        &self,
+        gaussians: &Gaussians,
+        ids: Range<usize>,
+        directions: &Directions,
+        out: &mut GradientSpan<'_>,
+    ) {
+        let n = ids.len().min(BLOCK);
+        // By value of Y_k: what the colour takes times the coefficients.
+        let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
+        for (k, by_value) in by_value.iter_mut().enumerate().take(colour::coefficients(gaussians)).skip(1) {
+            let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
+            for i in 0..n {
+                by_value[i] =
+                    sh[0][i] * self.colour[0][i] + sh[1][i] * self.colour[1][i] + sh[2][i] * self.colour[2][i];
+            }
+        }
+        let mut parts = [[0.0f32; BLOCK]; 3];
+        for i in 0..n {
+            let d = directions.at(i);
+            let mut sum = [0.0; 3];
+            let slopes = colour::basis_gradient(d);
+            // Not zipped and skipped: that does not run in vectors.
+            for k in 1..slopes.len() {
+                let (of, slope) = (by_value[k][i], slopes[k]);
+                sum = [sum[0] + of * slope[0], sum[1] + of * slope[1], sum[2] + of * slope[2]];
+            }
+            // Along itself a direction does not change.
+            let radial = sum[0] * d[0] + sum[1] * d[1] + sum[2] * d[2];
+            for axis in 0..3 {
+                parts[axis][i] = directions.per_distance[i] * (sum[axis] - radial * d[axis]);
+            }
+        }
+        for (axis, parts) in parts.iter().enumerate() {
+            out.add(Columns::POSITION, axis, ids.start, parts[..n].iter().copied());
+        }
+    }
+
+    /// Opacity, scale, rotation, and position through the footprint.
+    #[inline(always)]
+    fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &View, out: &mut GradientSpan<'_>) {
+        let n = ids.len().min(BLOCK);
+        let plane = |column: Columns, c: usize| &gaussians.column(column).plane(c)[ids.clone()][..n];
+        let position: [&[f32]; 3] = std::array::from_fn(|c| plane(Columns::POSITION, c));
+        let rotation: [&[f32]; 4] = std::array::from_fn(|c| plane(Columns::ROTATION, c));
+        let log_scale: [&[f32]; 3] = std::array::from_fn(|c| plane(Columns::LOG_SCALE, c));
+        let logit = plane(Columns::OPACITY, 0);
+        let mut parts = [[0.0f32; BLOCK]; 11];
+        let Block { p, first, second, .. } = self;
+        for i in 0..n {
+            let taken = Taken::new(
+                [position[0][i].into(), position[1][i].into(), position[2][i].into()],
+                [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()],
+                [log_scale[0][i], log_scale[1][i], log_scale[2][i]],
+                [first[0][i], first[1][i]],
+                [second[0][i], second[1][i], second[2][i]],
+                view,
+            );
+            for axis in 0..3 {
+                parts[axis][i] = taken.position[axis] as f32;
+                parts[7 + axis][i] = taken.log_scale[axis] as f32;
+            }
+            for c in 0..4 {
+                parts[3 + c][i] = taken.rotation[c] as f32;
+            }
+            parts[10][i] = ((1.0 - opacity(logit[i])) * p[i]) as f32;
+        }
+        let places = [
+            (Columns::POSITION, 0, 3),
+            (Columns::ROTATION, 3, 4),
+            (Columns::LOG_SCALE, 7, 3),
+            (Columns::OPACITY, 10, 1),
+        ];
+        for (column, first, width) in places {
+            for c in 0..width {
+                out.add(column, c, ids.start, parts[first + c][..n].iter().copied());
+            }
+        }
+    }
+}
+
+/// What one Gaussian's geometry takes.
+struct Taken {
+    position: [f64; 3],
+    rotation: [f64; 4],
+    log_scale: [f64; 3],
+}
+
+impl Taken {
+    /// `first` and `second` are those of [`Sums`].
+    #[inline(always)]
+    fn new(
+        position: [f64; 3],
+        q: [f64; 4],
+        log_scale: [f32; 3],
+        [x, y]: [f64; 2],
+        [xx, xy, yy]: [f64; 3],
+        view: &View,
+    ) -> Self {
+        let shape = Shape::new(position, q, log_scale, view);
+        let seen = shape.covariance();
+        let [a, b] = shape.spread;
+
+        // Offsets in standard deviations: s = (x − slope·y)·per_s, t = y·per_t.
+        let (slope, per_s, per_t) = (seen.xy / seen.yy, (seen.yy / seen.det).sqrt(), (1.0 / seen.yy).sqrt());
+        let (s, t) = (per_s * x, per_t * y);
+        let (ss, st, tt) = (per_s * per_s * xx, per_s * per_t * xy, per_t * per_t * yy);
+        // By each of the Gaussian's axes: ∂L/∂ log scale, ∂L/∂a and ∂L/∂b.
+        let by_axis = |j: usize| {
+            // The axis as s and t see it.
+            let (along_s, along_t) = (per_s * (a[j] - slope * b[j]), per_t * b[j]);
+            let (by_s, by_t) = (ss * along_s + st * along_t, st * along_s + tt * along_t);
+            let by_a = per_s * by_s;
+            let kept = f64::from(log_scale[j]).abs() <= LOGARITHM_LIMIT;
+            (if kept { by_s * along_s + by_t * along_t } else { 0.0 }, by_a, per_t * by_t - slope * by_a)
+        };
+        let [(scale_0, a_0, b_0), (scale_1, a_1, b_1), (scale_2, a_2, b_2)] = [by_axis(0), by_axis(1), by_axis(2)];
+
+        // a and b are `to` · axes · scale.
+        let by_to = |by: [f64; 3]| {
+            let by = [by[0] * shape.scale[0], by[1] * shape.scale[1], by[2] * shape.scale[2]];
+            let along = |axis: usize| dot(by, [shape.axes[0][axis], shape.axes[1][axis], shape.axes[2][axis]]);
+            [along(0), along(1), along(2)]
+        };
+        let (by_to_u, by_to_v) = (by_to([a_0, a_1, a_2]), by_to([b_0, b_1, b_2]));
+        // Turning the Gaussian one way is turning `to` the other way.
+        let (turn_u, turn_v) = (cross(by_to_u, shape.to[0]), cross(by_to_v, shape.to[1]));
+        let torque = [turn_u[0] + turn_v[0], turn_u[1] + turn_v[1], turn_u[2] + turn_v[2]];
+
+        // `to` is focal/depth · (row k − slope · row of the depth), with the slope cut at the limit.
+        let [row_x, row_y, row_z] = view.rotation;
+        let by_slope = |k: usize, by_center: f64, by_to: [f64; 3]| {
+            let through_to = view.focal[k] / shape.depth * dot(row_z, by_to);
+            let kept = shape.slopes[k].abs() <= view.slope_limit[k];
+            view.focal[k] * by_center - if kept { through_to } else { 0.0 }
+        };
+        let by_slope_x = by_slope(0, per_s * s, by_to_u);
+        let by_slope_y = by_slope(1, per_t * t - slope * per_s * s, by_to_v);
+        let by_size = dot(shape.to[0], by_to_u) + dot(shape.to[1], by_to_v);
+        let by_depth = -by_size - shape.slopes[0] * by_slope_x - shape.slopes[1] * by_slope_y;
+        let inverse = 1.0 / shape.depth;
+        let along =
+            |axis: usize| inverse * (row_x[axis] * by_slope_x + row_y[axis] * by_slope_y + row_z[axis] * by_depth);
+        Taken {
+            position: [along(0), along(1), along(2)],
+            rotation: by_quaternion(q, torque),
+            log_scale: [scale_0, scale_1, scale_2],
+        }
+    }
+}
+
+/// ∂L/∂ wxyz quaternion of any length, given ∂L/∂ angle about each of the world's axes: 2·(0, torque) ⊗ q / ‖q‖². A
+/// quaternion changes by half an angle times itself; along itself nothing changes. Not finite for a zero one.
+#[inline(always)]
+fn by_quaternion([w, x, y, z]: [f64; 4], torque: [f64; 3]) -> [f64; 4] {
+    let twice = 2.0 / (w * w + x * x + y * y + z * z);
+    let [cross_x, cross_y, cross_z] = cross(torque, [x, y, z]);
+    [
+        -twice * dot(torque, [x, y, z]),
+        twice * (w * torque[0] + cross_x),
+        twice * (w * torque[1] + cross_y),
+        twice * (w * torque[2] + cross_z),
+    ]
+}

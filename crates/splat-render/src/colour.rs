@@ -1,0 +1,113 @@
+//! Colour of Gaussians seen from a point: real spherical harmonics up to degree 3.
+//!
+//! Data in: SH planes of a block and the camera's centre. Data out: rgb, unclamped above. The basis is
+//! the field's (signs of Kerbl et al. 2023; constants as in Sloan, "Stupid Spherical Harmonics Tricks", 2008).
+
+use std::ops::Range;
+
+use super::convention::BLOCK;
+use splat_core::{Gaussians, HIGHEST_DEGREE, SH_C0, sh_coefficients};
+
+/// Red, green and blue of one block.
+pub(super) type Colours = [[f32; BLOCK]; 3];
+
+/// Writes the colours of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`
+/// clamped at 0 (NaN becomes 0). Coefficients beyond degree 3, or short of a whole degree, are not read.
+#[inline(always)]
+pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colours) {
+    let n = ids.len().min(BLOCK);
+    for channel in out.iter_mut() {
+        channel[..n].fill(0.5);
+    }
+    let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
+    let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
+    for i in 0..n {
+        let (direction, _) = direction([position[0][i], position[1][i], position[2][i]], center);
+        for (values, value) in values.iter_mut().zip(basis(direction)) {
+            values[i] = value;
+        }
+    }
+    for (k, values) in values.iter().enumerate().take(coefficients(gaussians)) {
+        for (channel, sum) in out.iter_mut().enumerate() {
+            let plane = &gaussians.sh.plane(3 * k + channel)[ids.clone()][..n];
+            for i in 0..n {
+                sum[i] += values[i] * plane[i];
+            }
+        }
+    }
+    for channel in out.iter_mut() {
+        for value in &mut channel[..n] {
+            *value = value.max(0.0);
+        }
+    }
+}
+
+/// Coefficients per channel that are read.
+pub(super) fn coefficients(gaussians: &Gaussians) -> usize {
+    let fits = |&degree: &usize| 3 * sh_coefficients(degree) <= gaussians.sh.width();
+    (0..=HIGHEST_DEGREE).rev().find(fits).map_or(0, sh_coefficients)
+}
+
+/// Unit vector from `center` to `position`, and one over their distance.
+#[inline(always)]
+pub(super) fn direction(position: [f32; 3], center: [f64; 3]) -> ([f32; 3], f64) {
+    // Differences in f64: far from the origin the direction would otherwise be rounded away.
+    let d =
+        [f64::from(position[0]) - center[0], f64::from(position[1]) - center[1], f64::from(position[2]) - center[2]];
+    let inverse = 1.0 / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
+    ([(d[0] * inverse) as f32, (d[1] * inverse) as f32, (d[2] * inverse) as f32], inverse)
+}
+
+/// Constants of the polynomials, several of which share one.
+const C1: f32 = 0.488_602_5;
+const C2: [f32; 3] = [1.092_548_5, 0.315_391_57, 0.546_274_2];
+const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445_305_7];
+
+/// Y_k of a unit vector.
+#[inline(always)]
+pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; sh_coefficients(3)] {
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    [
+        SH_C0 as f32,
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2[0] * x * y,
+        -C2[0] * y * z,
+        C2[1] * (2.0 * zz - xx - yy),
+        -C2[0] * x * z,
+        C2[2] * (xx - yy),
+        -C3[0] * y * (3.0 * xx - yy),
+        C3[1] * x * y * z,
+        -C3[2] * y * (4.0 * zz - xx - yy),
+        C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        -C3[2] * x * (4.0 * zz - xx - yy),
+        C3[4] * z * (xx - yy),
+        -C3[0] * x * (xx - 3.0 * yy),
+    ]
+}
+
+/// Derivatives of the polynomials of [`basis`] by x, y and z.
+#[inline(always)]
+pub(super) fn basis_gradient([x, y, z]: [f32; 3]) -> [[f32; 3]; sh_coefficients(3)] {
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    let times = |c: f32, v: [f32; 3]| [c * v[0], c * v[1], c * v[2]];
+    [
+        [0.0; 3],
+        [0.0, -C1, 0.0],
+        [0.0, 0.0, C1],
+        [-C1, 0.0, 0.0],
+        times(C2[0], [y, x, 0.0]),
+        times(-C2[0], [0.0, z, y]),
+        times(C2[1], [-2.0 * x, -2.0 * y, 4.0 * z]),
+        times(-C2[0], [z, 0.0, x]),
+        times(C2[2], [2.0 * x, -2.0 * y, 0.0]),
+        times(-C3[0], [6.0 * x * y, 3.0 * (xx - yy), 0.0]),
+        times(C3[1], [y * z, x * z, x * y]),
+        times(-C3[2], [-2.0 * x * y, 4.0 * zz - xx - 3.0 * yy, 8.0 * y * z]),
+        times(C3[3], [-6.0 * x * z, -6.0 * y * z, 6.0 * zz - 3.0 * (xx + yy)]),
+        times(-C3[2], [4.0 * zz - 3.0 * xx - yy, -2.0 * x * y, 8.0 * x * z]),
+        times(C3[4], [2.0 * x * z, -2.0 * y * z, xx - yy]),
+        times(-C3[0], [3.0 * (xx - yy), -6.0 * x * y, 0.0]),
+    ]
+}

@@ -1,0 +1,424 @@
+//! From Gaussians to footprints in the picture: EWA projection of one block, in f64.
+//!
+//! In f64 because a radius is rounded up to whole pixels and decides which tiles a Gaussian reaches, and
+//! because the 2-D covariance of a needle cancels in f32. Data in: planes of one frame's states and a
+//! camera. Data out: one [`Splat`] for every Gaussian that can change a pixel. Memory: a few stack arrays
+//! of [`BLOCK`] entries. Source: Zwicker et al., "EWA Splatting", 2002, with the constants of Kerbl et al.,
+//! "3D Gaussian Splatting", 2023.
+
+use std::f64::consts::{LN_2, LOG2_E};
+use std::ops::Range;
+
+use super::colour::{self, Colours};
+use super::convention::{BLOCK, MIN_ALPHA, TILE};
+use splat_core::functions::exp;
+use splat_core::{Camera, Gaussians};
+
+/// Variance added to the diagonal of every 2-D covariance, pixels².
+const DILATION: f64 = 0.3;
+/// The Jacobian is taken at directions no further out than this many half fields of view.
+const FIELD_MARGIN: f64 = 1.3;
+/// Logarithms of scales and logits are cut to ± this: squares of squares of scales stay finite in f64.
+pub(super) const LOGARITHM_LIMIT: f64 = 80.0;
+/// Below this logit an opacity, .0025, is less than [`MIN_ALPHA`].
+const LEAST_LOGIT: f32 = -6.0;
+/// Slack of the alpha bound in powers of two: thousands of times the rounding of the blend's exponent.
+const REACH_SLACK: f64 = 1e-3;
+
+/// What of a camera the projection needs.
+pub(super) struct View {
+    /// Rows of the rotation from world to camera.
+    pub(super) rotation: [[f64; 3]; 3],
+    translation: [f64; 3],
+    pub(super) focal: [f64; 2],
+    /// Where the optical axis lands when pixel centres are integers.
+    principal: [f64; 2],
+    pub(super) slope_limit: [f64; 2],
+    pub(super) center: [f64; 3],
+    pub(super) size: [u32; 2],
+    /// Tiles across and down.
+    pub(super) tiles: [u32; 2],
+    /// View depths up to this are not drawn; an f32 in the reference kernel.
+    near: f64,
+}
+
+impl View {
+    pub(super) fn new(camera: &Camera) -> Self {
+        let rows = camera.rotation.transpose();
+        View {
+            rotation: [rows.x_axis.to_array(), rows.y_axis.to_array(), rows.z_axis.to_array()],
+            translation: camera.translation.to_array(),
+            focal: [camera.fx, camera.fy],
+            principal: [camera.cx - 0.5, camera.cy - 0.5],
+            slope_limit: [
+                FIELD_MARGIN * f64::from(camera.width) / (2.0 * camera.fx),
+                FIELD_MARGIN * f64::from(camera.height) / (2.0 * camera.fy),
+            ],
+            center: camera.center().to_array(),
+            size: [camera.width, camera.height],
+            tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
+            near: f64::from(camera.near as f32),
+        }
+    }
+}
+
+/// The footprint of one Gaussian in one picture.
+///
+/// With pixel offset (dx, dy) from the centre, the exponent of its alpha is, in powers of two,
+/// `−narrow·(dx − slope·dy)² − fall·dy²`: the quadratic form of the inverse covariance with the square
+/// completed over x, which neither cancels nor goes positive.
+/// Alone in its line of the cache, for splats are read in another order than they lie.
+#[derive(Debug, Clone, Copy)]
+#[repr(align(64))]
+pub(super) struct Splat {
+    /// Centre in pixels, pixel centres at integers.
+    pub(super) u: f64,
+    pub(super) v: f64,
+    pub(super) narrow: f32,
+    pub(super) slope: f32,
+    pub(super) fall: f32,
+    /// Exponents below `−reach` give an alpha that is skipped.
+    pub(super) reach: f32,
+    pub(super) opacity: f32,
+    /// View depth, scene units, added up in f32 as the reference kernel does: where Gaussians nearly tie
+    /// its rounding decides which is in front (81 against 116 dB on one reference render).
+    pub(super) order: f32,
+    pub(super) colour: [f32; 3],
+    /// Index among the Gaussians.
+    pub(super) id: u32,
+}
+
+/// Tiles [x0, x1) × [y0, y1) in which a splat can change a pixel.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct TileRect {
+    pub(super) x0: u32,
+    pub(super) x1: u32,
+    pub(super) y0: u32,
+    pub(super) y1: u32,
+}
+
+/// The visible part of some Gaussians: entry i of both belongs together, in increasing id.
+#[derive(Debug, Default)]
+pub(super) struct Splats {
+    pub(super) splats: Vec<Splat>,
+    pub(super) rects: Vec<TileRect>,
+}
+
+impl Splats {
+    pub(super) fn clear(&mut self) {
+        self.splats.clear();
+        self.rects.clear();
+    }
+
+    pub(super) fn append(&mut self, mut next: Splats) {
+        self.splats.append(&mut next.splats);
+        self.rects.append(&mut next.rects);
+    }
+}
+
+/// Appends the visible Gaussians of `ids` to `out`; with `coloured`, their colours too (else black).
+///
+/// A Gaussian with a value that is not finite is not visible.
+pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
+        #[target_feature(enable = "avx2")]
+        fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+            project_blocks(gaussians, ids, view, coloured, out);
+        }
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: AVX2 was detected on the line above.
+            return unsafe { project_avx2(gaussians, ids, view, coloured, out) };
+        }
+    }
+    project_blocks(gaussians, ids, view, coloured, out);
+}
+
+#[inline(always)]
+fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+    // Room for all at once: growing would copy, and room that is never written takes no memory.
+    out.splats.reserve_exact(ids.len());
+    out.rects.reserve_exact(ids.len());
+    let mut footprints = Footprints::default();
+    let mut colours: Colours = [[0.0; BLOCK]; 3];
+    for start in ids.clone().step_by(BLOCK) {
+        let block = start..(start + BLOCK).min(ids.end);
+        let logits = &gaussians.opacity_logit.plane(0)[block.clone()];
+        if logits.iter().all(|&logit| logit < LEAST_LOGIT) {
+            continue;
+        }
+        let before = out.splats.len();
+        footprints.fill(gaussians, block.clone(), view);
+        for i in 0..block.len() {
+            if let Some((splat, rect)) = footprints.splat(i, (start + i) as u32, view) {
+                out.splats.push(splat);
+                out.rects.push(rect);
+            }
+        }
+        if coloured && out.splats.len() > before {
+            colour::evaluate(gaussians, block, view.center, &mut colours);
+            for splat in &mut out.splats[before..] {
+                let i = splat.id as usize - start;
+                splat.colour = [colours[0][i], colours[1][i], colours[2][i]];
+            }
+        }
+    }
+}
+
+/// Projected quantities of one block.
+struct Footprints {
+    depth: [f64; BLOCK],
+    order: [f32; BLOCK],
+    u: [f64; BLOCK],
+    v: [f64; BLOCK],
+    /// The exponent of alpha, see [`Splat`].
+    narrow: [f64; BLOCK],
+    slope: [f64; BLOCK],
+    fall: [f64; BLOCK],
+    /// Half the width and height of the ellipse where alpha has halved once, pixels.
+    half_u: [f64; BLOCK],
+    half_v: [f64; BLOCK],
+    /// 3σ of the longest axis rounded up, pixels.
+    radius: [f64; BLOCK],
+    opacity: [f64; BLOCK],
+}
+
+impl Default for Footprints {
+    fn default() -> Self {
+        let zero = [0.0; BLOCK];
+        Footprints {
+            depth: zero,
+            order: [0.0; BLOCK],
+            u: zero,
+            v: zero,
+            narrow: zero,
+            slope: zero,
+            fall: zero,
+            half_u: zero,
+            half_v: zero,
+            radius: zero,
+            opacity: zero,
+        }
+    }
+}
+
+impl Footprints {
+    /// Projects every Gaussian of the block, visible or not: without branches the loop runs in vectors.
+    #[inline(always)]
+    fn fill(&mut self, gaussians: &Gaussians, block: Range<usize>, view: &View) {
+        let n = block.len().min(BLOCK);
+        let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[block.clone()][..n]);
+        let rotation: [&[f32]; 4] = std::array::from_fn(|c| &gaussians.rotation.plane(c)[block.clone()][..n]);
+        let log_scale: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.log_scale.plane(c)[block.clone()][..n]);
+        let logit = &gaussians.opacity_logit.plane(0)[block.clone()][..n];
+        let [w0, w1, w2] = view.rotation[2].map(|x| x as f32);
+        let w3 = view.translation[2] as f32;
+        for i in 0..n {
+            let p: [f64; 3] = [position[0][i].into(), position[1][i].into(), position[2][i].into()];
+            let q: [f64; 4] =
+                [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()];
+            let shape = Shape::new(p, q, [log_scale[0][i], log_scale[1][i], log_scale[2][i]], view);
+            let Covariance { xx, xy, yy, det } = shape.covariance();
+            // m² − det of the dilated covariance, written as a sum of squares.
+            let spread = 0.25 * (xx - yy) * (xx - yy) + xy * xy;
+            let largest = 0.5 * (xx + yy) + (if spread < 0.1 { 0.1 } else { spread }).sqrt();
+            self.depth[i] = shape.depth;
+            self.order[i] = (w0 * position[0][i] + w1 * position[1][i]) + (w2 * position[2][i] + w3);
+            self.u[i] = view.focal[0] * shape.slopes[0] + view.principal[0];
+            self.v[i] = view.focal[1] * shape.slopes[1] + view.principal[1];
+            self.narrow[i] = 0.5 * LOG2_E * yy / det;
+            self.slope[i] = xy / yy;
+            self.fall[i] = 0.5 * LOG2_E / yy;
+            self.half_u[i] = (2.0 * LN_2 * xx).sqrt();
+            self.half_v[i] = (2.0 * LN_2 * yy).sqrt();
+            self.radius[i] = (3.0 * largest.sqrt()).ceil();
+            self.opacity[i] = opacity(logit[i]);
+        }
+    }
+
+    /// The footprint of Gaussian `i` of the block, or none when it cannot change any pixel.
+    #[inline(always)]
+    fn splat(&self, i: usize, id: u32, view: &View) -> Option<(Splat, TileRect)> {
+        let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
+        let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.narrow[i].is_finite();
+        if !(depth > view.near && finite && opacity >= f64::from(MIN_ALPHA)) {
+            return None;
+        }
+        let reach = log2_bound(opacity / f64::from(MIN_ALPHA)) + REACH_SLACK;
+        // The reference kernel's square of tiles, then what of it the ellipse alpha ≥ 1/255 can touch.
+        let root = reach.sqrt();
+        let (x0, x1) = tile_range(u, self.radius[i], root * self.half_u[i], view.tiles[0]);
+        let (y0, y1) = tile_range(v, self.radius[i], root * self.half_v[i], view.tiles[1]);
+        if x0 >= x1 || y0 >= y1 {
+            return None;
+        }
+        let splat = Splat {
+            u,
+            v,
+            narrow: self.narrow[i] as f32,
+            slope: self.slope[i] as f32,
+            fall: self.fall[i] as f32,
+            reach: reach as f32,
+            opacity: opacity as f32,
+            order: self.order[i],
+            colour: [0.0; 3],
+            id,
+        };
+        Some((splat, TileRect { x0, x1, y0, y1 }))
+    }
+}
+
+/// How a camera sees the axes of one Gaussian.
+pub(super) struct Shape {
+    /// View depth, scene units.
+    pub(super) depth: f64,
+    /// x / depth and y / depth in camera axes.
+    pub(super) slopes: [f64; 2],
+    /// World directions that move u and v, pixels per scene unit: rows of the Jacobian times the camera's rotation.
+    pub(super) to: [[f64; 3]; 2],
+    /// Columns of the Gaussian's rotation.
+    pub(super) axes: [[f64; 3]; 3],
+    pub(super) scale: [f64; 3],
+    /// Standard deviations along the axes as seen in u and v, pixels: `to` · axes · scale.
+    pub(super) spread: [[f64; 3]; 2],
+}
+
+/// The widened 2-D covariance, pixels², and its determinant.
+pub(super) struct Covariance {
+    pub(super) xx: f64,
+    pub(super) xy: f64,
+    pub(super) yy: f64,
+    pub(super) det: f64,
+}
+
+impl Shape {
+    /// Of a Gaussian at `p` with wxyz quaternion `q`.
+    #[inline(always)]
+    pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &View) -> Self {
+        let [r0, r1, r2] = view.rotation;
+        let [t0, t1, t2] = view.translation;
+        let z = dot(r2, p) + t2;
+        let slopes = [(dot(r0, p) + t0) / z, (dot(r1, p) + t1) / z];
+        let axes = rotation_matrix(q);
+        let s = [
+            exp(limit(log_scale[0].into(), LOGARITHM_LIMIT)),
+            exp(limit(log_scale[1].into(), LOGARITHM_LIMIT)),
+            exp(limit(log_scale[2].into(), LOGARITHM_LIMIT)),
+        ];
+        let (jx, jy) = (view.focal[0] / z, view.focal[1] / z);
+        let (kx, ky) = (limit(slopes[0], view.slope_limit[0]), limit(slopes[1], view.slope_limit[1]));
+        let to_u = [jx * (r0[0] - kx * r2[0]), jx * (r0[1] - kx * r2[1]), jx * (r0[2] - kx * r2[2])];
+        let to_v = [jy * (r1[0] - ky * r2[0]), jy * (r1[1] - ky * r2[1]), jy * (r1[2] - ky * r2[2])];
+        // Not `array::map`: it may be compiled apart, and a loop that calls it does not run in vectors.
+        let spread = [
+            [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]],
+            [dot(to_v, axes[0]) * s[0], dot(to_v, axes[1]) * s[1], dot(to_v, axes[2]) * s[2]],
+        ];
+        Shape { depth: z, slopes, to: [to_u, to_v], axes, scale: s, spread }
+    }
+
+    #[inline(always)]
+    pub(super) fn covariance(&self) -> Covariance {
+        let [a, b] = self.spread;
+        let (aa, bb) = (dot(a, a), dot(b, b));
+        let cross = cross(a, b);
+        Covariance {
+            xx: aa + DILATION,
+            xy: dot(a, b),
+            yy: bb + DILATION,
+            det: dot(cross, cross) + DILATION * (aa + bb) + DILATION * DILATION,
+        }
+    }
+}
+
+/// Opacity in [0, 1] of a stored logit.
+#[inline(always)]
+pub(super) fn opacity(logit: f32) -> f64 {
+    1.0 / (1.0 + exp(limit(-f64::from(logit), LOGARITHM_LIMIT)))
+}
+
+/// Tiles along one axis: those touched by `at ± radius` as the reference kernel counts them, without
+/// those whose pixels all lie further than `half` from `at`.
+#[inline(always)]
+fn tile_range(at: f64, radius: f64, half: f64, tiles: u32) -> (u32, u32) {
+    let tile = f64::from(TILE);
+    let start = ((at - radius) / tile).floor().max(((at - half - (tile - 1.0)) / tile).ceil());
+    let end = ((at + radius + tile - 1.0) / tile).floor().min(((at + half) / tile).floor() + 1.0);
+    // A float-to-integer cast saturates: below the image it becomes 0.
+    ((start as u32).min(tiles), (end as u32).min(tiles))
+}
+
+/// An upper bound of log₂ x, at most 0.087 above it, for normal positive x: the bits of a float read as an
+/// integer are its logarithm but for the mantissa, and log₂(1 + m) ≤ m + 0.0861.
+#[inline(always)]
+fn log2_bound(x: f64) -> f64 {
+    x.to_bits() as i64 as f64 * (1.0 / (1u64 << 52) as f64) - (1023.0 - 0.0861)
+}
+
+/// `x` cut to ± `bound`; NaN stays, so that it is noticed. (`f64::clamp` may panic, which keeps a loop
+/// from running in vectors.)
+#[inline(always)]
+fn limit(x: f64, bound: f64) -> f64 {
+    let x = if x > bound { bound } else { x };
+    if x < -bound { -bound } else { x }
+}
+
+#[inline(always)]
+pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// Columns of the rotation of a wxyz quaternion of any length; the identity for a zero one.
+#[inline(always)]
+fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
+    // 2/|q|² in place of normalising; the floor keeps 0 · s = 0 for a zero quaternion.
+    let norm = w * w + x * x + y * y + z * z;
+    let s = 2.0 / if norm < f64::MIN_POSITIVE { f64::MIN_POSITIVE } else { norm };
+    [
+        [1.0 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)],
+        [s * (x * y - w * z), 1.0 - s * (x * x + z * z), s * (y * z + w * x)],
+        [s * (x * z + w * y), s * (y * z - w * x), 1.0 - s * (x * x + y * y)],
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn log2_bound_is_above_by_less_than_0_087() {
+        for step in 0..100_000 {
+            let x = 1.0 + f64::from(step) * 2.54e-3;
+            let excess = log2_bound(x) - x.log2();
+            assert!((0.0..0.087).contains(&excess), "log2 of {x} is exceeded by {excess}");
+        }
+    }
+
+    #[test]
+    fn a_zero_quaternion_is_the_identity() {
+        assert_eq!(rotation_matrix([0.0; 4]), [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+    }
+
+    #[test]
+    fn tile_ranges_are_the_reference_kernels_where_the_ellipse_does_not_cut() {
+        for step in -400..4000 {
+            let at = f64::from(step) * 0.1;
+            for radius in [1.0f64, 3.0, 17.0, 250.0] {
+                let expected_start = (((at - radius) / 16.0) as i64).clamp(0, 20) as u32;
+                let expected_end = (((at + radius + 15.0) / 16.0) as i64).clamp(0, 20) as u32;
+                let (start, end) = tile_range(at, radius, 1e9, 20);
+                if expected_start < expected_end {
+                    assert_eq!((start, end), (expected_start, expected_end), "at {at} radius {radius}");
+                } else {
+                    assert!(start >= end, "at {at} radius {radius}: got {start}..{end}, expected none");
+                }
+            }
+        }
+    }
+}
