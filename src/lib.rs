@@ -9,7 +9,6 @@
 //! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`link`], [`render`], [`metrics`], [`archive`], [`fit`] | pure mathematics: slices in, values out |
 //! | L3 | [`ingest`], [`stream`], [`emit`], [`work`], [`families`], [`demo`], [`player`] | files, threads, terminals |
 //! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`], [`selfcheck`] | memory, the order of the passes, what verbs do |
-//! | L5 | [`cli`] | arguments and exit codes |
 //!
 //! [`method`] derives what is computed.
 
@@ -20,7 +19,6 @@ pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
 
 pub mod archive;
 pub mod budget;
-pub mod cli;
 pub mod compress;
 pub mod demo;
 pub mod emit;

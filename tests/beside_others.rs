@@ -7,6 +7,7 @@ mod scene;
 
 use std::fs;
 use std::io::Write;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -26,10 +27,20 @@ fn started(workplace: &Workplace, mut command: Command) -> Child {
     piped.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
-/// Starts the program; it waits for what comes on standard input.
+/// Starts the program; it waits for what comes on standard input. Signals end it even where they are ignored in this
+/// process, as in one that a shell started in the background.
 fn waiting(workplace: &Workplace, arguments: &str) -> Child {
     let mut command = Command::new(program());
     command.args(arguments.split_whitespace());
+    let reset = || {
+        for signal in [libc::SIGINT, libc::SIGTERM, libc::SIGHUP] {
+            // SAFETY: the default action is a valid disposition of each of these signals.
+            unsafe { libc::signal(signal, libc::SIG_DFL) };
+        }
+        Ok(())
+    };
+    // SAFETY: `signal` may be called between fork and exec, and nothing else is.
+    unsafe { command.pre_exec(reset) };
     started(workplace, command)
 }
 

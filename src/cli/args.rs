@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::{RecipeFlags, numbers};
-use crate::emit::atomic::Replace;
-use crate::emit::bounds::MaxError;
-use crate::error::quoted;
-use crate::families::Link;
-use crate::ingest::cameras::Times;
-use crate::verbs::method::Method;
-use crate::verbs::precision::Turned;
-use crate::work::Part;
+use splatsieve::emit::atomic::Replace;
+use splatsieve::emit::bounds::MaxError;
+use splatsieve::error::quoted;
+use splatsieve::families::Link;
+use splatsieve::ingest::cameras::Times;
+use splatsieve::verbs::method::Method;
+use splatsieve::verbs::precision::Turned;
+use splatsieve::work::Part;
 
 /// Headings of groups of options.
 const CAMERAS: &str = "Cameras";

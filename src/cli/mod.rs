@@ -16,41 +16,41 @@ use std::process::ExitCode;
 use clap::FromArgMatches;
 use gseq::Compression;
 
-use crate::budget::{self, Budget, Tell};
-use crate::compress::summary::Detail;
-use crate::compress::{Only, Request, Run, Target, compress, divided_stages, foresee};
-use crate::emit::atomic::{Replace, as_named, take_warnings};
-use crate::emit::image::ImageFormat;
-use crate::emit::kind::OutputKind;
-use crate::error::{Error, Result, ShowPath};
-use crate::families::{Conventions, Link};
-use crate::ingest::cameras::Times;
-use crate::model::Split;
-use crate::recipe::preset_text;
-use crate::report::{self, ReportOptions, trade_off};
-use crate::scene::pictures::PictureSet;
-use crate::scene::{InputOptions, scratch_beside};
-use crate::selfcheck;
-use crate::stream::{Mode, Progress, tell};
-use crate::verbs::container::Storing;
-use crate::verbs::demo::DemoOptions;
-use crate::verbs::evaluate::EvaluateOptions;
-use crate::verbs::method::Method;
-use crate::verbs::precision::{PrecisionOptions, Turned};
-use crate::verbs::render::{RenderOptions, Wanted};
-use crate::verbs::sweep::SweepOptions;
-use crate::verbs::video::{VideoOptions, Way, places, video};
-use crate::verbs::view::ViewOptions;
-use crate::verbs::{archive, container, convert, demo, evaluate, precision, render, score, sweep, view};
-use crate::work;
 use args::{
     CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, Rot4d, SideBySide,
     SplitArg, Sweep, Trained, Verb, View,
 };
 use output::{print, print_as};
+use splatsieve::budget::{self, Budget, Tell};
+use splatsieve::compress::summary::Detail;
+use splatsieve::compress::{Only, Request, Run, Target, compress, divided_stages, foresee};
+use splatsieve::emit::atomic::{Replace, as_named, take_warnings};
+use splatsieve::emit::image::ImageFormat;
+use splatsieve::emit::kind::OutputKind;
+use splatsieve::error::{Error, Result, ShowPath};
+use splatsieve::families::{Conventions, Link};
+use splatsieve::ingest::cameras::Times;
+use splatsieve::model::Split;
+use splatsieve::recipe::preset_text;
+use splatsieve::report::{self, ReportOptions, trade_off};
+use splatsieve::scene::pictures::PictureSet;
+use splatsieve::scene::{InputOptions, scratch_beside};
+use splatsieve::selfcheck;
+use splatsieve::stream::{Mode, Progress, tell};
+use splatsieve::verbs::container::Storing;
+use splatsieve::verbs::demo::DemoOptions;
+use splatsieve::verbs::evaluate::EvaluateOptions;
+use splatsieve::verbs::method::Method;
+use splatsieve::verbs::precision::{PrecisionOptions, Turned};
+use splatsieve::verbs::render::{RenderOptions, Wanted};
+use splatsieve::verbs::sweep::SweepOptions;
+use splatsieve::verbs::video::{VideoOptions, Way, places, video};
+use splatsieve::verbs::view::ViewOptions;
+use splatsieve::verbs::{archive, container, convert, demo, evaluate, precision, render, score, sweep, view};
+use splatsieve::work;
 
 /// Runs the program on the arguments of this process.
-pub fn main() -> ExitCode {
+pub(crate) fn main() -> ExitCode {
     let cli = match parse(std::env::args_os()) {
         Ok(cli) => cli,
         Err(error) => {
@@ -429,7 +429,7 @@ fn render_options(args: Render) -> Result<RenderOptions> {
     };
     let output = args.output.unwrap_or_default();
     let mut input = input_options(args.input, None, Some(&output));
-    input.use_cameras(args.cameras);
+    args.cameras.apply_to(&mut input);
     input.work = work_of(args.kept);
     Ok(RenderOptions {
         input,
@@ -448,7 +448,7 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
         None => (Way::View(args.view), PictureSet::All),
     };
     let mut input = input_options(args.input, None, Some(&output));
-    input.use_cameras(args.cameras);
+    args.cameras.apply_to(&mut input);
     input.work = work_of(args.kept);
     let options = VideoOptions {
         input,
@@ -473,7 +473,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     original.allow_gaps = args.allow_gaps;
     original.link = args.link.map_or(Link::Auto, Link::from);
     original.conventions = conventions(&args.trained);
-    original.use_cameras(args.cameras);
+    args.cameras.apply_to(&mut original);
     original.memory = budget_of(args.memory);
     EvaluateOptions {
         original,
@@ -490,7 +490,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
 
 fn view_options(args: View) -> ViewOptions {
     let mut original = input_options(args.input, None, Some(&args.output));
-    original.use_cameras(args.cameras);
+    args.cameras.apply_to(&mut original);
     ViewOptions {
         original,
         compressed: args.compressed,
@@ -543,7 +543,7 @@ fn viewed(options: &ViewOptions) -> Result<String> {
 
 fn sweep_options(args: Sweep) -> SweepOptions {
     let mut input = input_options(args.input, None, Some(&args.output));
-    input.use_cameras(args.cameras);
+    args.cameras.apply_to(&mut input);
     let named = |name: &String| Method::ALL.into_iter().find(|method| method.name() == name);
     SweepOptions {
         input,
@@ -561,7 +561,7 @@ fn sweep_options(args: Sweep) -> SweepOptions {
 
 fn precision_options(args: args::Precision) -> Result<PrecisionOptions> {
     let mut input = input_options(args.input, None, Some(&args.output));
-    input.use_cameras(args.cameras);
+    args.cameras.apply_to(&mut input);
     let named = |name: &String| Turned::ALL.into_iter().find(|knob| knob.name() == name);
     let knobs: Vec<Turned> = args.knobs.iter().filter_map(named).collect();
     Ok(PrecisionOptions {
@@ -606,7 +606,7 @@ fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) 
     options.is_scratch_named = input.scratch_dir.is_some();
     options.scratch = input.scratch_dir.or_else(|| output.and_then(scratch_beside));
     if let Some(cameras) = cameras {
-        options.use_cameras(cameras.file);
+        cameras.file.apply_to(&mut options);
         options.split = match cameras.split {
             Some(SplitArg::Train) | None => Some(Split::Train),
             Some(SplitArg::Val) => Some(Split::Val),
@@ -617,12 +617,13 @@ fn input_options(input: Input, cameras: Option<Cameras>, output: Option<&Path>) 
     options
 }
 
-impl InputOptions {
-    fn use_cameras(&mut self, file: CameraFile) {
-        self.cameras = file.cameras;
-        self.size = file.size;
-        self.times = file.times.unwrap_or_default();
-        self.frames = file.frames.map(|frames| frames as usize);
+impl CameraFile {
+    /// Passes the arguments on to the options of an input.
+    fn apply_to(self, options: &mut InputOptions) {
+        options.cameras = self.cameras;
+        options.size = self.size;
+        options.times = self.times.unwrap_or_default();
+        options.frames = self.frames.map(|frames| frames as usize);
     }
 }
 

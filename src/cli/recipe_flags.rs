@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
-use crate::compress::Record;
-use crate::error::{Error, Result, ShowPath, quoted};
-use crate::ingest::text::read_text;
-use crate::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
+use splatsieve::compress::Record;
+use splatsieve::error::{Error, Result, ShowPath, quoted};
+use splatsieve::ingest::text::read_text;
+use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
 const RECIPE: &str = "Recipe";
 const HEADING: &str = "Recipe, every parameter (`splatsieve recipe` prints a documented file)";
@@ -185,7 +185,7 @@ pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<V
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::Columns;
+    use splatsieve::model::Columns;
 
     fn parse(args: &[&str]) -> Result<Recipe> {
         let command = RecipeFlags::augment_args(Command::new("t").no_binary_name(true));
@@ -200,7 +200,7 @@ mod tests {
         let mut expected = Recipe::preset("paper").unwrap();
         expected.score.mu = 2.0;
         expected.score.weigh_motion_by_life = true;
-        expected.select.low_priority = crate::recipe::LowPriority::Rescue;
+        expected.select.low_priority = splatsieve::recipe::LowPriority::Rescue;
         assert_eq!(recipe, expected);
     }
 
