@@ -28,7 +28,8 @@ mod tests {
 
     use super::*;
     use crate::compress::journal::Journal;
-    use crate::compress::summary::{ArchiveSummary, BandsSummary, FieldSummary, GoalSummary, RefinedSummary, Saved};
+    use crate::compress::records::{BandsSummary, FieldSummary, RefinedSummary, Saved};
+    use crate::compress::summary::{ArchiveSummary, GoalSummary};
 
     fn kept<T: Serialize + DeserializeOwned>(value: T) -> T {
         postcard::from_bytes::<AsToml<T>>(&postcard::to_stdvec(&AsToml(value)).unwrap()).unwrap().0

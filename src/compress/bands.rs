@@ -4,9 +4,9 @@
 
 use super::field::{PICTURES, least};
 use super::journal::Journal;
+use super::records::BandsSummary;
 use super::request::Request;
 use super::score::scored;
-use super::summary::BandsSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;

@@ -3,10 +3,10 @@
 //! Memory: two states of one frame, and two pictures.
 
 use super::journal::Journal;
+use super::records::FieldSummary;
 use super::refine::CLOSE_ENOUGH;
 use super::request::Request;
 use super::score::scored;
-use super::summary::FieldSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
 use crate::emit::kind::OutputKind;
 use crate::error::Result;

@@ -2,8 +2,7 @@
 
 use std::fmt::Write as _;
 
-use serde::{Deserialize, Serialize};
-
+use super::records::{Forecast, Range, StageForecast};
 use crate::budget::{Need, Tell, Workload, size};
 use crate::stream::duration;
 
@@ -18,42 +17,6 @@ const OFF_SEARCHING: [f64; 2] = [0.15, 2.5];
 const TOGETHER: f64 = 0.6;
 /// Seconds that starting, opening and writing take, whatever is done.
 const AT_LEAST: f64 = 0.5;
-/// A value that is known within bounds.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Range {
-    /// Hardly less.
-    pub least: f64,
-    /// About.
-    pub likely: f64,
-    /// Hardly more.
-    pub most: f64,
-}
-
-/// What a stage will take of all processors together.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct StageForecast {
-    /// Its name.
-    pub name: String,
-    /// Seconds, about.
-    pub core_seconds: f64,
-}
-
-/// What a run will take.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Forecast {
-    /// Wall-clock time.
-    pub seconds: Range,
-    /// Time of all processors together.
-    pub core_seconds: Range,
-    /// Threads at work.
-    pub threads: u64,
-    /// Whether some work was done to measure by.
-    pub measured: bool,
-    /// Most memory.
-    pub memory_bytes: u64,
-    /// Stage by stage.
-    pub stages: Vec<StageForecast>,
-}
 
 impl Forecast {
     /// Of stages that need what `needs` says, or at best take `least` core-seconds.

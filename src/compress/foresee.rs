@@ -6,13 +6,14 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::emit::beside_names;
-use super::forecast::Forecast;
 use super::job::Job;
 use super::journal::Journal;
 use super::measure::{Outlook, Stages};
 use super::pace::measured;
+use super::records::Forecast;
+use super::records::LeftOut;
 use super::request::{Goal, Quality, Request};
-use super::summary::{CameraSummary, LeftOut};
+use super::summary::CameraSummary;
 use crate::TOOL;
 use crate::budget::{Budget, Plan, Tell, Workload};
 use crate::emit::kind::OutputKind;

@@ -8,8 +8,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::as_toml::AsToml;
-use super::forecast::Forecast;
-use super::summary::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, Stage};
+use super::records::Forecast;
+use super::records::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, Stage};
 use crate::budget::peak_memory_bytes;
 use crate::error::Result;
 use crate::scene::Scene;

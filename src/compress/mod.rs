@@ -21,6 +21,7 @@ mod near;
 mod pace;
 mod prune;
 mod record;
+pub mod records;
 mod refine;
 mod request;
 pub mod rounds;

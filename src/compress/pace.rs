@@ -8,9 +8,10 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::forecast::{Forecast, core_seconds};
+use super::forecast::core_seconds;
 use super::journal::Clock;
 use super::measure::Stages;
+use super::records::Forecast;
 use crate::budget::{LOOK, Pace, Plan, REMOVE, RENDER, Workload};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians};

@@ -6,8 +6,9 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
+use super::records::Saved;
 use super::statistics::Statistics;
-use super::summary::{FlagSummary, Saved, TermSummary};
+use super::summary::{FlagSummary, TermSummary};
 use crate::budget::{Need, Part, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::families::trajectories::state_bytes;

@@ -10,7 +10,8 @@ use super::html::{bytes, count, escape, figure, file_name, percent};
 use super::run::Run;
 use super::shown::Shown;
 use super::{precision, trade_off};
-use crate::compress::summary::{Stage, Summary};
+use crate::compress::records::Stage;
+use crate::compress::summary::Summary;
 use crate::families::Size;
 use crate::verbs::evaluation::{Both, Comparison, FrameMeans, Means, ViewMeans};
 

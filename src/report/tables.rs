@@ -1,7 +1,7 @@
 //! The page's tables as CSV.
 
 use super::failure::FailureMode;
-use crate::compress::summary::Stage;
+use crate::compress::records::Stage;
 use crate::verbs::csv::{known, table};
 
 /// One line per failure mode.

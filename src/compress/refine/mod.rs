@@ -19,8 +19,8 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
+use super::records::RefinedSummary;
 use super::score::{Scored, scored};
-use super::summary::RefinedSummary;
 use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload, of_left};
 use crate::error::Result;
 use crate::limits::Limits;
