@@ -14,7 +14,7 @@ use std::hint::black_box;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::link::{Joiner, Linker};
 use splatsieve::model::Gaussians;
-use splatsieve::select::hash_id;
+use splatsieve::model::hash_id;
 
 const COUNT: usize = 60_000;
 const FRAMES: usize = 6;

@@ -8,9 +8,9 @@
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3};
+use splatsieve::model::hash_id;
 use splatsieve::model::{Camera, Columns, Gaussians, Schedule};
 use splatsieve::recipe::Recipe;
-use splatsieve::select::hash_id;
 use splatsieve::stats::{BlockScan, ScanPlan};
 
 const GAUSSIANS: usize = 16_384;

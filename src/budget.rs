@@ -7,7 +7,6 @@
 //! live in each, and a byte per tile of a container, which are parts like any other.
 
 use std::fmt::Write as _;
-use std::fs;
 
 use bytesize::ByteSize;
 
@@ -17,7 +16,7 @@ use crate::families::Residence;
 use crate::families::trajectories::state_bytes;
 use crate::ingest::frame_stream::StreamHeader;
 use crate::limits::{Limits, ReadLimit};
-use crate::machine::memory_limit;
+use crate::machine::{memory_limit, peak_memory_bytes};
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
 use crate::render;
 use crate::stream::{BLOCK, PICTURES_PER_THREAD, duration};
@@ -595,19 +594,6 @@ pub fn seconds(work: &Workload, needs: &[Need]) -> Vec<(&'static str, f64)> {
 /// What this process has taken so far, for a person; none where the system does not say.
 pub fn taken() -> Option<String> {
     peak_memory_bytes().map(|bytes| format!("memory: at most {} taken", size(bytes)))
-}
-
-/// Largest resident memory of this process so far, mapped pages included (`VmHWM`); none where the
-/// system does not say.
-pub fn peak_memory_bytes() -> Option<u64> {
-    let status = fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
-}
-
-/// Lets [`peak_memory_bytes`] begin anew from what is resident now; false where the system has no such thing.
-pub fn reset_peak_memory() -> bool {
-    fs::write("/proc/self/clear_refs", "5").is_ok()
 }
 
 /// Bytes of the tables by which zstd, at a level, finds matches in `bytes` bytes: at most those of each level's group, and

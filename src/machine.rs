@@ -140,6 +140,19 @@ fn of_process(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<(u64, St
     }
 }
 
+/// Largest resident memory of this process so far, mapped pages included (`VmHWM`); none where the
+/// system does not say.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+/// Lets [`peak_memory_bytes`] begin anew from what is resident now; false where the system has no such thing.
+pub fn reset_peak_memory() -> bool {
+    fs::write("/proc/self/clear_refs", "5").is_ok()
+}
+
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;

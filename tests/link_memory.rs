@@ -9,7 +9,7 @@ use std::path::Path;
 use splatsieve::emit::ply::write_inria;
 use splatsieve::families::{OpenOptions, open};
 use splatsieve::model::Gaussians;
-use splatsieve::select::hash_id;
+use splatsieve::model::hash_id;
 
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;

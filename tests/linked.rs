@@ -12,8 +12,8 @@ use std::time::Instant;
 use scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
 use splatsieve::families::Link;
 use splatsieve::model::Gaussians;
+use splatsieve::model::hash_id;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
-use splatsieve::select::hash_id;
 
 const FRAMES: usize = 37;
 

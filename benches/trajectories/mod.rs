@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use splatsieve::families::ModelFolder;
+use splatsieve::model::hash_id;
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::select::hash_id;
 use splatsieve::source::{FrameSource, Ids};
 use splatsieve::stream::HeldFrames;
 

@@ -21,6 +21,7 @@ use crate::families::stream::{AHEAD, Streamed, frame_block};
 use crate::families::trajectories::OWN_OUTPUT;
 use crate::ingest::cameras;
 use crate::ingest::frame_stream::FrameStream;
+use crate::model::RobustBox;
 use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::recipe;
 use crate::scene::{
@@ -28,7 +29,7 @@ use crate::scene::{
     scene_of,
 };
 use crate::source::{FrameSource, Reads};
-use crate::stats::{RobustBox, ScanPlan};
+use crate::stats::ScanPlan;
 use crate::stream::{HeldFrames, RunningContribution, RunningScan, Sampler};
 
 /// Opens a scene to be measured, with the limits of its budget; `plan` says what is to be done with such a scene. A
@@ -206,7 +207,7 @@ fn receive_measured<S: Stages>(
 
 /// A virtual rig around the first of the frames.
 fn rig_around(held: &HeldFrames) -> Rig {
-    let bounds = RobustBox::of(held.position(0));
+    let bounds = RobustBox::from_positions(held.position(0));
     cameras::virtual_rig(bounds.middle, bounds.extent())
 }
 

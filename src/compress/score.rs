@@ -13,13 +13,14 @@ use crate::budget::{Need, Part, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::families::trajectories::state_bytes;
 use crate::limits::Limits;
+use crate::model::RobustBox;
 use crate::model::{Columns, Flags, Gaussians, Rows};
 use crate::recipe::{self, NonFinite};
 use crate::reduction::Reference;
 use crate::scene::Scene;
 use crate::score::{Scores, Term, score};
 use crate::select::{self, Overrides, Ranking, Selection, select};
-use crate::stats::{RobustBox, fill_anisotropy, snap, ulp};
+use crate::stats::{fill_anisotropy, snap, ulp};
 use crate::stream::{Progress, Scanned, Seen, frames_to_see, gather};
 
 /// What the stage is called.
@@ -140,7 +141,7 @@ impl Score {
                 true => Gaussians::zeros(info.count, info.sh_degree),
                 false => gather(source, &all, reference_frame, Columns::POSITION | Columns::LOG_SCALE)?,
             };
-            let extent = RobustBox::of(&state.position).extent();
+            let extent = RobustBox::from_positions(&state.position).extent();
             let canonical = scene.input.canonical().unwrap_or(&state);
             fill_anisotropy(&mut rows, &canonical.log_scale, self.score.anisotropy, extent);
             check_views(scene, &rows)?;

@@ -13,8 +13,8 @@ use super::accuracy::{Accuracy, Drawn};
 use crate::error::{Error, Result};
 use crate::ingest::cameras::virtual_rig;
 use crate::ingest::splatv::{MAGIC, ROW_BYTES, Row, TEXELS, WORDS};
+use crate::model::RobustBox;
 use crate::model::{Camera, Column};
-use crate::stats::RobustBox;
 
 /// Of the cameras around a scene one that is neither at its top nor at its bottom.
 const WELL_PLACED: usize = 4;
@@ -88,7 +88,7 @@ pub fn camera(camera: &Camera) -> Value {
 
 /// The cameras of a file that none come with: one that sees most of what is at `positions`.
 pub fn seen_whole(positions: &Column) -> Value {
-    let found = RobustBox::of(positions);
+    let found = RobustBox::from_positions(positions);
     virtual_rig(found.middle, found.extent()).cameras.get(WELL_PLACED).map_or(json!([]), |of| json!([camera(of)]))
 }
 

@@ -1,8 +1,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::*;
+use crate::model::hash_id;
 use crate::model::{Gaussians, SH_C0, opacity};
-use crate::select::hash_id;
 
 /// Even numbers in [0, 1) that follow from a seed.
 struct Dice(u64);

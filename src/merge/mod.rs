@@ -28,9 +28,9 @@ pub mod voxels;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::model::hash_id;
 use crate::model::{Columns, Gaussians};
 use crate::recipe;
-use crate::select::hash_id;
 use gates::{Appearance, Gates};
 pub use groups::Groups;
 use known::KNOWN_BYTES;

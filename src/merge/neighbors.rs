@@ -21,7 +21,7 @@ use rayon::prelude::*;
 
 use super::tree::{Nearest, Point, Tree};
 use super::voxels::{Voxels, along, voxel_of};
-use crate::select::hash_id;
+use crate::model::hash_id;
 
 /// Points in a voxel without a tree, at most. Trees in voxels of 8 to 64 points cost up to a third more among evenly
 /// strewn points and gain 7% among clusters.

@@ -54,9 +54,9 @@ impl FrameSource for Scene {
 mod tests {
     use super::*;
     use crate::compress::tests::scene;
+    use crate::model::RobustBox;
     use crate::model::{Columns, Gaussians};
     use crate::render::render;
-    use crate::stats::RobustBox;
     use crate::stream::gather_all;
 
     #[test]
@@ -72,7 +72,7 @@ mod tests {
         assert!(hidden.pick(&others) == expected);
         let camera = &scene.schedule.cameras[0];
         assert_eq!(render(&hidden, camera, [0.2; 3]).data, render(&expected, camera, [0.2; 3]).data);
-        let [found, expected] = [&hidden, &expected].map(|state| RobustBox::of(&state.position));
+        let [found, expected] = [&hidden, &expected].map(|state| RobustBox::from_positions(&state.position));
         assert_eq!((found.low, found.high), (expected.low, expected.high));
         scene.set_absent(&[]);
         assert!(gather_all(scene.source(), 2, Columns::all()).unwrap() == whole);

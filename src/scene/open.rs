@@ -11,9 +11,9 @@ use super::stream::open_arriving;
 use crate::error::{Error, Result, ShowPath};
 use crate::families::{self, Family, Timing};
 use crate::ingest::cameras::{self, Clock, Times};
+use crate::model::RobustBox;
 use crate::model::{Columns, Rig, opacity};
 use crate::source::FrameSource;
-use crate::stats::RobustBox;
 use crate::stream::gather_all;
 
 /// Opens an input; cameras only say which frames it has.
@@ -174,7 +174,7 @@ pub fn first_box(source: &dyn FrameSource) -> Result<Option<RobustBox>> {
     if source.info().times.is_empty() {
         return Ok(None);
     }
-    Ok(Some(RobustBox::of(&gather_all(source, 0, Columns::POSITION)?.position)))
+    Ok(Some(RobustBox::from_positions(&gather_all(source, 0, Columns::POSITION)?.position)))
 }
 
 /// Folder for scratch files of a run that writes `output`: where the result goes there is room for its input. `None` for a

@@ -5,10 +5,8 @@
 //! [`WORKING_BYTES_PER_GAUSSIAN`] meanwhile. Source: "Temporally-Aware
 //! Pruning for Compact 4D Gaussian Splatting Models", section 3.3.
 
-mod hash;
 mod ranking;
 
-pub use hash::hash_id;
 pub use ranking::Ranking;
 
 use serde::{Deserialize, Serialize};

@@ -4,7 +4,7 @@
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
-use super::hash_id;
+use crate::model::hash_id;
 use crate::recipe::{LowPriority, Select};
 use crate::score::Scores;
 

@@ -3,6 +3,7 @@
 use proptest::prelude::*;
 
 use super::*;
+use crate::model::hash_id;
 use crate::recipe::Recipe;
 
 /// Scores in which S is the sum of the normalised parts.

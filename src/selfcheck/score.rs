@@ -3,8 +3,8 @@
 use super::case::{Case, Worst};
 use super::made::clouds::Random;
 use crate::model::Column;
+use crate::model::RobustBox;
 use crate::score::FloatSketch;
-use crate::stats::RobustBox;
 
 /// Against the sorted values: the value at the rank, to the bit.
 pub(super) fn percentiles() -> Case {
@@ -29,7 +29,7 @@ pub(super) fn robust_box() -> Case {
         for count in [1, 100, 1003] {
             let axes = [7, 8, 9].map(|seed| (0..count).map(|i| values(count)[(i * seed) % count] as f32).collect());
             let axes: [Vec<f32>; 3] = axes;
-            let found = RobustBox::of(&Column::from_planes(3, axes.concat()));
+            let found = RobustBox::from_positions(&Column::from_planes(3, axes.concat()));
             for (axis, values) in axes.iter().enumerate() {
                 let values: Vec<f64> = values.iter().map(|&x| x.into()).collect();
                 for (got, p) in [(found.low, 1), (found.middle, 50), (found.high, 99)] {

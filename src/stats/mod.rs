@@ -9,7 +9,6 @@
 //! may be cut anywhere and run in any order without changing a bit.
 
 mod anisotropy;
-mod bounds;
 mod life;
 mod motion;
 mod noise;
@@ -21,7 +20,6 @@ mod state;
 mod tests;
 
 pub use anisotropy::fill_anisotropy;
-pub use bounds::RobustBox;
 pub use noise::{Snapped, snap, ulp};
 pub use plan::ScanPlan;
 pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, NEEDED};

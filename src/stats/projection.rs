@@ -260,7 +260,7 @@ mod tests {
     use glam::{DMat3, DVec3};
 
     use super::*;
-    use crate::select::hash_id;
+    use crate::model::hash_id;
 
     const LEN: usize = 1003;
 

@@ -232,8 +232,8 @@ fn clear_non_finite(rows: &mut Rows) {
 mod tests {
     use super::*;
     use crate::model::Schedule;
+    use crate::model::hash_id;
     use crate::recipe::{Motion, Recipe, Scan};
-    use crate::select::hash_id;
 
     fn random(k: usize) -> f32 {
         (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32

@@ -4,9 +4,9 @@ use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 
 use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap, ulp};
+use crate::model::hash_id;
 use crate::model::{Camera, Columns, Flags, Gaussians, Schedule};
 use crate::recipe::{Motion, Recipe, Scan};
-use crate::select::hash_id;
 use crate::selfcheck::oracle::statistics as oracle;
 
 fn recipe(motion: Motion) -> Scan {

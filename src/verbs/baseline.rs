@@ -8,11 +8,11 @@ use crate::compress::emit::write_alone;
 use crate::emit::kind::OutputKind;
 use crate::error::Result;
 use crate::limits::Limits;
+use crate::model::hash_id;
 use crate::model::{Columns, Gaussians};
 use crate::recipe::Recipe;
 use crate::reduction::Reduction;
 use crate::scene::{InputOptions, open_scene};
-use crate::select::hash_id;
 use crate::stream::gather;
 
 /// What a baseline ranks by, largest first, ties by hashed id.

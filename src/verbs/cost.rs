@@ -2,9 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::budget::{peak_memory_bytes, reset_peak_memory};
 use crate::compress::journal::Clock;
 use crate::error::Result;
+use crate::machine::{peak_memory_bytes, reset_peak_memory};
 
 /// What some runs of the same work took.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use entries::{ENTRIES, Entry, Place};
-use splatsieve::select::hash_id;
+use splatsieve::model::hash_id;
 
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;

@@ -6,10 +6,12 @@ pub mod error;
 pub mod functions;
 mod gaussians;
 mod gradients;
+mod hash;
 mod jacobian;
 mod ranges;
 mod raw;
 mod rig;
+mod robust_box;
 mod rows;
 mod schedule;
 
@@ -18,10 +20,12 @@ pub use camera::Camera;
 pub use covariance::scale_rotation;
 pub use gaussians::{Column, Columns, Gaussians};
 pub use gradients::{GradientSpan, Gradients};
+pub use hash::hash_id;
 pub use jacobian::Jacobian;
 pub use ranges::ranges;
 pub use raw::Raw;
 pub use rig::{Rig, Shot, Split};
+pub use robust_box::RobustBox;
 pub use rows::{Flags, Rows, Statistic, Values};
 pub use schedule::{Picture, Schedule};
 

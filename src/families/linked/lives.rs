@@ -10,9 +10,9 @@ use crate::error::Result;
 use crate::ingest::cameras::virtual_rig;
 use crate::link::{Joiner, Linker};
 use crate::metrics::psnr;
+use crate::model::RobustBox;
 use crate::model::{Columns, Gaussians};
 use crate::render::Renderer;
-use crate::stats::RobustBox;
 
 /// Pictures with joined lives are at least as near to those of lives apart, and those with what is held to those without, dB.
 const LEAST_DB: f64 = 40.0;
@@ -126,7 +126,7 @@ fn likeness(a: &[Gaussians], b: &[Gaussians]) -> f64 {
     let mut renderer = Renderer::on_all_threads();
     let mut found = Vec::new();
     for (a, b) in a.iter().zip(b) {
-        let around = RobustBox::of(&a.position);
+        let around = RobustBox::from_positions(&a.position);
         let rig = virtual_rig(around.middle, around.extent());
         for view in 0..VIEWS {
             let camera = &rig.cameras[view * rig.cameras.len() / VIEWS];

@@ -16,7 +16,7 @@ const NEAR: f64 = 0.1;
 const SIDE_PX: u32 = 512;
 
 /// Cameras on a Fibonacci sphere of radius 2 × `extent` around `center`, looking at it, every one at
-/// every frame, all for training; [`crate::stats::RobustBox`] gives the two numbers.
+/// every frame, all for training; [`crate::model::RobustBox`] gives the two numbers.
 ///
 /// Camera k of n looks from latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z is up in the
 /// pictures. An extent that is zero or not finite counts as 1, a centre that is not finite as 0.

@@ -7,7 +7,7 @@ use super::tiles::Kept;
 use super::*;
 use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
 use crate::model::Gaussians;
-use crate::select::hash_id;
+use crate::model::hash_id;
 use crate::source::Wanted;
 
 const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;

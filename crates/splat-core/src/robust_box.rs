@@ -1,8 +1,8 @@
-//! The robust extent of a scene, the unit of relative lengths.
+//! The extent of a scene without outliers, the unit of relative lengths.
 
 use glam::DVec3;
 
-use crate::model::Column;
+use crate::Column;
 
 /// Box between the 1st and 99th percentile of the positions, axis by axis: a few floaters do not
 /// stretch it.
@@ -17,9 +17,9 @@ pub struct RobustBox {
 }
 
 impl RobustBox {
-    /// The box of `position` (`[3, N]`); percentiles are nearest ranks over finite values. Without
-    /// any, a point at the origin.
-    pub fn of(position: &Column) -> RobustBox {
+    /// Returns the box of `position` (`[3, N]`). Percentiles are nearest ranks over finite values; without any of them the
+    /// box is the origin.
+    pub fn from_positions(position: &Column) -> RobustBox {
         let mut found = RobustBox { low: DVec3::ZERO, middle: DVec3::ZERO, high: DVec3::ZERO };
         for axis in 0..3 {
             let mut values: Vec<f32> = position.plane(axis).iter().copied().filter(|x| x.is_finite()).collect();
@@ -55,7 +55,7 @@ mod tests {
             position.set_row(i, [i as f32, 2.0, -(i as f32)]);
         }
         position.set_row(0, [-1e9, f32::NAN, f32::INFINITY]);
-        let found = RobustBox::of(&position);
+        let found = RobustBox::from_positions(&position);
         assert_eq!(found.low, DVec3::new(9.0, 2.0, -990.0));
         assert_eq!(found.high.x, 989.0);
         assert_eq!(found.extent(), 980.0);
@@ -63,7 +63,7 @@ mod tests {
 
     #[test]
     fn extent_of_nothing_is_one() {
-        assert_eq!(RobustBox::of(&Column::zeros(3, 0)).extent(), 1.0);
-        assert_eq!(RobustBox::of(&Column::zeros(3, 7)).extent(), 1.0);
+        assert_eq!(RobustBox::from_positions(&Column::zeros(3, 0)).extent(), 1.0);
+        assert_eq!(RobustBox::from_positions(&Column::zeros(3, 7)).extent(), 1.0);
     }
 }
