@@ -143,7 +143,7 @@ fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> 
         }
         let rows = scored.rows().unwrap();
         let size = |node: usize| groups[node].iter().map(|&id| rows.c[id]).sum::<f64>();
-        let hash = |node: usize| splatsieve::select::hash_id(groups[node][0] as u64);
+        let hash = |node: usize| splatsieve::model::hash_id(groups[node][0] as u64);
         let mut order: Vec<usize> = (0..groups.len()).collect();
         order.sort_by(|&a, &b| size(b).partial_cmp(&size(a)).unwrap().then(hash(a).cmp(&hash(b))));
         let position = |node: usize| DVec3::from(nodes.position.row::<3>(node).map(f64::from));

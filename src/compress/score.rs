@@ -6,9 +6,8 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
-use super::records::Saved;
+use super::records::{FlagSummary, Saved, TermSummary};
 use super::statistics::Statistics;
-use super::summary::{FlagSummary, TermSummary};
 use crate::budget::{Need, Part, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::families::trajectories::state_bytes;

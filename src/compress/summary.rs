@@ -11,7 +11,9 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::{Deserialize, Serialize};
 
-use super::records::{BandsSummary, FieldSummary, Forecast, LeftOut, RefinedSummary, Stage, number, sizes};
+use super::records::{
+    BandsSummary, FieldSummary, FlagSummary, Forecast, LeftOut, RefinedSummary, Stage, TermSummary, number, sizes,
+};
 use crate::archive::Parts;
 use crate::error::{Result, ShowPath};
 use crate::families::{Family, Size};
@@ -140,38 +142,6 @@ impl CameraSummary {
             pairs: scene.schedule.pairs(),
         }
     }
-}
-
-/// A term of the scores.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct TermSummary {
-    /// [`Graded::name`](crate::score::Graded::name).
-    pub name: String,
-    /// 1st percentile.
-    #[serde(deserialize_with = "number")]
-    pub p1: f64,
-    /// 99th percentile.
-    #[serde(deserialize_with = "number")]
-    pub p99: f64,
-    /// Whether the percentiles differ, so that the term grades rather than splits.
-    pub active: bool,
-}
-
-/// Counts of odd Gaussians.
-#[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct FlagSummary {
-    /// NaN or infinity in some frame.
-    pub non_finite: usize,
-    /// Zero quaternion in some frame.
-    pub zero_rotation: usize,
-    /// D set to 0 as rounding noise.
-    pub snapped_d: usize,
-    /// κ set to 0 as rounding noise.
-    pub snapped_kappa: usize,
-    /// Never alive.
-    pub never_alive: usize,
-    /// In no picture of the scored cameras.
-    pub never_in_view: usize,
 }
 
 /// What merging did.

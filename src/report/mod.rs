@@ -30,8 +30,8 @@ use serde::de::DeserializeOwned;
 
 use crate::compress::journal::Journal;
 use crate::compress::measure::{Measure, Stages};
+use crate::compress::records::TermSummary;
 use crate::compress::score::{SCORED, Scored, UserOverrides};
-use crate::compress::summary::TermSummary;
 use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
 use crate::emit::kind::check_folder_name;
 use crate::error::{Error, Result};
