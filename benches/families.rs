@@ -21,8 +21,9 @@ use cpu_time::ProcessTime;
 use criterion::measurement::{Measurement, ValueFormatter, WallTime};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::deform::{Motion, Network, Tensor, Tensors};
-use splatsieve::families::{self, OpenOptions};
 use splatsieve::model::{Column, Columns, Gaussians};
+
+use splatsieve::models::OpenOptions;
 use splatsieve::source::Ids;
 
 const BLOCK: usize = 1024;
@@ -186,7 +187,7 @@ fn states(criterion: &mut Criterion<Processor>) {
             _ => (model, BLOCK),
         };
         group.throughput(Throughput::Elements(count as u64));
-        let opened = families::open(&path, &OpenOptions::default());
+        let opened = splatsieve::models::open(&path, &OpenOptions::default());
         let family = opened.and_then(|family| family.with_times(times.clone())).expect("a trained model");
         let mut reader = family.source().open(Ids::Range(0..count)).expect("Gaussians");
         let (mut frame, mut out) = (0, Gaussians::zeros(0, family.source().info().sh_degree));

@@ -12,9 +12,9 @@ use std::collections::HashMap;
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use splatsieve::link::{Joiner, Linker};
 use splatsieve::model::Gaussians;
 use splatsieve::model::hash_id;
+use splatsieve::tracking::{Joiner, Linker};
 
 const COUNT: usize = 60_000;
 const FRAMES: usize = 6;

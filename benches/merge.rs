@@ -21,21 +21,22 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::Compression;
-use splatsieve::demo;
-use splatsieve::emit::container::write_container;
-use splatsieve::ingest::container::Container;
-use splatsieve::merge::motion::{MotionGate, PairMotion};
-use splatsieve::merge::neighbors::PointIndex;
-use splatsieve::merge::proxy::Importance;
-use splatsieve::merge::tree::{Nearest, Point, Tree};
-use splatsieve::merge::voxels::voxel_order;
-use splatsieve::merge::{self, Asked, Survivors};
+use splatsieve::diagnostics::demo_scene;
+use splatsieve::files::container::Container;
+use splatsieve::merging;
+use splatsieve::merging::motion::{MotionGate, PairMotion};
+use splatsieve::merging::motion_pass::PairMeter;
+use splatsieve::merging::neighbors::PointIndex;
+use splatsieve::merging::proxy::Importance;
+use splatsieve::merging::tree::{Nearest, Point, Tree};
+use splatsieve::merging::voxels::voxel_order;
+use splatsieve::merging::{Asked, Survivors};
 use splatsieve::model::hash_id;
 use splatsieve::model::{Column, Columns, Gaussians};
+use splatsieve::outputs::container::write_container;
+use splatsieve::passes::gather;
 use splatsieve::recipe::{Motion, Recipe};
 use splatsieve::source::FrameSource;
-use splatsieve::stream::gather;
-use splatsieve::stream::motion::PairMeter;
 
 /// As many as the presets look at.
 const NEIGHBOURS: usize = 32;
@@ -229,7 +230,7 @@ fn motion(criterion: &mut Criterion) {
     });
     group.finish();
 
-    let scene = demo::Scene::new(20_000, 48);
+    let scene = demo_scene::Scene::new(20_000, 48);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.gseq");
     write_container(&scene, &path, Compression::Zstd(1), BTreeMap::new(), |_| ()).unwrap();
@@ -280,7 +281,7 @@ fn whole(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("merge");
     group.sample_size(10).throughput(Throughput::Elements(n as u64));
     group.bench_function("pass", |bencher| {
-        bencher.iter(|| one_thread.install(|| merge::run(&survivors, &recipe, None, usize::MAX, alike)));
+        bencher.iter(|| one_thread.install(|| merging::run(&survivors, &recipe, None, usize::MAX, alike)));
     });
 }
 

@@ -17,11 +17,11 @@ use std::path::Path;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gseq::{Compression, Reader, TileBuffer, TileId, encode_tile};
-use splatsieve::emit::bounds::{Bounds, MaxError};
-use splatsieve::emit::container::{GAUSSIAN_BLOCK, Packing, write_container};
 use splatsieve::model::Columns;
+use splatsieve::outputs::bounds::{Bounds, MaxError};
+use splatsieve::outputs::container::{GAUSSIAN_BLOCK, Packing, write_container};
+use splatsieve::passes::HeldFrames;
 use splatsieve::source::FrameSource;
-use splatsieve::stream::HeldFrames;
 
 const LEVEL: i32 = 1;
 const WITHIN: Compression = Compression::Bounded { max_error: 1e-3, level: 15 };

@@ -11,7 +11,7 @@ use glam::{DMat3, DVec3};
 use splatsieve::model::hash_id;
 use splatsieve::model::{Camera, Columns, Gaussians, Schedule};
 use splatsieve::recipe::Recipe;
-use splatsieve::stats::{BlockScan, ScanPlan};
+use splatsieve::statistics::{BlockScan, ScanPlan};
 
 const GAUSSIANS: usize = 16_384;
 

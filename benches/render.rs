@@ -32,10 +32,10 @@ use std::time::Instant;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use glam::{DMat3, DVec3, Quat, Vec3};
-use splatsieve::demo::Scene;
+use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients};
 use splatsieve::render::{Contribution, Image, Renderer};
-use splatsieve::selfcheck::oracle::picture as oracle;
 use splatsieve::source::{FrameSource, Ids};
 
 /// Pictures, without and with their derivative, whose median times give the rates and the ratio.

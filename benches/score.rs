@@ -10,7 +10,7 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use splatsieve::model::hash_id;
-use splatsieve::score::FloatSketch;
+use splatsieve::statistics::score::FloatSketch;
 
 fn value(k: usize) -> f64 {
     let uniform = |salt: u64| ((hash_id(k as u64 | salt << 48) >> 11) as f64 + 0.5) / (1u64 << 53) as f64;

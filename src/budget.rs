@@ -10,16 +10,17 @@ use std::fmt::Write as _;
 
 use bytesize::ByteSize;
 
-use crate::emit::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::error::{Error, Result};
-use crate::families::Residence;
-use crate::families::trajectories::state_bytes;
-use crate::ingest::frame_stream::StreamHeader;
+use crate::files::frame_stream::StreamHeader;
 use crate::limits::{Limits, ReadLimit};
 use crate::machine::{memory_limit, peak_memory_bytes};
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
+use crate::models::Residence;
+use crate::models::trajectories::state_bytes;
+use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
+use crate::passes::{BLOCK, PICTURES_PER_THREAD};
+use crate::progress::duration;
 use crate::render;
-use crate::stream::{BLOCK, PICTURES_PER_THREAD, duration};
 
 /// What a run says of itself before it begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -388,7 +389,7 @@ impl Plan {
         let plan = Self::closest(work, budget.limit(), needs);
         let fits = plan.excess() == 0;
         match budget.tell {
-            Tell::Plan => crate::stream::tell(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()),
+            Tell::Plan => crate::progress::tell(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()),
             Tell::Time | Tell::Nothing => (),
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
@@ -546,7 +547,7 @@ impl Plan {
             let stages = seconds(&self.work, &self.needs);
             let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
             let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds)));
-            crate::stream::tell(&format!(
+            crate::progress::tell(&format!(
                 "time: about {} ({})",
                 duration(whole),
                 named.collect::<Vec<_>>().join(" + ")

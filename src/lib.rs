@@ -1,14 +1,22 @@
 //! Shrinks trained dynamic (4D) Gaussian-splatting models after training.
 //!
-//! The program is one pipeline; the modules are its stations, in layers that only look downward:
+//! The program is one pipeline: a model is opened as a [`scene`], [`statistics`] and scores rank its Gaussians,
+//! [`pruning`] and [`merging`] choose which stay, [`refinement`] fits them to renders of the original, and [`outputs`]
+//! writes what is left. Each folder uses only folders above it in this table, which `tests/layers.rs` checks.
 //!
-//! | layer | modules | what lives there |
-//! |---|---|---|
-//! | L0 | crate [`gseq`] | bytes, columns, tiles |
-//! | L1 | [`error`], [`machine`], [`limits`], [`model`], [`recipe`], [`reduction`], [`source`] | the vocabulary |
-//! | L2 | [`deform`], [`stats`], [`score`], [`select`], [`merge`], [`link`], [`render`], [`metrics`], [`archive`], [`fit`] | pure mathematics: slices in, values out |
-//! | L3 | [`ingest`], [`stream`], [`emit`], [`work`], [`families`], [`demo`], [`player`] | files, threads, terminals |
-//! | L4 | [`budget`], [`scene`], [`compress`], [`verbs`], [`report`], [`selfcheck`] | memory, the order of the passes, what verbs do |
+//! | folders | what is in them |
+//! |---|---|
+//! | crates [`gseq`], `splat-core`, `splat-render`, `splat-fields` | the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
+//! | [`limits`], [`machine`], [`recipe`], [`reduction`], [`source`] | memory limits, parameters of a run, what is left of a model, and how frames are read |
+//! | [`archive`], [`fit`] | the codec of `.gsz` archives; curves fitted to the states of a Gaussian |
+//! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; results that stages keep |
+//! | [`progress`], [`passes`] | progress on standard error; driving a pass over frames on all threads |
+//! | [`outputs`] | sequences as containers, curves, streams, films and tables |
+//! | [`tracking`], [`merging`] | which Gaussian of one frame is which of the next; which Gaussians become one |
+//! | [`models`] | one folder per model format: recognize, open, evaluate, write back |
+//! | [`budget`], [`statistics`], [`scene`], [`journal`] | the memory plan; statistics and scores; an input with its cameras; what stages record |
+//! | [`pruning`], [`refinement`], [`pipeline`] | stages, and the order they run in |
+//! | [`evaluation`], [`commands`], [`report`], [`diagnostics`], [`player`] | measuring a result, the other commands, pages for people, the self-check and experiments |
 //!
 //! [`method`] derives what is computed.
 
@@ -19,33 +27,35 @@ pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
 
 pub mod archive;
 pub mod budget;
-pub mod compress;
-pub mod demo;
-pub mod emit;
-pub mod families;
+pub mod cache;
+pub mod commands;
+pub mod evaluation;
+pub mod files;
 pub mod fit;
-pub mod ingest;
+pub mod journal;
 pub mod machine;
-pub mod merge;
+pub mod merging;
+pub mod models;
+pub mod outputs;
+pub mod passes;
+pub mod pipeline;
+pub mod progress;
+pub mod pruning;
+pub mod refinement;
+pub mod statistics;
+pub mod tracking;
 /// How what is computed follows from what is wanted; comments elsewhere cite its sections.
 #[doc = include_str!("method.md")]
 pub mod method {}
 pub mod limits;
-pub mod link;
 pub mod player;
 pub mod recipe;
 pub mod reduction;
-pub mod refine;
 pub mod report;
 pub mod scene;
-pub mod score;
-pub mod select;
-pub mod selfcheck;
 pub mod source;
-pub mod stats;
-pub mod stream;
-pub mod verbs;
-pub mod work;
+
+pub mod diagnostics;
 
 pub use splat_core as model;
 pub use splat_core::error;

@@ -6,9 +6,9 @@ use std::fs;
 use std::path::Path;
 
 use scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, state, tiny};
-use splatsieve::emit::container::write_container;
-use splatsieve::families::{Family, ModelFolder};
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::models::{Family, ModelFolder};
+use splatsieve::outputs::container::write_container;
 
 /// How to have the tiny model archived without refining anything.
 const TINY: &str = "{tiny} --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only --archive-psnr 50";
@@ -73,7 +73,7 @@ fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
     let (workplace, _) = with_archive();
     workplace.done("unpack small.gsz -o small");
     let folder = model(&workplace.path("small"));
-    let archive = splatsieve::families::open(&workplace.path("small.gsz"), &Default::default()).unwrap();
+    let archive = splatsieve::models::open(&workplace.path("small.gsz"), &Default::default()).unwrap();
     assert_eq!(archive.kind(), "gsz archive");
     let archive = archive.with_times(vec![0.0, 0.4, 1.0]).unwrap();
     for frame in 0..3 {
@@ -105,7 +105,7 @@ fn the_bytes_of_an_archive_do_not_depend_on_threads() {
 #[test]
 fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_asked_for() {
     let workplace = Workplace::new();
-    let made = splatsieve::demo::Scene::new(1500, 20);
+    let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);
     let raw = gseq::Compression::Raw;
     write_container(&made, &workplace.path("frames.gseq"), raw, Default::default(), |_| ()).unwrap();
     let how = "--target-ratio 0.5 --no-refine --prune-only";
@@ -122,7 +122,7 @@ fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_as
     let psnr = found["psnr"].as_f64().unwrap_or_else(|| panic!("{found}"));
     assert!((44.0..48.0).contains(&psnr), "{psnr} dB");
     // Every value is within the bound that is named.
-    let open = |name: &str| splatsieve::families::open(&workplace.path(name), &Default::default()).unwrap();
+    let open = |name: &str| splatsieve::models::open(&workplace.path(name), &Default::default()).unwrap();
     let [before, after] = ["exact.gseq", "small.gsz"].map(open);
     assert_eq!(after.kind(), "gseq container");
     for frame in [0, 7, 19] {

@@ -8,7 +8,7 @@ use std::fs;
 use gseq::Reader;
 use scene::{Workplace, files, state};
 use serde_json::Value;
-use splatsieve::ingest::container::Container;
+use splatsieve::files::container::Container;
 use splatsieve::model::Columns;
 use splatsieve::source::FrameSource;
 

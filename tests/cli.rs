@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use scene::{PlyRows, Workplace, arrays, files, state, tiny};
-use splatsieve::ingest::container::Container;
+use splatsieve::files::container::Container;
 
 const CLOUD: &str = "model/point_cloud/iteration_7/point_cloud.ply";
 const FIELD: &str = "model/point_cloud/iteration_7/deformation.pth";

@@ -8,9 +8,9 @@ use std::fs;
 use std::path::Path;
 
 use scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, shared, state, tiny};
-use splatsieve::families::ModelFolder;
-use splatsieve::ingest::container::Container;
-use splatsieve::ingest::ply_sequence::PlySequence;
+use splatsieve::files::container::Container;
+use splatsieve::files::ply_sequence::PlySequence;
+use splatsieve::models::ModelFolder;
 use splatsieve::source::FrameSource;
 
 const N: usize = 300;

@@ -6,16 +6,17 @@ mod scene;
 use std::path::Path;
 
 use scene::{Workplace, state, tiny, without_sh_head};
-use splatsieve::emit::kind::OutputKind;
-use splatsieve::families::{self, Family, OpenOptions};
 use splatsieve::limits::Limits;
 use splatsieve::model::{ALL_HARMONICS, Columns, Gaussians};
+use splatsieve::models;
+use splatsieve::models::{Family, OpenOptions};
+use splatsieve::outputs::kind::OutputKind;
 use splatsieve::recipe::{Precision, Recipe};
 use splatsieve::reduction::{Change, Cluster, Reduction, Reference};
 
 /// Opens `path`, at three times where it leaves them open.
 fn open(path: &Path) -> Box<dyn Family> {
-    let input = families::open(path, &OpenOptions::default()).unwrap();
+    let input = models::open(path, &OpenOptions::default()).unwrap();
     if input.source().info().times.is_empty() { input.with_times(vec![0.0, 0.25, 1.0]).unwrap() } else { input }
 }
 

@@ -6,10 +6,10 @@ mod memory;
 
 use std::path::Path;
 
-use splatsieve::emit::ply::write_inria;
-use splatsieve::families::{OpenOptions, open};
+use splatsieve::files::ply::write::write_inria;
 use splatsieve::model::Gaussians;
 use splatsieve::model::hash_id;
+use splatsieve::models::{OpenOptions, open};
 
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;

@@ -10,9 +10,9 @@ use std::process::Stdio;
 use std::time::Instant;
 
 use scene::{PlyRows, Workplace, bits, lasting_files, shared, state};
-use splatsieve::families::Link;
 use splatsieve::model::Gaussians;
 use splatsieve::model::hash_id;
+use splatsieve::models::Link;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 const FRAMES: usize = 37;
@@ -456,7 +456,7 @@ fn links(model: PathBuf, noise: f32) -> [f64; 3] {
     let options = InputOptions { path: model.clone(), cameras: Some(model.clone()), ..InputOptions::default() };
     let scene = open_scene(&options).unwrap();
     let (count, frames) = (scene.source().info().count, scene.source().info().times.len());
-    let mut linker = splatsieve::link::Linker::default();
+    let mut linker = splatsieve::tracking::Linker::default();
     let (mut last, mut right, mut wrong, mut doubtful): (Option<Vec<u32>>, _, _, _) = (None, 0, 0, 0);
     for t in 0..frames {
         let given = state(scene.source(), t);

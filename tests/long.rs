@@ -11,9 +11,9 @@ use std::path::Path;
 use std::process::Output;
 
 use scene::Workplace;
-use splatsieve::emit::frame_stream::StreamWriter;
-use splatsieve::ingest::frame_stream::StreamHeader;
+use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::outputs::frame_stream::StreamWriter;
 
 /// Scores and prunes by formula: what looks at pictures takes time, not memory that grows with frames.
 const REQUEST: &str = "--coverage projected --prune-only --no-refine --choose-by-views=false --target-ratio 0.5 \

@@ -8,10 +8,10 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use scene::{Workplace, files, lasting_files, said};
-use splatsieve::emit::container::write_container;
 use splatsieve::error::Result;
 use splatsieve::model::hash_id;
 use splatsieve::model::{Columns, Gaussians, SequenceInfo};
+use splatsieve::outputs::container::write_container;
 use splatsieve::source::{BlockReader, FrameSource, Ids};
 
 const GAUSSIANS: usize = 30_000;

@@ -7,17 +7,17 @@ mod memory;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use splatsieve::demo::Scene;
-use splatsieve::emit::container::write_container;
-use splatsieve::ingest::container::Container;
-use splatsieve::merge::known::KNOWN_BYTES;
-use splatsieve::merge::motion::MotionGate;
-use splatsieve::merge::neighbors::PointIndex;
-use splatsieve::merge::tree::Point;
+use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::files::container::Container;
+use splatsieve::merging::known::KNOWN_BYTES;
+use splatsieve::merging::motion::MotionGate;
+use splatsieve::merging::motion_pass::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
+use splatsieve::merging::neighbors::PointIndex;
+use splatsieve::merging::tree::Point;
 use splatsieve::model::Columns;
+use splatsieve::outputs::container::write_container;
+use splatsieve::passes::gather;
 use splatsieve::recipe::Recipe;
-use splatsieve::stream::gather;
-use splatsieve::stream::motion::{BYTES_PER_PAIR, PairMeter, bytes_per_gaussian};
 
 #[global_allocator]
 static ALLOCATOR: memory::Counting = memory::Counting;

@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DQuat, DVec3};
 use scene::{PlyRows, Workplace, by_formula, lasting_files, state, tiny};
-use splatsieve::compress::score::{Scored, UserOverrides};
-use splatsieve::compress::{Only, Request, Target, compress_scene, score_scene};
 use splatsieve::limits::Limits;
-use splatsieve::merge::proxy::{ProxyState, merge_state};
+use splatsieve::merging::proxy::{ProxyState, merge_state};
 use splatsieve::model::{Columns, Gaussians, SH_C0};
+use splatsieve::pipeline::{Only, Request, Target, compress_scene, score_scene};
+use splatsieve::pruning::score::{Scored, UserOverrides};
 use splatsieve::recipe::{Merge, MergePass, Motion, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
@@ -284,7 +284,7 @@ fn proxies_are_solved_at_their_leaders(
 ) {
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
-    let result = splatsieve::families::ModelFolder::open(output, None).unwrap();
+    let result = splatsieve::models::ModelFolder::open(output, None).unwrap();
     let result = result.with_times(scene.source().info().times.clone()).unwrap();
     let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
     let at_reference = &whole.frames[whole.reference];
@@ -479,7 +479,7 @@ fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
     let (scored, whole) = (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), Whole::read(&scene));
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
-    let result = splatsieve::families::ModelFolder::open(&output, None).unwrap();
+    let result = splatsieve::models::ModelFolder::open(&output, None).unwrap();
     let result = result.with_times(scene.source().info().times.clone()).unwrap();
     let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
     let limit = recipe.merge.max_drift * whole.extent;

@@ -7,9 +7,9 @@ use std::fs;
 
 use scene::{Workplace, files};
 use serde_json::{Value, json};
-use splatsieve::demo::Scene;
-use splatsieve::emit::kind::OutputKind;
-use splatsieve::families::trajectories::write_sequence;
+use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::models::trajectories::write_sequence;
+use splatsieve::outputs::kind::OutputKind;
 
 /// More than two frame blocks, one of them not full.
 const FRAMES: usize = 70;

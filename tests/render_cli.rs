@@ -10,9 +10,9 @@ use std::process::Output;
 
 use assert_cmd::Command;
 use serde_json::{Value, json};
-use splatsieve::demo::Scene;
-use splatsieve::emit::kind::OutputKind;
-use splatsieve::families::trajectories::write_sequence;
+use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::models::trajectories::write_sequence;
+use splatsieve::outputs::kind::OutputKind;
 use tempfile::TempDir;
 
 const FRAMES: usize = 4;

@@ -3,11 +3,11 @@
 use std::path::Path;
 
 use glam::DVec3;
-use splatsieve::families::ModelFolder;
+use splatsieve::diagnostics::selfcheck::made::clouds::{Random, camera, plain_camera, scene, single};
+use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
 use splatsieve::model::{Camera, Columns, Gaussians, Gradients, Raw};
+use splatsieve::models::ModelFolder;
 use splatsieve::render::{Image, Renderer, render};
-use splatsieve::selfcheck::made::clouds::{Random, camera, plain_camera, scene, single};
-use splatsieve::selfcheck::oracle::picture as oracle;
 use splatsieve::source::FrameSource;
 
 const BACKGROUND: [f32; 3] = [0.1, 0.9, 0.4];

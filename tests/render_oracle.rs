@@ -3,10 +3,10 @@
 use std::num::NonZeroU32;
 
 use glam::DVec3;
+use splatsieve::diagnostics::selfcheck::made::clouds::{camera, plain_camera, scene, single};
+use splatsieve::diagnostics::selfcheck::oracle::picture as oracle;
 use splatsieve::model::{Camera, Gaussians};
 use splatsieve::render::{Contribution, Image, Renderer, contribution, render};
-use splatsieve::selfcheck::made::clouds::{camera, plain_camera, scene, single};
-use splatsieve::selfcheck::oracle::picture as oracle;
 
 fn stride(s: u32) -> NonZeroU32 {
     NonZeroU32::new(s).unwrap()

@@ -7,12 +7,12 @@ use std::fs;
 use std::hint::black_box;
 
 use gseq::{Compression, TileBuffer, TileId};
-use splatsieve::demo::Scene;
-use splatsieve::emit::container::{FRAME_BLOCK, write_container};
-use splatsieve::ingest::container::Container;
+use splatsieve::diagnostics::demo_scene::Scene;
+use splatsieve::files::container::Container;
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::outputs::container::{FRAME_BLOCK, write_container};
+use splatsieve::passes::Frames;
 use splatsieve::source::{BlockReader, FrameSource, Ids, Wanted};
-use splatsieve::stream::Frames;
 
 const COUNT: usize = 20_000;
 const FRAMES: usize = 1200;

@@ -5,7 +5,7 @@ mod scene;
 
 use scene::{Run, Workplace, lasting_files, shared};
 use serde_json::Value;
-use splatsieve::compress::summary::{SCHEMA, Summary};
+use splatsieve::pipeline::summary::{SCHEMA, Summary};
 
 /// Runs a compression twice: as asked, then by the recipe it wrote, and expects the same files.
 fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use scene::{Workplace, state, tiny};
-use splatsieve::ingest::container::Container;
+use splatsieve::files::container::Container;
 use splatsieve::model::Columns;
 use splatsieve::source::FrameSource;
 

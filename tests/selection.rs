@@ -4,9 +4,9 @@
 mod scene;
 
 use scene::{by_formula, scene, tiny};
-use splatsieve::compress::score::{Scored, UserOverrides};
-use splatsieve::compress::score_scene;
 use splatsieve::model::Rows;
+use splatsieve::pipeline::score_scene;
+use splatsieve::pruning::score::{Scored, UserOverrides};
 use splatsieve::recipe::{Anisotropy, LowPriority, Recipe};
 
 const N: usize = 300;

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use gseq::{Reader, TileId};
 use scene::{Workplace, files, lasting_files, state};
-use splatsieve::ingest::container::Container;
+use splatsieve::files::container::Container;
 use splatsieve::source::FrameSource;
 
 fn splatsieve(workplace: &Workplace, arguments: &str) -> Command {

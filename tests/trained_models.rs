@@ -6,9 +6,9 @@ use std::fmt::{self, Display, Formatter};
 use std::path::Path;
 
 use scene::{arrays, shared, state, tiny};
-use splatsieve::compress::score::UserOverrides;
-use splatsieve::compress::score_scene;
 use splatsieve::model::{Gaussians, Rows, Schedule};
+use splatsieve::pipeline::score_scene;
+use splatsieve::pruning::score::UserOverrides;
 use splatsieve::recipe::{Motion, Recipe};
 
 fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {

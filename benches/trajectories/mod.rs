@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use splatsieve::families::ModelFolder;
 use splatsieve::model::hash_id;
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::models::ModelFolder;
+use splatsieve::passes::HeldFrames;
 use splatsieve::source::{FrameSource, Ids};
-use splatsieve::stream::HeldFrames;
 
 #[path = "../../tests/models/mod.rs"]
 mod models;
@@ -62,7 +62,7 @@ fn curves() -> HeldFrames {
 
 /// The values of a column in tiles as the container has them: for each block of Gaussians `[frames][width][len]`.
 pub(crate) fn tiles(scene: &HeldFrames, column: Columns) -> Vec<Vec<f32>> {
-    const BLOCK: usize = splatsieve::emit::container::GAUSSIAN_BLOCK;
+    const BLOCK: usize = splatsieve::outputs::container::GAUSSIAN_BLOCK;
     let mut state = Gaussians::zeros(0, scene.info().sh_degree);
     let block = |start: usize| {
         let mut reader = scene.open(Ids::Range(start..start + BLOCK)).unwrap();

@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::{RecipeFlags, numbers};
-use splatsieve::emit::atomic::Replace;
-use splatsieve::emit::bounds::MaxError;
+use splatsieve::cache::Part;
+use splatsieve::diagnostics::precision::Turned;
 use splatsieve::error::quoted;
-use splatsieve::families::Link;
-use splatsieve::ingest::cameras::Times;
-use splatsieve::verbs::method::Method;
-use splatsieve::verbs::precision::Turned;
-use splatsieve::work::Part;
+use splatsieve::evaluation::method::Method;
+use splatsieve::files::atomic::Replace;
+use splatsieve::files::cameras::Times;
+use splatsieve::models::Link;
+use splatsieve::outputs::bounds::MaxError;
 
 /// Headings of groups of options.
 const CAMERAS: &str = "Cameras";

@@ -6,8 +6,8 @@ use std::path::Path;
 use clap::{Command, CommandFactory};
 
 use super::args::Cli;
-use splatsieve::emit::atomic::{Kind, Replace, StagedFile, StagedFolder, check_target};
 use splatsieve::error::{Error, Result, ShowPath};
+use splatsieve::files::atomic::{Kind, Replace, StagedFile, StagedFolder, check_target};
 
 /// Text that every manual page of this program holds: its title.
 const PAGE: &str = ".TH splatsieve";

@@ -22,32 +22,35 @@ use args::{
 };
 use output::{print, print_as};
 use splatsieve::budget::{self, Budget, Tell};
-use splatsieve::compress::summary::Detail;
-use splatsieve::compress::{Only, Request, Run, Target, compress, divided_stages, foresee};
-use splatsieve::emit::atomic::{Replace, as_named, take_warnings};
-use splatsieve::emit::image::ImageFormat;
-use splatsieve::emit::kind::OutputKind;
+use splatsieve::cache;
+use splatsieve::commands::container::Storing;
+use splatsieve::commands::render::{RenderOptions, Wanted};
+use splatsieve::commands::video::{VideoOptions, Way, places, video};
+use splatsieve::commands::{archive, container, convert, render, score};
+use splatsieve::diagnostics::demo::DemoOptions;
+use splatsieve::diagnostics::precision::{PrecisionOptions, Turned};
+use splatsieve::diagnostics::selfcheck;
+use splatsieve::diagnostics::sweep::SweepOptions;
+use splatsieve::diagnostics::{demo, precision, sweep};
 use splatsieve::error::{Error, Result, ShowPath};
-use splatsieve::families::{Conventions, Link};
-use splatsieve::ingest::cameras::Times;
+use splatsieve::evaluation;
+use splatsieve::evaluation::EvaluateOptions;
+use splatsieve::evaluation::method::Method;
+use splatsieve::files::atomic::{Replace, as_named, take_warnings};
+use splatsieve::files::cameras::Times;
+use splatsieve::files::image::write::ImageFormat;
 use splatsieve::model::Split;
+use splatsieve::models::{Conventions, Link};
+use splatsieve::outputs::kind::OutputKind;
+use splatsieve::pipeline::summary::Detail;
+use splatsieve::pipeline::{Only, Request, Run, Target, compress, divided_stages, foresee};
+use splatsieve::player::view;
+use splatsieve::player::view::ViewOptions;
+use splatsieve::progress::{Mode, Progress, tell};
 use splatsieve::recipe::preset_text;
 use splatsieve::report::{self, ReportOptions, trade_off};
 use splatsieve::scene::pictures::PictureSet;
 use splatsieve::scene::{InputOptions, scratch_beside};
-use splatsieve::selfcheck;
-use splatsieve::stream::{Mode, Progress, tell};
-use splatsieve::verbs::container::Storing;
-use splatsieve::verbs::demo::DemoOptions;
-use splatsieve::verbs::evaluate::EvaluateOptions;
-use splatsieve::verbs::method::Method;
-use splatsieve::verbs::precision::{PrecisionOptions, Turned};
-use splatsieve::verbs::render::{RenderOptions, Wanted};
-use splatsieve::verbs::sweep::SweepOptions;
-use splatsieve::verbs::video::{VideoOptions, Way, places, video};
-use splatsieve::verbs::view::ViewOptions;
-use splatsieve::verbs::{archive, container, convert, demo, evaluate, precision, render, score, sweep, view};
-use splatsieve::work;
 
 /// Runs the program on the arguments of this process.
 pub(crate) fn main() -> ExitCode {
@@ -164,7 +167,7 @@ fn run(cli: Cli) -> Result<()> {
             let mut options =
                 EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models) };
             options.original.work = work_of(args.kept);
-            let found = evaluate::evaluate(&options)?;
+            let found = evaluation::evaluate(&options)?;
             notes(&found.work_notes);
             print_as(as_json, &if as_json { json(&found) } else { found.text() })
         }
@@ -284,11 +287,11 @@ fn run(cli: Cli) -> Result<()> {
         }
         Verb::Work(args) => {
             if args.clean {
-                let (files, bytes) = work::clean(&args.folder)?;
+                let (files, bytes) = cache::clean(&args.folder)?;
                 return print(&format!("{}: {files} files, {bytes} bytes removed\n", args.folder.shown()));
             }
-            let listed = work::list(&args.folder)?;
-            print_as(args.json, &if args.json { json(&listed) } else { work::text(&listed) })
+            let listed = cache::list(&args.folder)?;
+            print_as(args.json, &if args.json { json(&listed) } else { cache::text(&listed) })
         }
         Verb::Demo(args) => {
             let options = DemoOptions {
@@ -585,8 +588,8 @@ fn part_of(split: SplitArg) -> PictureSet {
     }
 }
 
-fn work_of(kept: Kept) -> Option<work::Asked> {
-    kept.work.map(|folder| work::Asked { folder, part: kept.part })
+fn work_of(kept: Kept) -> Option<cache::Asked> {
+    kept.work.map(|folder| cache::Asked { folder, part: kept.part })
 }
 
 fn budget_of(memory: Memory) -> Budget {

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
-use splatsieve::compress::Record;
 use splatsieve::error::{Error, Result, ShowPath, quoted};
-use splatsieve::ingest::text::read_text;
+use splatsieve::files::text::read_text;
+use splatsieve::pipeline::Record;
 use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
 const RECIPE: &str = "Recipe";

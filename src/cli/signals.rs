@@ -11,7 +11,7 @@ pub(super) fn install() {
     use signal_hook::iterator::Signals;
     use signal_hook::low_level::exit;
 
-    use splatsieve::emit::atomic::withdraw_all;
+    use splatsieve::files::atomic::withdraw_all;
 
     let heeded = [SIGINT, SIGTERM, SIGHUP].into_iter().filter(|&signal| !is_ignored(signal));
     // Without it a signal ends the process at once, and the next run tidies up.

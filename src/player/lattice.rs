@@ -7,8 +7,8 @@ use std::ops::Range;
 
 use serde::Serialize;
 
-use crate::emit::accuracy::{Accuracy, Drawn};
 use crate::error::Result;
+use crate::files::accuracy::{Accuracy, Drawn};
 use crate::model::{Column, Columns, Gaussians, opacity, sh_coefficients};
 
 /// Distances between lattice points; a value is off by half of its own at most.
@@ -114,7 +114,7 @@ pub fn write_points(state: &Gaussians, which: Columns, steps: &Steps, points: &m
 /// Confirms that the positions of `points`, written of all columns of `state` with harmonics up to `sh_degree`, are about those of the state.
 ///
 /// # Errors
-/// A Gaussian that is seen, further from where it was than [`accuracy`](crate::emit::accuracy) allows.
+/// A Gaussian that is seen, further from where it was than [`accuracy`](crate::files::accuracy) allows.
 pub fn check_positions(state: &Gaussians, sh_degree: usize, steps: &Steps, points: &[i32]) -> Result<()> {
     let count = state.len();
     let mut accuracy = Accuracy::new(&state.position);

@@ -6,3 +6,4 @@
 pub mod lattice;
 pub mod page;
 pub mod track;
+pub mod view;

@@ -15,9 +15,9 @@ use serde::Serialize;
 
 use super::track::Track;
 use crate::TOOL;
-use crate::emit::atomic::ScratchFolder;
-use crate::emit::policy::{digest_of, policy};
 use crate::error::{Error, Result};
+use crate::files::atomic::ScratchFolder;
+use crate::files::page_policy::{digest_of, policy};
 use crate::model::{Rig, Split};
 
 /// The page of a folder.

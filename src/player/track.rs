@@ -21,8 +21,9 @@ use serde::Serialize;
 use super::lattice::{Steps, check_positions, components, width, write_points};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
+use crate::passes::States;
+use crate::progress::Progress;
 use crate::source::{FrameSource, Wanted};
-use crate::stream::{Progress, States};
 
 /// Lattice points of a group's frames that lie ready together.
 pub const GROUP_VALUES: usize = 1 << 23;
@@ -196,8 +197,8 @@ mod tests {
     use flate2::read::ZlibDecoder;
 
     use super::*;
-    use crate::demo;
-    use crate::stream::gather_all;
+    use crate::diagnostics::demo_scene;
+    use crate::passes::gather_all;
 
     /// Every frame of the chunks, `[frames][width][N]`: the words of the header of this file, one value at a time.
     fn unpacked(track: &Track, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
@@ -257,7 +258,7 @@ mod tests {
 
     #[test]
     fn what_is_unpacked_is_within_half_a_step_of_every_value() {
-        let scene = demo::Scene::new(700, 47);
+        let scene = demo_scene::Scene::new(700, 47);
         let frames = [0, 1, 2, 5, 9, 12, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 46];
         let (track, chunks) = encoded(&scene, &frames, 3);
         assert!(track.chunks() > 2 && track.groups.last() == Some(&frames.len()), "{:?}", track.groups);
@@ -289,7 +290,7 @@ mod tests {
 
     #[test]
     fn one_frame_is_one_chunk_and_fewer_bands_are_fewer_components() {
-        let scene = demo::Scene::new(300, 5);
+        let scene = demo_scene::Scene::new(300, 5);
         let (track, chunks) = encoded(&scene, &[3], 0);
         assert_eq!((track.chunks(), track.sh_degree, track.varying.len()), (1, 0, 0));
         let found = unpacked(&track, &chunks);
@@ -299,7 +300,7 @@ mod tests {
 
     #[test]
     fn the_bytes_do_not_depend_on_the_threads() {
-        let scene = demo::Scene::new(900, 12);
+        let scene = demo_scene::Scene::new(900, 12);
         let frames: Vec<usize> = (0..12).collect();
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -310,7 +311,7 @@ mod tests {
 
     #[test]
     fn the_demo_takes_few_bytes_for_a_gaussian_and_frame() {
-        let scene = demo::Scene::new(2000, 48);
+        let scene = demo_scene::Scene::new(2000, 48);
         let frames: Vec<usize> = (0..48).collect();
         let bytes: usize = encoded(&scene, &frames, 3).1.iter().map(Vec::len).sum();
         let of_each = bytes as f64 / (2000.0 * 48.0);

@@ -5,7 +5,7 @@
 
 use super::chart;
 use super::html::escape;
-use crate::emit::policy::{digest_of, policy};
+use crate::files::page_policy::{digest_of, policy};
 
 const STYLE: &str = include_str!("page.css");
 

@@ -11,10 +11,10 @@
 use serde::{Deserialize, Serialize};
 
 use super::traits::{Kind, Traits};
+use crate::evaluation::Taken;
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{Camera, Column, Gaussians, SH_C0};
 use crate::render::{Image, render};
-use crate::verbs::evaluate::Taken;
 
 /// PSNR below which an error can be seen: one part in a hundred, root mean square.
 pub const VISIBLE_DB: f64 = 40.0;

@@ -11,13 +11,13 @@ use serde::Serialize;
 
 use super::shown::{Shown, brighter, difference, shrink, shrinkage};
 use crate::budget::Workload;
-use crate::emit::image::jpeg_bytes;
 use crate::error::{Error, Result};
+use crate::evaluation::SideBySide;
+use crate::files::image::write::jpeg_bytes;
 use crate::metrics::psnr;
 use crate::model::Picture;
 use crate::render::Image;
 use crate::scene::pictures::thin;
-use crate::verbs::evaluate::SideBySide;
 
 /// Views that are followed: that of the worst picture, and that of the median one if it is another.
 pub const VIEWS: usize = 2;

@@ -6,9 +6,9 @@ use super::failure::FailureMode;
 use super::film::Film;
 use super::histogram::Histogram;
 use super::shown::Choice;
-use crate::verbs::evaluation::{Evaluation, PictureScores};
-use crate::verbs::precision::found::Precision;
-use crate::verbs::trade_off::TradeOff;
+use crate::evaluation::found::{Evaluation, PictureScores};
+use crate::evaluation::precision::Precision;
+use crate::evaluation::trade_off::TradeOff;
 
 /// Everything the page shows, as data.
 #[derive(Debug, Serialize)]

@@ -9,9 +9,9 @@ use std::borrow::Cow;
 use serde::Serialize;
 
 use super::run::Fate;
+use crate::files::csv::table;
 use crate::model::{Rows, Statistic, Values};
-use crate::score::{Graded, Scores};
-use crate::verbs::csv::table;
+use crate::statistics::score::{Graded, Scores};
 
 /// Bins of a histogram.
 const BINS: usize = 40;

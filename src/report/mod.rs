@@ -28,19 +28,20 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 
-use crate::compress::journal::Journal;
-use crate::compress::measure::{Measure, Stages};
-use crate::compress::records::TermSummary;
-use crate::compress::score::{SCORED, Scored, UserOverrides};
-use crate::emit::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
-use crate::emit::kind::check_folder_name;
+use crate::cache::Key;
 use crate::error::{Error, Result};
-use crate::ingest::text::read_text;
+use crate::evaluation;
+use crate::evaluation::{EvaluateOptions, SideBySide, Taken};
+use crate::files::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
+use crate::files::text::read_text;
+use crate::journal::Journal;
+use crate::journal::records::TermSummary;
 use crate::model::{Camera, Gaussians, Rows, Schedule, Split};
+use crate::outputs::kind::check_folder_name;
+use crate::pipeline::stages::measure::{Measure, Stages};
+use crate::pruning::score::{SCORED, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
-use crate::verbs::evaluate::{self, EvaluateOptions, SideBySide, Taken};
-use crate::work::Key;
 pub use findings::Report;
 
 use failure::{FailureMode, Members, judge, observe};
@@ -91,7 +92,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     side.keep_to(options.evaluate.original.memory, |work, limits| {
         let mut needs = measure.needs(work, limits);
         needs.push(traits::need(work));
-        needs.extend(evaluate::needs(work, limits).into_iter().map(|mut need| {
+        needs.extend(evaluation::needs(work, limits).into_iter().map(|mut need| {
             need.per_gaussian.push(("rows", SCORED + 8));
             need.fixed.push(("films", film::bytes(work)));
             need

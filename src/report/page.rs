@@ -10,10 +10,10 @@ use super::html::{bytes, count, escape, figure, file_name, percent};
 use super::run::Run;
 use super::shown::Shown;
 use super::{precision, trade_off};
-use crate::compress::records::Stage;
-use crate::compress::summary::Summary;
-use crate::families::Size;
-use crate::verbs::evaluation::{Both, Comparison, FrameMeans, Means, ViewMeans};
+use crate::evaluation::found::{Both, Comparison, FrameMeans, Means, ViewMeans};
+use crate::journal::records::Stage;
+use crate::models::Size;
+use crate::pipeline::summary::Summary;
 
 /// What moves the slider.
 const SCRIPT: &str = include_str!("page.js");

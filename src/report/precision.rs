@@ -7,7 +7,7 @@ use super::chart::{Axis, Plot, Series};
 use super::document::{document, figure_of, links, list};
 use super::html::{count, escape, figure, file_name};
 use super::trade_off::Chart;
-use crate::verbs::precision::found::{ADDED, Curve, KEPT, Knob, Mark, PICTURES, Precision, STAYING, meaning};
+use crate::evaluation::precision::{ADDED, Curve, KEPT, Knob, Mark, PICTURES, Precision, STAYING, meaning};
 
 /// The page's name in the folder of its data.
 pub const PAGE: &str = "precision.html";
@@ -179,8 +179,8 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::verbs::cost::{Cost, Spread};
-    use crate::verbs::precision::found::Source;
+    use crate::evaluation::cost::{Cost, Spread};
+    use crate::evaluation::precision::Source;
 
     fn mark(value: f64, errors: &[(&str, f64)]) -> Mark {
         let seconds = Spread::of(vec![value]);

@@ -9,13 +9,13 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::compress::emit::{INDEX_MAP, RECIPE, beside};
-use crate::compress::summary::Summary;
-use crate::emit::atomic::MARKER;
-use crate::ingest::names::shown_name;
-use crate::ingest::npy::header_is_sound;
-use crate::ingest::open::open_file;
-use crate::ingest::text::read_text;
+use crate::files::atomic::MARKER;
+use crate::files::names::shown_name;
+use crate::files::npy::header_is_sound;
+use crate::files::open::open_file;
+use crate::files::text::read_text;
+use crate::pipeline::stages::emit::{INDEX_MAP, RECIPE, beside};
+use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
 
 /// What became of a Gaussian of the original.
@@ -121,7 +121,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::emit::index_map::write_index_map;
+    use crate::outputs::index_map::write_index_map;
 
     #[test]
     fn gaussians_that_share_a_place_are_merged() {

@@ -9,11 +9,11 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use crate::emit::image::{ImageFormat, image_bytes};
 use crate::error::{Error, Result};
+use crate::evaluation::Taken;
+use crate::evaluation::found::{Evaluation, Score};
+use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
-use crate::verbs::evaluate::Taken;
-use crate::verbs::evaluation::{Evaluation, Score};
 
 /// Pictures to look at: the worst, that of the worst view, of the worst frame, and the median.
 pub const CHOSEN: usize = 4;

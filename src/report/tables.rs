@@ -1,8 +1,8 @@
 //! The page's tables as CSV.
 
 use super::failure::FailureMode;
-use crate::compress::records::Stage;
-use crate::verbs::csv::{known, table};
+use crate::files::csv::{known, table};
+use crate::journal::records::Stage;
 
 /// One line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {

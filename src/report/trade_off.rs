@@ -5,9 +5,9 @@
 use super::chart::{Axis, Plot, Series};
 use super::document::{document, figure_of, links, list};
 use super::html::{bytes, count, escape, figure, file_name};
-use crate::compress::summary::GoalSummary;
-use crate::verbs::method::Method;
-use crate::verbs::trade_off::{Knob, Point, TradeOff};
+use crate::evaluation::method::Method;
+use crate::evaluation::trade_off::{Knob, Point, TradeOff};
+use crate::pipeline::summary::GoalSummary;
 
 /// The page's name in the folder of a sweep.
 pub const PAGE: &str = "sweep.html";
@@ -183,7 +183,7 @@ fn curves(found: &TradeOff) -> Vec<Curve<'_>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::verbs::trade_off::Setting;
+    use crate::evaluation::trade_off::Setting;
 
     fn point(method: &str, count: usize, psnr: f64, peak_memory_bytes: Option<u64>) -> Point {
         let bytes = count as u64 * 248;

@@ -8,14 +8,14 @@
 use rayon::prelude::*;
 
 use crate::budget::{Need, Workload};
-use crate::compress::score::{SCORED, Scored};
 use crate::error::Result;
 use crate::limits::Limits;
-use crate::merge::neighbors::PointIndex;
-use crate::merge::tree::Point;
+use crate::merging::neighbors::PointIndex;
+use crate::merging::tree::Point;
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
+use crate::passes::{Frames, gather};
+use crate::pruning::score::{SCORED, Scored};
 use crate::source::{BlockReader, FrameSource, Ids, Wanted};
-use crate::stream::{Frames, gather};
 
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
 /// scene and 500 pixels across, a pixel per frame.

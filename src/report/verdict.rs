@@ -2,8 +2,8 @@
 
 use super::failure::{FailureMode, Verdict};
 use super::html::percent;
+use crate::evaluation::found::Evaluation;
 use crate::metrics::PSNR_CAP_DB;
-use crate::verbs::evaluation::Evaluation;
 
 /// Mean PSNR, dB, from which a loss is called by the words beside it. From 50 dB on, the root mean square
 /// error is less than one step of 255; at 40 dB under three, at 30 eight, at 24 sixteen.

@@ -53,11 +53,11 @@ impl FrameSource for Scene {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compress::tests::scene;
     use crate::model::RobustBox;
     use crate::model::{Columns, Gaussians};
+    use crate::passes::gather_all;
+    use crate::pipeline::tests::scene;
     use crate::render::render;
-    use crate::stream::gather_all;
 
     #[test]
     fn renders_and_boxes_are_those_of_the_others() {

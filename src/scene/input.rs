@@ -4,11 +4,13 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
+use crate::cache;
 use crate::error::{Error, Result, ShowPath};
-use crate::families::{self, Conventions, Family, Link, OpenOptions};
-use crate::ingest::cameras::{self, CameraOptions, Clock, Times};
+use crate::files::cameras;
+use crate::files::cameras::{CameraOptions, Clock, Times};
 use crate::model::{Rig, Split};
-use crate::work;
+use crate::models;
+use crate::models::{Conventions, Family, Link, OpenOptions};
 
 /// What to read and from where to look.
 #[derive(Debug, Clone, Default)]
@@ -41,7 +43,7 @@ pub struct InputOptions {
     /// Memory that the run may take.
     pub memory: Budget,
     /// Where what stages find is kept; none: nowhere.
-    pub work: Option<work::Asked>,
+    pub work: Option<cache::Asked>,
 }
 
 impl InputOptions {
@@ -127,6 +129,6 @@ pub fn load_cameras(
         &CameraOptions { size: options.size, frames, times, clock, memory: options.memory.read_limit() },
     )?;
     let is_states = input.is_none_or(Family::stands_in_frames);
-    let beside = || is_states.then(|| families::trained_background(path)).flatten();
+    let beside = || is_states.then(|| models::trained_background(path)).flatten();
     Ok(Some(Rig { background: rig.background.or_else(beside), ..rig }))
 }

@@ -14,12 +14,12 @@ mod work;
 use std::path::PathBuf;
 
 use crate::budget::{Budget, Need, Pace, Plan, Workload};
+use crate::cache::Work;
 use crate::error::Result;
-use crate::families::Family;
 use crate::limits::Limits;
 use crate::model::{Rig, Schedule, Split};
+use crate::models::Family;
 use crate::source::Reads;
-use crate::work::Work;
 
 use absent::Absent;
 pub use input::{InputOptions, Opened, load_cameras};

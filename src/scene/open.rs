@@ -9,12 +9,14 @@ use super::input::{InputOptions, Opened, load_cameras};
 use super::pictures::no_picture;
 use super::stream::open_arriving;
 use crate::error::{Error, Result, ShowPath};
-use crate::families::{self, Family, Timing};
-use crate::ingest::cameras::{self, Clock, Times};
+use crate::files::cameras;
+use crate::files::cameras::{Clock, Times};
 use crate::model::RobustBox;
 use crate::model::{Columns, Rig, opacity};
+use crate::models;
+use crate::models::{Family, Timing};
+use crate::passes::gather_all;
 use crate::source::FrameSource;
-use crate::stream::gather_all;
 
 /// Opens an input; cameras only say which frames it has.
 ///
@@ -27,7 +29,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
     }
     let path = &options.path;
     let mut notes = Vec::new();
-    let input = families::open(path, &options.opening())?;
+    let input = models::open(path, &options.opening())?;
     let rig = cameras_of(options, &*input)?;
     let times = rig.as_ref().map(Rig::times).unwrap_or_default();
     let input = match input.timing() {

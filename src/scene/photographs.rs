@@ -7,7 +7,7 @@ use hashbrown::HashMap;
 
 use super::work::stamps;
 use crate::error::{Error, Result, ShowPath};
-use crate::ingest::image::read_png;
+use crate::files::image::read_png;
 use crate::model::{Camera, Picture, Rig};
 use crate::render::Image;
 

@@ -6,15 +6,15 @@ use std::path::Path;
 use super::input::{InputOptions, Opened, load_cameras};
 use crate::budget::{Budget, Need, Plan, Workload};
 use crate::error::{Error, Result};
-use crate::families::Residence;
-use crate::families::stream::{AHEAD, Streamed, frame_block};
-use crate::families::{Family, Linked};
-use crate::ingest::cameras::Clock;
-use crate::ingest::frame_stream::{FrameStream, StreamHeader};
+use crate::files::cameras::Clock;
+use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::model::{Columns, Rig};
-use crate::stats;
-use crate::stream::BLOCK;
+use crate::models::Residence;
+use crate::models::stream::{AHEAD, Streamed, frame_block};
+use crate::models::{Family, Linked};
+use crate::passes::BLOCK;
+use crate::statistics;
 
 /// What messages call standard input.
 const STANDARD_INPUT: &str = "standard input";
@@ -156,7 +156,7 @@ pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<
     let mut fixed = work.writing();
     fixed.push(("times", PER_FRAME * frames));
     if let Some(visible) = measuring {
-        per_gaussian.push(("accumulators", stats::BYTES_PER_GAUSSIAN as u64));
+        per_gaussian.push(("accumulators", statistics::BYTES_PER_GAUSSIAN as u64));
         fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
         if visible {
             let nothing_held = Workload { input: Residence { frame_block: 0, ..work.input }, ..*work };

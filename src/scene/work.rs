@@ -7,10 +7,10 @@ use std::time::UNIX_EPOCH;
 use super::Scene;
 use super::input::InputOptions;
 use crate::TOOL;
+use crate::cache::{Key, Work};
 use crate::error::{Error, Result, ShowPath};
-use crate::families::Family;
+use crate::models::Family;
 use crate::render;
-use crate::work::{Key, Work};
 
 /// Under what the digest of an input is kept.
 const DIGEST: &str = "input";

@@ -9,18 +9,21 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use flate2::Crc;
-use splatsieve::families::{self, OpenOptions};
-use splatsieve::ingest::cameras::{self, CameraOptions};
-use splatsieve::ingest::container::Container;
-use splatsieve::ingest::frame_stream::FrameStream;
-use splatsieve::ingest::in_memory;
-use splatsieve::ingest::ply::check_header;
+use splatsieve::archive;
+use splatsieve::files::cameras;
+use splatsieve::files::cameras::CameraOptions;
+use splatsieve::files::container::Container;
+use splatsieve::files::frame_stream::FrameStream;
+use splatsieve::files::in_memory;
+use splatsieve::files::ply::check_header;
 use splatsieve::limits::ReadLimit;
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::models;
+use splatsieve::models::OpenOptions;
+use splatsieve::models::archive::unpack;
+use splatsieve::passes::gather;
 use splatsieve::recipe::Recipe;
 use splatsieve::source::FrameSource;
-use splatsieve::stream::gather;
-use splatsieve::{archive, families::archive::unpack};
 use xxhash_rust::xxh3::xxh3_64;
 
 use crate::memory;
@@ -229,7 +232,7 @@ fn colmap(bytes: &[u8], place: &Place) -> Outcome {
 
 /// A model of any family, at two times where its frames are still to be chosen.
 fn model(path: &Path) -> Outcome {
-    let mut model = families::open(path, &OpenOptions::default())?;
+    let mut model = models::open(path, &OpenOptions::default())?;
     if model.source().info().times.is_empty() {
         model = model.with_times(vec![0.0, 0.5])?;
     }

@@ -9,14 +9,14 @@ use std::collections::BTreeMap;
 
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
-use splatsieve::compress::score::UserOverrides;
-use splatsieve::compress::score_scene;
-use splatsieve::emit::container::write_container;
-use splatsieve::ingest::container::Container;
+use splatsieve::files::container::Container;
 use splatsieve::model::{Camera, Columns, Gaussians, Rig, Rows, Shot, Split};
+use splatsieve::outputs::container::write_container;
+use splatsieve::passes::HeldFrames;
+use splatsieve::pipeline::score_scene;
+use splatsieve::pruning::score::UserOverrides;
 use splatsieve::recipe::{Motion, Recipe};
 use splatsieve::scene::Scene;
-use splatsieve::stream::HeldFrames;
 
 use super::scene::by_formula;
 

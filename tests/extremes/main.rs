@@ -65,9 +65,9 @@ use std::path::Path;
 use std::process::Output;
 
 use scene::Workplace;
-use splatsieve::emit::frame_stream::StreamWriter;
-use splatsieve::ingest::frame_stream::StreamHeader;
+use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::outputs::frame_stream::StreamWriter;
 
 /// `n` grey balls of radius 0.05 strewn over a unit square by the golden ratio, opacity 0.73.
 fn balls(n: usize) -> Gaussians {

@@ -2,9 +2,9 @@
 
 use super::scene::{Workplace, files};
 use super::{balls, piped};
-use splatsieve::emit::frame_stream::StreamWriter;
-use splatsieve::ingest::frame_stream::StreamHeader;
+use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::Columns;
+use splatsieve::outputs::frame_stream::StreamWriter;
 use std::path::Path;
 
 /// A stream of five frames of four balls.

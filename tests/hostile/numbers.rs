@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use splatsieve::emit::ply::write_inria;
+use splatsieve::files::ply::write::write_inria;
 use splatsieve::model::{Column, Gaussians};
 
 use crate::runner::{Attack, Folder, Outcome};

@@ -17,7 +17,7 @@ use super::runner::{Folder, Outcome, Random, SMALL_MEMORY, is_optimized, program
 
 /// Gaussians of the smallest input.
 const COUNT: usize = 40;
-/// First line of the lock file in a workspace of the program, as `src/emit/atomic/workspace.rs` has it.
+/// First line of the lock file in a workspace of the program, as `src/files/atomic/workspace.rs` has it.
 const LOCK_LINE: &str = "workspace of a splatsieve run\n";
 /// User without rights of its own, for tests that the superuser runs.
 const NOBODY: u32 = 65534;

@@ -13,9 +13,9 @@ use std::thread;
 
 use assert_cmd::Command;
 use splatsieve::model::{Columns, Gaussians};
+use splatsieve::passes::gather;
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 use splatsieve::source::FrameSource;
-use splatsieve::stream::gather;
 use tempfile::TempDir;
 
 /// The model that lives with the code; see `scripts/make_fixture.py`.
@@ -174,7 +174,7 @@ impl Workplace {
     pub(crate) fn ply(&self, name: &str, gaussians: &Gaussians) -> PathBuf {
         let path = self.path(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
-        splatsieve::emit::ply::write_inria(gaussians, &[], &path).unwrap();
+        splatsieve::files::ply::write::write_inria(gaussians, &[], &path).unwrap();
         path
     }
 }

@@ -3,17 +3,17 @@
 use glam::DVec3;
 
 use super::*;
-use crate::compress::score::{Scored, UserOverrides};
-use crate::compress::score_scene;
-use crate::demo::{Body, Scene};
-use crate::emit::container::write_container;
-use crate::ingest::container::Container;
+use crate::diagnostics::demo_scene::{Body, Scene};
+use crate::evaluation::Taken;
+use crate::files::container::Container;
 use crate::model::Split;
+use crate::outputs::container::write_container;
+use crate::passes::gather;
+use crate::pipeline::score_scene;
+use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::Recipe;
 use crate::report::traits::{shares, traits};
 use crate::source::FrameSource;
-use crate::stream::gather;
-use crate::verbs::evaluate::Taken;
 
 /// The demo scene with its scores and traits.
 struct Looked {

@@ -1,0 +1,240 @@
+//! Pieces as files.
+//!
+//! A piece, all numbers little-endian:
+//!
+//! | bytes | what |
+//! |---|---|
+//! | 8 | `SPLSPIEC` |
+//! | 4 | version, 1 |
+//! | 4 | length of the text |
+//! | 8 | length of the content |
+//! | 8 | XXH3-64 of text and content |
+//! | 16 | key |
+//! | ... | text: what the piece belongs to, UTF-8; none in a scratch file |
+//! | ... | content |
+//!
+//! Its name: `<stage>.<key, 32 hexadecimal digits>.piece`, of a part `<stage>.<key>.<i>-of-<n>.piece`.
+
+use std::fs::{self, File};
+use std::io::{self, BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::Path;
+
+use serde::de::DeserializeOwned;
+use xxhash_rust::xxh3::Xxh3;
+
+use super::key::Key;
+use super::part::Part;
+use crate::error::{Error, Result};
+use crate::files::digest::hash_rest;
+
+const MAGIC: [u8; 8] = *b"SPLSPIEC";
+const VERSION: u32 = 1;
+/// Bytes before the text.
+const HEADER: usize = 48;
+/// Ends the names of pieces.
+pub(super) const ENDING: &str = ".piece";
+/// Bytes of all texts in a piece, at most.
+const MOST_TEXT: u64 = 8 << 20;
+
+/// What a piece is called.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Name {
+    pub(super) stage: String,
+    /// In 32 digits.
+    pub(super) key: String,
+    /// Index and number of parts; 1 of 1 is the whole.
+    pub(super) part: (usize, usize),
+}
+
+impl Name {
+    pub(super) fn new(stage: &str, key: Key, part: Part) -> Name {
+        Name { stage: stage.to_owned(), key: key.text(), part: part.numbers() }
+    }
+
+    pub(super) fn file(&self) -> String {
+        let Name { stage, key, part } = self;
+        match part {
+            (_, 1) => format!("{stage}.{key}{ENDING}"),
+            (index, of) => format!("{stage}.{key}.{index}-of-{of}{ENDING}"),
+        }
+    }
+
+    /// That of a file, if it is one of a piece.
+    pub(super) fn of(file: &str) -> Option<Name> {
+        let mut fields = file.strip_suffix(ENDING)?.split('.');
+        let (stage, key, part) = (fields.next()?, fields.next()?, fields.next());
+        let part = match part {
+            None => (1, 1),
+            Some(part) => {
+                let (index, of) = part.split_once("-of-")?;
+                (index.parse().ok()?, of.parse().ok()?)
+            }
+        };
+        let name = Name { stage: stage.to_owned(), key: key.to_owned(), part };
+        // Nothing else is written that way.
+        (fields.next().is_none() && key.len() == 32 && name.file() == file).then_some(name)
+    }
+}
+
+/// Names of all pieces of `folder`.
+pub(super) fn names(folder: &Path) -> Result<Vec<Name>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(folder).map_err(Error::io("read the work folder", folder))? {
+        let entry = entry.map_err(Error::io("read the work folder", folder))?;
+        found.extend(entry.file_name().to_str().and_then(Name::of));
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// Writes a piece to a file.
+pub(super) struct Writer {
+    file: BufWriter<File>,
+    key: u128,
+    text: u32,
+    length: u64,
+    hash: Box<Xxh3>,
+    /// What went wrong, for who is told only that something did.
+    pub(super) failed: Option<io::Error>,
+}
+
+impl Writer {
+    /// Behind room for the header.
+    pub(super) fn new(file: File, key: u128, about: &str) -> io::Result<Writer> {
+        let mut writer = Writer {
+            file: BufWriter::new(file),
+            key,
+            text: about.len() as u32,
+            length: 0,
+            hash: Box::new(Xxh3::new()),
+            failed: None,
+        };
+        writer.file.write_all(&[0; HEADER])?;
+        writer.write_all(about.as_bytes())?;
+        writer.length = 0;
+        Ok(writer)
+    }
+
+    /// Where the content begins.
+    pub(super) fn start(&self) -> u64 {
+        HEADER as u64 + u64::from(self.text)
+    }
+
+    /// Writes the header; gives the file, open for reading.
+    pub(super) fn finish(self) -> io::Result<File> {
+        let mut header = Vec::with_capacity(HEADER);
+        header.extend_from_slice(&MAGIC);
+        header.extend_from_slice(&VERSION.to_le_bytes());
+        header.extend_from_slice(&self.text.to_le_bytes());
+        header.extend_from_slice(&self.length.to_le_bytes());
+        header.extend_from_slice(&self.hash.digest().to_le_bytes());
+        header.extend_from_slice(&self.key.to_le_bytes());
+        let mut file = self.file.into_inner().map_err(io::IntoInnerError::into_error)?;
+        file.seek(SeekFrom::Start(0))?;
+        file.write_all(&header)?;
+        Ok(file)
+    }
+}
+
+impl Write for Writer {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.file.write(bytes).inspect_err(|error| self.failed = Some(again(error)))?;
+        self.hash.update(&bytes[..written]);
+        self.length += written as u64;
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush().inspect_err(|error| self.failed = Some(again(error)))
+    }
+}
+
+/// The same error once more.
+fn again(error: &io::Error) -> io::Error {
+    error.raw_os_error().map_or_else(|| io::Error::new(error.kind(), error.to_string()), io::Error::from_raw_os_error)
+}
+
+/// A piece that was written, open for reading at its content.
+pub(super) struct Piece {
+    file: File,
+    about: String,
+    start: u64,
+    length: u64,
+}
+
+/// Numbers of a header.
+struct Header {
+    text: u64,
+    content: u64,
+    hash: u64,
+    key: u128,
+}
+
+impl Header {
+    fn of(bytes: &[u8; HEADER]) -> std::result::Result<Header, String> {
+        let number = |start: usize, length: usize| {
+            bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
+        };
+        if bytes[..8] != MAGIC {
+            return Err("it is no piece".to_owned());
+        }
+        if number(8, 4) != u128::from(VERSION) {
+            return Err(format!("version {}, expected {VERSION}", number(8, 4)));
+        }
+        let [text, content, hash] = [(12, 4), (16, 8), (24, 8)].map(|(start, length)| number(start, length) as u64);
+        Ok(Header { text, content, hash, key: number(32, 16) })
+    }
+}
+
+impl Piece {
+    /// Opens a piece and looks at every byte of it; of a damaged one what is wrong. `key`: the one it should have.
+    ///
+    /// Plain reads: a map of a large piece would count as memory of this process.
+    pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<Piece, String>> {
+        let failed = |error| Error::io("read", path)(error);
+        let mut file = File::open(path).map_err(Error::io("open", path))?;
+        let length = file.metadata().map_err(failed)?.len();
+        if length < HEADER as u64 {
+            return Ok(Err(format!("{length} bytes, of a header of {HEADER}")));
+        }
+        let mut bytes = [0; HEADER];
+        file.read_exact(&mut bytes).map_err(failed)?;
+        let Header { text, content, hash, key: own } = match Header::of(&bytes) {
+            Ok(header) => header,
+            Err(why) => return Ok(Err(why)),
+        };
+        let start = HEADER as u64 + text;
+        if u128::from(start) + u128::from(content) != u128::from(length) {
+            return Ok(Err(format!("{length} bytes, expected {}", u128::from(start) + u128::from(content))));
+        }
+        if key != format!("{own:032x}") {
+            return Ok(Err("it is another piece than its name says".to_owned()));
+        }
+        let mut found = Xxh3::new();
+        hash_rest(&mut file, path, &mut found)?;
+        if found.digest() != hash {
+            return Ok(Err("its bytes are not those that were written".to_owned()));
+        }
+        let mut about = vec![0; text as usize];
+        file.seek(SeekFrom::Start(HEADER as u64)).and_then(|_| file.read_exact(&mut about)).map_err(failed)?;
+        let about = String::from_utf8_lossy(&about).into_owned();
+        Ok(Ok(Piece { file, about, start, length: content }))
+    }
+
+    /// Its file, and where its content begins.
+    pub(super) fn into_file(self) -> (File, u64) {
+        (self.file, self.start)
+    }
+
+    /// What it holds.
+    pub(super) fn value<T: DeserializeOwned>(self) -> postcard::Result<T> {
+        // Texts are read into it one after the other.
+        let mut texts = vec![0; self.length.min(MOST_TEXT) as usize];
+        postcard::from_io((BufReader::new(self.file), &mut texts)).map(|(value, _)| value)
+    }
+
+    /// What it belongs to.
+    pub(super) fn about(&self) -> &str {
+        &self.about
+    }
+}

@@ -1,0 +1,135 @@
+//! The folder that pieces are in.
+
+use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::key::Key;
+use super::part::MOST_PARTS;
+use super::piece::{ENDING, Name, Piece, names};
+use super::spill::{Spill, Spilling};
+use crate::error::{Error, Result, ShowPath};
+use crate::files::atomic::remove_leftovers;
+
+/// A work folder that is written to.
+#[derive(Debug)]
+pub(super) struct Place {
+    folder: PathBuf,
+    /// What all keys begin with.
+    context: Key,
+    about: String,
+}
+
+impl Place {
+    /// `folder`, created if it is not there.
+    pub(super) fn at(folder: &Path, about: String) -> Result<Place> {
+        match fs::create_dir(folder) {
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+                Err(Error::io("create the work folder", folder)(error))
+            }
+            _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.shown()))),
+            _ => {
+                remove_leftovers(folder, ENDING);
+                Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about })
+            }
+        }
+    }
+
+    /// What is read and written from now on follows from this, too.
+    pub(super) fn follow_from(&mut self, context: Key) {
+        self.context = self.context.and(&context);
+    }
+
+    /// `key` in this context.
+    pub(super) fn key(&self, key: Key) -> Key {
+        self.context.and(&key)
+    }
+
+    /// Which of several parts of `stage` are there, by how many there are in all.
+    pub(super) fn parts(&self, stage: &str, key: Key) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
+        let key = self.key(key).text();
+        let mut found: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
+        for name in names(&self.folder)? {
+            let (index, of) = name.part;
+            if name.stage == stage && name.key == key && (1..=of).contains(&index) && (2..=MOST_PARTS).contains(&of) {
+                found.entry(of).or_default().insert(index);
+            }
+        }
+        Ok(found)
+    }
+
+    /// To what parts of `stage` belong that follow from something else.
+    pub(super) fn others(&self, stage: &str, key: Key) -> Result<BTreeSet<String>> {
+        let key = self.key(key).text();
+        let is_other = |name: &Name| name.stage == stage && name.key != key && name.part.1 > 1;
+        let mut found = BTreeMap::new();
+        for name in names(&self.folder)?.into_iter().filter(is_other) {
+            // One of each is enough; one that is damaged belongs to nobody.
+            if let Entry::Vacant(new) = found.entry(name.key.clone()) {
+                let piece = Piece::open(&self.folder.join(name.file()), &name.key)?;
+                new.insert(piece.map_or_else(|_| "nobody knows".to_owned(), |piece| piece.about().to_owned()));
+            }
+        }
+        Ok(found.into_values().collect())
+    }
+
+    /// What is in a piece, if it is there. `damaged` is told of one that is not as it was written; it counts as none.
+    pub(super) fn read<T: DeserializeOwned>(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<T>> {
+        let Some(piece) = self.open_piece(name, &damaged)? else { return Ok(None) };
+        let found = piece.value();
+        let wrong = |error| damaged(format!("{} holds something else ({error}): computed again", name.file()));
+        Ok(found.map_err(wrong).ok())
+    }
+
+    /// The content of a piece, if it is there and as it was written.
+    pub(super) fn open(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<Spill>> {
+        let at = self.folder.join(name.file());
+        let spill = |piece: Piece| {
+            let (file, start) = piece.into_file();
+            Spill::of(file, start, at)
+        };
+        Ok(self.open_piece(name, &damaged)?.map(spill))
+    }
+
+    fn open_piece(&self, name: &Name, damaged: &impl Fn(String)) -> Result<Option<Piece>> {
+        let path = self.folder.join(name.file());
+        if !path.exists() {
+            return self.is_there().map(|()| None);
+        }
+        match Piece::open(&path, &name.key) {
+            Ok(Ok(piece)) => Ok(Some(piece)),
+            Ok(Err(why)) => {
+                damaged(format!("{} is damaged ({why}): computed again", name.file()));
+                Ok(None)
+            }
+            // Somebody removed it meanwhile.
+            Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// A folder that has vanished is not one without pieces.
+    fn is_there(&self) -> Result<()> {
+        fs::metadata(&self.folder).map(|_| ()).map_err(Error::io("find the work folder", &self.folder))
+    }
+
+    /// Writes a piece.
+    pub(super) fn write<T: Serialize>(&self, name: &Name, found: &T) -> Result<()> {
+        let mut spilling = self.begin(name)?;
+        spilling.write_value(found)?;
+        spilling.finish()?;
+        Ok(())
+    }
+
+    /// A piece in the making.
+    pub(super) fn begin(&self, name: &Name) -> Result<Spilling> {
+        self.is_there()?;
+        let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();
+        Spilling::named(&self.folder.join(name.file()), key, &self.about)
+    }
+}

@@ -1,0 +1,319 @@
+//! The verbs around containers: pack, info, verify, unpack, recover.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{Stdin, Write};
+use std::ops::Range;
+use std::path::Path;
+
+use gseq::{Compression, Reader, RecoverReport, VerifyReport};
+use serde::Serialize;
+
+use crate::TOOL;
+use crate::budget::{Budget, Need, Plan, Workload};
+use crate::cache::Spilling;
+use crate::error::{Error, Result, ShowPath};
+use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::files::container::Container;
+use crate::files::frame_stream::{FrameStream, StreamHeader};
+use crate::limits::Limits;
+use crate::model::Columns;
+use crate::models;
+use crate::models::stream::pack_stream;
+use crate::models::trajectories::write_sequence;
+use crate::models::{ColumnInfo, Family, Size, Timing};
+use crate::outputs::bounds::{Bounds, MaxError};
+use crate::outputs::container::{
+    BOUNDED_FRAME_BLOCK, FRAME_BLOCK, Packing, join_container, spill_blocks, write_container,
+};
+use crate::outputs::frame_stream::StreamWriter;
+use crate::outputs::kind::{OutputKind, check_container_name, check_folder_name};
+use crate::passes::Frames;
+use crate::pipeline::stages::emit::ENCODING;
+use crate::pipeline::summary::InputSummary;
+use crate::progress::Progress;
+use crate::scene::{
+    InputOptions, Opened, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
+};
+use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+
+/// What packing is called.
+const PACK: &str = "pack";
+
+/// What `pack` wrote.
+#[derive(Debug)]
+pub struct Packed {
+    /// N.
+    pub gaussians: usize,
+    /// T.
+    pub frames: usize,
+    /// Size of the container.
+    pub bytes: u64,
+    /// Why that is more than its input has, if it is.
+    pub larger: Option<String>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// How `pack` stores values.
+#[derive(Debug, Clone)]
+pub enum Storing {
+    /// Every bit of them.
+    Exact(Compression),
+    /// Those of these columns within a bound, by zstd at a level.
+    Within(Vec<MaxError>, i32),
+}
+
+impl Storing {
+    /// In a scene whose extent is asked for where a bound is of it.
+    fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
+        match self {
+            Storing::Exact(compression) => Ok((*compression).into()),
+            Storing::Within(asked, level) => Ok(Packing::within(Bounds::of(asked, extent)?, *level)),
+        }
+    }
+}
+
+/// Packs any input into a container. That of a stream names no digest of its source, which is known only
+/// when the container's header has long been written.
+///
+/// # Errors
+/// What is wrong with the input; a bound of the extent of a stream, which is known at its end alone.
+pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
+    check_container_name(output, "pack")?;
+    check_target(output, Kind::File, &[&input.path], overwrite)?;
+    let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {
+        Some(stream) if is_linked(stream.header(), input) => link_stream(stream, input, None)?,
+        Some(stream) => return pack_arriving(stream, input, output, storing, overwrite),
+        None => open_input(input)?,
+    };
+    let source = opened.input.source();
+    Plan::fit(workload(&*opened.input), input.memory, |work, _| packing(work, storing))?.tell_time(input.memory.tell);
+    let (work, digest) = kept_work(input, &*opened.input)?;
+    let extent = || Ok(first_box(source)?.map_or(1.0, |bounds| bounds.extent()));
+    let packing = storing.packing(|| work.known("extent", work.key(&()), extent))?;
+    let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
+    let progress = |frames: usize| Progress::new(PACK, "states", (source.info().count * frames) as u64);
+    let staged = if work.keeps() {
+        let encode = |blocks: Range<usize>, to: &mut Spilling| {
+            let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
+            spill_blocks(source, packing, blocks, to, |done| progress.advance(done))
+        };
+        let spills =
+            work.divided_spill(PACK, packing.key(), packing.frame_blocks(source), &input.scratch_folder(), encode)?;
+        work.not_divided("writing")?;
+        let staged = StagedFile::new(output, overwrite)?;
+        join_container(source, staged.path(), packing, attributes, &spills)?;
+        staged
+    } else {
+        let staged = StagedFile::new(output, overwrite)?;
+        let progress = progress(source.info().times.len());
+        write_container(source, staged.path(), packing, attributes, |done| progress.advance(done))?;
+        staged
+    };
+    let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+    staged.commit()?;
+    let info = opened.input.source().info();
+    let larger = Size::of_frames(bytes).why_larger_than(&opened.input.size()?);
+    let notes = opened.notes.into_iter().chain(work.take_notes()).collect();
+    Ok(Packed { gaussians: info.count, frames: info.times.len(), bytes, larger, notes })
+}
+
+/// Packs a stream of numbered Gaussians as it arrives.
+fn pack_arriving(
+    stream: FrameStream<Stdin>,
+    input: &InputOptions,
+    output: &Path,
+    storing: &Storing,
+    overwrite: Replace,
+) -> Result<Packed> {
+    let packing = storing.packing(|| {
+        let message = "--max-error: expected scene units, as the extent of a stream is known at its end alone, found %";
+        Err(Error::usage(message))
+    })?;
+    let staged = StagedFile::new(output, overwrite)?;
+    let mut room = room_to_pack(input, stream.header())?;
+    let received = pack_stream(stream, staged.path(), packing, |held| room.admit(held.len()))?;
+    let container = Container::open(staged.path())?;
+    let (gaussians, frames) = (container.info().count, container.info().times.len());
+    let bytes = fs::metadata(staged.path()).map_err(Error::io("read", staged.path()))?.len();
+    staged.commit()?;
+    let larger = Size::of_frames(bytes).why_larger_than(&Size::of_frames(received));
+    Ok(Packed { gaussians, frames, bytes, larger, notes: Vec::new() })
+}
+
+/// Writes any input as a frame stream; gives the input.
+///
+/// Memory: see [`unpacking`].
+pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
+    let opened = open_input(input)?;
+    let source = opened.input.source();
+    let info = source.info();
+    let header =
+        StreamHeader { count: info.count, sh_degree: info.sh_degree, varying: info.varying, is_unlinked: false };
+    let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
+    plan.tell_time(input.memory.tell);
+    let held = plan.limits.frames_held;
+    let wanted = Wanted::every().holding(held);
+    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
+    let mut state = frames.state();
+    if !info.times.is_empty() {
+        frames.read(0, Columns::all(), &mut state)?;
+    }
+    let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+    let mut stream = StreamWriter::new(to, Path::new("standard output"), header, &state)?;
+    for (frame, &time) in info.times.iter().enumerate() {
+        frames.read(frame, info.varying, &mut state)?;
+        stream.frame(time, &state)?;
+        progress.advance(1);
+    }
+    stream.finish()?;
+    drop((progress, frames));
+    Ok(opened)
+}
+
+/// Writes every frame of an input as a PLY file into the folder `output`; gives the input.
+pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result<Opened> {
+    check_folder_name(output, "unpack")?;
+    check_target(output, Kind::Folder, &[&input.path], overwrite)?;
+    let opened = open_input(input)?;
+    let source = opened.input.source();
+    let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
+    plan.tell_time(input.memory.tell);
+    let held = plan.limits.frames_held;
+    let staged = StagedFolder::new(output, overwrite)?;
+    write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
+    let marker = serde_json::json!({
+        "tool": TOOL,
+        "input": InputSummary::of(&*opened.input, &input.path, opened.input.digest()?)?.without_folders(),
+    });
+    let path = staged.path().join(MARKER);
+    fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
+    staged.commit()?;
+    Ok(opened)
+}
+
+/// Reads every byte of a container and checks it, within the memory that a run takes by default.
+pub fn verify(path: &Path) -> Result<VerifyReport> {
+    let memory = Budget::default().read_limit().bytes();
+    Ok(Reader::open_within(path, memory)?.verify_within(memory)?)
+}
+
+/// Saves the complete frames of a container that was cut short.
+pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<RecoverReport> {
+    check_container_name(output, "recover")?;
+    check_target(output, Kind::File, &[input], overwrite)?;
+    let staged = StagedFile::new(output, overwrite)?;
+    let report = gseq::recover_within(input, staged.path(), Budget::default().read_limit().bytes())?;
+    if report.frames == 0 {
+        let found = format!("{} time stamps and {} intact tiles", report.frames_seen, report.tiles_seen);
+        return Err(Error::input(input, "", "at least one complete frame to save", found)
+            .hint("nothing was written: a frame is saved if every tile of its block, and all before it, are intact"));
+    }
+    staged.commit()?;
+    Ok(report)
+}
+
+/// What an input holds.
+#[derive(Debug, Serialize)]
+pub struct Info {
+    /// The input.
+    #[serde(flatten)]
+    pub input: InputSummary,
+    /// Time stamps of first and last frame; none without frames, or where cameras choose them.
+    pub times: Option<(f64, f64)>,
+    /// Columns of a container.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub columns: Vec<ColumnInfo>,
+}
+
+/// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
+pub fn info(options: &InputOptions) -> Result<Info> {
+    let input: Box<dyn Family> = match options.is_stream() {
+        true => open_input(options)?.input,
+        false => models::open(&options.path, &options.opening())?,
+    };
+    let times = &input.source().info().times;
+    let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
+    let mut summary = InputSummary::of(&*input, &options.path, input.digest()?)?;
+    if input.timing() == Timing::Continuous {
+        summary.frames = None;
+    }
+    Ok(Info { input: summary, times, columns: input.columns()? })
+}
+
+/// Of an input that nobody looks at.
+fn workload(input: &dyn Family) -> Workload {
+    Workload::new(input.source().info(), input.residence())
+}
+
+/// What it takes to write every frame as a container.
+fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
+    let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
+    let level = match storing {
+        Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
+        Storing::Exact(_) => 0,
+    };
+    // The first frame is read for its extent.
+    let (together, positions) = match storing {
+        Storing::Within(..) => (BOUNDED_FRAME_BLOCK, 16),
+        Storing::Exact(_) => (FRAME_BLOCK, 0),
+    };
+    let per_gaussian = vec![("positions", positions)];
+    let fixed = [work.writing_together(together), vec![work.compressing(level, together)]].concat();
+    vec![Need { stage: PACK, reads: 1.0, seconds, per_gaussian, fixed }]
+}
+
+/// What it takes to write every frame by itself.
+fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
+    let states = ("states", work.state(Columns::all()));
+    let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
+    let seconds = 2.0 * work.reading(work.count(), work.frames as f64);
+    vec![Need { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.arriving()] }]
+}
+
+impl Info {
+    /// A few lines for a person.
+    pub fn text(&self) -> String {
+        let input = &self.input;
+        let mut out = format!(
+            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes{}, digest {}\n",
+            Path::new(&input.path).shown(),
+            input.kind,
+            input.gaussians,
+            input.sh_degree,
+            match self.times {
+                Some((first, last)) => format!("{} frames from t = {first} to {last}", input.frames.unwrap_or(0)),
+                None => match input.frames {
+                    Some(_) => "no frames".to_owned(),
+                    None => "continuous in time".to_owned(),
+                },
+            },
+            if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
+            input.bytes,
+            input.size.map_or(String::new(), |size| format!(": {}", size.parts())),
+            input.digest,
+        );
+        for column in &self.columns {
+            let range = match (column.min, column.max) {
+                (Some(min), Some(max)) => format!("{min} to {max}"),
+                _ => "no finite value".to_owned(),
+            };
+            out += &format!(
+                "  {:<14} x{:<3} {:>6} tiles ({} constant, {} raw)  {:>12} bytes of {:>12}  {range}{}\n",
+                column.name,
+                column.width,
+                column.tiles,
+                column.constant_tiles,
+                column.raw_tiles,
+                column.stored_bytes,
+                column.raw_bytes,
+                match column.max_error {
+                    0.0 => String::new(),
+                    bound => format!(", at most {bound} off"),
+                }
+            );
+        }
+        out
+    }
+}

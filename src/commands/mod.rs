@@ -1,0 +1,8 @@
+//! Commands beside `compress`, from input to output.
+
+pub mod archive;
+pub mod container;
+pub mod convert;
+pub mod render;
+pub mod score;
+pub mod video;

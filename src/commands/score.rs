@@ -1,0 +1,62 @@
+//! Statistics and scores of every Gaussian to a file, nothing removed.
+
+use std::path::{Path, PathBuf};
+
+use crate::budget::Workload;
+use crate::error::{Error, Result, ShowPath};
+use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
+use crate::journal::Journal;
+use crate::outputs::rows::RowTable;
+use crate::pipeline::open_to_measure;
+use crate::pipeline::stages::measure::{Measure, Outlook};
+use crate::pruning::score::UserOverrides;
+use crate::recipe::Recipe;
+use crate::scene::InputOptions;
+
+/// Writes the rows of an input as `.npz` or `.csv`, by the output's name.
+pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Replace) -> Result<ScoreReport> {
+    recipe.validate().map_err(Error::usage)?;
+    let extension = output.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    if !matches!(extension.as_str(), "npz" | "csv") {
+        return Err(Error::usage(format!("{}: expected a name that ends in .npz or .csv", output.shown())));
+    }
+    check_target(output, Kind::File, &[&input.path], overwrite)?;
+    let journal = &mut Journal::default();
+    let plan = |outlook: Outlook, _: &Workload| Ok(Measure::new(recipe, outlook.has_cameras, UserOverrides::default()));
+    let (scene, measure, arrived) = open_to_measure(input, plan, journal)?;
+    let scored = measure.run(&scene, arrived, journal)?;
+    let scores = scored.scores(&recipe.score)?;
+    let rows = scored.rows()?;
+    let table = RowTable {
+        rows: &rows,
+        static_score: &scores.static_score,
+        dynamic_score: &scores.dynamic_score,
+        score: &scores.score,
+        keep: &scored.selection.keep,
+    };
+    let staged = StagedFile::new(output, overwrite)?;
+    match extension.as_str() {
+        "npz" => table.write_npz(staged.path())?,
+        _ => table.write_csv(staged.path())?,
+    }
+    staged.commit()?;
+    Ok(ScoreReport {
+        output: output.to_owned(),
+        gaussians: scored.count(),
+        kept: scored.selection.counts.kept,
+        notes: scene.notes,
+    })
+}
+
+/// What `score` wrote.
+#[derive(Debug)]
+pub struct ScoreReport {
+    /// The file.
+    pub output: PathBuf,
+    /// Rows in it.
+    pub gaussians: usize,
+    /// Rows the recipe would keep before merging.
+    pub kept: usize,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}

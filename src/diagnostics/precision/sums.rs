@@ -1,0 +1,263 @@
+//! What rounding does to the running sums of a scan: in f32, in f32 with the lost digits carried along, and as the scan has
+//! them, in f64.
+//!
+//! Some of the scene's trajectories are played to and fro for as long as it takes to see errors grow. Expected: the same
+//! sums in f64 with the lost digits carried along.
+
+use std::collections::BTreeMap;
+
+use num_traits::Float;
+
+use super::Bench;
+use crate::error::Result;
+use crate::evaluation::precision::{Curve, Knob, Mark, Source, relative_l2};
+use crate::model::{Columns, Flags, Gaussians, Schedule, opacity};
+use crate::passes::Frames;
+use crate::recipe::{self, Motion, Recipe};
+use crate::source::{BlockReader, Ids, Wanted};
+use crate::statistics::{BlockScan, NEEDED, ScanPlan};
+
+/// Gaussians whose sums are looked at, evenly among all.
+const GAUSSIANS: usize = 64;
+/// Frames of the scene that are played, evenly among all: at most.
+const MOST_FRAMES: usize = 240;
+/// Frames that they are played for.
+const PLAYED: [usize; 4] = [100, 1000, 10_000, 100_000];
+
+/// What errors of sums are measured against.
+const AGAINST: &str = "f64, compensated";
+
+/// A running sum.
+trait Sum<T: Float>: Default {
+    fn add(&mut self, value: T);
+    fn total(self) -> f64;
+}
+
+/// One number, and what rounding loses is lost.
+struct Plain<T>(T);
+
+/// Kahan's sum: a second number holds what rounding lost.
+struct Compensated<T>(T, T);
+
+impl<T: Float> Default for Plain<T> {
+    fn default() -> Self {
+        Plain(T::zero())
+    }
+}
+
+impl<T: Float> Default for Compensated<T> {
+    fn default() -> Self {
+        Compensated(T::zero(), T::zero())
+    }
+}
+
+impl<T: Float> Sum<T> for Plain<T> {
+    fn add(&mut self, value: T) {
+        self.0 = self.0 + value;
+    }
+
+    fn total(self) -> f64 {
+        wide(self.0)
+    }
+}
+
+impl<T: Float> Sum<T> for Compensated<T> {
+    fn add(&mut self, value: T) {
+        let value = value - self.1;
+        let sum = self.0 + value;
+        self.1 = (sum - self.0) - value;
+        self.0 = sum;
+    }
+
+    fn total(self) -> f64 {
+        wide(self.0) - wide(self.1)
+    }
+}
+
+fn wide<T: Float>(value: T) -> f64 {
+    value.to_f64().unwrap_or(f64::NAN)
+}
+
+fn narrow<T: Float>(value: f64) -> T {
+    T::from(value).unwrap_or(T::nan())
+}
+
+/// D, κ and V of every Gaussian.
+type Statistics = [Vec<f64>; 3];
+
+impl Bench<'_> {
+    /// Sums over longer and longer sequences.
+    pub(super) fn sums(&self) -> Result<Option<Knob>> {
+        let source = self.scene.source();
+        let info = source.info();
+        let frames = info.times.len();
+        if frames < 3 {
+            return Ok(None);
+        }
+        let every = frames.div_ceil(MOST_FRAMES);
+        let finite = |id: &u32| !self.scanned.rows.flags[*id as usize].contains(Flags::NON_FINITE);
+        let ids: Vec<u32> = (0..info.count as u32).filter(finite).collect();
+        let count = ids.len().min(GAUSSIANS);
+        let ids: Vec<u32> = (0..count).map(|k| ids[k * ids.len() / count]).collect();
+        let shown: Vec<usize> = (0..frames).step_by(every).collect();
+        let columns = Columns::POSITION | Columns::OPACITY;
+        let mut reader = Frames::open(source, Ids::List(&ids), NEEDED, &Wanted::of(shown.iter().copied()))?;
+        let mut states = Vec::with_capacity(shown.len());
+        for frame in shown {
+            let mut state = Gaussians::zeros(0, 0);
+            reader.read(frame, NEEDED, &mut state)?;
+            states.push(state);
+        }
+        let decoded: Vec<Decoded> = states.iter().map(Decoded::of).collect();
+        let mut curves = Vec::new();
+        type Way = (&'static str, fn(&[Decoded], usize) -> Statistics);
+        let ways: [Way; 2] =
+            [("f32", summed::<f32, Plain<f32>>), ("f32, compensated", summed::<f32, Compensated<f32>>)];
+        let expected = PLAYED.map(|played| summed::<f64, Compensated<f64>>(&decoded, played));
+        for (name, sum) in ways {
+            let marks = self.played(&expected, |played| Ok(sum(&decoded, played)))?;
+            curves.push(Curve::new(name, AGAINST, marks, None, &[]));
+        }
+        let marks = self.played(&expected, |played| scanned(&states, played, columns))?;
+        curves.push(Curve::new("f64, as the scan has them", AGAINST, marks, None, &[]));
+        Ok(Some(Knob {
+            name: "sums".to_owned(),
+            about: format!(
+                "Running sums over frames: D, κ and V of {count} Gaussians whose frames are played to and fro. Marks are \
+                 numbers of frames."
+            ),
+            source: Source::Rounding,
+            curves,
+        }))
+    }
+
+    /// A mark for every number of frames.
+    fn played(&self, expected: &[Statistics], sums: impl Fn(usize) -> Result<Statistics>) -> Result<Vec<Mark>> {
+        let mark = |(played, expected): (usize, &Statistics)| {
+            let (found, cost) = self.repeats.measure(|| sums(played), || Ok(()))?;
+            let errors = ["D", "kappa", "V"].into_iter().zip(found.iter().zip(expected));
+            let errors: BTreeMap<String, f64> = errors
+                .map(|(of, (found, expected))| {
+                    (of.to_owned(), relative_l2(found.iter().copied(), expected.iter().copied()))
+                })
+                .collect();
+            self.advance();
+            Ok(Mark { value: played as f64, step: played as f64, cost, errors, psnr: None })
+        };
+        PLAYED.into_iter().zip(expected).map(mark).collect()
+    }
+}
+
+/// Frame of `count` that is shown as the `k`-th of frames played to and fro.
+fn place(k: usize, count: usize) -> usize {
+    let turn = 2 * (count - 1);
+    let at = k % turn;
+    at.min(turn - at)
+}
+
+/// What sums are of at one frame.
+struct Decoded {
+    position: Vec<[f32; 3]>,
+    opacity: Vec<f64>,
+}
+
+impl Decoded {
+    fn of(state: &Gaussians) -> Decoded {
+        Decoded {
+            position: (0..state.len()).map(|row| state.position.row(row)).collect(),
+            opacity: state.opacity_logit.plane(0).iter().map(|&logit| opacity(logit)).collect(),
+        }
+    }
+}
+
+/// D, κ and V over `played` frames of Gaussians that live throughout, in numbers T summed by S.
+fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> Statistics {
+    let count = states.first().map_or(0, |state| state.opacity.len());
+    let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+    let difference = |a: [T; 3], b: [T; 3]| -> [T; 3] { std::array::from_fn(|axis| a[axis] - b[axis]) };
+    let of_gaussian = |i: usize| -> [f64; 3] {
+        let at = |k: usize| &states[place(k, states.len())];
+        let position = |k: usize| at(k).position[i].map(|x| narrow::<T>(f64::from(x)));
+        let first: T = narrow(at(0).opacity[i]);
+        let (mut steps, mut turns, mut shifted, mut squares) = (S::default(), S::default(), S::default(), S::default());
+        let mut before: Option<[T; 3]> = None;
+        for k in 0..played {
+            let opacity = narrow::<T>(at(k).opacity[i]) - first;
+            shifted.add(opacity);
+            squares.add(opacity * opacity);
+            if k > 0 {
+                let step = difference(position(k), position(k - 1));
+                steps.add(length2(step));
+                if let Some(before) = before {
+                    turns.add(length2(difference(step, before)).sqrt());
+                }
+                before = Some(step);
+            }
+        }
+        let of = |terms: usize| terms.max(1) as f64;
+        [
+            (steps.total() / of(played - 1)).sqrt(),
+            turns.total() / of(played - 2),
+            squares.total() / of(played) - (shifted.total() / of(played)).powi(2),
+        ]
+    };
+    let found: Vec<[f64; 3]> = (0..count).map(of_gaussian).collect();
+    std::array::from_fn(|statistic| found.iter().map(|of| of[statistic]).collect())
+}
+
+/// The same by the scan itself, of Gaussians that all count as living.
+fn scanned(states: &[Gaussians], played: usize, changed: Columns) -> Result<Statistics> {
+    let times: Vec<f64> = (0..played).map(|k| k as f64).collect();
+    let mut schedule = Schedule::default();
+    schedule.push(played, &[]);
+    let scan = recipe::Scan { alpha_min: 0.0, motion: Motion::Runs, ..Recipe::preset("default")?.scan };
+    let plan = ScanPlan::new(&scan, &times, &schedule)?;
+    let mut block = BlockScan::new(states.first().map_or(0, Gaussians::len), 0, &plan);
+    for k in 0..played {
+        block.frame(k, &states[place(k, states.len())], &[], changed);
+    }
+    let rows = block.finish().rows;
+    Ok([rows.d, rows.kappa, rows.v])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_played_to_and_fro() {
+        assert_eq!((0..9).map(|k| place(k, 4)).collect::<Vec<_>>(), [0, 1, 2, 3, 2, 1, 0, 1, 2]);
+    }
+
+    #[test]
+    fn sums_of_a_steady_walk_are_those_of_its_formula_in_any_number() {
+        // A quarter a frame, to and fro between 0 and 1: every fourth frame it turns, by half; opacities as it stands.
+        let at = |k: u32| Decoded { position: vec![[0.25 * k as f32, 0.0, 0.0]], opacity: vec![0.25 * f64::from(k)] };
+        let states: Vec<Decoded> = (0..5).map(at).collect();
+        // Of 4 frames to a side, 17 frames are two rounds: turns at frames 4, 8 and 12.
+        let d = 0.25;
+        let kappa = 3.0 * 0.5 / 15.0;
+        let levels: Vec<f64> = (0..17).map(|k| 0.25 * place(k, 5) as f64).collect();
+        let mean = levels.iter().sum::<f64>() / 17.0;
+        let v = levels.iter().map(|a| (a - mean).powi(2)).sum::<f64>() / 17.0;
+        let ways = [summed::<f32, Plain<f32>>, summed::<f32, Compensated<f32>>, summed::<f64, Compensated<f64>>];
+        for (way, sum) in ways.into_iter().enumerate() {
+            let [found_d, found_kappa, found_v] = sum(&states, 17).map(|values| values[0]);
+            for (found, expected) in [(found_d, d), (found_kappa, kappa), (found_v, v)] {
+                assert!((found - expected).abs() < 1e-6 * expected, "way {way}: {found}, expected {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_a_plain_sum_loses_a_compensated_one_keeps() {
+        let (mut plain, mut compensated) = (Plain::<f32>::default(), Compensated::<f32>::default());
+        for _ in 0..1_000_000 {
+            plain.add(0.1);
+            compensated.add(0.1);
+        }
+        let expected = 1e6 * f64::from(0.1f32);
+        assert!((plain.total() / expected - 1.0).abs() > 1e-3);
+        assert!((compensated.total() / expected - 1.0).abs() < 1e-7);
+    }
+}

@@ -1,0 +1,146 @@
+//! What one Gaussian keeps of those that it stands for.
+
+use glam::{DMat3, DQuat, DVec3};
+
+use super::case::{Case, Worst};
+use super::made::clouds::{Random, scene};
+use crate::error::{Error, Result};
+use crate::merging::moments::{Ellipsoid, Part, align_axes, moments};
+use crate::merging::proxy::{Importance, merge_state, weights};
+use crate::merging::{Survivors, run};
+use crate::model::{Columns, Gaussians};
+use crate::recipe::{Merge, Placement, ProxyOpacity, Recipe};
+
+/// Against Σ formed in f64, in parts of its largest entry; a dozen parts lose some 1e-15.
+pub(super) fn mixture() -> Case {
+    Case::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
+        let mut random = Random(1);
+        let mut worst = Worst::default();
+        for count in [1, 2, 3, 12] {
+            let mut within = |low, high| f64::from(random.within(low, high));
+            let parts: Vec<Part> = (1..=count)
+                .map(|k| Part {
+                    weight: 2.0 * f64::from(k) / f64::from(count * (count + 1)),
+                    position: DVec3::new(within(-1.0, 1.0), within(-1.0, 1.0), within(-1.0, 1.0)),
+                    rotation: DQuat::from_xyzw(within(-1.0, 1.0), within(-1.0, 1.0), within(-1.0, 1.0), 0.3)
+                        .normalize(),
+                    scales: DVec3::new(within(0.01, 1.0), within(0.01, 1.0), within(0.01, 1.0)),
+                })
+                .collect();
+            keeps_moments(&moments(&parts, None), &parts, &mut worst);
+        }
+        Ok(worst)
+    })
+}
+
+/// Twice the same is the same: scales of 1 : 1e12 come back to 1e-12 of each; a covariance in f64 would keep nothing of
+/// the smallest.
+pub(super) fn needle() -> Case {
+    Case::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
+        let mut worst = Worst::default();
+        let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
+        for scales in [DVec3::new(1e6, 1.0, 1e-6), DVec3::new(1e-6, 1e6, 1e-6), DVec3::new(1e-6, 3e-6, 1e6)] {
+            let part = Part { weight: 0.5, position: DVec3::new(1.0, 2.0, 3.0), rotation, scales };
+            let found = align_axes(&moments(&[part, part], None), rotation);
+            (0..3).for_each(|axis| worst.relative(found.scales[axis], scales[axis]));
+        }
+        Ok(worst)
+    })
+}
+
+/// As [`mixture`], of stored Gaussians 1000 units away, whose offsets lose 1e-13 there; opacity is 1 − Π(1 − α).
+pub(super) fn proxy() -> Case {
+    Case::new("proxy of five", "mass, mean, covariance, colour: f64", 1e-10, || {
+        let mut states = scene(4, 5, 1);
+        states.position.planes_mut().iter_mut().for_each(|x| *x = 1000.0 + 0.1 * *x);
+        let (coverage, visibility) = ([1.0, 2.0, 3.0, 4.0, 5.0], [0.5, 1.0, 0.25, 1.0, 0.75]);
+        let seen: Vec<f64> = coverage.iter().zip(&visibility).map(|(c, vis)| c * vis).collect();
+        let total: f64 = seen.iter().sum();
+        let rows = [0, 1, 2, 3, 4];
+        let importance = Importance { ids: &rows, coverage: &coverage, visibility: &visibility };
+        let members: Vec<(u32, f64)> = rows.into_iter().zip(weights(&rows, &importance, &states)).collect();
+        let recipe = Merge { placement: Placement::Mean, ..recipe(ProxyOpacity::Union)? };
+        let found = merge_state(&members, &states, 2, &recipe, Columns::all());
+
+        let mut worst = Worst::default();
+        let parts: Vec<Part> = (0..5).map(|i| part(&states, i, seen[i] / total)).collect();
+        let [w, x, y, z] = found.rotation;
+        let rotation = DQuat::from_xyzw(x, y, z, w);
+        let scales = DVec3::from(found.log_scale).exp();
+        keeps_moments(&Ellipsoid { mean: found.position, rotation, scales }, &parts, &mut worst);
+        let opacity = |logit: f64| 1.0 / (1.0 + (-logit).exp());
+        let clear: f64 = states.opacity_logit.plane(0).iter().map(|&logit| 1.0 - opacity(logit.into())).product();
+        worst.near(opacity(found.opacity_logit), 1.0 - clear, 1.0);
+        for c in 0..3 {
+            let plane = states.sh.plane(c);
+            let average: f64 = parts.iter().zip(plane).map(|(part, &x)| part.weight * f64::from(x)).sum();
+            worst.near(found.sh[c], average, 1.0);
+        }
+        Ok(worst)
+    })
+}
+
+/// Exact copies become one whose parameters are theirs to the bit, of the opacity that the rule has for them in f32.
+pub(super) fn duplicates() -> Case {
+    Case::new("duplicates", "8 copies and 1 apart: 2, opacity", 1e-6, || {
+        let one = scene(6, 1, 0);
+        let mut states = one.pick(&[0; 9]);
+        states.position.plane_mut(0)[8] += 1e3;
+        let opacity = 0.05f64;
+        states.opacity_logit.plane_mut(0).fill((opacity / (1.0 - opacity)).ln() as f32);
+        let rows: Vec<u32> = (0..9).collect();
+        let importance = Importance { ids: &rows, coverage: &[1.0; 9], visibility: &[1.0; 9] };
+        let survivors = Survivors { states: &states, rows: &rows, importance, classes: &[Some(0); 9], extent: 1.0 };
+        let mut worst = Worst::default();
+        for (rule, expected) in [
+            (ProxyOpacity::Sum, 8.0 * opacity),
+            (ProxyOpacity::Area, 8.0 * opacity),
+            (ProxyOpacity::Union, 1.0 - (1.0 - opacity).powi(8)),
+        ] {
+            let merged =
+                run(&survivors, &recipe(rule)?, None, 1000, |asked| Ok::<_, Error>(vec![1.0; asked.pairs().len()]))?;
+            let groups = &merged.groups;
+            let members: Vec<&[u32]> = (0..groups.len()).map(|group| groups.members(group)).collect();
+            let mut sorted = members;
+            sorted.sort_unstable();
+            worst.same(&sorted[..], &[&rows[..8], &rows[8..]]);
+            for column in (Columns::POSITION | Columns::LOG_SCALE | Columns::SH).iter() {
+                worst.same(merged.proxies.column(column).planes(), states.column(column).pick(&[0]).planes());
+            }
+            let logit = f64::from(merged.proxies.opacity_logit.planes().first().copied().unwrap_or(f32::NAN));
+            worst.near(1.0 / (1.0 + (-logit).exp()), expected, 1.0);
+        }
+        Ok(worst)
+    })
+}
+
+fn recipe(opacity: ProxyOpacity) -> Result<Merge> {
+    Ok(Merge { opacity, ..Recipe::preset("default")?.merge })
+}
+
+/// Gaussian `i` as it is stored.
+fn part(states: &Gaussians, i: usize, weight: f64) -> Part {
+    let [w, x, y, z] = states.rotation.row::<4>(i).map(f64::from);
+    Part {
+        weight,
+        position: DVec3::from(states.position.row::<3>(i).map(f64::from)),
+        rotation: DQuat::from_xyzw(x, y, z, w).normalize(),
+        scales: DVec3::from(states.log_scale.row::<3>(i).map(f64::from)).exp(),
+    }
+}
+
+/// Mean and covariance by the textbook, forming Σ; both in parts of what Σ has as its largest entry.
+fn keeps_moments(found: &Ellipsoid, parts: &[Part], worst: &mut Worst) {
+    let covariance = |rotation: DQuat, scales: DVec3| {
+        let axes = DMat3::from_quat(rotation);
+        axes * DMat3::from_diagonal(scales * scales) * axes.transpose()
+    };
+    let outer = |v: DVec3| DMat3::from_cols(v * v.x, v * v.y, v * v.z);
+    let mean: DVec3 = parts.iter().map(|part| part.weight * part.position).sum();
+    let spread = |part: &Part| (covariance(part.rotation, part.scales) + outer(part.position - mean)) * part.weight;
+    let expected = parts.iter().map(spread).fold(DMat3::ZERO, |sum, part| sum + part).to_cols_array();
+    let largest = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
+    (0..3).for_each(|axis| worst.near(found.mean[axis], mean[axis], largest.sqrt()));
+    let got = covariance(found.rotation, found.scales).to_cols_array();
+    got.iter().zip(expected).for_each(|(&got, expected)| worst.near(got, expected, largest));
+}

@@ -1,0 +1,59 @@
+//! Percentiles, by which values are normalised and scenes measured.
+
+use super::case::{Case, Worst};
+use super::made::clouds::Random;
+use crate::model::Column;
+use crate::model::RobustBox;
+use crate::statistics::score::FloatSketch;
+
+/// Against the sorted values: the value at the rank, to the bit.
+pub(super) fn percentiles() -> Case {
+    Case::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
+        let mut worst = Worst::default();
+        for count in [1, 2, 50, 99, 100, 101, 1000, 20_011] {
+            let values = values(count);
+            let sketch = FloatSketch::of(values.iter().copied());
+            for p in [0, 1, 50, 99, 100] {
+                let got = sketch.percentile(p as f64, values.iter().copied());
+                worst.same(&got, &Some(sorted_percentile(&values, p)));
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// As [`percentiles`].
+pub(super) fn robust_box() -> Case {
+    Case::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
+        let mut worst = Worst::default();
+        for count in [1, 100, 1003] {
+            let axes = [7, 8, 9].map(|seed| (0..count).map(|i| values(count)[(i * seed) % count] as f32).collect());
+            let axes: [Vec<f32>; 3] = axes;
+            let found = RobustBox::from_positions(&Column::from_planes(3, axes.concat()));
+            for (axis, values) in axes.iter().enumerate() {
+                let values: Vec<f64> = values.iter().map(|&x| x.into()).collect();
+                for (got, p) in [(found.low, 1), (found.middle, 50), (found.high, 99)] {
+                    worst.same(&got[axis], &sorted_percentile(&values, p));
+                }
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// The value at rank ⌈p·n/100⌉, at least 1.
+fn sorted_percentile(values: &[f64], p: usize) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted[(sorted.len() * p).div_ceil(100).max(1) - 1]
+}
+
+/// Distinct values over twenty powers of ten, both signs, subnormals of f32 among them.
+fn values(count: usize) -> Vec<f64> {
+    let mut random = Random(count as u64);
+    let value = |_| {
+        let sign = if random.draw() < 0.2 { -1.0 } else { 1.0 };
+        sign * f64::from(random.within(0.5, 1.0)) * 10f64.powi(random.within(-42.0, 4.0) as i32)
+    };
+    (0..count).map(value).collect()
+}

@@ -1,0 +1,286 @@
+//! The statistics of a scan.
+
+use std::f64::consts::PI;
+
+use glam::{DMat3, DVec3};
+
+use super::case::{Case, Worst};
+use super::made::clouds::{Random, camera};
+use super::oracle::statistics::{Row, row};
+use crate::error::Result;
+use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
+use crate::recipe::{Motion, Recipe, Scan};
+use crate::statistics::{BlockScan, ScanPlan};
+
+const BOTH: [Motion; 2] = [Motion::Literal, Motion::Runs];
+
+/// Against the definition, with lives of many gaps; sums of 40 terms in f64 lose some 1e-15, and variances a few digits
+/// more.
+pub(super) fn motion() -> Case {
+    Case::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
+        let frames = wanderers(500, 40);
+        let mut worst = Worst::default();
+        for motion in BOTH {
+            let (schedule, recipe) = (unseen(frames.len()), recipe(motion)?);
+            let got = scan(&frames, &schedule, &recipe)?;
+            for i in 0..got.len() {
+                let Row { d, kappa, v, life, .. } = row(i, &frames, &schedule, &recipe);
+                worst.relative(got.d[i], d);
+                worst.relative(got.kappa[i], kappa);
+                worst.relative(got.v[i], v);
+                worst.same(&got.life[i], &life);
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// Against whole numbers of ulps; the differences are exact, and a sum of 2000 squares in f64 loses 1e-14 at most.
+pub(super) fn motion_far_away() -> Case {
+    Case::new("motion far away", "D, κ at 1e6: whole numbers of ulps", 1e-13, || walks(&[(1e6, 0.0625)]))
+}
+
+/// As [`motion_far_away`], where positions are subnormal and where their squares overflow f32.
+pub(super) fn motion_of_any_size() -> Case {
+    Case::new("motion of any size", "D, κ at 1e-42, 1e37: whole numbers", 1e-13, || {
+        walks(&[(0.0, f32::from_bits(1)), (0.0, 2f32.powi(115))])
+    })
+}
+
+/// x = t² at whole t of mean step m has velocities m·(t + t') and turns of 2m²; sums of 40 terms in f64.
+pub(super) fn uneven_frames() -> Case {
+    Case::new("uneven frames", "D, κ of t² at odd stamps: formula", 1e-13, || {
+        let times: Vec<f64> = (0..40).map(|k| f64::from(k + k / 3 + 5 * (k / 7))).collect();
+        let frames: Vec<Gaussians> = times
+            .iter()
+            .map(|&time| {
+                let mut frame = resting(1);
+                frame.position.set_row(0, [0.0, (time * time) as f32, 0.0]);
+                frame
+            })
+            .collect();
+        let got = scan_at(&times, &frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let steps = times.len() - 1;
+        let mean_step = times[steps] / steps as f64;
+        let squares: f64 = times.windows(2).map(|pair| (mean_step * (pair[0] + pair[1])).powi(2)).sum();
+        let mut worst = Worst::default();
+        worst.relative(got.d[0], (squares / steps as f64).sqrt());
+        worst.relative(got.kappa[0], 2.0 * mean_step * mean_step);
+        Ok(worst)
+    })
+}
+
+/// Nothing, one and two life frames have exact answers.
+pub(super) fn short_lives() -> Case {
+    Case::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
+        let mut worst = Worst::default();
+        for motion in BOTH {
+            // Whether it lives in each frame; steps of 3 and turns of 6 that count, for the paper and in runs.
+            for (life, steps, turns) in [
+                (&[0][..], [0, 0], [0, 0]),
+                (&[1], [0, 0], [0, 0]),
+                (&[1, 1], [1, 1], [0, 0]),
+                (&[0, 1, 1], [2, 1], [0, 0]),
+                (&[1, 0, 1], [1, 0], [0, 0]),
+                (&[1, 1, 1], [2, 2], [1, 1]),
+                // The turn about the last life frame is none.
+                (&[1, 1, 1, 0], [2, 2], [1, 1]),
+                (&[1, 1, 0, 0], [1, 1], [0, 0]),
+            ] {
+                let frames: Vec<Gaussians> = (0..life.len()).map(|t| zigzag(t, life[t] == 1)).collect();
+                let got = scan(&frames, &unseen(frames.len()), &recipe(motion)?)?;
+                let alive = life.iter().sum::<u32>();
+                let (k, divisor) = match motion {
+                    Motion::Literal => (0, alive),
+                    Motion::Runs => (1, steps[1]),
+                };
+                worst.same(&got.life[0], &alive);
+                worst.same(&got.d[0], &(f64::from(9 * steps[k]) / f64::from(divisor.max(1))).sqrt());
+                worst.same(&got.kappa[0], &f64::from(6 * turns[k]));
+                worst.same(&got.v[0], &0.0);
+            }
+        }
+        Ok(worst)
+    })
+}
+
+/// Opacities of 0.9 that differ by 1e-6 are off by 1e-16, so V by less than 1e-9 of itself; of unshifted moments nothing
+/// would be left but 2 digits.
+pub(super) fn steady_opacity() -> Case {
+    Case::new("steady opacity", "V of 0.9 ± 1e-6: two passes in f64", 1e-9, || {
+        let mut random = Random(5);
+        let opacity = |x: f32| 1.0 / (1.0 + (-f64::from(x)).exp());
+        let logits: Vec<f32> = (0..1000).map(|_| 2.197_224_6 + random.within(-1e-5, 1e-5)).collect();
+        let frames: Vec<Gaussians> = logits
+            .iter()
+            .map(|&logit| {
+                let mut frame = resting(2);
+                // The second one never changes.
+                frame.opacity_logit.plane_mut(0).copy_from_slice(&[logit, -0.7]);
+                frame
+            })
+            .collect();
+        let got = scan(&frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let count = logits.len() as f64;
+        let mean = logits.iter().map(|&x| opacity(x)).sum::<f64>() / count;
+        let variance = logits.iter().map(|&x| (opacity(x) - mean).powi(2)).sum::<f64>() / count;
+        let mut worst = Worst::default();
+        worst.relative(got.v[0], variance);
+        worst.same(&got.v[1], &0.0);
+        Ok(worst)
+    })
+}
+
+/// Against full matrices in f64, in parts of the area or of 1 px; C is summed in units of some 3e-11 px.
+pub(super) fn projected_area() -> Case {
+    Case::new("projected area", "C, Vis: full matrices, f64 (px)", 1e-9, || {
+        let frames = wanderers(500, 3);
+        let cameras = vec![camera(320, 256), camera(40, 300)];
+        let mut schedule = Schedule::new(cameras);
+        schedule.push(frames.len(), &[(0, 0), (1, 1)]);
+        let recipe = recipe(Motion::Runs)?;
+        let got = scan(&frames, &schedule, &recipe)?;
+        let mut worst = Worst::default();
+        for i in 0..got.len() {
+            let Row { c, vis, .. } = row(i, &frames, &schedule, &recipe);
+            worst.near(got.c[i], c, c.max(1.0));
+            worst.same(&got.vis[i], &vis);
+        }
+        Ok(worst)
+    })
+}
+
+/// Turned about the line of sight, a needle of variances a and b px² has det Σ = (a + 0.3)(b + 0.3); formed from Σ's
+/// entries nothing of it is left. In parts of the area or of 1 px, as in [`projected_area`].
+pub(super) fn needle_on_screen() -> Case {
+    Case::new("needle on screen", "C of 1e4 × 1e-8 px: closed form (px)", 1e-9, || {
+        let (size, focal) = (256, 250.0);
+        let camera = Camera {
+            width: size,
+            height: size,
+            near: Camera::NEAR,
+            fx: focal,
+            fy: focal,
+            // Pixel centres are whole numbers, so the picture's middle is half a pixel off its size's.
+            cx: f64::from(size) / 2.0,
+            cy: f64::from(size) / 2.0,
+            rotation: DMat3::IDENTITY,
+            translation: DVec3::ZERO,
+        };
+        let mut schedule = Schedule::new(vec![camera]);
+        schedule.push(1, &[(0, 0)]);
+        let mut worst = Worst::default();
+        for (turn, length) in [(0.1f32, 1e2f64), (0.4, 1e3), (0.9, 1e4), (1.3, 1e5)] {
+            let mut frame = resting(1);
+            let depth = 2.0f32;
+            frame.position.set_row(0, [0.0, 0.0, depth]);
+            frame.rotation.set_row(0, [1.0, 0.0, 0.0, turn]);
+            let logs = [length, 1e-8, 1e-8].map(|px| (px * f64::from(depth) / focal).ln() as f32);
+            frame.log_scale.set_row(0, logs);
+            let got = scan(&[frame], &schedule, &recipe(Motion::Runs)?)?;
+            let variance = |k: usize| (f64::from(logs[k]).exp() * focal / f64::from(depth)).powi(2);
+            let (a, b) = (variance(0), variance(1));
+            let (sine, cosine) = (2.0 * f64::from(turn).atan()).sin_cos();
+            let sides = [cosine * cosine * a + sine * sine * b, sine * sine * a + cosine * cosine * b];
+            let share = |variance: f64| (f64::from(size) / (6.0 * (variance + 0.3).sqrt())).min(1.0);
+            let area = 9.0 * PI * ((a + 0.3) * (b + 0.3)).sqrt() * share(sides[0]) * share(sides[1]);
+            // Half opaque.
+            worst.near(got.c[0], area / 2.0, (area / 2.0).max(1.0));
+        }
+        Ok(worst)
+    })
+}
+
+/// One Gaussian that walks along x by whole numbers of `unit` from `from`, for every (from, unit).
+fn walks(sizes: &[(f32, f32)]) -> Result<Worst> {
+    let mut worst = Worst::default();
+    for &(from, unit) in sizes {
+        let mut random = Random(9);
+        let mut place = 0i64;
+        let places: Vec<i64> = (0..2000)
+            .map(|_| {
+                // Back when it is far out, so that every place is a number of f32.
+                let step = (1000.0 * random.draw()) as i64;
+                place += if place > 0 { -step } else { step };
+                place
+            })
+            .collect();
+        let frames: Vec<Gaussians> = places
+            .iter()
+            .map(|&place| {
+                let mut frame = resting(1);
+                frame.position.set_row(0, [from + place as f32 * unit, 0.0, 0.0]);
+                frame
+            })
+            .collect();
+        let got = scan(&frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let steps: Vec<i64> = places.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        let squares: i64 = steps.iter().map(|step| step * step).sum();
+        let turns: i64 = steps.windows(2).map(|pair| (pair[1] - pair[0]).abs()).sum();
+        worst.relative(got.d[0], (squares as f64 / steps.len() as f64).sqrt() * f64::from(unit));
+        worst.relative(got.kappa[0], turns as f64 / (steps.len() - 1) as f64 * f64::from(unit));
+    }
+    Ok(worst)
+}
+
+/// One Gaussian whose steps are +3, −3, …
+fn zigzag(t: usize, alive: bool) -> Gaussians {
+    let mut frame = resting(1);
+    frame.position.set_row(0, [3.0 * (t % 2) as f32, 0.0, 0.0]);
+    frame.opacity_logit.set_row(0, [if alive { 0.0 } else { -9.0 }]);
+    frame
+}
+
+/// Gaussians at the origin, half opaque.
+fn resting(count: usize) -> Gaussians {
+    let mut frame = Gaussians::zeros(count, 0);
+    frame.rotation.plane_mut(0).fill(1.0);
+    frame
+}
+
+/// Gaussians that jump about before a camera at the origin, some of them behind it; a third of their frames they are
+/// dead.
+fn wanderers(count: usize, frames: usize) -> Vec<Gaussians> {
+    let mut random = Random(3);
+    let mut frame = |_| {
+        let mut frame = Gaussians::zeros(count, 0);
+        for i in 0..count {
+            let depth = random.within(-0.5, 6.0);
+            frame.position.set_row(i, [random.within(-3.0, 3.0), random.within(-3.0, 3.0), depth]);
+            frame.rotation.set_row(i, std::array::from_fn::<f32, 4, _>(|_| random.within(-1.0, 1.0)));
+            frame.log_scale.set_row(i, std::array::from_fn::<f32, 3, _>(|_| random.within(-5.0, -1.0)));
+            frame.opacity_logit.set_row(i, [random.within(-3.0, 3.0) - if random.draw() < 0.33 { 6.0 } else { 0.0 }]);
+        }
+        frame
+    };
+    (0..frames).map(&mut frame).collect()
+}
+
+fn recipe(motion: Motion) -> Result<Scan> {
+    Ok(Scan { motion, ..Recipe::preset("default")?.scan })
+}
+
+fn unseen(frames: usize) -> Schedule {
+    let mut schedule = Schedule::default();
+    schedule.push(frames, &[]);
+    schedule
+}
+
+/// The rows of evenly spaced frames.
+fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
+    let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
+    scan_at(&times, frames, schedule, recipe)
+}
+
+/// The rows of frames at `times`, told where opacities stay, as sources do.
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
+    let plan = ScanPlan::new(recipe, times, schedule)?;
+    let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
+    for (t, (frame, views)) in frames.iter().zip(schedule.iter()).enumerate() {
+        let cameras: Vec<&Camera> = views.iter().map(|&(_, camera)| &schedule.cameras[camera as usize]).collect();
+        let stays = t > 0 && frame.opacity_logit == frames[t - 1].opacity_logit;
+        let changed = if stays { Columns::all().difference(Columns::OPACITY) } else { Columns::all() };
+        block.frame(t, frame, &cameras, changed);
+    }
+    Ok(block.finish().rows)
+}

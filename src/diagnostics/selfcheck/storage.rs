@@ -1,0 +1,204 @@
+//! What comes back of what was written.
+
+use std::collections::BTreeMap;
+use std::iter::repeat;
+use std::path::Path;
+
+use gseq::Compression;
+
+use super::case::{Case, Worst};
+use super::made::clouds::{Random, scene};
+use crate::archive::{
+    ATTRIBUTES, Content, Encoded, FieldSteps, Role, Steps, TensorSteps, attribute, decode, encode, round_cloud, step,
+};
+use crate::deform::Tensor;
+use crate::error::{Error, Result};
+use crate::files::atomic::ScratchFolder;
+use crate::files::container::Container;
+use crate::limits::ReadLimit;
+use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::outputs::bounds::{Bounds, MaxError};
+use crate::outputs::container::{Packing, write_container};
+use crate::source::{BlockReader, FrameSource, Ids};
+
+/// Every bit, NaN and −0 among them, and of a column whose last frame is its first.
+pub(super) fn container() -> Case {
+    Case::new("container", "values of 70 frames: the same bits", 0.0, || {
+        let mut worst = Worst::default();
+        let made = Frames::new();
+        for compression in [Compression::Raw, Compression::Zstd(1)] {
+            through_container(&made, compression, |got, expected, _| worst.same(&got.to_bits(), &expected.to_bits()))?;
+        }
+        Ok(worst)
+    })
+}
+
+/// In parts of the bound that was asked for.
+pub(super) fn bounded_container() -> Case {
+    Case::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
+        let mut worst = Worst::default();
+        let mut made = Frames::new();
+        for column in made.frames.iter_mut().flat_map(|frame| frame.columns_mut(Columns::all())) {
+            column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
+        }
+        let asked = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
+        let asked: Vec<MaxError> =
+            asked.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
+        let bounds = Bounds::of(&asked, || Ok(1.0))?;
+        through_container(&made, Packing::within(bounds, 3), |got, expected, column| {
+            worst.near(got.into(), expected.into(), bounds.column(column));
+        })?;
+        Ok(worst)
+    })
+}
+
+/// In parts of half a step of the grid, and a rounding to f32.
+pub(super) fn archive_grid() -> Case {
+    Case::new("archive's grid", "values: within ½ step of theirs", 1.0, || {
+        let (content, steps) = model();
+        let Encoded { bytes, order, .. } = encode(&content, &steps)?;
+        let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
+        let expected = content.cloud.pick(&order);
+        let mut worst = Worst::default();
+        let half = |k: i32, value: f32| 0.5 * step(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
+        for (k, &step) in steps.cloud.iter().enumerate().take(used_attributes(&content)) {
+            for (got, expected) in attribute(&back.cloud, k).zip(attribute(&expected, k)) {
+                worst.near(got.into(), expected.into(), half(step, expected));
+            }
+        }
+        let matrix =
+            |content: &Content| content.tensors.get("a.matrix").map_or(Vec::new(), |tensor| tensor.data.clone());
+        let (got, expected) = (matrix(&back), matrix(&content));
+        worst.same(&(back.cloud.len(), got.len()), &(content.cloud.len(), expected.len()));
+        got.iter().zip(expected).for_each(|(&got, x)| worst.near(got.into(), x.into(), half(MATRIX_STEP, x)));
+        Ok(worst)
+    })
+}
+
+/// What is on the grid, and bytes, come back to the bit: predicting and coding lose nothing.
+pub(super) fn archive_codes() -> Case {
+    Case::new("archive's codes", "symbols and bytes: the same", 0.0, || {
+        let (content, steps) = model();
+        let Encoded { bytes, order, .. } = encode(&content, &steps)?;
+        let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
+        let mut expected = content.cloud.pick(&order);
+        let attributes: Vec<usize> = (0..used_attributes(&content)).collect();
+        round_cloud(&mut expected, &steps.cloud, &attributes);
+        let mut worst = Worst::default();
+        worst.same(&back.cloud, &expected);
+        worst.same(&back.files, &content.files);
+        worst.same(&back.tensors.get("a.exact"), &content.tensors.get("a.exact"));
+        let beside: Vec<u8> = order.iter().map(|&id| content.beside[id as usize]).collect();
+        worst.same(&back.beside, &beside);
+        Ok(worst)
+    })
+}
+
+/// The grid of a matrix: 2^(−60/8).
+const MATRIX_STEP: i32 = -60;
+
+/// A model of 2000 Gaussians of degree 2 with two tensors and a file, and grids for it.
+fn model() -> (Content, Steps) {
+    let mut random = Random(12);
+    let mut tensor = |shape: &[usize]| Tensor {
+        shape: shape.to_vec(),
+        data: (0..shape.iter().product()).map(|_| random.within(-1.0, 1.0)).collect(),
+    };
+    let mut content = Content { cloud: scene(13, 2000, 2), times: [0.0, 1.0], ..Content::default() };
+    for (name, shape, role) in [("a.matrix", [20, 30], Role::Weights), ("a.exact", [5, 8], Role::Exact)] {
+        content.tensors.insert(name.to_owned(), tensor(&shape));
+        content.field.insert(name.to_owned(), role);
+    }
+    content.files.insert("cfg_args".to_owned(), b"Namespace()".to_vec());
+    content.beside = (0..content.cloud.len()).map(|i| (i * 7) as u8).collect();
+    let of_matrix = TensorSteps { step: MATRIX_STEP, channels: Vec::new() };
+    let field = FieldSteps([("a.matrix".to_owned(), of_matrix)].into());
+    (content, Steps { cloud: [-64, -50, -40, -30, -45, -35, -25, 0], field })
+}
+
+/// Position to opacity, and the bands that there are.
+fn used_attributes(content: &Content) -> usize {
+    ATTRIBUTES.len() - 3 + content.cloud.sh_degree()
+}
+
+/// Hands every value that comes back of `made`, and what it was, to `compare`.
+fn through_container(
+    made: &Frames,
+    packing: impl Into<Packing>,
+    mut compare: impl FnMut(f32, f32, Columns),
+) -> Result<()> {
+    let folder = ScratchFolder::new(&std::env::temp_dir())?;
+    let path = folder.path().join("made.gseq");
+    write_container(made, &path, packing, BTreeMap::new(), |_| ())?;
+    let container = Container::open(&path)?;
+    let mut reader = container.open(Ids::Range(0..made.info.count))?;
+    let mut state = Gaussians::zeros(0, made.info.sh_degree);
+    for (frame, expected) in made.frames.iter().enumerate() {
+        reader.read(frame, Columns::all(), &mut state)?;
+        for column in Columns::all().iter() {
+            // What is missing is no number.
+            let got = state.column(column).planes().iter().copied().chain(repeat(f32::NAN));
+            let values = got.zip(expected.column(column).planes());
+            values.for_each(|(got, &expected)| compare(got, expected, column));
+        }
+    }
+    Ok(())
+}
+
+/// Frames in memory.
+struct Frames {
+    info: SequenceInfo,
+    frames: Vec<Gaussians>,
+}
+
+impl Frames {
+    /// 1100 Gaussians, more than a block, at 70 frames, more than two: positions wander, opacities jump, rotations are
+    /// at their first value again in the last frame of a block, scales and colours stay.
+    fn new() -> Frames {
+        let (count, times) = (1100, 70);
+        let mut random = Random(14);
+        let mut now = scene(15, count, 1);
+        now.opacity_logit.plane_mut(0)[..4].copy_from_slice(&[f32::NAN, f32::INFINITY, -0.0, 1e-40]);
+        let rotation = now.rotation.clone();
+        let mut frame = |t: usize| {
+            if t > 0 {
+                now.position.planes_mut().iter_mut().for_each(|x| *x += random.within(-0.01, 0.01));
+                now.opacity_logit.plane_mut(0)[4..].iter_mut().for_each(|x| *x = random.within(-6.0, 6.0));
+            }
+            now.rotation.clone_from(&rotation);
+            // Blocks are of 32 frames, or of 64 within bounds.
+            if (1..31).contains(&(t % 32)) && t != times - 1 {
+                now.rotation.planes_mut().iter_mut().for_each(|x| *x += 0.5);
+            }
+            now.clone()
+        };
+        let frames = (0..times).map(&mut frame).collect();
+        let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
+        let times = (0..times).map(|t| t as f64).collect();
+        Frames { info: SequenceInfo { count, times, sh_degree: 1, varying }, frames }
+    }
+}
+
+impl FrameSource for Frames {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        Ok(Box::new(Rows { frames: &self.frames, rows: ids.iter().map(|id| id as u32).collect() }))
+    }
+}
+
+struct Rows<'a> {
+    frames: &'a [Gaussians],
+    rows: Vec<u32>,
+}
+
+impl BlockReader for Rows<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        for column in want.iter() {
+            *out.column_mut(column) = self.frames[frame].column(column).pick(&self.rows);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,54 @@
+//! Work that is shared out.
+
+use std::fs;
+
+use super::case::{Case, Worst};
+use super::made::clouds::{camera, scene};
+use crate::budget::Budget;
+use crate::diagnostics::demo;
+use crate::diagnostics::demo::DemoOptions;
+use crate::error::{Error, Result};
+use crate::files::atomic::{Replace, ScratchFolder};
+use crate::model::{Columns, Gradients};
+use crate::pipeline::Target;
+use crate::recipe::Recipe;
+use crate::render::{Image, Renderer};
+
+/// Byte by byte: which thread does what must not show.
+pub(super) fn same_bytes() -> Case {
+    Case::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
+        let (one, two) = (made_on(1)?, made_on(2)?);
+        let mut worst = Worst::default();
+        worst.same(&two, &one);
+        Ok(worst)
+    })
+}
+
+/// The compressed demo scene, and a picture's gradients, as `threads` threads make them.
+fn made_on(threads: usize) -> Result<(Vec<u8>, Gradients)> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+    let pool = pool.map_err(|error| Error::usage(format!("{threads} threads: {error}")))?;
+    pool.install(|| {
+        let folder = ScratchFolder::new(&std::env::temp_dir())?;
+        let output = folder.path().join("demo");
+        let mut recipe = Recipe::preset("default")?;
+        // Enough to go through all of it.
+        recipe.refine.refine_steps = 10;
+        demo::run(&DemoOptions {
+            gaussians: 400,
+            frames: 6,
+            kept: Target::Ratio(0.5),
+            recipe,
+            output: Some(output.clone()),
+            overwrite: Replace::Never,
+            memory: Budget::default(),
+        })?;
+        let path = output.join("compressed.gseq");
+        let bytes = fs::read(&path).map_err(Error::io("read", &path))?;
+        let scene = scene(31, 3000, 1);
+        let mut gradients = Gradients::new(scene.len(), Columns::all(), 1);
+        let loss = |picture: &Image| (0.0, picture.clone());
+        Renderer::on_all_threads().gradient(&scene, &camera(80, 60), [0.5; 3], loss, &mut gradients);
+        Ok((bytes, gradients))
+    })
+}

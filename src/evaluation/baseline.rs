@@ -1,0 +1,99 @@
+//! The field's static baselines: pruning by one property of the model at rest, blind to time and to what
+//! is seen (the paper's "opacity/scale thresholds"), and pruning at random.
+
+use std::path::Path;
+
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::model::hash_id;
+use crate::model::{Columns, Gaussians};
+use crate::outputs::kind::OutputKind;
+use crate::passes::gather;
+use crate::pipeline::Target;
+use crate::pipeline::stages::emit::write_alone;
+use crate::recipe::Recipe;
+use crate::reduction::Reduction;
+use crate::scene::{InputOptions, open_scene};
+
+/// What a baseline ranks by, largest first, ties by hashed id.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Baseline {
+    /// Opacity.
+    Opacity,
+    /// Largest scale.
+    Scale,
+    /// Hashed id alone.
+    Random,
+}
+
+/// Writes the `target` best of an input by `baseline`; gives its bytes. The state
+/// ranked is the canonical one of a model with a deformation field, else that of the first frame.
+///
+/// # Errors
+/// As of `compress`.
+pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Target>, output: &Path) -> Result<u64> {
+    let scene = open_scene(options)?;
+    let source = scene.source();
+    let count = source.info().count;
+    let wanted = target.map_or(Ok(count), |target| target.count(count))?;
+    let ids: Vec<u32> = (0..count as u32).collect();
+    let state = match scene.input.canonical() {
+        Some(canonical) => canonical.clone(),
+        None if count == 0 => Gaussians::default(),
+        None => gather(source, &ids, 0, Columns::OPACITY | Columns::LOG_SCALE)?,
+    };
+    let kept = best(baseline, &state, ids, wanted);
+    let kind = OutputKind::of(output, None, scene.input.own_output());
+    scene.input.check_output(kind, output)?;
+    let reduction = Reduction::pruned(kept, &Recipe::preset("default")?.merge);
+    write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE)
+}
+
+/// The `wanted` best of `ids`, increasing.
+fn best(baseline: Baseline, state: &Gaussians, mut ids: Vec<u32>, wanted: usize) -> Vec<u32> {
+    let value = |id: u32| -> f32 {
+        let row = id as usize;
+        let value = match baseline {
+            // As the opacity itself: it grows with its logit.
+            Baseline::Opacity => state.opacity_logit.plane(0)[row],
+            Baseline::Scale => state.log_scale.row::<3>(row).into_iter().fold(f32::NEG_INFINITY, f32::max),
+            Baseline::Random => 0.0,
+        };
+        if value.is_nan() { f32::NEG_INFINITY } else { value }
+    };
+    ids.sort_unstable_by(|&a, &b| {
+        value(b).total_cmp(&value(a)).then_with(|| hash_id(a.into()).cmp(&hash_id(b.into())))
+    });
+    ids.truncate(wanted);
+    ids.sort_unstable();
+    ids
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state() -> Gaussians {
+        let mut state = Gaussians::zeros(4, 0);
+        state.opacity_logit.plane_mut(0).copy_from_slice(&[1.0, f32::NAN, 3.0, 2.0]);
+        for (row, scales) in
+            [[0.0, 0.0, 9.0], [5.0, 5.0, 5.0], [1.0, 1.0, 1.0], [0.0, 6.0, 0.0]].into_iter().enumerate()
+        {
+            state.log_scale.set_row::<3>(row, scales);
+        }
+        state
+    }
+
+    #[test]
+    fn each_baseline_keeps_the_largest_of_its_own_property_in_the_order_of_ids() {
+        let kept = |baseline, wanted| best(baseline, &state(), (0..4).collect(), wanted);
+        assert_eq!(kept(Baseline::Opacity, 2), [2, 3]);
+        assert_eq!(kept(Baseline::Opacity, 3), [0, 2, 3]);
+        assert_eq!(kept(Baseline::Scale, 2), [0, 3]);
+        let mut by_hash: Vec<u32> = (0..4).collect();
+        by_hash.sort_unstable_by_key(|&id| hash_id(id.into()));
+        by_hash.truncate(2);
+        by_hash.sort_unstable();
+        assert_eq!(kept(Baseline::Random, 2), by_hash);
+    }
+}

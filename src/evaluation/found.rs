@@ -1,0 +1,360 @@
+//! What an evaluation found, for people and for programs: scores of every picture and their means.
+//!
+//! Data in: scores per picture, by frame, then view. Data out: means overall, per view and per frame, as
+//! JSON, as text, and the pictures themselves as CSV. Means are arithmetic, in the order of the pictures.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::ShowPath;
+use crate::files::csv::{known, table};
+use crate::files::names::name_of;
+use crate::models::Size;
+use crate::models::size::of;
+use crate::pipeline::summary::CameraSummary;
+
+/// One value for the model before compression and one for the model after it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Both<T> {
+    /// Before.
+    pub original: T,
+    /// After.
+    pub compressed: T,
+}
+
+/// How close two pictures are.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Score {
+    /// [`crate::metrics::psnr`], dB.
+    pub psnr: f64,
+    /// [`crate::metrics::ssim`].
+    pub ssim: f64,
+    /// [`crate::metrics::temporal_error`] from the view's picture before; none of its first.
+    pub temporal: Option<f64>,
+    /// [`crate::metrics::flip`], where it is asked for.
+    pub flip: Option<f64>,
+}
+
+/// The scores of one (frame, view).
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PictureScores {
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// Its time stamp.
+    pub time: f64,
+    /// View number.
+    pub view: u32,
+    /// Compressed against original.
+    pub loss: Score,
+    /// Each against the ground truth, where that is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub truth: Option<Both<Score>>,
+}
+
+/// Means over pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Means {
+    /// Number of pictures.
+    pub pairs: usize,
+    /// Mean PSNR, dB.
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+    /// Mean temporal error of those pictures that have one; none if no view is seen twice.
+    pub temporal: Option<f64>,
+    /// Mean FLIP, where it is asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flip: Option<f64>,
+}
+
+/// Means over the pictures of one view.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ViewMeans {
+    /// View number.
+    pub view: u32,
+    /// Its means.
+    #[serde(flatten)]
+    pub means: Means,
+}
+
+/// Means over the pictures of one frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct FrameMeans {
+    /// Frame of the sequence.
+    pub frame: usize,
+    /// Its time stamp.
+    pub time: f64,
+    /// Its means; the temporal error is that since the frame evaluated before.
+    #[serde(flatten)]
+    pub means: Means,
+}
+
+/// Pictures of one origin against pictures of another.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Comparison {
+    /// Over all pictures.
+    #[serde(flatten)]
+    pub overall: Means,
+    /// View by view, by number.
+    pub per_view: Vec<ViewMeans>,
+    /// Frame by frame.
+    pub per_frame: Vec<FrameMeans>,
+}
+
+/// Both models against the ground truth.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TruthComparison {
+    /// Folder of the pictures.
+    pub folder: String,
+    /// Pictures compared with each other; those that have a photograph are `pairs`.
+    pub of: usize,
+    /// The compressed model.
+    #[serde(flatten)]
+    pub compressed: Comparison,
+    /// The original, for what was lost to be seen.
+    pub original: Comparison,
+}
+
+/// Everything an evaluation found.
+#[derive(Debug, Clone, Serialize)]
+pub struct Evaluation {
+    /// Program and version.
+    pub tool: String,
+    /// Paths as given.
+    pub path: Both<String>,
+    /// Gaussians.
+    pub count: Both<usize>,
+    /// Bytes of everything that a renderer opens of a model.
+    pub bytes: Both<u64>,
+    /// The same by part.
+    pub size: Both<Size>,
+    /// From where they were looked at.
+    pub cameras: CameraSummary,
+    /// Red, green, blue behind the scene.
+    pub background: [f32; 3],
+    /// Compressed against original.
+    #[serde(flatten)]
+    pub loss: Comparison,
+    /// Both against the ground truth, where that is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ground_truth: Option<TruthComparison>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+    /// The same of the work folder, which are no part of the result.
+    #[serde(skip)]
+    pub work_notes: Vec<String>,
+    /// Every picture; for the CSV.
+    #[serde(skip)]
+    pub pictures: Vec<PictureScores>,
+}
+
+impl Means {
+    /// Of nothing: no pairs, and NaN, which JSON shows as null.
+    fn of(scores: &[Score]) -> Means {
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        let all = |value: fn(&Score) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
+        let given = |value: fn(&Score) -> Option<f64>| {
+            let values: Vec<f64> = scores.iter().filter_map(value).collect();
+            (!values.is_empty()).then(|| mean(&values))
+        };
+        Means {
+            pairs: scores.len(),
+            psnr: all(|score| score.psnr),
+            ssim: all(|score| score.ssim),
+            temporal: given(|score| score.temporal),
+            flip: given(|score| score.flip),
+        }
+    }
+}
+
+impl Comparison {
+    /// Averages what `score` picks of each picture; of those that have it; none if all lack it.
+    pub fn of(pictures: &[PictureScores], score: impl Fn(&PictureScores) -> Option<Score>) -> Option<Comparison> {
+        let (pictures, scores): (Vec<&PictureScores>, Vec<Score>) =
+            pictures.iter().filter_map(|picture| Some((picture, score(picture)?))).unzip();
+        if scores.is_empty() {
+            return None;
+        }
+        let mut views: BTreeMap<u32, Vec<Score>> = BTreeMap::new();
+        for (picture, &score) in pictures.iter().zip(&scores) {
+            views.entry(picture.view).or_default().push(score);
+        }
+        let mut per_frame = Vec::new();
+        let mut rest = &scores[..];
+        for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
+            let (these, after) = rest.split_at(frame.len());
+            per_frame.push(FrameMeans { frame: frame[0].frame, time: frame[0].time, means: Means::of(these) });
+            rest = after;
+        }
+        Some(Comparison {
+            overall: Means::of(&scores),
+            per_view: views.iter().map(|(&view, scores)| ViewMeans { view, means: Means::of(scores) }).collect(),
+            per_frame,
+        })
+    }
+}
+
+impl Evaluation {
+    /// Returns the evaluation with the last names of all paths alone, for a file.
+    pub fn without_folders(mut self) -> Evaluation {
+        let truth = self.ground_truth.as_mut().map(|truth| &mut truth.folder);
+        for path in [&mut self.path.original, &mut self.path.compressed].into_iter().chain(truth) {
+            *path = name_of(Path::new(path));
+        }
+        self
+    }
+
+    /// A few lines for a person.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        let Both { original, compressed } = self.count;
+        let percent = 100.0 * compressed as f64 / original.max(1) as f64;
+        // Writing to a String cannot fail.
+        let (before, after) = (self.size.original, self.size.compressed);
+        let _ = writeln!(
+            out,
+            "{}: {original} Gaussians; {} bytes: {}",
+            Path::new(&self.path.original).shown(),
+            before.whole(),
+            before.parts()
+        );
+        let _ = writeln!(
+            out,
+            "{}: {compressed} Gaussians ({percent:.1}%); bytes: {}: {}",
+            Path::new(&self.path.compressed).shown(),
+            of(after.whole(), before.whole()),
+            after.parts_of(&before)
+        );
+        let frames = self.loss.per_frame.len();
+        let _ = writeln!(out, "{} pictures of {frames} frames: {}", self.cameras.pairs, self.cameras.origin);
+        let with_flip = self.loss.overall.flip.is_some();
+        let flip = if with_flip { "     FLIP" } else { "" };
+        let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");
+        let mut line = |what: &str, means: &Means| {
+            let temporal = means.temporal.map_or("-".to_owned(), |error| format!("{error:.6}"));
+            let flip = means.flip.map_or(String::new(), |error| format!(" {error:>8.5}"));
+            let _ = writeln!(out, "  {what:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
+        };
+        line("compressed against original", &self.loss.overall);
+        if let Some(truth) = &self.ground_truth {
+            line("compressed against ground truth", &truth.compressed.overall);
+            line("original against ground truth", &truth.original.overall);
+        }
+        let worst_view = self.loss.per_view.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr));
+        let worst_frame = self.loss.per_frame.iter().min_by(|a, b| a.means.psnr.total_cmp(&b.means.psnr));
+        if let (Some(view), Some(frame)) = (worst_view, worst_frame) {
+            line(&format!("worst view: {}", view.view), &view.means);
+            line(&format!("worst frame: {}", frame.frame), &frame.means);
+        }
+        if let Some(truth) = &self.ground_truth {
+            let pairs = truth.compressed.overall.pairs;
+            if pairs < truth.of {
+                let _ = writeln!(
+                    out,
+                    "  ground truth: {pairs} of {} pictures have a photograph in {}",
+                    truth.of, truth.folder
+                );
+            }
+        }
+        for note in &self.notes {
+            let _ = writeln!(out, "  note: {note}");
+        }
+        out
+    }
+
+    /// One line per picture under a line of names; a value that does not exist is empty.
+    pub fn csv(&self) -> String {
+        let with_flip = self.loss.overall.flip.is_some();
+        let compared = if self.ground_truth.is_some() { &["", "_gt", "_gt_original"][..] } else { &[""] };
+        let mut names = ["frame", "view", "time"].map(str::to_owned).to_vec();
+        for with in compared {
+            names.extend(["psnr", "ssim", "temporal"].map(|score| format!("{score}{with}")));
+            names.extend(with_flip.then(|| format!("flip{with}")));
+        }
+        let row = |picture: &PictureScores| {
+            let mut row = vec![picture.frame.to_string(), picture.view.to_string(), picture.time.to_string()];
+            let truth = picture.truth.map(|truth| [truth.compressed, truth.original]);
+            for score in std::iter::once(picture.loss).chain(truth.into_iter().flatten()) {
+                row.extend([score.psnr.to_string(), score.ssim.to_string(), known(score.temporal)]);
+                row.extend(with_flip.then(|| known(score.flip)));
+            }
+            row.resize(names.len(), String::new());
+            row
+        };
+        table(&names, self.pictures.iter().map(row))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> PictureScores {
+        let loss = Score { psnr, ssim: psnr / 100.0, temporal, flip: None };
+        PictureScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
+    }
+
+    #[test]
+    fn means_weigh_every_picture_alike_and_skip_a_missing_temporal_error() {
+        let pictures = [
+            picture(0, 1, 30.0, None),
+            picture(0, 2, 40.0, None),
+            picture(2, 1, 50.0, Some(0.25)),
+            picture(2, 7, 20.0, None),
+            picture(3, 1, 10.0, Some(0.75)),
+        ];
+        let found = Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap();
+        assert_eq!(found.overall, Means { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
+        let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
+        assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
+        let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
+        assert_eq!(frames, [(0, 35.0, None), (2, 35.0, Some(0.25)), (3, 10.0, Some(0.75))]);
+        assert!(Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
+    }
+
+    fn evaluation(pictures: Vec<PictureScores>) -> Evaluation {
+        let truth = Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
+        Evaluation {
+            tool: String::new(),
+            path: Both { original: String::new(), compressed: String::new() },
+            count: Both { original: 0, compressed: 0 },
+            bytes: Both { original: 0, compressed: 0 },
+            size: Both { original: Size::default(), compressed: Size::default() },
+            cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
+            background: [0.0; 3],
+            loss: Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap(),
+            ground_truth: truth.map(|of| TruthComparison {
+                folder: String::new(),
+                of: 2,
+                compressed: of.clone(),
+                original: of,
+            }),
+            notes: Vec::new(),
+            work_notes: Vec::new(),
+            pictures,
+        }
+    }
+
+    #[test]
+    fn csv_is_these_bytes() {
+        let mut pictures = vec![picture(0, 1, 30.0, None), picture(3, 2, 3e-5, Some(0.25))];
+        assert_eq!(
+            evaluation(pictures.clone()).csv(),
+            "frame,view,time,psnr,ssim,temporal\n0,1,0,30,0.3,\n3,2,0.75,0.00003,0.0000003,0.25\n"
+        );
+        for picture in &mut pictures {
+            picture.loss.flip = Some(0.5);
+            picture.truth = Some(Both { original: Score { flip: None, ..picture.loss }, compressed: picture.loss });
+        }
+        assert_eq!(
+            evaluation(pictures).csv(),
+            "frame,view,time,psnr,ssim,temporal,flip,psnr_gt,ssim_gt,temporal_gt,flip_gt,\
+             psnr_gt_original,ssim_gt_original,temporal_gt_original,flip_gt_original\n\
+             0,1,0,30,0.3,,0.5,30,0.3,,0.5,30,0.3,,\n\
+             3,2,0.75,0.00003,0.0000003,0.25,0.5,0.00003,0.0000003,0.25,0.5,0.00003,0.0000003,0.25,\n"
+        );
+    }
+}

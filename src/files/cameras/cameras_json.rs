@@ -1,0 +1,122 @@
+//! The two files called `cameras.json`.
+//!
+//! *This project's*, one entry per picture:
+//!
+//! ```json
+//! { "background": [1, 1, 1],
+//!   "frames": [ { "v": 0, "time": 0.0, "split": "train", "image": "train/t000_v00.png",
+//!                 "width": 288, "height": 288, "fx": 347.6, "fy": 347.6, "cx": 144, "cy": 144,
+//!                 "w2c": [[1,0,0,0],[0,1,0,0],[0,0,1,3],[0,0,0,1]] } ] }
+//! ```
+//!
+//! `w2c` is world to camera, row-major, OpenCV axes; focal lengths and the principal point are in
+//! pixels, the middle of the picture at `width / 2`. Optional: `background` (linear RGB in [0, 1]),
+//! `v` (view number, else by distinct camera), `time` (else every frame), `split` (`train`, `val` or `test`,
+//! else train), `image` (relative to the file). Other keys are ignored.
+//!
+//! *3DGS's*, one entry per camera, written beside a trained model: `width`, `height`, `fx`, `fy`,
+//! `position` (of the camera), `rotation` (camera to world, row-major, OpenCV axes), `img_name`. It
+//! has no times, so each camera sees every frame unless `--times` says otherwise; it does not tell test from train, so all are train.
+
+use std::path::Path;
+
+use super::CameraOptions;
+use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
+use super::fields::{Fields, place};
+use super::pictures::each_picture;
+use super::times::{self, Times};
+use crate::error::Result;
+use crate::files::json::small::Small;
+use crate::files::names::shown_name;
+use crate::limits::ReadLimit;
+use crate::model::{Camera, Rig, Split};
+
+/// Keys of a picture.
+const PICTURE: [&str; 11] = ["w2c", "split", "width", "height", "fx", "fy", "cx", "cy", "time", "image", "v"];
+/// Keys of a camera.
+const CAMERA: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation", "position"];
+
+/// Reads this project's own file, of which `outline` is what lies around the pictures.
+pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
+    let shared = Fields::of(file, None, outline)?;
+    let background = shared.optional_vector("background")?;
+    if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
+        return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
+    }
+    let mut assembly = Assembly::new(memory);
+    assembly.begin(file, shared.list("frames")?)?;
+    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
+        assembly.add(per_picture(file, Fields::of(file, Some(index), frame)?)?)
+    })?;
+    let background = background.map(|rgb| rgb.map(|c| c as f32));
+    assembly.finish(background, shown_name(file))
+}
+
+fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
+    let (rotation, translation) = own.pose("w2c")?;
+    let split = match own.optional_text("split")? {
+        None | Some("train") => Split::Train,
+        Some("test") => Split::Test,
+        Some("val") => Split::Val,
+        Some(_) => return Err(own.wrong("split", "\"train\", \"val\" or \"test\"")),
+    };
+    let camera = Camera {
+        width: own.side("width")?,
+        height: own.side("height")?,
+        fx: own.number("fx")?,
+        fy: own.number("fy")?,
+        cx: own.number("cx")?,
+        cy: own.number("cy")?,
+        rotation,
+        translation,
+        near: Camera::NEAR,
+    };
+    Ok(Picture {
+        camera,
+        time: own.optional_number("time")?,
+        split,
+        image: own.optional_text("image")?.map(|name| file.with_file_name(name)),
+        view: own.optional_index("v")?,
+    })
+}
+
+/// Reads the file of a 3DGS model folder, a list of `count` cameras.
+pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions) -> Result<Rig> {
+    let mut assembly = Assembly::new(options.memory);
+    assembly.begin(file, count)?;
+    let mut origin = shown_name(file);
+    let mut times = Vec::new();
+    if options.times != Times::Own {
+        let mut names: Vec<Box<str>> = Vec::new();
+        each_picture(file, None, &["img_name"], |index, camera| {
+            let name = match camera.get("img_name") {
+                Some(Small::Text(name)) => name.clone(),
+                _ => "".into(),
+            };
+            assembly.gauge().take(file, &place(Some(index)), "the names of pictures", name.len() as u64 + 96)?;
+            names.push(name);
+            Ok(())
+        })?;
+        let (given, said) = times::give(file, &names, &options.times, assembly.gauge())?;
+        origin += &format!(" ({said})");
+        times = given;
+    }
+    each_picture(file, None, &CAMERA, |index, camera| {
+        let time = times.get(index).copied().flatten();
+        assembly.add(Picture { time, ..per_camera(file, Fields::of(file, Some(index), camera)?)? })
+    })?;
+    assembly.finish(None, origin)
+}
+
+fn per_camera(file: &Path, own: Fields<'_>) -> Result<Picture> {
+    let size @ (width, height) = (own.side("width")?, own.side("height")?);
+    let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];
+    let name = own.optional_text("img_name")?;
+    Ok(Picture {
+        camera: from_camera_to_world(size, intrinsics, own.matrix3("rotation")?, own.vector("position")?.into()),
+        time: None,
+        split: Split::Train,
+        image: name.map(|name| file.with_file_name(name)),
+        view: name.and_then(view_in_name),
+    })
+}

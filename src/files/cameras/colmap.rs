@@ -1,0 +1,365 @@
+//! A COLMAP reconstruction: `cameras` and `images`, as `.bin` or `.txt` (<https://colmap.github.io/format.html>); points
+//! are not needed.
+//!
+//! An image has a unit quaternion wxyz and a translation, world to camera in OpenCV axes, the number of its camera, and
+//! its name below `images/` beside `sparse/`. The middle of the first pixel is at 0.5, as here. Cameras must be without
+//! distortion: SIMPLE_PINHOLE, PINHOLE, or another whose coefficients are all 0. `--size` scales focal lengths and principal
+//! point. Pictures in folders called `test` or `val` are held out, all others are for training. Times are at
+//! [`super::times`], those of a folder for each frame at [`super::frames`].
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DQuat, DVec3};
+use hashbrown::HashMap;
+
+use super::assemble::{Assembly, Gauge, Picture};
+use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
+use crate::error::{Error, Result, ShowPath, quoted};
+use crate::files::names::shown_name;
+use crate::files::open::open_file;
+use crate::files::text::Lines;
+use crate::model::{Camera, Rig, Split};
+
+/// Longest name of a picture.
+const MAX_NAME: u64 = 4096;
+/// Bytes of a point that an image sees: two coordinates and a number.
+const POINT: u64 = 24;
+/// Bytes of a camera in its table, and of a picture in its list beside its name, while they grow by being copied to twice
+/// their size.
+const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
+const IMAGE_BYTES: u64 = 3 * size_of::<Image>() as u64 + 160;
+/// Furthest that the length of a quaternion may be from 1.
+const UNIT_TOLERANCE: f64 = 1e-3;
+
+/// Models by number: name, parameters, of which those that are distortion begin at.
+const MODELS: [(&str, usize, usize); 12] = [
+    ("SIMPLE_PINHOLE", 3, 3),
+    ("PINHOLE", 4, 4),
+    ("SIMPLE_RADIAL", 4, 3),
+    ("RADIAL", 5, 3),
+    ("OPENCV", 8, 4),
+    ("OPENCV_FISHEYE", 8, 0),
+    ("FULL_OPENCV", 12, 4),
+    ("FOV", 5, 0),
+    ("SIMPLE_RADIAL_FISHEYE", 4, 0),
+    ("RADIAL_FISHEYE", 5, 0),
+    ("THIN_PRISM_FISHEYE", 12, 0),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16, 0),
+];
+
+/// fx, fy, cx, cy in pixels of a picture (width, height).
+#[derive(Debug, Clone, Copy)]
+struct Lens {
+    size: (u32, u32),
+    intrinsics: [f64; 4],
+}
+
+struct Image {
+    quaternion: [f64; 4],
+    translation: [f64; 3],
+    camera: u32,
+    name: Box<str>,
+}
+
+/// Reads the reconstruction that `found` is, or is a file of.
+///
+/// # Errors
+/// Files that are missing, cut short or malformed; a distorted camera; those of the times.
+pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
+    let folder = folder_of(found)?;
+    let binary = folder.join("cameras.bin").is_file();
+    let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
+    let (cameras, images) = (file("cameras"), file("images"));
+    let mut assembly = Assembly::new(options.memory);
+    let gauge = assembly.gauge();
+    let lenses = if binary { read_cameras(&cameras, gauge)? } else { parse_cameras(&cameras, gauge)? };
+    let mut listed = if binary { read_images(&images, gauge)? } else { parse_images(&images, gauge)? };
+    // A reconstruction lists its pictures in the order in which it found them.
+    listed.sort_by(|a, b| natord::compare(&a.name, &b.name).then_with(|| a.name.cmp(&b.name)));
+    let pictures_in = pictures_folder(&folder);
+    let picture = |image: &Image| -> Result<Picture> {
+        let wrong = |expected: String, found: String| {
+            Error::input(&images, format!("picture {}", quoted(&image.name)), expected, found)
+        };
+        let lens = lenses
+            .get(&image.camera)
+            .ok_or_else(|| wrong(format!("a camera of {}", cameras.shown()), format!("camera {}", image.camera)))?;
+        let [w, x, y, z] = image.quaternion;
+        let quaternion = DQuat::from_xyzw(x, y, z, w);
+        if (quaternion.length() - 1.0).abs().partial_cmp(&UNIT_TOLERANCE).is_none_or(|order| order.is_gt()) {
+            return Err(wrong("a quaternion of length 1".into(), format!("{w} {x} {y} {z}")));
+        }
+        let (size, [fx, fy, cx, cy]) = scaled(*lens, options.size);
+        Ok(Picture {
+            camera: Camera {
+                width: size.0,
+                height: size.1,
+                fx,
+                fy,
+                cx,
+                cy,
+                rotation: DMat3::from_quat(quaternion.normalize()),
+                translation: DVec3::from(image.translation),
+                near: Camera::NEAR,
+            },
+            time: None,
+            split: split_of(&image.name),
+            image: Some(pictures_in.join(&*image.name)),
+            view: None,
+        })
+    };
+    if let (Some(first), Times::Own) = (frames::of(&folder), &options.times) {
+        let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
+        if listed.len().saturating_mul(frames) > MAX_PICTURES {
+            return Err(Error::usage(format!(
+                "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+                folder.shown(),
+                listed.len()
+            )));
+        }
+        let origin = format!("{} (each of {frames} frames)", shown_name(&folder));
+        let pictures = listed.iter().map(picture).collect::<Result<Vec<_>>>()?;
+        assembly.begin(&images, listed.len() * frames)?;
+        frames::repeated(&pictures, &first, frames).try_for_each(|picture| assembly.add(picture))?;
+        return assembly.finish(None, origin);
+    }
+    let names: Vec<Box<str>> = listed.iter().map(|image| image.name.clone()).collect();
+    let (given, said) = times::give(&images, &names, &options.times, assembly.gauge())?;
+    assembly.begin(&images, listed.len())?;
+    for (index, image) in listed.iter().enumerate() {
+        assembly.add(Picture { time: given.get(index).copied().flatten(), ..picture(image)? })?;
+    }
+    let origin = shown_name(&folder);
+    let origin = if said.is_empty() { origin } else { format!("{origin} ({said})") };
+    assembly.finish(None, origin)
+}
+
+/// The folder that holds the files.
+fn folder_of(found: &Path) -> Result<PathBuf> {
+    let holds = |folder: &Path| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file());
+    let folder = if found.is_dir() { found } else { found.parent().unwrap_or(Path::new("")) };
+    [folder.to_owned(), folder.join("0")].into_iter().find(|folder| holds(folder)).ok_or_else(|| {
+        Error::input(folder, "", "a COLMAP reconstruction: cameras.bin and images.bin, or both as .txt", "neither")
+    })
+}
+
+/// Where the pictures are: `images` beside `sparse`, else the folder that holds it.
+fn pictures_folder(folder: &Path) -> PathBuf {
+    let below = if folder.ends_with("sparse/0") { 2 } else { usize::from(folder.ends_with("sparse")) };
+    let root = folder.ancestors().nth(below).unwrap_or(folder);
+    Some(root.join("images")).filter(|images| images.is_dir()).unwrap_or_else(|| root.to_owned())
+}
+
+fn split_of(name: &str) -> Split {
+    match name
+        .split(['/', '\\'])
+        .rev()
+        .skip(1)
+        .find_map(|part| Some(part).filter(|part| matches!(*part, "test" | "val")))
+    {
+        Some("test") => Split::Test,
+        Some(_) => Split::Val,
+        None => Split::Train,
+    }
+}
+
+fn scaled(Lens { size, intrinsics: [fx, fy, cx, cy] }: Lens, asked: Option<(u32, u32)>) -> ((u32, u32), [f64; 4]) {
+    let Some(asked) = asked else { return (size, [fx, fy, cx, cy]) };
+    let (x, y) = (f64::from(asked.0) / f64::from(size.0), f64::from(asked.1) / f64::from(size.1));
+    (asked, [fx * x, fy * y, cx * x, cy * y])
+}
+
+/// A camera of the model called `name`, checked to be without distortion.
+fn lens(
+    wrong: impl Fn(String, String) -> Error,
+    name: &str,
+    (width, height): (u64, u64),
+    values: &[f64],
+) -> Result<Lens> {
+    let names = || MODELS.map(|model| model.0).join(", ");
+    let &(_, count, distortion) = MODELS
+        .iter()
+        .find(|model| model.0 == name)
+        .ok_or_else(|| wrong(format!("a camera model of {}", names()), quoted(name)))?;
+    if values.len() != count {
+        return Err(wrong(format!("{count} parameters of {name}"), values.len().to_string()));
+    }
+    if distortion == 0 || values[distortion..].iter().any(|&value| value != 0.0) {
+        return Err(wrong("a camera without distortion (SIMPLE_PINHOLE or PINHOLE)".into(), name.to_owned()).hint(
+            "undistort the pictures: colmap image_undistorter writes them with a reconstruction that is read here",
+        ));
+    }
+    let side = |side: u64| u32::try_from(side).ok().filter(|side| (1..=MAX_SIDE_PX).contains(side));
+    let (Some(w), Some(h)) = (side(width), side(height)) else {
+        return Err(wrong(format!("a picture of 1 to {MAX_SIDE_PX} pixels a side"), format!("{width} × {height}")));
+    };
+    let intrinsics = match *values {
+        [f, cx, cy] | [f, cx, cy, _] | [f, cx, cy, _, _] if distortion == 3 => [f, f, cx, cy],
+        [fx, fy, cx, cy, ..] => [fx, fy, cx, cy],
+        _ => return Err(wrong("focal length and principal point".into(), "fewer parameters".into())),
+    };
+    Ok(Lens { size: (w, h), intrinsics })
+}
+
+fn parse_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
+    let mut lenses = HashMap::new();
+    let mut lines = Lines::open(path)?;
+    while let Some((number, line)) = lines.next_line()? {
+        let (at, line) = (number - 1, line.trim());
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let wrong = |expected: String, found: String| Error::input(path, format!("line {}", at + 1), expected, found);
+        let expected = || wrong("CAMERA_ID MODEL WIDTH HEIGHT PARAMS".into(), quoted(line));
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let [id, model, width, height, values @ ..] = &words[..] else { return Err(expected()) };
+        let (Ok(id), Ok(width), Ok(height)) = (id.parse(), width.parse(), height.parse()) else {
+            return Err(expected());
+        };
+        let values: Vec<f64> =
+            values.iter().map(|value| value.parse()).collect::<std::result::Result<_, _>>().map_err(|_| expected())?;
+        gauge.take(path, &format!("line {number}"), "the cameras", LENS_BYTES)?;
+        lenses.insert(id, lens(wrong, model, (width, height), &values)?);
+    }
+    Ok(lenses)
+}
+
+fn parse_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
+    let mut images = Vec::new();
+    let mut lines = Lines::open(path)?;
+    while let Some((number, line)) = lines.next_line()? {
+        let (at, line) = (number - 1, line.trim());
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let wrong = || {
+            let expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME";
+            Error::input(path, format!("line {}", at + 1), expected, quoted(line))
+        };
+        let mut rest = line;
+        let mut word = || -> Option<&str> {
+            let (word, after) = rest.split_once(char::is_whitespace)?;
+            rest = after.trim_start();
+            Some(word)
+        };
+        let mut values = [0.0; 7];
+        word().and_then(|id| id.parse::<u32>().ok()).ok_or_else(wrong)?;
+        for value in &mut values {
+            *value = word().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
+        }
+        let camera = word().and_then(|word| word.parse().ok()).ok_or_else(wrong)?;
+        let [w, x, y, z, tx, ty, tz] = values;
+        gauge.take(path, &format!("line {number}"), "the pictures", IMAGE_BYTES + 2 * rest.len() as u64)?;
+        let name = rest.into();
+        images.push(Image { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
+        // The points that it sees, on a line that may be empty.
+        lines.skip_line()?;
+    }
+    Ok(images)
+}
+
+/// Little-endian numbers of a file, one after the other.
+struct Binary<'a> {
+    path: &'a Path,
+    file: BufReader<File>,
+    at: u64,
+    len: u64,
+}
+
+impl<'a> Binary<'a> {
+    fn open(path: &'a Path) -> Result<Binary<'a>> {
+        let file = open_file(path)?;
+        let len = file.metadata().map_err(Error::io("read the size of", path))?.len();
+        Ok(Binary { path, file: BufReader::new(file), at: 0, len })
+    }
+
+    fn wrong(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
+        Error::input(self.path, format!("byte {}", self.at), expected, found)
+    }
+
+    fn ends(&self, what: &str) -> Error {
+        self.wrong(what, format!("the end of the file, of {} bytes", self.len)).hint("it is cut short: copy it again")
+    }
+
+    fn bytes<const W: usize>(&mut self, what: &str) -> Result<[u8; W]> {
+        if self.len - self.at < W as u64 {
+            return Err(self.ends(what));
+        }
+        let mut bytes = [0; W];
+        self.file.read_exact(&mut bytes).map_err(Error::io("read", self.path))?;
+        self.at += W as u64;
+        Ok(bytes)
+    }
+
+    fn u32(&mut self, what: &str) -> Result<u32> {
+        self.bytes(what).map(u32::from_le_bytes)
+    }
+
+    fn u64(&mut self, what: &str) -> Result<u64> {
+        self.bytes(what).map(u64::from_le_bytes)
+    }
+
+    fn f64s<const W: usize>(&mut self, what: &str) -> Result<[f64; W]> {
+        let mut values = [0.0; W];
+        for value in &mut values {
+            *value = f64::from_le_bytes(self.bytes(what)?);
+        }
+        Ok(values)
+    }
+
+    /// A text that ends with a zero byte.
+    fn text(&mut self, what: &str) -> Result<String> {
+        let mut bytes = Vec::new();
+        let most = MAX_NAME.min(self.len - self.at);
+        (&mut self.file).take(most).read_until(0, &mut bytes).map_err(Error::io("read", self.path))?;
+        if bytes.pop() != Some(0) {
+            return Err(self.wrong(what, format!("none that ends within {MAX_NAME} bytes")));
+        }
+        self.at += bytes.len() as u64 + 1;
+        String::from_utf8(bytes).map_err(|_| self.wrong(what, "a name that is no UTF-8"))
+    }
+
+    fn skip(&mut self, bytes: Option<u64>, what: &str) -> Result<()> {
+        let Some(bytes) = bytes.filter(|&bytes| bytes <= self.len - self.at) else { return Err(self.ends(what)) };
+        // No file is longer than i64 counts.
+        self.file.seek_relative(bytes as i64).map_err(Error::io("read", self.path))?;
+        self.at += bytes;
+        Ok(())
+    }
+}
+
+fn read_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
+    let mut file = Binary::open(path)?;
+    let mut lenses = HashMap::new();
+    for _ in 0..file.u64("a number of cameras")? {
+        let (id, model) = (file.u32("a camera")?, file.u32("a camera model")?);
+        let &(name, count, _) = MODELS
+            .get(model as usize)
+            .ok_or_else(|| file.wrong(format!("a camera model, 0 to {}", MODELS.len() - 1), model.to_string()))?;
+        let size = (file.u64("a width")?, file.u64("a height")?);
+        let at = file.at;
+        let values = (0..count).map(|_| Ok(file.f64s::<1>("a parameter")?[0])).collect::<Result<Vec<f64>>>()?;
+        let wrong =
+            |expected: String, found: String| Error::input(path, format!("byte {at}, camera {id}"), expected, found);
+        gauge.take(path, &format!("byte {at}"), "the cameras", LENS_BYTES)?;
+        lenses.insert(id, lens(wrong, name, size, &values)?);
+    }
+    Ok(lenses)
+}
+
+fn read_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
+    let mut file = Binary::open(path)?;
+    let mut images = Vec::new();
+    for _ in 0..file.u64("a number of images")? {
+        file.u32("an image")?;
+        let (quaternion, translation) = (file.f64s("a rotation")?, file.f64s("a translation")?);
+        let (camera, name) = (file.u32("a camera")?, file.text("a picture's name")?);
+        gauge.take(path, &format!("byte {}", file.at), "the pictures", IMAGE_BYTES + 2 * name.len() as u64)?;
+        let points = file.u64("a number of points")?;
+        file.skip(points.checked_mul(POINT), "the points of a picture")?;
+        images.push(Image { quaternion, translation, camera, name: name.into() });
+    }
+    Ok(images)
+}

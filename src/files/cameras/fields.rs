@@ -1,0 +1,162 @@
+//! Typed access to the keys of one JSON object, with errors that name the picture and the key.
+
+use std::path::Path;
+
+use glam::{DMat3, DVec3};
+
+use super::MAX_SIDE_PX;
+use crate::error::{Error, Result};
+use crate::files::json::small::{Object, Small};
+
+/// What a pose is, for messages.
+pub(super) const POSE: &str = "3 or 4 rows of 4 finite numbers";
+
+/// One JSON object of a camera file: a picture's, or the file's own.
+#[derive(Clone, Copy)]
+pub(super) struct Fields<'a> {
+    path: &'a Path,
+    /// Index of the picture in the file; none for the file's own keys.
+    frame: Option<usize>,
+    map: &'a Object,
+}
+
+impl<'a> Fields<'a> {
+    /// The keys of `value`, which must be an object.
+    pub(super) fn of(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
+        match value {
+            Small::Object(map) => Ok(Fields { path, frame, map }),
+            other => Err(Error::input(path, place(frame), "an object", other.describe())),
+        }
+    }
+
+    /// An error about `key`.
+    pub(super) fn wrong(&self, key: &str, expected: impl Into<String>) -> Error {
+        let found = self.map.get(key).map_or_else(|| "nothing".to_owned(), Small::describe);
+        let place = match self.frame {
+            Some(frame) => format!("frame {frame}, key \"{key}\""),
+            None => format!("key \"{key}\""),
+        };
+        Error::input(self.path, place, expected, found)
+    }
+
+    /// A finite number, if the key is there and not null.
+    pub(super) fn optional_number(&self, key: &str) -> Result<Option<f64>> {
+        match self.map.get(key) {
+            None | Some(Small::Null) => Ok(None),
+            Some(value) => match value.as_f64().filter(|number| number.is_finite()) {
+                Some(number) => Ok(Some(number)),
+                None => Err(self.wrong(key, "a finite number")),
+            },
+        }
+    }
+
+    /// A finite number.
+    pub(super) fn number(&self, key: &str) -> Result<f64> {
+        self.optional_number(key)?.ok_or_else(|| self.wrong(key, "a finite number"))
+    }
+
+    /// A picture side in pixels, if the key is there; some writers give it as 800.0.
+    pub(super) fn optional_side(&self, key: &str) -> Result<Option<u32>> {
+        match self.optional_number(key)? {
+            None => Ok(None),
+            Some(side) if side.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&side) => {
+                Ok(Some(side as u32))
+            }
+            Some(_) => Err(self.wrong(key, format!("a whole number of pixels, 1 to {MAX_SIDE_PX}"))),
+        }
+    }
+
+    /// A picture side in pixels.
+    pub(super) fn side(&self, key: &str) -> Result<u32> {
+        self.optional_side(key)?.ok_or_else(|| self.wrong(key, "a number of pixels"))
+    }
+
+    /// A text, if the key is there and not null.
+    pub(super) fn optional_text(&self, key: &str) -> Result<Option<&'a str>> {
+        match self.map.get(key) {
+            None | Some(Small::Null) => Ok(None),
+            Some(Small::Text(text)) => Ok(Some(text)),
+            Some(_) => Err(self.wrong(key, "a text")),
+        }
+    }
+
+    /// A whole number that fits 32 bits, if the key is there and not null.
+    pub(super) fn optional_index(&self, key: &str) -> Result<Option<u32>> {
+        match self.map.get(key) {
+            None | Some(Small::Null) => Ok(None),
+            Some(value) => match value.as_u64().and_then(|number| u32::try_from(number).ok()) {
+                Some(number) => Ok(Some(number)),
+                None => Err(self.wrong(key, "a whole number, 0 or more")),
+            },
+        }
+    }
+
+    /// Width and height in pixels.
+    pub(super) fn sides(&self, key: &str) -> Result<[u32; 2]> {
+        let side = |value: f64| {
+            (value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value)).then_some(value as u32)
+        };
+        let found = self.map.get(key).and_then(numbers).and_then(|[w, h]| Some([side(w)?, side(h)?]));
+        found.ok_or_else(|| self.wrong(key, format!("width and height, 1 to {MAX_SIDE_PX} pixels")))
+    }
+
+    /// Three numbers, if the key is there.
+    pub(super) fn optional_vector(&self, key: &str) -> Result<Option<[f64; 3]>> {
+        match self.map.get(key) {
+            None | Some(Small::Null) => Ok(None),
+            Some(value) => numbers(value).map(Some).ok_or_else(|| self.wrong(key, "3 finite numbers")),
+        }
+    }
+
+    /// Three numbers.
+    pub(super) fn vector(&self, key: &str) -> Result<[f64; 3]> {
+        self.optional_vector(key)?.ok_or_else(|| self.wrong(key, "3 finite numbers"))
+    }
+
+    /// A row-major 3 × 3 matrix.
+    pub(super) fn matrix3(&self, key: &str) -> Result<DMat3> {
+        let rows = self.map.get(key).and_then(Small::elements).filter(|rows| rows.len() == 3);
+        rows.and_then(|rows| Some(from_rows([numbers(&rows[0])?, numbers(&rows[1])?, numbers(&rows[2])?])))
+            .ok_or_else(|| self.wrong(key, "3 rows of 3 finite numbers"))
+    }
+
+    /// The rotation and translation of a row-major 3 × 4 or 4 × 4 pose `[R | t]`.
+    pub(super) fn pose(&self, key: &str) -> Result<(DMat3, DVec3)> {
+        let rows = self.map.get(key).and_then(Small::elements).filter(|rows| matches!(rows.len(), 3 | 4));
+        let rows: Option<Vec<[f64; 4]>> = rows.and_then(|rows| rows.iter().map(numbers).collect());
+        let rows = rows.ok_or_else(|| self.wrong(key, POSE))?;
+        if rows.get(3).is_some_and(|last| *last != [0.0, 0.0, 0.0, 1.0]) {
+            return Err(self
+                .wrong(key, "0 0 0 1 as its last row")
+                .hint("a transposed matrix has the position there: write it row by row"));
+        }
+        let rotation = from_rows([0, 1, 2].map(|r| [rows[r][0], rows[r][1], rows[r][2]]));
+        Ok((rotation, DVec3::new(rows[0][3], rows[1][3], rows[2][3])))
+    }
+
+    /// Number of elements of the list under `key`.
+    pub(super) fn list(&self, key: &str) -> Result<usize> {
+        match self.map.get(key) {
+            Some(Small::List(_, total)) => Ok(*total),
+            _ => Err(self.wrong(key, "a list")),
+        }
+    }
+}
+
+/// "frame 12", or nothing.
+pub(super) fn place(frame: Option<usize>) -> String {
+    frame.map_or_else(String::new, |frame| format!("frame {frame}"))
+}
+
+fn numbers<const W: usize>(value: &Small) -> Option<[f64; W]> {
+    let list: &[Small; W] = value.elements()?.try_into().ok()?;
+    let mut out = [0.0; W];
+    for (to, from) in out.iter_mut().zip(list) {
+        *to = from.as_f64().filter(|number| number.is_finite())?;
+    }
+    Some(out)
+}
+
+fn from_rows(rows: [[f64; 3]; 3]) -> DMat3 {
+    DMat3::from_cols_array_2d(&rows).transpose()
+}

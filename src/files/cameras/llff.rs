@@ -1,0 +1,126 @@
+//! `poses_bounds.npy` of LLFF and DyNeRF: f64 or f32 `[V, 17]`, one row per camera.
+//!
+//! A row is a 3 × 5 matrix, row by row, and two depth bounds (unused). The columns are the camera's
+//! down, right and backward axes in the world, its position, and (height, width, focal) in pixels of
+//! the original pictures. The pictures are used at half that size unless another is given, the
+//! focal length scaled with the width; the principal point is the middle. Camera 0 is held out.
+//! Every camera sees every frame; frame i of n is at time i/n, so 1 is never reached (FORMATS:
+//! the DyNeRF loader of 4DGaussians).
+
+use std::io::{BufReader, Read, Seek};
+use std::path::Path;
+
+use glam::{DMat3, DVec3};
+use npyz::{NpyFile, Order, TypeChar};
+
+use super::assemble::{Assembly, Gauge, Picture, check, from_camera_to_world};
+use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
+use crate::error::ShowPath;
+use crate::error::{Error, Result};
+use crate::files::names::shown_name;
+use crate::files::npy::{HEAD, header_is_sound};
+use crate::files::open::open_file;
+use crate::model::{Camera, Rig, Split};
+
+/// Values per camera.
+const WIDTH: usize = 17;
+/// Frames of the original DyNeRF scenes.
+const DEFAULT_FRAMES: usize = 300;
+
+/// Reads `file`.
+pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
+    let mut assembly = Assembly::new(options.memory);
+    let rows = read_rows(file, assembly.gauge())?;
+    let cameras =
+        rows.iter().enumerate().map(|(index, row)| camera(file, index, row, options)).collect::<Result<Vec<_>>>()?;
+    let frames = options.frames.unwrap_or(DEFAULT_FRAMES);
+    if frames.saturating_mul(cameras.len()) > MAX_PICTURES {
+        return Err(Error::usage(format!(
+            "{}: {} cameras × {frames} frames are more than {MAX_PICTURES} pictures",
+            file.shown(),
+            cameras.len()
+        )));
+    }
+    let mut origin = shown_name(file);
+    if options.frames.is_none() {
+        origin += &format!(" ({DEFAULT_FRAMES} frames, as in the original DyNeRF scenes)");
+    }
+    assembly.begin(file, frames * cameras.len())?;
+    pictures(&cameras, frames).try_for_each(|picture| assembly.add(picture))?;
+    assembly.finish(None, origin)
+}
+
+/// One picture per frame and camera, frame after frame.
+fn pictures(cameras: &[Camera], frames: usize) -> impl Iterator<Item = Picture> {
+    let picture = move |frame: usize, view: usize| Picture {
+        camera: cameras[view].clone(),
+        time: Some(frame as f64 / frames as f64),
+        split: if view == 0 { Split::Test } else { Split::Train },
+        image: None,
+        view: Some(view as u32),
+    };
+    (0..frames).flat_map(move |frame| (0..cameras.len()).map(move |view| picture(frame, view)))
+}
+
+fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions) -> Result<Camera> {
+    let wrong = |expected: String, found: String| Error::input(file, format!("row {index}"), expected, found);
+    let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
+    let [height, width, focal] = column(4).to_array();
+    let side = |side: f64| side.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&side);
+    if !side(width) || !side(height) {
+        let expected = format!("height and width of 1 to {MAX_SIDE_PX} whole pixels in columns 4 and 9");
+        return Err(wrong(expected, format!("{height} and {width}")));
+    }
+    // At least one pixel: half of a picture one pixel high.
+    let half = |side: f64| ((side as u32) / 2).max(1);
+    let (width_px, height_px) = options.size.unwrap_or((half(width), half(height)));
+    let focal = focal * f64::from(width_px) / width;
+    let camera_to_world = DMat3::from_cols(column(1), column(0), -column(2));
+    let intrinsics = [focal, focal, 0.5 * f64::from(width_px), 0.5 * f64::from(height_px)];
+    let camera = from_camera_to_world((width_px, height_px), intrinsics, camera_to_world, column(3));
+    check(&camera).map_err(|(expected, found)| wrong(expected, found))?;
+    Ok(camera)
+}
+
+/// The rows of the array in `file`, checked to be `[V, 17]` floats that are all there.
+fn read_rows(file: &Path, gauge: &mut Gauge) -> Result<Vec<[f64; WIDTH]>> {
+    let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
+    let mut opened = open_file(file)?;
+    let bytes = opened.metadata().map_err(Error::io("read the size of", file))?.len();
+    let mut head = Vec::new();
+    (&mut opened).take(HEAD).read_to_end(&mut head).map_err(Error::io("read", file))?;
+    if !header_is_sound(&head, bytes) {
+        return Err(unreadable("a header that no array of numbers has".into()));
+    }
+    opened.rewind().map_err(Error::io("read", file))?;
+    let array = NpyFile::new(BufReader::new(opened)).map_err(|error| unreadable(error.to_string()))?;
+    let dtype = array.dtype();
+    let real = match &dtype {
+        npyz::DType::Plain(plain) if plain.type_char() == TypeChar::Float => plain.num_bytes(),
+        _ => None,
+    };
+    let [count, width] = *array.shape() else {
+        return Err(Error::input(file, "header", "shape [V, 17]", format!("{:?}", array.shape())));
+    };
+    if width != WIDTH as u64 || count == 0 {
+        return Err(Error::input(file, "header", "shape [V, 17], V at least 1", format!("[{count}, {width}]")));
+    }
+    if array.order() != Order::C {
+        return Err(Error::input(file, "header", "rows stored one after the other (C order)", "Fortran order")
+            .hint("save it again with numpy.ascontiguousarray"));
+    }
+    // The length is checked against the bytes at hand before anything of that size is made.
+    if real.is_some_and(|size| count.saturating_mul(WIDTH as u64 * size as u64) > bytes) {
+        return Err(Error::input(file, "data", format!("{count} rows of {WIDTH}"), format!("{bytes} bytes in all")));
+    }
+    // The values as they are stored, as f64 and row by row, and a camera for each.
+    gauge.take(file, "data", &format!("{count} rows of {WIDTH}"), count.saturating_mul(24 * WIDTH as u64 + 256))?;
+    let truncated =
+        |error: std::io::Error| Error::input(file, "data", format!("{count} rows of {WIDTH}"), error.to_string());
+    let values: Vec<f64> = match real {
+        Some(8) => array.into_vec::<f64>().map_err(truncated)?,
+        Some(4) => array.into_vec::<f32>().map_err(truncated)?.into_iter().map(f64::from).collect(),
+        _ => return Err(Error::input(file, "header", "dtype float64 or float32", dtype.descr())),
+    };
+    Ok(values.as_chunks().0.to_vec())
+}

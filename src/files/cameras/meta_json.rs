@@ -1,0 +1,176 @@
+//! `train_meta.json` and `test_meta.json` of Dynamic3DGaussians: for every frame the cameras that took it.
+//!
+//! Keys: `w`, `h`, pixels; by frame and camera `k`, the 3 × 3 matrix of focal lengths and principal point, pixels; `w2c`, world
+//! to camera, row-major, OpenCV axes; `fn`, the picture below `ims`; `cam_id`. There are no times: frame i of T is at
+//! i / (T − 1).
+
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+
+use super::assemble::{Assembly, Picture};
+use super::fields::{Fields, POSE, place};
+use super::pictures::outline;
+use crate::error::ShowPath;
+use crate::error::{Error, Result};
+use crate::files::json::lists::{Ask, At, each_element};
+use crate::files::json::small::Small;
+use crate::files::names::shown_name;
+use crate::limits::ReadLimit;
+use crate::model::{Camera, Rig, Split};
+
+/// The files of a sequence, and what of it they list.
+const FILES: [(&str, Split); 2] = [("train_meta.json", Split::Train), ("test_meta.json", Split::Test)];
+
+/// Keys of lists by frame and camera.
+const KEYS: [&str; 4] = ["k", "w2c", "fn", "cam_id"];
+
+/// Whether a document is such a file.
+pub(super) fn is_one(outline: &Small) -> bool {
+    ["k", "w2c"].iter().all(|key| matches!(outline.get(key), Some(Small::List(..))))
+}
+
+/// Reads `file`; with what lies beside it, if a folder was asked for.
+///
+/// # Errors
+/// A value that is missing, of another length, or no camera; files of different numbers of frames.
+pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<Rig> {
+    let split = |path: &Path| FILES.iter().find(|(name, _)| path.ends_with(name)).map_or(Split::Train, |found| found.1);
+    let mut assembly = Assembly::new(memory);
+    let frames = add(&mut assembly, file, split(file))?;
+    for (name, split) in FILES.iter().filter(|(name, _)| with_others && !file.ends_with(name)) {
+        let other = file.with_file_name(name);
+        if other.is_file() {
+            let found = add(&mut assembly, &other, *split)?;
+            if found != frames {
+                let expected = format!("{frames} frames, as in {}", file.shown());
+                return Err(Error::input(&other, "k", expected, format!("{found} frames")));
+            }
+        }
+    }
+    assembly.finish(None, shown_name(file))
+}
+
+/// The values under one key, by frame and camera.
+#[derive(Debug)]
+struct Table<T> {
+    values: Vec<Option<T>>,
+    /// End of each frame's values.
+    ends: Vec<usize>,
+}
+
+impl<T> Table<T> {
+    const EMPTY: Table<T> = Table { values: Vec::new(), ends: Vec::new() };
+
+    /// Memory of one more value, as lists grow by being copied to twice their length.
+    const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
+
+    fn start(&self, frame: usize) -> usize {
+        frame.checked_sub(1).map_or(0, |before| self.ends[before])
+    }
+
+    fn len(&self, frame: usize) -> usize {
+        self.ends[frame] - self.start(frame)
+    }
+
+    fn get(&self, frame: usize, camera: usize) -> Option<&T> {
+        (frame < self.ends.len() && camera < self.len(frame))
+            .then(|| self.values[self.start(frame) + camera].as_ref())?
+    }
+}
+
+/// The values of a file.
+#[derive(Debug)]
+struct Tables {
+    intrinsics: Table<[f64; 4]>,
+    poses: Table<(DMat3, DVec3)>,
+    images: Table<Box<str>>,
+    views: Table<u32>,
+}
+
+impl Tables {
+    /// Takes the value of the key number `key` at `frame`.
+    fn take(&mut self, own: Fields<'_>, key: usize) -> Result<()> {
+        match key {
+            0 => {
+                let k = own.matrix3("k")?;
+                self.intrinsics.values.push(Some([k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]));
+            }
+            1 => self.poses.values.push(Some(own.pose("w2c")?)),
+            2 => self.images.values.push(own.optional_text("fn")?.map(Into::into)),
+            _ => self.views.values.push(own.optional_index("cam_id")?),
+        }
+        Ok(())
+    }
+
+    /// Ends a frame under the key number `key`.
+    fn end(&mut self, key: usize) {
+        match key {
+            0 => self.intrinsics.ends.push(self.intrinsics.values.len()),
+            1 => self.poses.ends.push(self.poses.values.len()),
+            2 => self.images.ends.push(self.images.values.len()),
+            _ => self.views.ends.push(self.views.values.len()),
+        }
+    }
+}
+
+/// Adds the pictures of a file; returns how many frames it has.
+fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
+    let outline = outline(file)?;
+    let shared = Fields::of(file, None, &outline)?;
+    let (width, height) = (shared.side("w")?, shared.side("h")?);
+    let frames = shared.list("k")?;
+    let mut tables =
+        Tables { intrinsics: Table::EMPTY, poses: Table::EMPTY, images: Table::EMPTY, views: Table::EMPTY };
+    let bytes =
+        [Table::<[f64; 4]>::BYTES, Table::<(DMat3, DVec3)>::BYTES, Table::<Box<str>>::BYTES + 32, Table::<u32>::BYTES];
+    let (mut used, mut next) = (0, [0; KEYS.len()]);
+    let ask = Ask { keys: &KEYS, nested: true, wanted: &[] };
+    each_element(file, ask, |At { key, index, inner }, value| {
+        let name = KEYS[key];
+        if index != next[key] {
+            return Err(Error::input(file, format!("key \"{name}\""), "this key once", "twice"));
+        }
+        let text = if let Small::Text(text) = &value { text.len() as u64 } else { 0 };
+        let taken = if inner.is_some() { bytes[key] + text } else { 3 * size_of::<usize>() as u64 };
+        assembly.gauge().take(file, &place(Some(index)), "its cameras", taken)?;
+        used += taken;
+        if inner.is_some() {
+            let entry = Small::of_entry(name, value);
+            return tables.take(Fields::of(file, Some(index), &entry)?, key);
+        }
+        next[key] += 1;
+        match value {
+            Small::List(..) => tables.end(key),
+            other if key == 0 => {
+                return Err(Error::input(
+                    file,
+                    format!("k of frame {index}"),
+                    "a list with a matrix for every camera",
+                    other.describe(),
+                ));
+            }
+            _ => tables.end(key),
+        }
+        Ok(())
+    })?;
+    let Tables { intrinsics, poses, images, views } = tables;
+    assembly.begin(file, intrinsics.values.len())?;
+    for frame in 0..intrinsics.ends.len() {
+        for camera in 0..intrinsics.len(frame) {
+            let nothing = || Error::input(file, format!("frame {frame}, key \"w2c\""), POSE, "nothing");
+            let [fx, fy, cx, cy] = *intrinsics.get(frame, camera).expect("a matrix for every camera");
+            let &(rotation, translation) = poses.get(frame, camera).ok_or_else(nothing)?;
+            let image = images.get(frame, camera).map(|name| PathBuf::from("ims").join(&**name));
+            assembly.add(Picture {
+                camera: Camera { width, height, fx, fy, cx, cy, rotation, translation, near: Camera::NEAR },
+                time: Some(frame as f64 / frames.saturating_sub(1).max(1) as f64),
+                split,
+                image: image.map(|image| file.with_file_name(image)),
+                view: views.get(frame, camera).copied(),
+            })?;
+        }
+    }
+    assembly.gauge().release(used);
+    Ok(frames)
+}

@@ -1,0 +1,152 @@
+//! NeRFies and HyperNeRF: `dataset.json`, `metadata.json` and a file `camera/ID.json` per picture.
+//!
+//! As the loader of 4DGaussians has them (`scene/hyper_loader.py`), with which models are trained: `orientation` is world
+//! to camera, row by row, in OpenCV axes, `position` the camera's own, both as they are: `scale` and `center` of
+//! `scene.json` are for other programs, and that file is not read. The focal length holds along both axes, the principal
+//! point is the middle; distortion, which that loader passes over, is passed over here. A picture's time is its `warp_id` by the largest. Held out are `val_ids`; where there are none
+//! every fourth picture is for training, from the first, and the one two after each but the last is held out.
+//! Pictures are those of `rgb/2x`, half the cameras' size, unless `--size` says another.
+
+use std::path::Path;
+
+use hashbrown::{HashMap, HashSet};
+
+use super::CameraOptions;
+use super::assemble::{Assembly, Gauge, Picture, from_camera_to_world};
+use super::fields::Fields;
+use super::pictures::whole;
+use crate::error::{Error, Result, quoted};
+use crate::files::image::measure;
+use crate::files::json::lists::{Ask, At, each_element, each_entry};
+use crate::files::json::small::Small;
+use crate::files::names::shown_name;
+use crate::model::{Rig, Split};
+
+/// Keys of a camera's file.
+const CAMERA: [&str; 4] = ["image_size", "focal_length", "orientation", "position"];
+/// Pictures between one for training and the next, where a data set names none to hold out.
+const TRAIN_EVERY: usize = 4;
+
+/// Reads the data set of which `file` is the `dataset.json`.
+///
+/// # Errors
+/// Files that are missing or malformed; a picture without a camera or a time.
+pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
+    let folder = file.parent().unwrap_or(Path::new(""));
+    let mut assembly = Assembly::new(options.memory);
+    let [ids, val, train] = names(file, assembly.gauge())?;
+    let splits = splits(&ids, &val, &train);
+    let metadata = folder.join("metadata.json");
+    let warps = warps(&metadata, &ids, assembly.gauge())?;
+    let latest = f64::from(warps.iter().copied().max().unwrap_or(0).max(1));
+    assembly.begin(file, splits.iter().map(Vec::len).sum())?;
+    for ((id, warp), splits) in ids.iter().zip(warps).zip(splits) {
+        if splits.is_empty() {
+            continue;
+        }
+        let picture = picture(folder, id, options)?;
+        for split in splits {
+            let time = f64::from(warp) / latest;
+            assembly.add(Picture { time: Some(time), split, ..picture.clone() })?;
+        }
+    }
+    assembly.finish(None, shown_name(folder))
+}
+
+/// Keys of the lists of names: all pictures, those held out, those for training.
+const LISTS: [&str; 3] = ["ids", "val_ids", "train_ids"];
+/// Bytes that a name takes beside its text, in its list and in two tables.
+const NAME_BYTES: u64 = 200;
+
+/// Reads the names of `file`. Those for training may be left out where none are held out.
+fn names(file: &Path, gauge: &mut Gauge) -> Result<[Vec<Box<str>>; 3]> {
+    let outline = whole(file, &LISTS)?;
+    let of = Fields::of(file, None, &outline)?;
+    let held_out = of.list(LISTS[1])?;
+    of.list(LISTS[0])?;
+    if held_out > 0 {
+        of.list(LISTS[2])?;
+    }
+    let mut names = [const { Vec::new() }; 3];
+    each_element(file, Ask { keys: &LISTS, nested: false, wanted: &[] }, |At { key, index, .. }, name| {
+        if index != names[key].len() {
+            return Err(Error::input(file, format!("key \"{}\"", LISTS[key]), "this key once", "twice"));
+        }
+        let Small::Text(name) = name else {
+            let place = format!("key \"{}\", element {index}", LISTS[key]);
+            return Err(Error::input(file, place, "a list of names", name.describe()));
+        };
+        gauge.take(file, "", "the names of its pictures", name.len() as u64 + NAME_BYTES)?;
+        names[key].push(name);
+        Ok(())
+    })?;
+    Ok(names)
+}
+
+/// Reads the `warp_id` of each picture.
+fn warps(file: &Path, ids: &[Box<str>], gauge: &mut Gauge) -> Result<Vec<u32>> {
+    gauge.take(file, "", "the times of its pictures", 64 * ids.len() as u64)?;
+    // A name may be there twice.
+    let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
+    let mut found = Vec::new();
+    for id in ids {
+        places.entry(id).or_insert_with(|| {
+            found.push(None);
+            found.len() as u32 - 1
+        });
+    }
+    each_entry(file, &["warp_id"], |id, own| {
+        if let Some(&place) = places.get(id) {
+            let own = Fields::of(file, None, &own)?;
+            found[place as usize] =
+                Some(own.optional_index("warp_id")?.ok_or_else(|| own.wrong("warp_id", "a number"))?);
+        }
+        Ok(())
+    })?;
+    let warp = |id: &str| {
+        let warp = places.get(id).and_then(|&place| found[place as usize]);
+        warp.ok_or_else(|| Error::input(file, "", format!("the picture {}", quoted(id)), "none of this name"))
+    };
+    ids.iter().map(|id| warp(id)).collect()
+}
+
+/// The splits of every picture, mostly one; of some none.
+fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Split>> {
+    if val.is_empty() {
+        let trained = ids.len().div_ceil(TRAIN_EVERY);
+        let held_out = |at: usize| at % TRAIN_EVERY == TRAIN_EVERY / 2 && at / TRAIN_EVERY + 1 < trained;
+        let split = |at: usize| match at % TRAIN_EVERY {
+            0 => vec![Split::Train],
+            _ if held_out(at) => vec![Split::Test],
+            _ => Vec::new(),
+        };
+        return (0..ids.len()).map(split).collect();
+    }
+    let set = |names: &'_ [Box<str>]| -> HashSet<Box<str>> { names.iter().cloned().collect() };
+    let (train, val) = (set(train), set(val));
+    let split = |id: &str| {
+        let is_in = [(Split::Train, train.contains(id)), (Split::Test, val.contains(id))];
+        is_in.into_iter().filter(|(_, is_in)| *is_in).map(|(split, _)| split).collect()
+    };
+    ids.iter().map(|id| split(id)).collect()
+}
+
+fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<Picture> {
+    let file = folder.join("camera").join(format!("{id}.json"));
+    let document = whole(&file, &CAMERA)?;
+    let own = Fields::of(&file, None, &document)?;
+    let [width, height] = own.sides("image_size")?;
+    let image = folder.join("rgb/2x").join(format!("{id}.png"));
+    let size = options.size.or_else(|| measure(&image)).unwrap_or(((width / 2).max(1), (height / 2).max(1)));
+    let focal = own.number("focal_length")?;
+    let (x, y) = (f64::from(size.0) / f64::from(width), f64::from(size.1) / f64::from(height));
+    let intrinsics = [focal * x, focal * y, 0.5 * f64::from(size.0), 0.5 * f64::from(size.1)];
+    let orientation = own.matrix3("orientation")?;
+    Ok(Picture {
+        camera: from_camera_to_world(size, intrinsics, orientation.transpose(), own.vector("position")?.into()),
+        time: None,
+        split: Split::Train,
+        image: Some(image),
+        view: None,
+    })
+}

@@ -1,0 +1,178 @@
+//! Times of pictures whose cameras' file has none: from the numbers in their names, or from a table.
+//!
+//! A picture's number is NNN of a name `…tNNN_vNN…`, else the last number in its file's name: 12 of
+//! `cam03/frame_00012.png`. Its time is (number − least)/(greatest − least), so that the last is at 1, as in the COLMAP
+//! loaders of the trained families. A table is a CSV of `name,time`: the name as the cameras have it, or its last part, with or
+//! without ending; times are taken as they are.
+
+use std::path::{Path, PathBuf};
+
+use hashbrown::HashMap;
+
+use super::assemble::Gauge;
+use crate::error::{Error, Result, ShowPath, quoted};
+use crate::files::names::shown_name;
+use crate::files::text::Lines;
+
+/// Bytes of an entry of a table beside its name, while the table grows by being copied to twice its size.
+const TABLE_ENTRY: u64 = 3 * 40 + 32;
+
+/// Where times come from.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub enum Times {
+    /// From the names of COLMAP's pictures if all have numbers; of other cameras their own.
+    #[default]
+    Own,
+    /// From the numbers in names, which all must have.
+    Names,
+    /// There are none: every picture shows every frame.
+    None,
+    /// From a table.
+    Table(PathBuf),
+}
+
+impl Times {
+    /// As a command line says it: `names`, `none`, or the table's path.
+    pub fn named(text: &str) -> Times {
+        match text {
+            "names" => Times::Names,
+            "none" => Times::None,
+            table => Times::Table(table.into()),
+        }
+    }
+
+    /// What [`Times::named`] takes; none of the cameras' own.
+    pub fn name(&self) -> Option<String> {
+        match self {
+            Times::Own => None,
+            Times::Names => Some("names".to_owned()),
+            Times::None => Some("none".to_owned()),
+            Times::Table(table) => Some(table.to_string_lossy().into_owned()),
+        }
+    }
+}
+
+/// Returns the times of the pictures called `names` in `file`, and where they come from, empty if there are none.
+///
+/// # Errors
+/// A name without a number, or that the table does not have; a table that is none.
+pub(super) fn give(
+    file: &Path,
+    names: &[Box<str>],
+    times: &Times,
+    gauge: &mut Gauge,
+) -> Result<(Vec<Option<f64>>, String)> {
+    gauge.take(file, "", "the times of its pictures", 40 * names.len() as u64)?;
+    let none = || Ok((Vec::new(), String::new()));
+    match times {
+        Times::None => none(),
+        Times::Table(table) => {
+            let known = read_table(table, gauge)?;
+            let time = |name: &str| {
+                let time = keys(name).find_map(|key| known.get(key)).copied();
+                time.map(Some).ok_or_else(|| {
+                    Error::input(table, "", format!("a line for the picture {}", quoted(name)), "none")
+                        .hint(format!("the names are those of {}", file.shown()))
+                })
+            };
+            let given = names.iter().map(|name| time(name)).collect::<Result<Vec<_>>>()?;
+            Ok((given, format!("times from {}", shown_name(table))))
+        }
+        Times::Own | Times::Names => {
+            let numbers: Vec<Option<u64>> = names.iter().map(|name| number(name)).collect();
+            if let Some(at) = numbers.iter().position(Option::is_none) {
+                if *times == Times::Own {
+                    return none();
+                }
+                return Err(Error::input(
+                    file,
+                    format!("picture {}", quoted(&names[at])),
+                    "a number in its name",
+                    "none",
+                )
+                .hint("give a table of names and times: --times TABLE.csv"));
+            }
+            let bounds = numbers.iter().flatten();
+            let (Some(&least), Some(&greatest)) = (bounds.clone().min(), bounds.max()) else { return none() };
+            let span = (greatest - least).max(1) as f64;
+            let time = |number: Option<u64>| number.map(|number| (number - least) as f64 / span);
+            let given = numbers.into_iter().map(time).collect();
+            Ok((given, format!("times from the numbers {least} to {greatest} in names")))
+        }
+    }
+}
+
+/// The number that says when, in a picture's name.
+fn number(name: &str) -> Option<u64> {
+    let file = name.rsplit(['/', '\\']).next()?;
+    let stem = file.rsplit_once('.').map_or(file, |(stem, _)| stem);
+    let digits = |text: &str| -> Option<u64> {
+        let end = text.rfind(|c: char| c.is_ascii_digit())? + 1;
+        let start = text[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |at| {
+            // Past that character, of however many bytes.
+            at + text[at..].chars().next().map_or(1, char::len_utf8)
+        });
+        text[start..end].parse().ok()
+    };
+    let before_view = stem.rfind("_v").map(|at| &stem[..at]).filter(|before| {
+        let rest = before.trim_end_matches(|c: char| c.is_ascii_digit());
+        rest.len() < before.len() && rest.ends_with('t')
+    });
+    digits(before_view.unwrap_or(stem))
+}
+
+/// What a picture may be called in a table.
+fn keys(name: &str) -> impl Iterator<Item = &str> {
+    let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    let stem = |text| Path::new(text).file_stem().and_then(|stem| stem.to_str()).unwrap_or(text);
+    [name, file, stem(file)].into_iter()
+}
+
+fn read_table(path: &Path, gauge: &mut Gauge) -> Result<HashMap<String, f64>> {
+    let mut known = HashMap::new();
+    let mut lines = Lines::open(path)?;
+    while let Some((number, line)) = lines.next_line()? {
+        let (at, line) = (number - 1, line.trim());
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let wrong = |expected: &str, found: String| Error::input(path, format!("line {}", at + 1), expected, found);
+        let parts = line.rsplit_once([',', ';', '\t']);
+        let (name, time) = parts.ok_or_else(|| wrong("a name, a comma and a time", quoted(line)))?;
+        let name = name.trim().trim_matches('"');
+        match time.trim().parse::<f64>() {
+            Ok(time) if time.is_finite() => {
+                gauge.take(path, &format!("line {number}"), "the table of times", name.len() as u64 + TABLE_ENTRY)?;
+                if known.insert(name.to_owned(), time).is_some_and(|before| before != time) {
+                    return Err(wrong("every name once", quoted(name)));
+                }
+            }
+            // A header.
+            Err(_) if at == 0 => (),
+            _ => return Err(wrong("a finite time behind the name", quoted(time.trim()))),
+        }
+    }
+    Ok(known)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_number_of_a_name_is_its_last_or_that_of_its_frame() {
+        for (name, expected) in [
+            ("cam03/frame_00012.png", Some(12)),
+            ("t007_v03.png", Some(7)),
+            ("IMG_4411.JPG", Some(4411)),
+            ("0009.png", Some(9)),
+            ("left1_000123.png", Some(123)),
+            ("größe_5ü.png", Some(5)),
+            ("cam3/still.png", None),
+            ("shot_v2.png", Some(2)),
+            ("99999999999999999999.png", None),
+        ] {
+            assert_eq!(number(name), expected, "{name}");
+        }
+    }
+}

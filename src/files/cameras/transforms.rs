@@ -1,0 +1,171 @@
+//! `transforms*.json` of NeRF and D-NeRF: one camera-to-world pose per picture, in OpenGL axes.
+//!
+//! Keys, of a frame or of the file (the frame's win): `fl_x fl_y cx cy w h`, or `camera_angle_x`
+//! (and `camera_angle_y`), the field of view in radians. Pixels are square and the principal point is
+//! the middle unless said otherwise. A frame has `file_path`, `transform_matrix` and, if the scene
+//! moves, `time`. Lens distortion (`k1` …) is ignored: pictures are taken to be undistorted.
+//!
+//! Times are divided by the largest of all splits' files, as the D-NeRF loaders do that the models were
+//! trained with (4DGaussians `scene/dataset_readers.py`, `read_timeline`): files that count frames
+//! 0 … T−1 and files that reach 1 give the same times. Models whose time counts something else take them as they are
+//! ([`Clock`]).
+
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+
+use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
+use super::fields::Fields;
+use super::pictures::{each_picture, outline};
+use super::{CameraOptions, Clock};
+use crate::error::{Result, ShowPath};
+use crate::files::image::measure;
+use crate::files::json::small::Small;
+use crate::files::names::shown_name;
+use crate::model::{Rig, Split};
+
+/// OpenGL camera axes (x right, y up, z backward) to OpenCV's (x right, y down, z forward).
+const FLIP: DMat3 = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+
+/// Keys of a picture.
+const PICTURE: [&str; 11] =
+    ["file_path", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "transform_matrix", "time"];
+
+/// Reads `file`; if it stands for its folder, `with_others` of train, val and test beside it. Of those a file that was named
+/// itself takes the largest time alone.
+pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> Result<Rig> {
+    let mut files = vec![file.to_owned()];
+    let mut latest = 0.0;
+    for other in others(file) {
+        if with_others {
+            files.push(other);
+        } else {
+            latest = latest_in(&other)?.max(latest);
+        }
+    }
+    files.sort_by_key(|file| split_of(file) as u8);
+    let mut assembly = Assembly::new(options.memory);
+    for file in &files {
+        add(&mut assembly, file, options)?;
+    }
+    let latest = assembly.latest(latest);
+    if latest > 0.0 && options.clock == Clock::Normalised {
+        assembly.divide_times(latest);
+    }
+    let names: Vec<String> = files.iter().map(|path| shown_name(path)).collect();
+    assembly.finish(None, names.join(" and "))
+}
+
+fn split_of(file: &Path) -> Split {
+    let name = file.file_name().unwrap_or_default().to_string_lossy();
+    match () {
+        () if name.contains("test") => Split::Test,
+        () if name.contains("val") => Split::Val,
+        () => Split::Train,
+    }
+}
+
+/// Those of train, val and test that lie beside `file`, if it is one of them.
+fn others(file: &Path) -> Vec<PathBuf> {
+    const ALL: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
+    let is_own = |name: &&str| file.file_name().is_some_and(|own| own.to_str() == Some(*name));
+    if !ALL.iter().any(&is_own) {
+        return Vec::new();
+    }
+    let others = ALL.iter().filter(|name| !is_own(name)).map(|name| file.with_file_name(name));
+    others.filter(|other| other.is_file()).collect()
+}
+
+/// The largest time in a file that need not be in order otherwise.
+fn latest_in(file: &Path) -> Result<f64> {
+    let mut latest = 0.0;
+    each_picture(file, Some("frames"), &["time"], |_, frame| {
+        let time = frame.get("time").and_then(Small::as_f64).filter(|time| time.is_finite());
+        latest = time.map_or(latest, |time| time.max(latest));
+        Ok(())
+    })?;
+    Ok(latest)
+}
+
+/// Adds the pictures of `file`.
+fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
+    let outline = outline(file)?;
+    let shared = Fields::of(file, None, &outline)?;
+    assembly.begin(file, shared.list("frames")?)?;
+    let split = split_of(file);
+    each_picture(file, Some("frames"), &PICTURE, |index, frame| {
+        assembly.add(picture(file, shared, Fields::of(file, Some(index), frame)?, split, options)?)
+    })
+}
+
+fn picture(file: &Path, shared: Fields<'_>, own: Fields<'_>, split: Split, options: &CameraOptions) -> Result<Picture> {
+    let name = own.optional_text("file_path")?;
+    let image = name.map(|name| resolve(file, name));
+    let size = size(shared, own, image.as_deref(), options)?;
+    let intrinsics = intrinsics(shared, own, size)?;
+    let (rotation, center) = own.pose("transform_matrix")?;
+    Ok(Picture {
+        camera: from_camera_to_world(size, intrinsics, rotation * FLIP, center),
+        time: own.optional_number("time")?,
+        split,
+        image,
+        view: name.and_then(view_in_name),
+    })
+}
+
+/// Picture size in pixels: the file's, else the picture's own, else the option's.
+fn size(shared: Fields<'_>, own: Fields<'_>, image: Option<&Path>, options: &CameraOptions) -> Result<(u32, u32)> {
+    let side =
+        |key| own.optional_side(key).and_then(|side| side.map_or_else(|| shared.optional_side(key), |s| Ok(Some(s))));
+    if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
+        return Ok((width, height));
+    }
+    // A picture that is missing or unreadable is no error: the size may be given instead.
+    image.and_then(measure).or(options.size).ok_or_else(|| {
+        let tried = image.map_or_else(String::new, |image| format!(", or the picture {}", image.shown()));
+        own.wrong("w", format!("the picture size as w and h{tried}"))
+            .hint("give --size WIDTHxHEIGHT (800x800 for the original D-NeRF scenes)")
+    })
+}
+
+/// fx, fy, cx, cy in pixels.
+fn intrinsics(shared: Fields<'_>, own: Fields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
+    let (width, height) = (f64::from(width), f64::from(height));
+    let focal = |fields: Fields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
+        if let Some(focal) = fields.optional_number(pixels)? {
+            return Ok(Some(focal));
+        }
+        Ok(fields.optional_number(angle)?.map(|angle| 0.5 * side / (0.5 * angle).tan()))
+    };
+    let mut fx = None;
+    let mut fy = None;
+    for fields in [own, shared] {
+        if fx.is_none() {
+            fx = focal(fields, "fl_x", "camera_angle_x", width)?;
+            // A vertical focal length of the file must not be paired with a horizontal one of the frame.
+            fy = focal(fields, "fl_y", "camera_angle_y", height)?;
+        }
+    }
+    let fx = fx.ok_or_else(|| shared.wrong("camera_angle_x", "camera_angle_x or fl_x, here or in every frame"))?;
+    let middle = |key, middle| -> Result<f64> {
+        Ok(own.optional_number(key)?.or(shared.optional_number(key)?).unwrap_or(middle))
+    };
+    Ok([fx, fy.unwrap_or(fx), middle("cx", 0.5 * width)?, middle("cy", 0.5 * height)?])
+}
+
+/// The picture a file names, relative to it. D-NeRF leaves the extension out.
+fn resolve(file: &Path, name: &str) -> PathBuf {
+    let named = file.parent().unwrap_or(Path::new("")).join(name.strip_prefix("./").unwrap_or(name));
+    let with = |extension: &str| {
+        let mut path = named.clone().into_os_string();
+        path.push(extension);
+        PathBuf::from(path)
+    };
+    let stated =
+        named.extension().is_some_and(|e| ["png", "jpg", "jpeg"].iter().any(|known| e.eq_ignore_ascii_case(known)));
+    if stated {
+        return named;
+    }
+    let candidates = [named.clone(), with(".png"), with(".jpg"), with(".jpeg")];
+    candidates.into_iter().find(|path| path.is_file()).unwrap_or_else(|| with(".png"))
+}

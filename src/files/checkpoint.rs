@@ -1,0 +1,502 @@
+//! PyTorch checkpoints: whatever `torch.save` wrote, with its tensors where they lie.
+//!
+//! Input: a path. Output: the tree of the pickle, and the values of tensors asked for. Nothing in the pickle is executed.
+//! Memory: the list of files, the tree, and one storage at a time, each checked against the [`ReadLimit`] before it is
+//! allocated. A tensor is `torch._utils._rebuild_tensor_v2(storage, offset,
+//! size, stride, …)`, or a parameter made of one; its storage is an entry of the archive, and storages may be shared. On which
+//! device one lay is no matter here.
+
+pub(crate) mod write;
+
+use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use flate2::Crc;
+use half::{bf16, f16};
+use hashbrown::HashMap;
+use zip::{CompressionMethod, ZipArchive};
+
+use super::pickle::Wrong;
+pub(crate) use super::pickle::{MAX_DEPTH, Node, NodeId, Pickle};
+use super::shared_file::SharedFile;
+use super::zip_directory::announced;
+use crate::error::{Error, Result, quoted};
+use crate::limits::ReadLimit;
+
+/// Maximum number of bytes of a pickle: that of ten thousand tensors has about one million.
+const MAX_PICKLE: u64 = 1 << 23;
+/// Maximum number of files of an archive.
+const MAX_ENTRIES: u64 = 1 << 16;
+/// Bytes that the list of files takes for each of them, beside three times its own bytes.
+const ENTRY_BYTES: u64 = 640;
+/// A view may repeat its storage (stride 0), so a small file can declare any number of values. No trained model means more
+/// than so many times what it stores.
+const MAX_EXPANSION: usize = 4;
+
+/// An open checkpoint.
+#[derive(Debug)]
+pub(crate) struct Checkpoint {
+    path: PathBuf,
+    memory: ReadLimit,
+    file: SharedFile,
+    archive: ZipArchive<SharedFile>,
+    pickle: Pickle,
+    /// Place of the pickle among the entries.
+    pickle_at: usize,
+    /// By key the place of a storage among the entries, and its bytes.
+    storages: HashMap<String, (usize, usize)>,
+}
+
+/// A type of the values of a tensor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    F16,
+    BF16,
+    F32,
+    F64,
+    /// Whole numbers, or truth values, of so many bytes.
+    Other(&'static str, usize),
+}
+
+impl Kind {
+    fn of(global: &str) -> Option<Kind> {
+        Some(match global {
+            "torch.HalfStorage" => Kind::F16,
+            "torch.BFloat16Storage" => Kind::BF16,
+            "torch.FloatStorage" => Kind::F32,
+            "torch.DoubleStorage" => Kind::F64,
+            "torch.LongStorage" => Kind::Other("int64", 8),
+            "torch.IntStorage" => Kind::Other("int32", 4),
+            "torch.ShortStorage" => Kind::Other("int16", 2),
+            "torch.CharStorage" => Kind::Other("int8", 1),
+            "torch.ByteStorage" => Kind::Other("uint8", 1),
+            "torch.BoolStorage" => Kind::Other("bool", 1),
+            "torch.ComplexFloatStorage" => Kind::Other("complex64", 8),
+            "torch.ComplexDoubleStorage" => Kind::Other("complex128", 16),
+            _ => return None,
+        })
+    }
+
+    /// As PyTorch calls it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Kind::F16 => "float16",
+            Kind::BF16 => "bfloat16",
+            Kind::F32 => "float32",
+            Kind::F64 => "float64",
+            Kind::Other(name, _) => name,
+        }
+    }
+
+    /// Bytes of a value.
+    pub(crate) fn bytes(self) -> usize {
+        match self {
+            Kind::F16 | Kind::BF16 => 2,
+            Kind::F32 => 4,
+            Kind::F64 => 8,
+            Kind::Other(_, bytes) => bytes,
+        }
+    }
+
+    /// Whether it is a floating-point type.
+    pub(crate) fn is_float(self) -> bool {
+        !matches!(self, Kind::Other(..))
+    }
+
+    /// The value in `stored`, of a floating-point type.
+    fn decode(self, stored: &[u8]) -> f32 {
+        match (self, stored) {
+            (Kind::F16, &[a, b]) => f16::from_le_bytes([a, b]).to_f32(),
+            (Kind::BF16, &[a, b]) => bf16::from_le_bytes([a, b]).to_f32(),
+            (Kind::F32, &[a, b, c, d]) => f32::from_le_bytes([a, b, c, d]),
+            (Kind::F64, _) => stored.try_into().map_or(f32::NAN, |stored| f64::from_le_bytes(stored) as f32),
+            _ => f32::NAN,
+        }
+    }
+
+    /// Stores `value`; a type that is no floating-point one takes zeros.
+    pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
+        match self {
+            Kind::F16 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
+            Kind::BF16 => stored.copy_from_slice(&bf16::from_f32(value).to_le_bytes()),
+            Kind::F32 => stored.copy_from_slice(&value.to_le_bytes()),
+            Kind::F64 => stored.copy_from_slice(&f64::from(value).to_le_bytes()),
+            Kind::Other(..) => stored.fill(0),
+        }
+    }
+}
+
+/// A view of a storage: element `i` of its `shape` is value `offset + Σ i·stride`.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Tensor {
+    /// The node that makes it: of a parameter the tensor inside.
+    pub(crate) id: NodeId,
+    /// What names its storage.
+    pub(crate) storage: String,
+    pub(crate) kind: Kind,
+    pub(crate) shape: Vec<usize>,
+    pub(crate) stride: Vec<usize>,
+    pub(crate) offset: usize,
+    pub(crate) places: Places,
+}
+
+/// Where in the pickle numbers of a tensor stand.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Places {
+    /// How many values its storage has.
+    pub(crate) numel: Range<usize>,
+    pub(crate) offset: Range<usize>,
+    pub(crate) shape: Vec<Range<usize>>,
+    pub(crate) stride: Vec<Range<usize>>,
+}
+
+impl Tensor {
+    /// Its type and shape, for a person.
+    pub(crate) fn describe(&self) -> String {
+        let shape = &self.shape;
+        format!("{} {shape:?}", self.kind.name())
+    }
+
+    /// Number of elements; none where that is no number.
+    pub(crate) fn len(&self) -> Option<usize> {
+        self.shape.iter().try_fold(1usize, |product, &length| product.checked_mul(length))
+    }
+
+    /// Calls `take` with the place in the storage of every element, the last index fastest.
+    pub(crate) fn each(&self, mut take: impl FnMut(usize)) {
+        if self.shape.contains(&0) {
+            return;
+        }
+        let (mut index, mut at) = (vec![0; self.shape.len()], self.offset);
+        loop {
+            take(at);
+            let mut axis = self.shape.len();
+            loop {
+                let Some(next) = axis.checked_sub(1) else { return };
+                axis = next;
+                index[axis] += 1;
+                at += self.stride[axis];
+                if index[axis] < self.shape[axis] {
+                    break;
+                }
+                at -= self.shape[axis] * self.stride[axis];
+                index[axis] = 0;
+            }
+        }
+    }
+}
+
+impl Checkpoint {
+    /// Opens the checkpoint at `path` within `memory`.
+    ///
+    /// # Errors
+    /// A file that is no zip archive of stored entries, or is cut short; a pickle that cannot be read; more memory than
+    /// allowed.
+    pub(crate) fn open(path: &Path, memory: ReadLimit) -> Result<Checkpoint> {
+        let file = SharedFile::open(path)?;
+        let wrong = |place: &str, found: String| {
+            Error::input(path, place, "a checkpoint as torch.save writes it", found).hint(
+                "if the file was copied, copy it again; one of PyTorch before 1.6 has to be loaded and saved anew",
+            )
+        };
+        let broken = |error: zip::result::ZipError| wrong(LIST, error.to_string());
+        let directory = announced(&mut file.clone()).map_err(|error| wrong(LIST, error.to_string()))?;
+        if directory.entries > MAX_ENTRIES {
+            return Err(wrong(LIST, format!("{} files", directory.entries)));
+        }
+        let listed = 3 * directory.bytes.min(file.len()) + ENTRY_BYTES * directory.entries;
+        memory.check(path, LIST, &format!("the names of {} files", directory.entries), listed)?;
+        let mut archive = ZipArchive::new(file.clone()).map_err(broken)?;
+        let (mut storages, mut pickle_at) = (HashMap::new(), None);
+        for index in 0..archive.len() {
+            let entry = archive.by_index(index).map_err(broken)?;
+            let at = |found: &str| wrong(&format!("file {}", quoted(entry.name())), found.to_owned());
+            if entry.compression() != CompressionMethod::Stored || entry.compressed_size() != entry.size() {
+                return Err(Error::input(
+                    path,
+                    format!("file {}", quoted(entry.name())),
+                    "a file that is stored as it is, as torch.save stores it",
+                    "a compressed one",
+                )
+                .hint("load the checkpoint with torch.load and save it again with torch.save"));
+            }
+            if entry.data_start().checked_add(entry.size()).is_none_or(|end| end > file.len()) {
+                return Err(at("cut short"));
+            }
+            match inside(entry.name()) {
+                PICKLE if entry.size() > MAX_PICKLE => {
+                    let place = entry.name().to_owned();
+                    return Err(Error::input(
+                        path,
+                        place,
+                        format!("a pickle of at most {MAX_PICKLE} bytes"),
+                        format!("{} bytes", entry.size()),
+                    ));
+                }
+                PICKLE if pickle_at.is_some() => return Err(at("a second one")),
+                PICKLE => pickle_at = Some((index, entry.size())),
+                "byteorder" if starts_big(&file, entry.data_start()) => {
+                    return Err(wrong("byteorder", "values of which the highest byte comes first".into()));
+                }
+                other => {
+                    if let Some(key) = other.strip_prefix("data/") {
+                        storages.insert(key.to_owned(), (index, entry.size() as usize));
+                    }
+                }
+            }
+        }
+        let (pickle_at, bytes) = pickle_at.ok_or_else(|| wrong(LIST, format!("no {PICKLE}")))?;
+        memory.check(path, PICKLE, "the list of files and the pickle", listed + bytes)?;
+        // An eighth is left to the allocator: what was freed before does not fit what is asked for now.
+        let left = (memory.bytes() - listed - bytes) / 8 * 7;
+        let bytes = bytes_of(&mut archive, &file, pickle_at).map_err(|error| wrong(PICKLE, error.to_string()))?;
+        let pickle = Pickle::read(&bytes, left).map_err(|error| match error {
+            Wrong::Malformed(at, found) => wrong(&format!("{PICKLE}, byte {at}"), found),
+            Wrong::TooMuch(at, expected, found) => Error::input(path, format!("{PICKLE}, byte {at}"), expected, found)
+                .hint("a trained model has far fewer: load the checkpoint and save its state dict alone"),
+            Wrong::Memory(at, taken) => {
+                let place = format!("{PICKLE}, byte {at}");
+                let whole = listed + bytes.len() as u64 + taken / 7 * 8 + 8;
+                memory.check(path, &place, "the values of the pickle", whole).err().unwrap_or_else(|| {
+                    Error::input(path, place, "values of fewer than 128 MiB", "more")
+                        .hint("a trained model has far fewer: load the checkpoint and save its state dict alone")
+                })
+            }
+        })?;
+        Ok(Checkpoint { path: path.to_owned(), memory, file, archive, pickle, pickle_at, storages })
+    }
+
+    /// Confirms that reading `what` at `place` may take `bytes` of memory.
+    pub(crate) fn allow(&self, place: &str, what: &str, bytes: u64) -> Result<()> {
+        self.memory.check(&self.path, place, what, bytes)
+    }
+
+    /// The tree.
+    pub(crate) fn pickle(&self) -> &Pickle {
+        &self.pickle
+    }
+
+    /// That what stands at `place` is something else than was expected.
+    pub(crate) fn wrong(&self, place: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
+        Error::input(&self.path, place, expected, found)
+    }
+
+    /// What a node is, for a person.
+    pub(crate) fn describe(&self, id: NodeId) -> String {
+        self.tensor(id).map_or_else(|| self.pickle.describe(id), |tensor| format!("a tensor, {}", tensor.describe()))
+    }
+
+    /// The tensor at a node: itself, or what a parameter is made of.
+    pub(crate) fn tensor(&self, id: NodeId) -> Option<Tensor> {
+        match self.pickle.call(id)? {
+            ("torch._utils._rebuild_parameter" | "torch._utils._rebuild_parameter_with_state", [tensor, ..]) => {
+                self.plain_tensor(*tensor)
+            }
+            _ => self.plain_tensor(id),
+        }
+    }
+
+    fn plain_tensor(&self, id: NodeId) -> Option<Tensor> {
+        let (name, arguments) = self.pickle.call(id)?;
+        let [storage, offset, size, stride, ..] = *arguments else { return None };
+        let Node::Outside(named) = self.pickle.node(storage) else { return None };
+        let [what, kind, key, _device, numel] = *self.pickle.elements(*named)? else { return None };
+        let Node::Global(kind) = self.pickle.node(kind) else { return None };
+        let is_tensor = name == "torch._utils._rebuild_tensor_v2" && self.pickle.text(what)? == "storage";
+        let (_, numel) = self.number(numel)?;
+        let (offset, offset_at) = self.number(offset)?;
+        let (shape, shape_at) = self.numbers(size)?;
+        let (stride, stride_at) = self.numbers(stride)?;
+        (is_tensor && shape.len() == stride.len()).then_some(())?;
+        Some(Tensor {
+            id,
+            storage: self.pickle.text(key)?.to_owned(),
+            kind: Kind::of(kind)?,
+            shape,
+            stride,
+            offset,
+            places: Places { numel, offset: offset_at, shape: shape_at, stride: stride_at },
+        })
+    }
+
+    /// Every tensor, each once.
+    pub(crate) fn tensors(&self) -> impl Iterator<Item = Tensor> {
+        self.pickle.ids().filter_map(|id| self.plain_tensor(id))
+    }
+
+    fn number(&self, id: NodeId) -> Option<(usize, Range<usize>)> {
+        match self.pickle.node(id) {
+            Node::Int(value, at) => Some((usize::try_from(*value).ok()?, at.start as usize..at.end as usize)),
+            _ => None,
+        }
+    }
+
+    fn numbers(&self, id: NodeId) -> Option<(Vec<usize>, Vec<Range<usize>>)> {
+        self.pickle.elements(id)?.iter().map(|&id| self.number(id)).collect()
+    }
+
+    /// The floating-point tensor at a node, which `place` names.
+    ///
+    /// # Errors
+    /// Something else there; a storage that is not there or has fewer values.
+    pub(crate) fn float_tensor(&self, id: NodeId, place: &str) -> Result<Tensor> {
+        let wrong = |expected: &str, found: String| self.wrong(place, expected, found);
+        let tensor = self.tensor(id).filter(|tensor| tensor.kind.is_float());
+        let tensor = tensor.ok_or_else(|| wrong("a tensor of floating-point numbers", self.describe(id)))?;
+        self.check(&tensor).map_err(|found| wrong("values for all of its elements", found))?;
+        Ok(tensor)
+    }
+
+    /// Confirms that the storage has every element of `tensor`, and that these are not many more than it has values.
+    pub(crate) fn check(&self, tensor: &Tensor) -> std::result::Result<(), String> {
+        let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
+        self.check_extent(tensor)?;
+        match tensor.len().is_some_and(|len| len <= values.saturating_mul(MAX_EXPANSION)) {
+            true => Ok(()),
+            false => Err(format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage)),
+        }
+    }
+
+    /// Confirms that the storage has every element of `tensor`.
+    pub(crate) fn check_extent(&self, tensor: &Tensor) -> std::result::Result<(), String> {
+        let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
+            return Err(format!("no file data/{}", tensor.storage));
+        };
+        let values = bytes / tensor.kind.bytes();
+        let said = || format!("{}, and {values} values in data/{}", tensor.describe(), tensor.storage);
+        let len = tensor.len().ok_or_else(said)?;
+        let last = tensor.shape.iter().zip(&tensor.stride).try_fold(tensor.offset, |last, (&length, &stride)| {
+            last.checked_add(length.saturating_sub(1).checked_mul(stride)?)
+        });
+        match last {
+            Some(last) if len == 0 || last < values => Ok(()),
+            _ => Err(said()),
+        }
+    }
+
+    /// Most values that the tensors of a storage may mean together.
+    pub(crate) fn most_values(&self, key: &str, kind: Kind) -> usize {
+        self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
+    }
+
+    /// The stored bytes of a storage.
+    ///
+    /// # Errors
+    /// A storage that is not there, or is not as it was written.
+    pub(crate) fn storage(&self, key: &str) -> Result<Vec<u8>> {
+        let place = format!("data/{key}");
+        let wrong = |found: String| {
+            self.wrong(&place, "the values as they were written", found)
+                .hint("the file is damaged or cut short: copy it again")
+        };
+        let &(index, bytes) = self.storages.get(key).ok_or_else(|| wrong("no such file".into()))?;
+        self.allow(&place, "its values", bytes as u64)?;
+        bytes_of(&mut self.archive.clone(), &self.file, index).map_err(|error| wrong(error.to_string()))
+    }
+
+    /// The elements of a floating-point tensor, which `place` names, as f32, the last index fastest.
+    ///
+    /// # Errors
+    /// Values that are not as they were written, or no numbers.
+    pub(crate) fn floats(&self, tensor: &Tensor, place: &str) -> Result<Vec<f32>> {
+        let values = self.values(tensor, place)?;
+        match values.iter().position(|value| !value.is_finite()) {
+            Some(at) => {
+                let row = at / tensor.shape.iter().skip(1).product::<usize>().max(1);
+                Err(self.wrong(place, "finite numbers", format!("{} in row {row}", values[at])))
+            }
+            None => Ok(values),
+        }
+    }
+
+    /// The elements of a floating-point tensor, which `place` names, as f32, the last index fastest; not checked to be finite.
+    ///
+    /// # Errors
+    /// Values that are not as they were written; more memory than allowed.
+    pub(crate) fn values(&self, tensor: &Tensor, place: &str) -> Result<Vec<f32>> {
+        let stored = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes as u64);
+        let (bytes, len) = (tensor.kind.bytes(), tensor.len().unwrap_or(0));
+        self.allow(place, "its values", stored.saturating_add(4 * len as u64))?;
+        let stored = self.storage(&tensor.storage)?;
+        let mut values = Vec::with_capacity(len);
+        tensor.each(|at| values.push(tensor.kind.decode(&stored[at * bytes..][..bytes])));
+        Ok(values)
+    }
+
+    /// Every file of the archive in order: its name, what it is, its bytes.
+    ///
+    /// # Errors
+    /// Those of `take`; a file that is not as it was written.
+    pub(crate) fn files(&self, mut take: impl FnMut(&str, File<'_>, Vec<u8>) -> Result<()>) -> Result<()> {
+        let mut archive = self.archive.clone();
+        for index in 0..archive.len() {
+            let broken = |error: &dyn std::fmt::Display| {
+                self.wrong(&format!("file {index}"), "its bytes as they were written", error.to_string())
+            };
+            let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
+            let bytes = bytes_of(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
+            let what = match inside(&name).strip_prefix("data/") {
+                _ if index == self.pickle_at => File::Pickle,
+                Some(key) => File::Storage(key),
+                None => File::Other,
+            };
+            take(&name, what, bytes)?;
+        }
+        Ok(())
+    }
+}
+
+/// A file of a checkpoint.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum File<'a> {
+    /// The tree.
+    Pickle,
+    /// The storage of that key.
+    Storage(&'a str),
+    /// Another one.
+    Other,
+}
+
+/// What the tree's file is called.
+const PICKLE: &str = "data.pkl";
+
+/// The name without the folder, which is called as the file was or `archive`.
+fn inside(name: &str) -> &str {
+    name.split_once('/').map_or(name, |(_, rest)| rest)
+}
+
+/// What the list of the archive's files is called in messages.
+const LIST: &str = "list of files";
+
+/// Whether the file has the text "big" at `at`.
+fn starts_big(file: &SharedFile, at: u64) -> bool {
+    let (mut file, mut text) = (file.clone(), [0; 3]);
+    file.seek(SeekFrom::Start(at)).and_then(|_| file.read_exact(&mut text)).is_ok() && &text == b"big"
+}
+
+/// All bytes of a stored entry, checked against its checksum. PyTorch writes 0 for a checksum that it did not compute.
+fn bytes_of(archive: &mut ZipArchive<SharedFile>, file: &SharedFile, index: usize) -> std::io::Result<Vec<u8>> {
+    let (start, size, expected) = {
+        let entry = archive.by_index(index)?;
+        (entry.data_start(), entry.size(), entry.crc32())
+    };
+    let mut file = file.clone();
+    if size > file.len() {
+        return Err(std::io::Error::other(format!("{size} bytes of a file of {}", file.len())));
+    }
+    let mut bytes = vec![0; size as usize];
+    file.seek(SeekFrom::Start(start))?;
+    file.read_exact(&mut bytes)?;
+    let mut sum = Crc::new();
+    sum.update(&bytes);
+    match expected == 0 || sum.sum() == expected {
+        true => Ok(bytes),
+        false => Err(std::io::Error::other("other bytes than its checksum is of")),
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod made;
+#[cfg(test)]
+mod tests;

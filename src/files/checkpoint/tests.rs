@@ -1,0 +1,315 @@
+use std::fs;
+use std::io::Cursor;
+
+use proptest::prelude::*;
+
+use super::made::{Made, MadeTensor, named, tensor, zip};
+use super::*;
+use crate::files::checkpoint::write::{Rows, write_like};
+
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Place {
+        Place(tempfile::tempdir().unwrap())
+    }
+
+    fn open(&self, bytes: &[u8]) -> Result<Checkpoint> {
+        let path = self.0.path().join("a.pt");
+        fs::write(&path, bytes).unwrap();
+        Checkpoint::open(&path, ReadLimit::NONE)
+    }
+
+    fn path(&self) -> PathBuf {
+        self.0.path().join("left.pt")
+    }
+
+    fn left(&self, from: &Checkpoint, kept: &[u32], rows: &[Rows]) -> Result<Checkpoint> {
+        let path = self.path();
+        write_like(from, kept, rows, &path)?;
+        Checkpoint::open(&path, ReadLimit::NONE)
+    }
+}
+
+fn ramp(n: usize) -> Vec<f32> {
+    (0..n).map(|i| i as f32 + 0.5).collect()
+}
+
+/// Two tensors of four rows, one of them a parameter and transposed, one with no rows; two that share a storage.
+fn model() -> Made {
+    let transposed = MadeTensor { stride: vec![1, 4], ..tensor(1, &[4, 3], &ramp(12)) };
+    let [first, second] =
+        [0, 12].map(|offset| MadeTensor { offset, shape: vec![4, 3], ..tensor(3, &[4, 3], &ramp(24)) });
+    let mask = MadeTensor { class: "BoolStorage", width: 1, bytes: vec![1, 0, 1, 1], ..tensor(4, &[4], &[]) };
+    Made::Tuple(vec![
+        Made::Dict(named(vec![
+            ("means", Made::Tensor(tensor(0, &[4, 3], &ramp(12)))),
+            ("turned", Made::Parameter(transposed)),
+            ("net", Made::Tensor(tensor(2, &[2, 2], &ramp(4)))),
+        ])),
+        Made::Ordered(named(vec![
+            ("first", Made::Tensor(first)),
+            ("second", Made::Tensor(second)),
+            ("mask", Made::Tensor(mask)),
+            ("step", Made::Int(7)),
+            ("rate", Made::Float(0.25)),
+            ("text", Made::Text("abc")),
+            ("nothing", Made::List(vec![Made::None, Made::Bool(true)])),
+        ])),
+    ])
+}
+
+fn find(checkpoint: &Checkpoint, part: usize, name: &str) -> Tensor {
+    let pickle = checkpoint.pickle();
+    let parts = pickle.elements(pickle.root()).unwrap();
+    checkpoint.tensor(pickle.item(parts[part], name).unwrap()).unwrap()
+}
+
+fn values(checkpoint: &Checkpoint, part: usize, name: &str) -> Vec<f32> {
+    checkpoint.floats(&find(checkpoint, part, name), name).unwrap()
+}
+
+#[test]
+fn tensors_have_their_values_whatever_their_strides_and_storages() {
+    let place = Place::new();
+    let checkpoint = place.open(&model().file()).unwrap();
+    assert_eq!(values(&checkpoint, 0, "means"), ramp(12));
+    let turned: Vec<f32> = (0..4).flat_map(|row| (0..3).map(move |c| (row + 4 * c) as f32 + 0.5)).collect();
+    assert_eq!(values(&checkpoint, 0, "turned"), turned);
+    assert_eq!(values(&checkpoint, 1, "second"), ramp(24)[12..]);
+    assert_eq!(checkpoint.tensors().count(), 6);
+    let mask = find(&checkpoint, 1, "mask");
+    assert_eq!(mask.describe(), "bool [4]");
+    let error = checkpoint.float_tensor(mask.id, "mask").unwrap_err().to_string();
+    assert!(error.contains("a.pt, mask") && error.contains("bool [4]"), "{error}");
+}
+
+#[test]
+fn every_type_of_numbers_becomes_f32() {
+    let place = Place::new();
+    let of = |class, width, bytes: Vec<u8>| {
+        let shape = vec![bytes.len() / width];
+        Made::Tensor(MadeTensor { class, width, bytes, ..tensor(0, &shape, &[]) }).file()
+    };
+    let le16 = |values: &[u16]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+    for (class, width, bytes, expected) in [
+        ("HalfStorage", 2, le16(&[0x3C00, 0xC000, 1]), vec![1.0, -2.0, 2f32.powi(-24)]),
+        ("BFloat16Storage", 2, le16(&[0x3F80, 0xC000, 1]), vec![1.0, -2.0, 2f32.powi(-133)]),
+        ("DoubleStorage", 8, 0.1f64.to_le_bytes().to_vec(), vec![0.1]),
+        ("FloatStorage", 4, 0.1f32.to_le_bytes().to_vec(), vec![0.1]),
+    ] {
+        let checkpoint = place.open(&of(class, width, bytes)).unwrap();
+        let tensor = checkpoint.float_tensor(checkpoint.pickle().root(), "t").unwrap();
+        assert_eq!(checkpoint.floats(&tensor, "t").unwrap(), expected, "{class}");
+    }
+    let checkpoint = place.open(&of("FloatStorage", 4, f32::NAN.to_le_bytes().repeat(3))).unwrap();
+    let tensor = checkpoint.float_tensor(checkpoint.pickle().root(), "t").unwrap();
+    let error = checkpoint.floats(&tensor, "t").unwrap_err().to_string();
+    assert!(error.contains("NaN in row 0"), "{error}");
+}
+
+#[test]
+fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
+    let place = Place::new();
+    let checkpoint = place.open(&model().file()).unwrap();
+    let of = |part, name, changed: &[u32], values: &[f32]| Rows {
+        tensor: find(&checkpoint, part, name),
+        changed: changed.to_vec(),
+        values: values.to_vec(),
+    };
+    let rows = [
+        of(0, "means", &[1], &[-1.0, -2.0, -3.0]),
+        of(0, "turned", &[0], &[-4.0, -5.0, -6.0]),
+        of(1, "first", &[], &[]),
+        of(1, "second", &[1], &[]),
+        of(1, "mask", &[], &[]),
+    ];
+    let left = place.left(&checkpoint, &[1, 3], &rows).unwrap();
+    assert_eq!(values(&left, 0, "means"), [3.5, 4.5, 5.5, -1.0, -2.0, -3.0]);
+    assert_eq!(values(&left, 0, "turned"), [-4.0, -5.0, -6.0, 3.5, 7.5, 11.5]);
+    // Columns come first in what is stored, as before.
+    assert_eq!(find(&left, 0, "turned").stride, [1, 2]);
+    assert_eq!(values(&left, 0, "net"), ramp(4));
+    assert_eq!(values(&left, 1, "first"), [3.5, 4.5, 5.5, 9.5, 10.5, 11.5]);
+    assert_eq!(values(&left, 1, "second"), [15.5, 16.5, 17.5, 0.0, 0.0, 0.0]);
+    assert_eq!(left.storage("4").unwrap(), [0, 1]);
+    assert_eq!(left.storage("3").unwrap().len(), 4 * 12);
+    // Only numbers differ between the pickles, and the files are the same ones in the same order.
+    let texts = |checkpoint: &Checkpoint| {
+        let of = |id| match checkpoint.pickle().node(id) {
+            Node::Int(..) => "a number".to_owned(),
+            other => format!("{other:?}"),
+        };
+        checkpoint.pickle().ids().map(of).collect::<Vec<_>>()
+    };
+    assert_eq!(texts(&left), texts(&checkpoint));
+    let names = |checkpoint: &Checkpoint| {
+        let mut names = Vec::new();
+        checkpoint
+            .files(|name, _, _| {
+                names.push(name.to_owned());
+                Ok(())
+            })
+            .unwrap();
+        names
+    };
+    assert_eq!(names(&left), names(&checkpoint));
+    // Bytes follow from the content.
+    let bytes = fs::read(place.path()).unwrap();
+    place.left(&checkpoint, &[1, 3], &rows).unwrap();
+    assert_eq!(fs::read(place.path()).unwrap(), bytes);
+    for (at, name) in [(0, "made/data.pkl"), (2, "made/data/0")] {
+        let mut archive = ZipArchive::new(Cursor::new(&bytes[..])).unwrap();
+        let file = archive.by_index(at).unwrap();
+        assert!(
+            file.name() == name && file.data_start().is_multiple_of(64),
+            "{} at {}",
+            file.name(),
+            file.data_start()
+        );
+    }
+}
+
+#[test]
+fn all_rows_are_the_same_values_again() {
+    let place = Place::new();
+    let checkpoint = place.open(&model().file()).unwrap();
+    let rows = [(0, "means"), (0, "turned"), (1, "mask")].map(|(part, name)| Rows {
+        tensor: find(&checkpoint, part, name),
+        changed: Vec::new(),
+        values: Vec::new(),
+    });
+    let left = place.left(&checkpoint, &[0, 1, 2, 3], &rows).unwrap();
+    let all = |checkpoint: &Checkpoint| {
+        let mut files = Vec::new();
+        checkpoint
+            .files(|name, what, bytes| {
+                files.push((name.to_owned(), what != File::Pickle, bytes));
+                Ok(())
+            })
+            .unwrap();
+        files.into_iter().filter(|file| file.1).collect::<Vec<_>>()
+    };
+    assert_eq!(all(&left), all(&checkpoint));
+}
+
+#[test]
+fn a_shape_that_two_tensors_share_is_refused_where_one_has_to_change() {
+    let place = Place::new();
+    let file =
+        Made::Tuple(vec![Made::Tensor(tensor(0, &[3, 3], &ramp(9))), Made::Tensor(tensor(1, &[3, 3], &ramp(9)))]);
+    let whole = file.file();
+    let checkpoint = place.open(&whole).unwrap();
+    let mut files = Vec::new();
+    checkpoint
+        .files(|name, _, bytes| {
+            files.push((inside(name).to_owned(), bytes));
+            Ok(())
+        })
+        .unwrap();
+    // Remembers the first shape, and recalls it in place of the second.
+    let shape = [&b"(J\x03\0\0\0J\x03\0\0\0t"[..]].concat();
+    let pickle = &mut files[0].1;
+    let found: Vec<usize> = (0..pickle.len() - shape.len()).filter(|&at| pickle[at..].starts_with(&shape)).collect();
+    pickle.splice(found[1]..found[1] + shape.len(), [b'h', 9]);
+    pickle.splice(found[0] + shape.len()..found[0] + shape.len(), [b'q', 9]);
+    let checkpoint = place.open(&zip(&files)).unwrap();
+    let id = |k: usize| checkpoint.pickle().elements(checkpoint.pickle().root()).unwrap()[k];
+    let of = |k| Rows { tensor: checkpoint.tensor(id(k)).unwrap(), changed: Vec::new(), values: Vec::new() };
+    let error = place.left(&checkpoint, &[0], &[of(0)]).unwrap_err().to_string();
+    assert!(error.contains("several share") && error.contains("clone()"), "{error}");
+    // Both: they agree.
+    place.left(&checkpoint, &[0], &[of(0), of(1)]).unwrap();
+}
+
+#[test]
+fn what_is_not_all_there_is_named() {
+    let place = Place::new();
+    let said = |of: MadeTensor| {
+        let checkpoint = place.open(&Made::Tensor(of).file()).unwrap();
+        checkpoint.float_tensor(checkpoint.pickle().root(), "means").unwrap_err().to_string()
+    };
+    let of = || tensor(0, &[4, 3], &ramp(12));
+    for wrong in [
+        MadeTensor { shape: vec![5, 3], ..of() },
+        MadeTensor { offset: 1, ..of() },
+        MadeTensor { shape: vec![1 << 20, 1 << 10], stride: vec![0, 0], ..of() },
+        MadeTensor { shape: vec![i32::MAX as usize; 4], stride: vec![i32::MAX as usize; 4], ..of() },
+        MadeTensor { bytes: Vec::new(), ..of() },
+    ] {
+        let error = said(wrong);
+        assert!(error.contains("means") && error.contains("data/0"), "{error}");
+    }
+    let no_rank = said(MadeTensor { stride: vec![1], ..of() });
+    assert!(no_rank.contains("_rebuild_tensor_v2"), "{no_rank}");
+    // The storage's file is not there.
+    let checkpoint = place.open(&Made::Tensor(of()).file()).unwrap();
+    let mut files = Vec::new();
+    checkpoint
+        .files(|name, _, bytes| {
+            files.push((inside(name).to_owned(), bytes));
+            Ok(())
+        })
+        .unwrap();
+    files.retain(|(name, _)| name != "data/0");
+    let checkpoint = place.open(&zip(&files)).unwrap();
+    let error = checkpoint.float_tensor(checkpoint.pickle().root(), "means").unwrap_err().to_string();
+    assert!(error.contains("no file data/0"), "{error}");
+    let error = place.open(&zip(&files[1..])).unwrap_err().to_string();
+    assert!(error.contains("no data.pkl"), "{error}");
+}
+
+#[test]
+fn a_file_cut_anywhere_is_refused_and_a_flipped_bit_is_never_unnoticed() {
+    let place = Place::new();
+    let whole = model().file();
+    for length in (0..whole.len()).step_by(7) {
+        let error = place.open(&whole[..length]).expect_err("a cut file must be refused").to_string();
+        assert!(error.contains("a.pt"), "{error}");
+    }
+    let expected = values(&place.open(&whole).unwrap(), 0, "means");
+    let root = |checkpoint: &Checkpoint| -> Option<Tensor> {
+        let pickle = checkpoint.pickle();
+        checkpoint.tensor(pickle.item(*pickle.elements(pickle.root())?.first()?, "means")?)
+    };
+    for at in (0..whole.len()).step_by(3) {
+        let mut bytes = whole.clone();
+        bytes[at] ^= 1 << (at % 8);
+        let Ok(checkpoint) = place.open(&bytes) else { continue };
+        let Some(tensor) = root(&checkpoint) else { continue };
+        if let Ok(tensor) = checkpoint.float_tensor(tensor.id, "means")
+            && let Ok(found) = checkpoint.floats(&tensor, "means")
+        {
+            assert_eq!(found, expected, "byte {at}");
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn hostile_pickles_are_read_or_refused(pickle in proptest::collection::vec(any::<u8>(), 0..300), flips in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..4)) {
+        let place = Place::new();
+        let look = |bytes: &[u8]| {
+            let Ok(checkpoint) = place.open(bytes) else { return };
+            for tensor in checkpoint.tensors() {
+                if let Ok(tensor) = checkpoint.float_tensor(tensor.id, "t") {
+                    _ = checkpoint.floats(&tensor, "t");
+                }
+                if !tensor.shape.is_empty() {
+                    _ = place.left(&checkpoint, &[], &[Rows { tensor, changed: Vec::new(), values: Vec::new() }]);
+                }
+            }
+        };
+        look(&zip(&[("data.pkl".to_owned(), pickle)]));
+        let mut files = Vec::new();
+        place.open(&model().file()).unwrap().files(|name, _, bytes| {
+            files.push((inside(name).to_owned(), bytes));
+            Ok(())
+        }).unwrap();
+        for (at, to) in flips {
+            let at = at.index(files[0].1.len());
+            files[0].1[at] = to;
+        }
+        look(&zip(&files));
+    }
+}

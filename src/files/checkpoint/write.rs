@@ -1,0 +1,231 @@
+//! A PyTorch checkpoint with fewer rows.
+//!
+//! In: an open checkpoint, and which of its tensors have a row per Gaussian. Out: a checkpoint of the same tree, of which these
+//! have fewer rows; names, order, types, devices and everything else are as they were, byte for byte. The pickle is not
+//! written anew: the numbers in it that have to change are. Memory: the pickle, and one storage as it was and as it becomes.
+//! Bytes depend on the content alone: files are dated 1980-01-01.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::ops::Range;
+use std::path::Path;
+
+use zip::write::FileOptions;
+use zip::{CompressionMethod, DateTime, ZipWriter};
+
+use crate::error::{Error, Result};
+use crate::files::checkpoint;
+use crate::files::checkpoint::{Checkpoint, NodeId, Pickle, Tensor};
+use crate::files::zip_output::ZipOutput;
+
+/// Where the bytes of a file begin is a multiple of so many, as PyTorch has it.
+const ALIGNMENT: u16 = 64;
+
+/// A tensor whose first axis counts Gaussians, and what becomes of it.
+#[derive(Debug)]
+pub(crate) struct Rows {
+    /// The tensor.
+    pub(crate) tensor: Tensor,
+    /// Rows of the result with other values than the row they come from, increasing.
+    pub(crate) changed: Vec<u32>,
+    /// Their values, `[changed, elements of a row]`, the last index fastest; empty: zeros.
+    pub(crate) values: Vec<f32>,
+}
+
+/// How a storage is made up anew.
+struct Part<'a> {
+    tensor: &'a Tensor,
+    /// None: all of its elements stay.
+    rows: Option<&'a Rows>,
+    shape: Vec<usize>,
+    stride: Vec<usize>,
+    offset: usize,
+    len: usize,
+}
+
+/// Writes `checkpoint` with the rows `kept` (increasing) of the tensors `rows` to `path`.
+///
+/// # Errors
+/// A tensor whose values are not all there; tensors that share what has to differ between them; a failed write.
+pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Rows], path: &Path) -> Result<()> {
+    let by_node: BTreeMap<NodeId, &Rows> =
+        rows.iter().filter(|rows| !rows.tensor.shape.is_empty()).map(|rows| (rows.tensor.id, rows)).collect();
+    let touched: BTreeSet<&str> = rows.iter().map(|rows| rows.tensor.storage.as_str()).collect();
+    let all: Vec<Tensor> = checkpoint.tensors().collect();
+    let mut numbers = BTreeMap::new();
+    let mut parts: BTreeMap<&str, Vec<Part<'_>>> = BTreeMap::new();
+    for tensor in all.iter().filter(|tensor| touched.contains(tensor.storage.as_str())) {
+        checkpoint
+            .check(tensor)
+            .map_err(|found| checkpoint.wrong(&format!("data/{}", tensor.storage), "values for all elements", found))?;
+        let rows = by_node.get(&tensor.id).copied();
+        let of_storage = parts.entry(&tensor.storage).or_default();
+        if of_storage.first().is_some_and(|first: &Part<'_>| first.tensor.kind != tensor.kind) {
+            return Err(checkpoint.wrong(&format!("data/{}", tensor.storage), "values of one type", "of several"));
+        }
+        let offset = of_storage.last().map_or(0, |last| last.offset + last.len);
+        let part = Part::new(tensor, rows, kept.len(), offset);
+        of_storage.push(part);
+    }
+    let mut expected: BTreeMap<NodeId, (Vec<usize>, Vec<usize>, usize)> = BTreeMap::new();
+    for (key, parts) in &parts {
+        let total = parts.iter().map(|part| part.len).sum::<usize>();
+        if total > checkpoint.most_values(key, parts[0].tensor.kind) {
+            return Err(checkpoint.wrong(
+                &format!("data/{key}"),
+                "tensors of about as many values",
+                format!("{total}"),
+            ));
+        }
+        for part in parts {
+            let places = &part.tensor.places;
+            let mut set = |at: &Range<usize>, value: usize| _ = numbers.insert((at.start, at.end), value as u64);
+            set(&places.numel, total);
+            set(&places.offset, part.offset);
+            places.shape.iter().zip(&part.shape).for_each(|(at, &value)| set(at, value));
+            places.stride.iter().zip(&part.stride).for_each(|(at, &value)| set(at, value));
+            expected.insert(part.tensor.id, (part.shape.clone(), part.stride.clone(), part.offset));
+        }
+    }
+    let failed = |error| Error::io("write", path)(error);
+    let mut archive =
+        ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?)));
+    checkpoint.files(|name, what, bytes| {
+        let bytes = match what {
+            checkpoint::File::Pickle => {
+                let written = checkpoint.pickle().with_numbers(&bytes, &numbers);
+                confirm(checkpoint, &written, &all, &expected)?;
+                written
+            }
+            checkpoint::File::Storage(key) => match parts.get(key) {
+                Some(parts) => {
+                    let mut out = Vec::with_capacity(bytes.len());
+                    parts.iter().for_each(|part| part.write(&bytes, kept, &mut out));
+                    out
+                }
+                None => bytes,
+            },
+            checkpoint::File::Other => bytes,
+        };
+        let options = FileOptions::default()
+            .compression_method(CompressionMethod::Stored)
+            .last_modified_time(DateTime::default())
+            .large_file(bytes.len() as u64 > u64::from(u32::MAX));
+        archive.start_file_aligned(name, options, ALIGNMENT).map_err(|error| failed(error.into()))?;
+        archive.write_all(&bytes).map_err(failed)
+    })?;
+    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
+}
+
+impl<'a> Part<'a> {
+    fn new(tensor: &'a Tensor, rows: Option<&'a Rows>, kept: usize, offset: usize) -> Part<'a> {
+        let mut shape = tensor.shape.clone();
+        if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
+            *first = kept;
+        }
+        let row: usize = tensor.shape.iter().skip(1).product();
+        let mut stride = tensor.stride.clone();
+        // Rows one after the other, and in each of them every place once: it stays so. Everything else keeps the order of its
+        // axes, without the gaps.
+        let is_dense = stride.first() == Some(&row) && {
+            let of_row =
+                Tensor { offset: 0, shape: tensor.shape[1..].to_vec(), stride: stride[1..].to_vec(), ..tensor.clone() };
+            let mut seen = vec![false; row];
+            of_row.each(|at| {
+                if let Some(seen) = seen.get_mut(at) {
+                    *seen = true;
+                }
+            });
+            seen.into_iter().all(|seen| seen)
+        };
+        if !is_dense {
+            let mut axes: Vec<usize> = (0..shape.len()).collect();
+            axes.sort_by_key(|&axis| std::cmp::Reverse(stride[axis]));
+            axes.iter().rev().fold(1, |step, &axis| {
+                stride[axis] = step;
+                step * shape[axis].max(1)
+            });
+        }
+        let len = shape.iter().product();
+        Part { tensor, rows, shape, stride, offset, len }
+    }
+
+    /// Adds its bytes, taken from those of the storage as it was.
+    fn write(&self, stored: &[u8], kept: &[u32], out: &mut Vec<u8>) {
+        let (bytes, start) = (self.tensor.kind.bytes(), out.len());
+        out.resize(start + self.len * bytes, 0);
+        let out = &mut out[start..];
+        let to = Tensor { offset: 0, shape: self.shape.clone(), stride: self.stride.clone(), ..self.tensor.clone() };
+        let Some(rows) = self.rows else {
+            let mut places = Vec::with_capacity(self.len);
+            to.each(|at| places.push(at));
+            let mut places = places.into_iter();
+            self.tensor.each(|at| {
+                if let Some(place) = places.next() {
+                    out[place * bytes..][..bytes].copy_from_slice(&stored[at * bytes..][..bytes]);
+                }
+            });
+            return;
+        };
+        // Places of the elements of a row, counted from its first one.
+        let of_row = |tensor: &Tensor| {
+            let mut places = Vec::new();
+            let row = Tensor {
+                offset: 0,
+                shape: tensor.shape[1..].to_vec(),
+                stride: tensor.stride[1..].to_vec(),
+                ..tensor.clone()
+            };
+            row.each(|at| places.push(at));
+            places
+        };
+        let (from_row, to_row) = (of_row(self.tensor), of_row(&to));
+        let (from_step, to_step) = (self.tensor.stride[0], self.stride[0]);
+        for (place, &row) in kept.iter().enumerate() {
+            let from = self.tensor.offset + row as usize * from_step;
+            for (&a, &b) in from_row.iter().zip(&to_row) {
+                out[(place * to_step + b) * bytes..][..bytes].copy_from_slice(&stored[(from + a) * bytes..][..bytes]);
+            }
+        }
+        let width = to_row.len();
+        for (k, &place) in rows.changed.iter().enumerate() {
+            for (c, &b) in to_row.iter().enumerate() {
+                let value = rows.values.get(k * width + c).copied().unwrap_or(0.0);
+                self.tensor.kind.encode(value, &mut out[(place as usize * to_step + b) * bytes..][..bytes]);
+            }
+        }
+    }
+}
+
+/// Confirms that the pickle as it will be written has every tensor as it is meant: two may share a shape of which one was to
+/// stay.
+fn confirm(
+    checkpoint: &Checkpoint,
+    written: &[u8],
+    all: &[Tensor],
+    expected: &BTreeMap<NodeId, (Vec<usize>, Vec<usize>, usize)>,
+) -> Result<()> {
+    let wrong = || {
+        checkpoint
+            .wrong("data.pkl", "tensors that have a shape each", "one that several share")
+            .hint("load the checkpoint with torch.load, give each tensor a clone() of its own, and save it again")
+    };
+    let pickle = Pickle::read(written, u64::MAX).map_err(|_| wrong())?;
+    for tensor in all {
+        let numbers = |id: NodeId| -> Option<Vec<usize>> {
+            pickle.elements(id)?.iter().map(|&id| usize::try_from(pickle.int(id)?).ok()).collect()
+        };
+        let found = pickle.call(tensor.id).and_then(|(_, arguments)| match *arguments {
+            [_, offset, size, stride, ..] => {
+                Some((numbers(size)?, numbers(stride)?, usize::try_from(pickle.int(offset)?).ok()?))
+            }
+            _ => None,
+        });
+        let own = (tensor.shape.clone(), tensor.stride.clone(), tensor.offset);
+        if found.as_ref() != Some(expected.get(&tensor.id).unwrap_or(&own)) {
+            return Err(wrong());
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,219 @@
+//! The bytes of a JSON file, checked before the parser sees them.
+
+use std::io::{Error as IoError, ErrorKind, Read, Result as IoResult};
+use std::path::{Path, PathBuf};
+
+use crate::error::Error;
+use crate::files::text::{not_utf_8, without_mark};
+
+/// Bytes that are read and checked together.
+const BUFFER: usize = 1 << 16;
+/// Maximum number of bytes of a text, quotes excluded.
+const MAX_TEXT: u32 = 1 << 20;
+/// Maximum number of bytes of a number.
+const MAX_NUMBER: u32 = 1 << 10;
+/// Maximum nesting depth of lists and objects.
+const MAX_DEPTH: u32 = 64;
+
+/// What the byte before belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Token {
+    None,
+    Text,
+    /// The byte after a backslash.
+    Escape,
+    /// A number or a word.
+    Word,
+}
+
+/// A reader of UTF-8 text that is refused where it is not, and where a text, a number or the nesting is beyond the limits.
+#[derive(Debug)]
+pub(super) struct Checked<R> {
+    file: R,
+    path: PathBuf,
+    buffer: Vec<u8>,
+    /// Part of the buffer that the parser has taken, and part that has been checked.
+    taken: usize,
+    checked: usize,
+    /// Part of the buffer that holds bytes: behind what is checked up to 3 bytes of a character that goes on.
+    filled: usize,
+    /// Place in the file of the first byte of the buffer.
+    start: u64,
+    is_begun: bool,
+    is_blank: bool,
+    token: Token,
+    token_bytes: u32,
+    depth: u32,
+    refusal: Option<Error>,
+}
+
+impl<R: Read> Checked<R> {
+    pub(super) fn new(file: R, path: &Path) -> Checked<R> {
+        Checked {
+            file,
+            path: path.to_owned(),
+            buffer: vec![0; BUFFER],
+            taken: 0,
+            checked: 0,
+            filled: 0,
+            start: 0,
+            is_begun: false,
+            is_blank: true,
+            token: Token::None,
+            token_bytes: 0,
+            depth: 0,
+            refusal: None,
+        }
+    }
+
+    /// Returns the error by which the text was refused, if it was.
+    pub(super) fn refusal(&mut self) -> Option<Error> {
+        self.refusal.take()
+    }
+
+    /// Whether there was nothing but white space.
+    pub(super) fn is_blank(&self) -> bool {
+        self.is_blank
+    }
+
+    /// Bytes from the last two on that the parser has taken.
+    pub(super) fn around(&mut self) -> Vec<u8> {
+        let mut around = self.buffer[self.taken.saturating_sub(2)..self.checked].to_vec();
+        if around.len() < 16 && self.fill().is_ok() {
+            around.extend(&self.buffer[..self.checked.min(16)]);
+        }
+        around
+    }
+
+    /// Replaces the bytes that were taken by the next ones.
+    fn fill(&mut self) -> IoResult<()> {
+        if self.refusal.is_some() {
+            return Err(ErrorKind::InvalidData.into());
+        }
+        self.buffer.copy_within(self.checked..self.filled, 0);
+        self.start += self.checked as u64;
+        self.filled -= self.checked;
+        (self.taken, self.checked) = (0, 0);
+        // More than once where few bytes come at a time: a mark at the beginning has three, a character up to four.
+        loop {
+            let count = match self.file.read(&mut self.buffer[self.filled..]) {
+                Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+                Err(error) => {
+                    self.refusal = Some(Error::io("read", &self.path)(IoError::new(error.kind(), error.to_string())));
+                    return Err(ErrorKind::Other.into());
+                }
+                Ok(count) => count,
+            };
+            self.filled += count;
+            if !self.is_begun && (count == 0 || self.filled >= 3) {
+                self.is_begun = true;
+                match without_mark(&self.path, &self.buffer[..self.filled]) {
+                    Ok(text) => {
+                        let mark = self.filled - text.len();
+                        (self.taken, self.checked) = (mark, mark);
+                    }
+                    Err(error) => return self.refuse(0, error),
+                }
+            }
+            if self.is_begun {
+                self.check(count == 0)?;
+            }
+            if self.checked > self.taken || count == 0 {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Keeps the error for the byte at `at` of the buffer.
+    fn refuse(&mut self, at: usize, error: Error) -> IoResult<()> {
+        self.refusal = Some(error);
+        // What comes before is still the parser's: it may be wrong earlier.
+        match at > self.taken {
+            true => Ok(()),
+            false => Err(ErrorKind::InvalidData.into()),
+        }
+    }
+
+    /// Checks the bytes that came in; `is_end`: there are no more.
+    fn check(&mut self, is_end: bool) -> IoResult<()> {
+        let from = self.checked;
+        let bad = match str::from_utf8(&self.buffer[from..self.filled]) {
+            Ok(_) => None,
+            Err(error) => Some((from + error.valid_up_to(), error.error_len().is_some() || is_end)),
+        };
+        let valid = bad.map_or(self.filled, |(at, _)| at);
+        for at in from..valid {
+            if let Some(expected) = self.step(self.buffer[at]) {
+                self.checked = at;
+                let place = format!("byte {}", self.start + at as u64);
+                let error = Error::input(&self.path, place, expected, "more");
+                return self.refuse(at, error.hint("check that this is a file of cameras"));
+            }
+        }
+        self.checked = valid;
+        match bad {
+            Some((at, true)) => {
+                let error = not_utf_8(&self.path, self.start + at as u64, self.buffer[at]);
+                self.refuse(at, error)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Goes one byte on; returns what was expected where that is beyond a limit.
+    fn step(&mut self, byte: u8) -> Option<String> {
+        if self.is_blank && !byte.is_ascii_whitespace() {
+            self.is_blank = false;
+        }
+        self.token_bytes = self.token_bytes.saturating_add(1);
+        self.token = match (self.token, byte) {
+            (Token::Text, b'"') => Token::None,
+            (Token::Text, b'\\') => Token::Escape,
+            (Token::Text | Token::Escape, _) if self.token_bytes > MAX_TEXT => {
+                return Some(format!("a text of at most {MAX_TEXT} bytes"));
+            }
+            (Token::Text | Token::Escape, _) => Token::Text,
+            (_, b'"') => {
+                self.token_bytes = 0;
+                Token::Text
+            }
+            (Token::Word, b'0'..=b'9' | b'a'..=b'z' | b'A'..=b'Z' | b'+' | b'-' | b'.') => {
+                if self.token_bytes > MAX_NUMBER {
+                    return Some(format!("a number of at most {MAX_NUMBER} characters"));
+                }
+                Token::Word
+            }
+            (_, b'0'..=b'9' | b'a'..=b'z' | b'A'..=b'Z' | b'+' | b'-' | b'.') => {
+                self.token_bytes = 1;
+                Token::Word
+            }
+            (_, b'[' | b'{') => {
+                self.depth += 1;
+                if self.depth > MAX_DEPTH {
+                    return Some(format!("lists and objects nested at most {MAX_DEPTH} deep"));
+                }
+                Token::None
+            }
+            (_, b']' | b'}') => {
+                self.depth = self.depth.saturating_sub(1);
+                Token::None
+            }
+            _ => Token::None,
+        };
+        None
+    }
+}
+
+impl<R: Read> Read for Checked<R> {
+    #[inline]
+    fn read(&mut self, out: &mut [u8]) -> IoResult<usize> {
+        if self.taken == self.checked {
+            self.fill()?;
+        }
+        let rest = &self.buffer[self.taken..self.checked];
+        let count = rest.len().min(out.len());
+        out[..count].copy_from_slice(&rest[..count]);
+        self.taken += count;
+        Ok(count)
+    }
+}

@@ -1,0 +1,315 @@
+//! The elements of lists in a JSON document, one at a time.
+
+use std::fmt;
+use std::io::Read;
+use std::path::Path;
+
+use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
+
+use super::small::{Keep, Key, MAX_ELEMENTS, Small};
+use super::{Stopped, read, read_from};
+use crate::error::Result;
+use crate::files::open::open_file;
+
+/// Place of a value in a document.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct At {
+    /// Index of the key among those asked for; 0 for a document that is a list itself.
+    pub(crate) key: usize,
+    /// Index in the list. Index 0 comes again where a key is repeated: the last list counts.
+    pub(crate) index: usize,
+    /// Index in the list within the list. `None`: that list is over, and the value is an empty one; or it is no list, and
+    /// the value is what is there instead.
+    pub(crate) inner: Option<usize>,
+}
+
+/// What is read of a document.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Ask<'a> {
+    /// Keys of an object under which the lists are; none: the document is the list.
+    pub(crate) keys: &'a [&'a str],
+    /// Whether the elements of the lists are lists themselves, whose elements are meant.
+    pub(crate) nested: bool,
+    /// Keys of the elements that are kept.
+    pub(crate) wanted: &'a [&'a str],
+}
+
+/// Hands the elements of the lists that `ask` names in the file at `path` to `each`.
+///
+/// # Errors
+/// Those of `each` and of [`read`].
+pub(crate) fn each_element(path: &Path, ask: Ask<'_>, each: impl FnMut(At, Small) -> Result<()>) -> Result<()> {
+    each_in(open_file(path)?, path, ask, each)
+}
+
+/// Hands the elements of the lists that `ask` names in the document that `file` holds to `each`.
+///
+/// # Errors
+/// Those of `each` and of [`read`].
+pub(crate) fn each_in(
+    file: impl Read,
+    path: &Path,
+    ask: Ask<'_>,
+    mut each: impl FnMut(At, Small) -> Result<()>,
+) -> Result<()> {
+    let stopped = Stopped::default();
+    let mut lists = Lists { ask, each: &mut each, stopped: &stopped };
+    read_from(file, path, &stopped, Document(&mut lists))
+}
+
+/// Hands the entries of the object in the file at `path` to `each`, in order; nothing of another document. `wanted`: keys
+/// of the values that are kept.
+///
+/// # Errors
+/// Those of `each` and of [`read`].
+pub(crate) fn each_entry(path: &Path, wanted: &[&str], mut each: impl FnMut(&str, Small) -> Result<()>) -> Result<()> {
+    let stopped = Stopped::default();
+    read(path, &stopped, Entries { wanted, each: &mut each, stopped: &stopped })
+}
+
+struct Lists<'a> {
+    ask: Ask<'a>,
+    each: &'a mut dyn FnMut(At, Small) -> Result<()>,
+    stopped: &'a Stopped,
+}
+
+/// Visits of values that are not asked for.
+macro_rules! ignore_scalars {
+    () => {
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("a JSON value")
+        }
+
+        fn visit_unit<E>(self) -> std::result::Result<(), E> {
+            Ok(())
+        }
+
+        fn visit_bool<E>(self, _: bool) -> std::result::Result<(), E> {
+            Ok(())
+        }
+
+        fn visit_i64<E>(self, _: i64) -> std::result::Result<(), E> {
+            Ok(())
+        }
+
+        fn visit_u64<E>(self, _: u64) -> std::result::Result<(), E> {
+            Ok(())
+        }
+
+        fn visit_f64<E>(self, _: f64) -> std::result::Result<(), E> {
+            Ok(())
+        }
+
+        fn visit_str<E>(self, _: &str) -> std::result::Result<(), E> {
+            Ok(())
+        }
+    };
+}
+
+macro_rules! any {
+    ($type:ty) => {
+        impl<'de> DeserializeSeed<'de> for $type {
+            type Value = ();
+
+            fn deserialize<D: Deserializer<'de>>(self, from: D) -> std::result::Result<(), D::Error> {
+                from.deserialize_any(self)
+            }
+        }
+    };
+}
+
+/// A document that holds lists.
+struct Document<'a, 'b>(&'a mut Lists<'b>);
+any!(Document<'_, '_>);
+
+impl<'de> Visitor<'de> for Document<'_, '_> {
+    type Value = ();
+    ignore_scalars!();
+
+    fn visit_seq<A: SeqAccess<'de>>(self, list: A) -> std::result::Result<(), A::Error> {
+        match self.0.ask.keys.is_empty() {
+            true => List { lists: self.0, key: 0 }.visit_seq(list),
+            false => IgnoredAny.visit_seq(list).map(drop),
+        }
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
+        while let Some(name) = map.next_key_seed(Key)? {
+            match self.0.ask.keys.iter().position(|key| *key == name) {
+                Some(key) => map.next_value_seed(List { lists: self.0, key })?,
+                None => drop(map.next_value::<IgnoredAny>()?),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A list that is asked for.
+struct List<'a, 'b> {
+    lists: &'a mut Lists<'b>,
+    key: usize,
+}
+any!(List<'_, '_>);
+
+impl<'de> Visitor<'de> for List<'_, '_> {
+    type Value = ();
+    ignore_scalars!();
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<(), A::Error> {
+        let Lists { ask, stopped, .. } = *self.lists;
+        for index in 0.. {
+            let at = At { key: self.key, index, inner: None };
+            let value = match ask.nested {
+                true => list.next_element_seed(Within { lists: self.lists, at })?,
+                false => list.next_element_seed(Keep { wanted: ask.wanted, elements: MAX_ELEMENTS })?,
+            };
+            let Some(value) = value else { break };
+            (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
+        }
+        Ok(())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<(), A::Error> {
+        IgnoredAny.visit_map(map).map(drop)
+    }
+}
+
+/// An element of a list that should be a list itself. Its value is what it is, without its elements.
+struct Within<'a, 'b> {
+    lists: &'a mut Lists<'b>,
+    at: At,
+}
+
+impl<'de> DeserializeSeed<'de> for Within<'_, '_> {
+    type Value = Small;
+
+    fn deserialize<D: Deserializer<'de>>(self, from: D) -> std::result::Result<Small, D::Error> {
+        from.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Within<'_, '_> {
+    type Value = Small;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON value")
+    }
+
+    fn visit_unit<E>(self) -> std::result::Result<Small, E> {
+        Ok(Small::Null)
+    }
+
+    fn visit_bool<E>(self, value: bool) -> std::result::Result<Small, E> {
+        Ok(Small::Bool(value))
+    }
+
+    fn visit_i64<E>(self, value: i64) -> std::result::Result<Small, E> {
+        Ok(Small::Number(value.into()))
+    }
+
+    fn visit_u64<E>(self, value: u64) -> std::result::Result<Small, E> {
+        Ok(Small::Number(value.into()))
+    }
+
+    fn visit_f64<E>(self, _: f64) -> std::result::Result<Small, E> {
+        Ok(Small::Large("a number".into()))
+    }
+
+    fn visit_str<E>(self, _: &str) -> std::result::Result<Small, E> {
+        Ok(Small::Large("a text".into()))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<Small, A::Error> {
+        let Lists { ask, stopped, .. } = *self.lists;
+        for inner in 0.. {
+            let keep = Keep { wanted: ask.wanted, elements: MAX_ELEMENTS };
+            let Some(value) = list.next_element_seed(keep)? else { break };
+            let at = At { inner: Some(inner), ..self.at };
+            (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
+        }
+        Ok(Small::List(Vec::new(), 0))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> std::result::Result<Small, A::Error> {
+        IgnoredAny.visit_map(map).map(|IgnoredAny| Small::Large("an object".into()))
+    }
+}
+
+/// An object whose entries are asked for.
+struct Entries<'a> {
+    wanted: &'a [&'a str],
+    each: &'a mut dyn FnMut(&str, Small) -> Result<()>,
+    stopped: &'a Stopped,
+}
+any!(Entries<'_>);
+
+impl<'de> Visitor<'de> for Entries<'_> {
+    type Value = ();
+    ignore_scalars!();
+
+    fn visit_seq<A: SeqAccess<'de>>(self, list: A) -> std::result::Result<(), A::Error> {
+        IgnoredAny.visit_seq(list).map(drop)
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
+        while let Some(key) = map.next_key_seed(Key)? {
+            let value = map.next_value_seed(Keep { wanted: self.wanted, elements: MAX_ELEMENTS })?;
+            (self.each)(&key, value).map_err(|error| self.stopped.by::<A::Error>(error))?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::Error;
+
+    fn file(text: &str) -> tempfile::NamedTempFile {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        file
+    }
+
+    fn elements(text: &str, keys: &[&str], nested: bool) -> Vec<(usize, usize, Option<usize>, String)> {
+        let mut found = Vec::new();
+        let ask = Ask { keys, nested, wanted: &[] };
+        each_element(file(text).path(), ask, |At { key, index, inner }, value| {
+            found.push((key, index, inner, value.describe()));
+            Ok(())
+        })
+        .unwrap();
+        found
+    }
+
+    #[test]
+    fn elements_come_in_order_with_their_places() {
+        let found = elements("[1, [2], {}]", &[], false);
+        assert_eq!(found, [(0, 0, None, "1".into()), (0, 1, None, "[2]".into()), (0, 2, None, "{}".into())]);
+        let found = elements("{\"a\": [1], \"c\": [9], \"b\": 3, \"b\": [2], \"a\": [4]}", &["a", "b"], false);
+        assert_eq!(found, [(0, 0, None, "1".into()), (1, 0, None, "2".into()), (0, 0, None, "4".into())]);
+        let found = elements("{\"a\": [[7, 8], [], 5]}", &["a"], true);
+        let empty = || "an empty list".to_owned();
+        assert_eq!(
+            found,
+            [
+                (0, 0, Some(0), "7".into()),
+                (0, 0, Some(1), "8".into()),
+                (0, 0, None, empty()),
+                (0, 1, None, empty()),
+                (0, 2, None, "5".into())
+            ]
+        );
+    }
+
+    #[test]
+    fn an_error_of_the_receiver_ends_the_reading_and_comes_back() {
+        let file = file("[1, 2, 3");
+        let ask = Ask { keys: &[], nested: false, wanted: &[] };
+        let error = each_element(file.path(), ask, |at, _| match at.index {
+            1 => Err(Error::usage("enough")),
+            _ => Ok(()),
+        });
+        assert_eq!(error.unwrap_err().to_string(), "enough");
+    }
+}

@@ -1,0 +1,33 @@
+//! File formats, the reader of each beside its writer: PLY, NumPy and PyTorch files, `.spz`, `.splatv`, containers, frame
+//! streams, cameras, images; and [`atomic`], by which every output appears whole or not at all.
+
+pub mod accuracy;
+pub mod atomic;
+pub mod cameras;
+pub(crate) mod checkpoint;
+pub mod container;
+pub(crate) mod csv;
+pub(crate) mod digest;
+pub mod frame_stream;
+pub mod image;
+#[doc(hidden)]
+pub mod in_memory;
+pub(crate) mod json;
+mod map;
+pub mod names;
+pub(crate) mod npy;
+pub(crate) mod npz;
+pub(crate) mod open;
+pub mod page_policy;
+mod pickle;
+pub mod ply;
+pub mod ply_frames;
+pub mod ply_sequence;
+pub(crate) mod python_literal;
+mod shared_file;
+pub mod splatv;
+pub mod spz;
+pub(crate) mod state_dict;
+pub mod text;
+mod zip_directory;
+pub(crate) mod zip_output;

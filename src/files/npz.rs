@@ -1,0 +1,340 @@
+//! numpy's `.npz` archives, of which arrays are read where they lie.
+//!
+//! In: a path. Out: the shape of every array, and values of those asked for. Memory: 2 MiB of a map of the file. An array
+//! that is compressed or not f32 is decoded once, into a scratch file without a name that is mapped in its place.
+pub(crate) mod write;
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use half::f16;
+use npyz::{DType, Endianness, NpyHeader, Order, TypeChar};
+use zip::ZipArchive;
+use zip::read::ZipFile;
+
+use super::map::FileMap;
+use super::npy::{HEAD, header_is_sound};
+use super::open::open_file;
+use super::zip_directory::{Announced, announced};
+use crate::error::{Error, Result};
+
+/// Most arrays of an archive.
+const MAX_ARRAYS: usize = 4096;
+/// Maximum number of bytes of the list of files at the end of an archive.
+const MAX_LIST: u64 = 4 << 20;
+/// Bytes of decoded arrays that each byte of an archive may stand for, beside [`SCRATCH`]. Trained models have 1 to 2.
+const SCRATCH_PER_BYTE: u64 = 64;
+/// Bytes of decoded arrays that any archive may have.
+const SCRATCH: u64 = 64 << 20;
+/// Most bytes that DEFLATE packs into one.
+const MOST_PER_BYTE: u64 = 1032;
+
+/// An open archive.
+#[derive(Debug)]
+pub(crate) struct Npz {
+    path: PathBuf,
+    map: Arc<FileMap>,
+    entries: Vec<Entry>,
+}
+
+/// An array of an archive.
+#[derive(Debug, Clone)]
+pub(crate) struct Entry {
+    /// Without `.npy`.
+    pub(crate) name: String,
+    /// Length of every axis, the slowest first.
+    pub(crate) shape: Vec<usize>,
+    /// How its values are stored; none: not as floating-point numbers in C order.
+    pub(crate) float: Option<Float>,
+    /// Type of its values, as numpy spells it.
+    pub(crate) descr: String,
+    /// Whether its first axis is the fastest.
+    pub(crate) is_fortran: bool,
+    /// Whether it is compressed.
+    pub(crate) is_compressed: bool,
+    /// Bytes in the archive.
+    stored: u64,
+    /// Place in the archive.
+    index: usize,
+    /// Bytes of its header, and where in the file its values begin if it is not compressed.
+    header: usize,
+    start: usize,
+}
+
+/// A type of floating-point numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Float {
+    /// 2, 4 or 8.
+    pub(crate) bytes: usize,
+    big_endian: bool,
+}
+
+impl Float {
+    /// Four bytes, the lowest first.
+    const F32: Float = Float { bytes: 4, big_endian: false };
+
+    fn of(header: &NpyHeader) -> Option<Float> {
+        let DType::Plain(plain) = header.dtype() else { return None };
+        let bytes = plain.num_bytes().filter(|bytes| [2, 4, 8].contains(bytes))?;
+        let is_float = plain.type_char() == TypeChar::Float && header.order() == Order::C;
+        is_float.then_some(Float { bytes, big_endian: plain.endianness() == Endianness::Big })
+    }
+
+    /// The value in `stored`, of as many bytes as it takes.
+    pub(crate) fn decode(self, stored: &[u8]) -> f32 {
+        let mut bytes = [0; 8];
+        bytes[..self.bytes].copy_from_slice(stored);
+        if self.big_endian {
+            bytes[..self.bytes].reverse();
+        }
+        let [a, b, c, d, ..] = bytes;
+        match self.bytes {
+            2 => f16::from_le_bytes([a, b]).to_f32(),
+            4 => f32::from_le_bytes([a, b, c, d]),
+            _ => f64::from_le_bytes(bytes) as f32,
+        }
+    }
+
+    /// Stores `value`.
+    pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
+        match self.bytes {
+            2 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
+            4 => stored.copy_from_slice(&value.to_le_bytes()),
+            _ => stored.copy_from_slice(&f64::from(value).to_le_bytes()),
+        }
+        if self.big_endian {
+            stored.reverse();
+        }
+    }
+}
+
+impl Entry {
+    /// Number of values.
+    pub(crate) fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+}
+
+impl Npz {
+    /// Opens the archive at `path` and reads the headers of its arrays.
+    ///
+    /// # Errors
+    /// A file that is no archive, or is cut short; an array with a header that says nothing, or whose values are not all
+    /// there.
+    pub(crate) fn open(path: &Path) -> Result<Npz> {
+        let map = FileMap::open(path)?;
+        let wrong = |place: String, found: String| {
+            Error::input(path, place, "arrays as numpy.savez writes them", found)
+                .hint("if the file was copied, copy it again: one that is cut short has lost its list of arrays")
+        };
+        let mut archive = open_zip(path)?.map_err(|found| wrong("list of arrays".into(), found))?;
+        if archive.len() > MAX_ARRAYS {
+            return Err(wrong("list of arrays".into(), format!("{} arrays", archive.len())));
+        }
+        let mut entries: Vec<Entry> = Vec::new();
+        for index in 0..archive.len() {
+            let mut file =
+                archive.by_index(index).map_err(|error| wrong(format!("array {index}"), error.to_string()))?;
+            let Some(name) = npyz::npz::array_name_from_file_name(file.name()).map(str::to_owned) else { continue };
+            if entries.iter().any(|entry| entry.name == name) {
+                return Err(wrong(name, "two arrays of this name".into()));
+            }
+            let entry = Entry::read(&mut file, index, name.clone()).map_err(|found| wrong(name.clone(), found))?;
+            let bytes = entry.float.map(|float| entry.len() * float.bytes);
+            if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
+                || entry.stored > map.len() as u64
+                || file.size() > entry.stored.saturating_mul(MOST_PER_BYTE).saturating_add(64)
+                || !entry.is_compressed && entry.start as u64 + (file.size() - entry.header as u64) > map.len() as u64
+            {
+                return Err(wrong(name, {
+                    let (shape, bytes) = (&entry.shape, file.size());
+                    format!("{shape:?} values in {bytes} bytes")
+                }));
+            }
+            entries.push(entry);
+        }
+        drop(archive);
+        Ok(Npz { path: path.to_owned(), map: Arc::new(map), entries })
+    }
+
+    /// Where it is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Its arrays, in the file's order.
+    pub(crate) fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The array called `name`.
+    pub(crate) fn entry(&self, name: &str) -> Option<&Entry> {
+        self.entries.iter().find(|entry| entry.name == name)
+    }
+
+    /// Confirms that the arrays called `names` are there, hold floating-point numbers in C order, and decode to no more
+    /// scratch bytes than an archive of this length may have. Nothing is decoded.
+    ///
+    /// # Errors
+    /// One of these does not hold; the error names the array.
+    pub(crate) fn check_floats(&self, names: &[&str]) -> Result<()> {
+        let most = SCRATCH + SCRATCH_PER_BYTE * self.map.len() as u64;
+        let mut decoded = 0u64;
+        for name in names {
+            let (entry, float) = self.float(name)?;
+            if !entry.is_in_place(float) {
+                decoded = decoded.saturating_add(4 * entry.len() as u64);
+            }
+            if decoded > most {
+                let expected = format!("arrays of at most {most} bytes in an archive of {}", self.map.len());
+                return Err(Error::input(&self.path, *name, expected, format!("{decoded} bytes up to this one"))
+                    .hint("if the model is meant to hold so many equal values, save it with numpy.savez"));
+            }
+        }
+        Ok(())
+    }
+
+    /// The array called `name` and the type of its values.
+    fn float(&self, name: &str) -> Result<(&Entry, Float)> {
+        let Some(entry) = self.entry(name) else {
+            let names: Vec<&str> = self.entries.iter().map(|entry| entry.name.as_str()).collect();
+            return Err(Error::input(&self.path, name, "an array of this name", names.join(", ")));
+        };
+        let Some(float) = entry.float else {
+            let found = format!("{} in another order or type", entry.descr);
+            return Err(Error::input(&self.path, name, "float16, float32 or float64 in C order", found));
+        };
+        Ok((entry, float))
+    }
+
+    /// The values of the array called `name`, decoded into a file in `scratch` where they cannot be read where they lie.
+    ///
+    /// # Errors
+    /// An array that is not there or holds no floating-point numbers in C order; one that does not decode; a scratch file
+    /// that cannot be written.
+    pub(crate) fn floats(&self, name: &str, scratch: &Path) -> Result<Floats> {
+        let (entry, float) = self.float(name)?;
+        if entry.is_in_place(float) {
+            return Ok(Floats { map: Arc::clone(&self.map), start: entry.start, len: entry.len() });
+        }
+        let file = tempfile::tempfile_in(scratch).map_err(Error::io("create a scratch file in", scratch))?;
+        let failed = |error| Error::io("write a scratch file in", scratch)(error);
+        let mut out = BufWriter::new(&file);
+        let mut piece = vec![0; entry.len().min(1 << 16) * float.bytes];
+        let mut left = entry.len() * float.bytes;
+        self.read(entry, |values| {
+            while left > 0 {
+                let piece = &mut piece[..left.min(1 << 16)];
+                values.read_exact(piece).map_err(|error| self.damaged(entry, &error))?;
+                for stored in piece.chunks_exact(float.bytes) {
+                    let value = float.decode(stored).to_le_bytes();
+                    out.write_all(&value).map_err(failed)?;
+                }
+                left -= piece.len();
+            }
+            out.flush().map_err(failed)
+        })?;
+        drop(out);
+        let map = FileMap::from_scratch(&file, 0..4 * entry.len() as u64, &self.path)?;
+        Ok(Floats { map: Arc::new(map), start: 0, len: entry.len() })
+    }
+
+    /// Has `take` read the stored values of `entry` from first to last.
+    ///
+    /// # Errors
+    /// Those of `take`; a file cut short since it was opened.
+    pub(crate) fn read(&self, entry: &Entry, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
+        self.map.check()?;
+        let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;
+        let mut file = archive.by_index(entry.index).map_err(|error| self.damaged(entry, &error))?;
+        let mut header = vec![0; entry.header];
+        file.read_exact(&mut header).map_err(|error| self.damaged(entry, &error))?;
+        take(&mut file)
+    }
+
+    /// That the values of `entry` are not as they were written.
+    pub(crate) fn damaged(&self, entry: &Entry, error: &dyn std::fmt::Display) -> Error {
+        Error::input(&self.path, &entry.name, "the values as they were written", error.to_string())
+    }
+}
+
+/// Opens the zip archive at `path`. The inner error says what was found in it.
+fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File>>, String>> {
+    let mut file = open_file(path)?;
+    let directory = match announced(&mut file) {
+        Ok(directory) => directory,
+        Err(error) => return Ok(Err(error.to_string())),
+    };
+    if directory.entries > MAX_ARRAYS as u64 || directory.bytes > MAX_LIST {
+        let Announced { entries, bytes } = directory;
+        return Ok(Err(format!(
+            "{entries} files in a list of {bytes} bytes, where at most {MAX_ARRAYS} files and {MAX_LIST} bytes can be"
+        )));
+    }
+    Ok(ZipArchive::new(BufReader::new(file)).map_err(|error| error.to_string()))
+}
+
+impl Entry {
+    /// Whether values of type `float` can be read where they lie.
+    fn is_in_place(&self, float: Float) -> bool {
+        !self.is_compressed && float == Float::F32
+    }
+
+    fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<Entry, String> {
+        let is_compressed = file.compression() != zip::CompressionMethod::Stored;
+        let start = file.data_start();
+        let mut text = Vec::new();
+        file.by_ref().take(HEAD).read_to_end(&mut text).map_err(|error| error.to_string())?;
+        if !header_is_sound(&text, file.size()) {
+            return Err("a header that no array of numbers has".into());
+        }
+        let mut rest = &text[..];
+        let header = NpyHeader::from_reader(&mut rest).map_err(|error| error.to_string())?;
+        let before = text.len() - rest.len();
+        Ok(Entry {
+            name,
+            shape: header.shape().iter().map(|&length| length as usize).collect(),
+            float: Float::of(&header),
+            descr: header.dtype().descr(),
+            is_fortran: header.order() == Order::Fortran,
+            is_compressed,
+            stored: file.compressed_size(),
+            index,
+            header: before,
+            start: start as usize + before,
+        })
+    }
+}
+
+/// Values of an array, f32, in its order.
+#[derive(Debug, Clone)]
+pub(crate) struct Floats {
+    map: Arc<FileMap>,
+    start: usize,
+    len: usize,
+}
+
+impl Floats {
+    /// Confirms that they are still there; call before a block of them is read.
+    pub(crate) fn check(&self) -> Result<()> {
+        self.map.check()
+    }
+
+    /// Records that the values of `range` were read, so that their pages can be released.
+    pub(crate) fn touched(&self, range: Range<usize>) {
+        self.map.touched(self.start + 4 * range.start..self.start + 4 * range.end);
+    }
+
+    /// The values from `first` on.
+    ///
+    /// # Panics
+    /// If there are not `W`.
+    pub(crate) fn row<const W: usize>(&self, first: usize) -> [f32; W] {
+        assert!(first + W <= self.len, "values {first} to {} of {}", first + W, self.len);
+        let (stored, _) = self.map[self.start + 4 * first..][..4 * W].as_chunks::<4>();
+        std::array::from_fn(|c| f32::from_le_bytes(stored[c]))
+    }
+}

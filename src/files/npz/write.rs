@@ -1,0 +1,117 @@
+//! A numpy `.npz` archive with fewer rows.
+//!
+//! In: an open archive, and for each of its arrays which rows stay. Out: an archive with the same arrays in the same order
+//! and types, compressed as they were. Memory: one frame of rows. Bytes depend on the content alone: entries are dated
+//! 1980-01-01.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use zip::write::FileOptions;
+use zip::{CompressionMethod, DateTime, ZipWriter};
+
+use crate::error::{Error, Result};
+use crate::files::npz::{Entry, Npz};
+use crate::files::zip_output::ZipOutput;
+
+/// Bytes from which an entry of an archive needs wide lengths.
+const LARGE: usize = 1 << 32;
+
+/// What becomes of an array.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Axis {
+    /// It stays as it is.
+    None,
+    /// Its axis 0 counts Gaussians.
+    First,
+    /// Its axis 1 counts Gaussians, axis 0 frames.
+    Second,
+}
+
+/// Writes `template` with the rows `kept` of its arrays along `axis` to `path`. `change` may change the values of a row: it
+/// gets the array's name, the frame, and the values of all rows that stay, and says of which rows it changed any; all
+/// others keep their bytes.
+///
+/// # Errors
+/// An array that does not decode; those of `change`; a failed write.
+pub(crate) fn write_like(
+    template: &Npz,
+    kept: &[u32],
+    axis: impl Fn(&Entry) -> Axis,
+    mut change: impl FnMut(&str, usize, &mut [f32]) -> Result<Vec<u32>>,
+    path: &Path,
+) -> Result<()> {
+    let failed = |error| Error::io("write", path)(error);
+    let mut archive =
+        ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?)));
+    for entry in template.entries() {
+        let axis = axis(entry);
+        let mut shape = entry.shape.clone();
+        match axis {
+            Axis::None => (),
+            Axis::First => shape[0] = kept.len(),
+            Axis::Second => shape[1] = kept.len(),
+        }
+        let method = if entry.is_compressed { CompressionMethod::Deflated } else { CompressionMethod::Stored };
+        let options = FileOptions::default()
+            .compression_method(method)
+            .last_modified_time(DateTime::default())
+            .large_file(entry.len().saturating_mul(8) >= LARGE);
+        archive.start_file(format!("{}.npy", entry.name), options).map_err(|error| failed(error.into()))?;
+        template.read(entry, |values| {
+            if axis == Axis::None {
+                archive.write_all(&header(&entry.descr, entry.is_fortran, &shape)).map_err(failed)?;
+                std::io::copy(values, &mut archive).map_err(|error| template.damaged(entry, &error))?;
+                return Ok(());
+            }
+            let Some(float) = entry.float else {
+                return Err(Error::input(template.path(), &entry.name, "floating-point numbers", &entry.descr));
+            };
+            archive.write_all(&header(&entry.descr, false, &shape)).map_err(failed)?;
+            let (frames, rows) = match axis {
+                Axis::Second => (entry.shape[0], &entry.shape[1..]),
+                _ => (1, &entry.shape[..]),
+            };
+            let width: usize = rows[1..].iter().product();
+            let row_bytes = width * float.bytes;
+            let (mut frame_bytes, mut left) = (vec![0; rows[0] * row_bytes], Vec::new());
+            let mut as_f32 = Vec::new();
+            for frame in 0..frames {
+                values.read_exact(&mut frame_bytes).map_err(|error| template.damaged(entry, &error))?;
+                left.clear();
+                kept.iter()
+                    .for_each(|&row| left.extend_from_slice(&frame_bytes[row as usize * row_bytes..][..row_bytes]));
+                as_f32.clear();
+                as_f32.extend(left.chunks_exact(float.bytes).map(|stored| float.decode(stored)));
+                for row in change(&entry.name, frame, &mut as_f32)? {
+                    let row = row as usize;
+                    let (stored, values) = (&mut left[row * row_bytes..][..row_bytes], &as_f32[row * width..][..width]);
+                    stored
+                        .chunks_exact_mut(float.bytes)
+                        .zip(values)
+                        .for_each(|(stored, &value)| float.encode(value, stored));
+                }
+                archive.write_all(&left).map_err(failed)?;
+            }
+            Ok(())
+        })?;
+    }
+    archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
+}
+
+/// The header of an array, version 1.0 of numpy's format: a dictionary padded to a multiple of 64 bytes.
+fn header(descr: &str, is_fortran: bool, shape: &[usize]) -> Vec<u8> {
+    let order = if is_fortran { "True" } else { "False" };
+    let lengths: String = shape.iter().map(|length| format!("{length}, ")).collect();
+    let lengths = if shape.len() == 1 { lengths.trim_end() } else { lengths.trim_end_matches(", ") };
+    let mut text = format!("{{'descr': {descr}, 'fortran_order': {order}, 'shape': ({lengths}), }}");
+    let before = 10;
+    let padding = (before + text.len() + 1).next_multiple_of(64) - (before + text.len() + 1);
+    text.extend(std::iter::repeat_n(' ', padding));
+    text.push('\n');
+    let mut header = b"\x93NUMPY\x01\x00".to_vec();
+    header.extend((text.len() as u16).to_le_bytes());
+    header.extend(text.as_bytes());
+    header
+}

@@ -1,0 +1,302 @@
+//! Gaussians to PLY files.
+//!
+//! In: Gaussians, or an open PLY and the rows to keep of it. Out: a file at the path given. Memory: one
+//! row. Writers that go through [`crate::files::atomic`] pass its temporary path.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::ops::Range;
+use std::path::Path;
+
+use crate::error::{Error, Result, ShowPath};
+use crate::files::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, name_without_bands, read_plane};
+use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
+use crate::reduction::{Change, Reduction};
+
+/// One row of a smaller PLY.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OutRow {
+    /// The Gaussian of the template whose row is copied: itself, or the leader of its cluster.
+    pub source: u32,
+    /// The proxy whose columns replace those of the row, if any.
+    pub proxy: Option<u32>,
+}
+
+/// The rows of what `reduction` leaves.
+pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
+    let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
+    for (proxy, cluster) in reduction.clusters.iter().enumerate() {
+        rows[cluster.output as usize].proxy = Some(proxy as u32);
+    }
+    rows
+}
+
+/// Writes a smaller PLY with the header of `template` (properties, order, types, comments, line ends):
+/// only the count changes, and harmonics above `sh_degree` go, so that `f_rest_*` are numbered anew. What stays of a row
+/// without a proxy is the template's, byte for byte but for what `change`, by row, adds to it (zeros leave the bytes). A
+/// row with one is the template's with position, rotation, log_scale, opacity_logit and sh replaced, each in the type of
+/// its property (integers: nearest, saturated); normals and further properties stay the leader's. A template without
+/// `scale_2` has no place for a proxy's third scale: order axes largest first.
+///
+/// Further elements and bytes after the last one are copied. A text template becomes little-endian
+/// binary; otherwise all rows in order without proxies give the template's own bytes.
+///
+/// # Errors
+/// A source or proxy that does not exist; proxies of another SH degree; changes of other rows; a template cut short since
+/// it was opened; a failed write.
+pub fn write_like(
+    template: &Ply,
+    rows: &[OutRow],
+    proxies: &Gaussians,
+    change: &Change,
+    sh_degree: usize,
+    path: &Path,
+) -> Result<()> {
+    check_rows(template, rows, proxies, change)?;
+    let name = |name: &str| name_without_bands(name, template.sh_degree(), sh_degree);
+    let big_endian = template.header().encoding == Encoding::BigEndian;
+    let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
+    write_rows_like(template, &sources, name, path, |place, bytes| {
+        if let Some(proxy) = rows[place].proxy {
+            replace(bytes, template.layout(), big_endian, proxies, proxy as usize);
+        }
+        add(bytes, template, change, place);
+    })
+}
+
+/// Writes the rows `sources` of `template`, each as `edit` leaves its bytes, given its place; properties get other names or
+/// go. Further elements and bytes after the last one are copied.
+///
+/// # Errors
+/// A source that does not exist; a template cut short since it was opened; a failed write.
+pub(crate) fn write_rows_like(
+    template: &Ply,
+    sources: &[u32],
+    name: impl Fn(&str) -> Option<String>,
+    path: &Path,
+    mut edit: impl FnMut(usize, &mut [u8]),
+) -> Result<()> {
+    template.check_unshrunk()?;
+    if let Some(source) = sources.iter().find(|&&source| source as usize >= template.count()) {
+        let (path, count) = (template.path().shown(), template.count());
+        return Err(Error::usage(format!("{path}: Gaussian {source} is to be kept, of {count} from 0")));
+    }
+    let mut left: Vec<Range<usize>> = Vec::new();
+    for property in template.properties().iter().filter(|property| name(&property.name).is_some()) {
+        let end = property.offset + property.scalar.bytes();
+        match left.last_mut() {
+            Some(last) if last.end == property.offset => last.end = end,
+            _ => left.push(property.offset..end),
+        }
+    }
+    create(path, |out| {
+        out.write_all(&template.header().text_for(sources.len(), name))?;
+        template.write_lead(out)?;
+        let mut changed = Vec::new();
+        for (place, &source) in sources.iter().enumerate() {
+            changed.clear();
+            changed.extend_from_slice(template.row(source as usize));
+            edit(place, &mut changed);
+            left.iter().try_for_each(|range| out.write_all(&changed[range.clone()]))?;
+        }
+        template.write_tail(out)
+    })
+}
+
+/// Writes `gaussians` in the INRIA layout: binary little-endian f32, zero normals, `comments` as
+/// comment lines (line breaks in them become spaces). An f32 keeps its bits.
+///
+/// # Errors
+/// A failed write; an SH width that belongs to no degree from 0 to 3.
+pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
+    let width = gaussians.sh.width();
+    if !(0..=HIGHEST_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
+        return Err(Error::usage(format!("{width} SH planes belong to no degree from 0 to 3")));
+    }
+    let rest = width - 3;
+    let mut planes: Vec<&[f32]> = Vec::new();
+    let zeros = vec![0.0; gaussians.len()];
+    planes.extend((0..3).map(|c| gaussians.position.plane(c)));
+    planes.extend([zeros.as_slice(); 3]);
+    planes.extend((0..3).map(|c| gaussians.sh.plane(c)));
+    // The file holds all of red, then green, then blue; a plane is 3 · coefficient + channel.
+    planes.extend((0..3).flat_map(|channel| (1..=rest / 3).map(move |k| gaussians.sh.plane(3 * k + channel))));
+    planes.push(gaussians.opacity_logit.plane(0));
+    planes.extend((0..3).map(|c| gaussians.log_scale.plane(c)));
+    planes.extend((0..4).map(|c| gaussians.rotation.plane(c)));
+    create(path, |out| {
+        out.write_all(inria_header(gaussians.len(), rest, comments).as_bytes())?;
+        for i in 0..gaussians.len() {
+            for plane in &planes {
+                out.write_all(&plane[i].to_le_bytes())?;
+            }
+        }
+        Ok(())
+    })
+}
+
+fn inria_header(count: usize, rest: usize, comments: &[String]) -> String {
+    let mut header = "ply\nformat binary_little_endian 1.0\n".to_owned();
+    for comment in comments {
+        header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
+    }
+    header += &format!("element vertex {count}\n");
+    let names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(str::to_owned).into_iter();
+    let names = names.chain((0..rest).map(|k| format!("f_rest_{k}")));
+    let last = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+    for name in names.chain(last.map(str::to_owned)) {
+        header += &format!("property float {name}\n");
+    }
+    header + "end_header\n"
+}
+
+/// What of the rows of `template` is no attribute of a Gaussian, of each of `rows` one after the other.
+pub(crate) fn beside(template: &Ply, rows: impl Iterator<Item = u32>) -> Vec<u8> {
+    let ranges = ranges_beside(template.properties(), template.layout());
+    rows.flat_map(|row| ranges.iter().flat_map(move |range| template.row(row as usize)[range.clone()].to_vec()))
+        .collect()
+}
+
+/// Bytes of each row of `template` that are no attribute of a Gaussian.
+pub(crate) fn bytes_beside(template: &Ply) -> usize {
+    ranges_beside(template.properties(), template.layout()).iter().map(ExactSizeIterator::len).sum()
+}
+
+/// Writes a PLY with `header`, read from `from`, `cloud` as its rows with what is `beside` each, and what is before and
+/// after them.
+///
+/// # Errors
+/// A header that is of no such rows; a failed write.
+pub(crate) fn write_rows(
+    from: &Path,
+    header: &Header,
+    [lead, tail]: [&[u8]; 2],
+    beside: &[u8],
+    cloud: &Gaussians,
+    path: &Path,
+) -> Result<()> {
+    let mismatch = |expected: String| Error::input(from, "header of the PLY", expected, "others");
+    let Some(vertex) = header.vertex().filter(|vertex| vertex.count == cloud.len() as u64) else {
+        return Err(mismatch(format!("{} rows", cloud.len())));
+    };
+    let layout = Layout::of(from, vertex)?;
+    let ranges = ranges_beside(&vertex.properties, &layout);
+    let width: usize = ranges.iter().map(|range| range.len()).sum();
+    if layout.planes(Columns::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
+        return Err(mismatch("the properties of the rows".to_owned()));
+    }
+    let big_endian = header.encoding == Encoding::BigEndian;
+    create(path, |out| {
+        out.write_all(&header.text)?;
+        out.write_all(lead)?;
+        let mut row = vec![0; vertex.stride];
+        for i in 0..cloud.len() {
+            let mut rest = &beside[i * width..(i + 1) * width];
+            for range in &ranges {
+                let (own, after) = rest.split_at(range.len());
+                row[range.clone()].copy_from_slice(own);
+                rest = after;
+            }
+            replace(&mut row, &layout, big_endian, cloud, i);
+            out.write_all(&row)?;
+        }
+        out.write_all(tail)
+    })
+}
+
+/// Where a row holds what is no attribute of a Gaussian.
+fn ranges_beside(properties: &[Property], layout: &Layout) -> Vec<Range<usize>> {
+    let mut used: Vec<usize> = Vec::new();
+    for column in Columns::all().iter() {
+        used.extend(layout.planes(column).iter().filter_map(|plane| match plane {
+            Plane::Property(property) => Some(property.offset),
+            Plane::Thin => None,
+        }));
+    }
+    let beside = properties.iter().filter(|property| !used.contains(&property.offset));
+    beside.map(|property| property.offset..property.offset + property.scalar.bytes()).collect()
+}
+
+/// Creates the file at `path` and lets `fill` write it.
+fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<()> {
+    let mut out = BufWriter::with_capacity(1 << 18, File::create(path).map_err(Error::io("create", path))?);
+    fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
+}
+
+fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change) -> Result<()> {
+    for column in change.columns().iter() {
+        let changes = change.0.column(column).len();
+        if changes != rows.len() {
+            let message = format!("{}: {changes} changes of {} rows", column.name(), rows.len());
+            return Err(Error::usage(message));
+        }
+    }
+    let planes = template.layout().planes(Columns::SH).len();
+    if !proxies.is_empty() && proxies.sh.width() != planes {
+        let width = proxies.sh.width();
+        return Err(Error::usage(format!("proxies have {width} SH planes, {} has {planes}", template.path().shown())));
+    }
+    for row in rows {
+        if let Some(proxy) = row.proxy.filter(|&proxy| proxy as usize >= proxies.len()) {
+            return Err(Error::usage(format!("proxy {proxy} is to be written, of {} counted from 0", proxies.len())));
+        }
+    }
+    Ok(())
+}
+
+/// Replaces the attributes in the bytes of a row by those of a proxy.
+fn replace(row: &mut [u8], layout: &Layout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
+    for column in Columns::all().iter() {
+        for (c, plane) in layout.planes(column).iter().enumerate() {
+            if let Plane::Property(property) = plane {
+                put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);
+            }
+        }
+    }
+}
+
+/// Adds the change of the Gaussian at `place` of the output to the bytes of its row.
+fn add(row: &mut [u8], template: &Ply, change: &Change, place: usize) {
+    let big_endian = template.header().encoding == Encoding::BigEndian;
+    for column in change.columns().iter() {
+        let by = change.0.column(column);
+        for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
+            let by = by.plane(c)[place];
+            if let (Plane::Property(property), true) = (plane, by != 0.0) {
+                put(row, property, big_endian, value(row, property, big_endian) + by);
+            }
+        }
+    }
+}
+
+/// A value in the bytes of a row, as the nearest f32.
+pub(crate) fn value(row: &[u8], property: &Property, big_endian: bool) -> f32 {
+    let mut value = [0.0];
+    read_plane(row, &[0], property, big_endian, &mut value);
+    value[0]
+}
+
+/// Writes a value into the bytes of a row, in the type of its property.
+pub(crate) fn put(row: &mut [u8], property: &Property, big_endian: bool, value: f32) {
+    let rounded = value.round();
+    let mut bytes = [0; 8];
+    let used = &mut bytes[..property.scalar.bytes()];
+    // `as` saturates and turns NaN into 0.
+    match property.scalar {
+        Scalar::F32 => used.copy_from_slice(&value.to_le_bytes()),
+        Scalar::F64 => used.copy_from_slice(&f64::from(value).to_le_bytes()),
+        Scalar::I8 => used.copy_from_slice(&(rounded as i8).to_le_bytes()),
+        Scalar::U8 => used.copy_from_slice(&(rounded as u8).to_le_bytes()),
+        Scalar::I16 => used.copy_from_slice(&(rounded as i16).to_le_bytes()),
+        Scalar::U16 => used.copy_from_slice(&(rounded as u16).to_le_bytes()),
+        Scalar::I32 => used.copy_from_slice(&(rounded as i32).to_le_bytes()),
+        Scalar::U32 => used.copy_from_slice(&(rounded as u32).to_le_bytes()),
+    }
+    if big_endian {
+        used.reverse();
+    }
+    row[property.offset..property.offset + used.len()].copy_from_slice(used);
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,136 @@
+use std::fs;
+
+use super::*;
+use crate::files::ply::write::write_inria;
+
+const N: usize = 7;
+
+/// A frame whose every value tells frame, column and place.
+fn state(frame: usize, count: usize) -> Gaussians {
+    let mut out = Gaussians::zeros(count, 1);
+    for column in Columns::all().iter() {
+        let fill = |(i, value): (usize, &mut f32)| *value = (1000 * frame + i) as f32;
+        out.column_mut(column).planes_mut().iter_mut().enumerate().for_each(fill);
+    }
+    out
+}
+
+fn write(folder: &Path, name: &str, gaussians: &Gaussians) {
+    write_inria(gaussians, &[], &folder.join(name)).unwrap();
+}
+
+/// A folder of `frames` files `f_0.ply`, `f_1.ply`, … written in reverse.
+fn folder(frames: usize) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    (0..frames).rev().for_each(|t| write(folder.path(), &format!("f_{t}.ply"), &state(t, N)));
+    folder
+}
+
+#[test]
+fn frames_come_in_natural_order_at_even_times() {
+    let folder = folder(12);
+    let sequence = PlySequence::open(folder.path()).unwrap();
+    let info = sequence.info();
+    assert_eq!((info.count, info.sh_degree, info.varying), (N, 1, Columns::all()));
+    assert_eq!(info.times, (0..12).map(|t| t as f64 / 12.0).collect::<Vec<_>>());
+    let mut reader = FrameSource::open(&sequence, Ids::Range(0..N)).unwrap();
+    let mut out = Gaussians::zeros(0, 1);
+    for t in [11, 2, 10, 0] {
+        reader.read(t, Columns::all(), &mut out).unwrap();
+        assert_eq!(out, state(t, N), "frame {t}");
+    }
+    assert!(reader.read(12, Columns::all(), &mut out).unwrap_err().to_string().contains("frame 12"));
+}
+
+#[test]
+fn a_block_reads_the_same_bits_as_the_whole() {
+    let folder = folder(3);
+    let sequence = PlySequence::open(folder.path()).unwrap();
+    let whole = state(2, N);
+    let mut out = Gaussians::zeros(0, 1);
+    let ids = [6, 0, 3, 3];
+    FrameSource::open(&sequence, Ids::List(&ids)).unwrap().read(2, Columns::all(), &mut out).unwrap();
+    for (i, &id) in ids.iter().enumerate() {
+        assert_eq!(out.sh.row::<12>(i), whole.sh.row::<12>(id as usize));
+    }
+    FrameSource::open(&sequence, Ids::Range(2..5)).unwrap().read(2, Columns::POSITION, &mut out).unwrap();
+    assert_eq!(out.position.plane(1), &whole.position.plane(1)[2..5]);
+    assert!(FrameSource::open(&sequence, Ids::Range(0..N + 1)).is_err());
+}
+
+#[test]
+fn a_single_file_is_one_frame_in_which_nothing_varies() {
+    let folder = folder(1);
+    for sequence in
+        [PlySequence::single(&folder.path().join("f_0.ply"), &PlyOptions::default()), PlySequence::open(folder.path())]
+    {
+        let sequence = sequence.unwrap();
+        assert_eq!((sequence.info().varying, &sequence.info().times[..]), (Columns::empty(), &[0.0][..]));
+        let mut out = Gaussians::zeros(0, 1);
+        FrameSource::open(&sequence, Ids::Range(0..N)).unwrap().read(0, Columns::all(), &mut out).unwrap();
+        assert_eq!(out, state(0, N));
+    }
+}
+
+#[test]
+fn a_frame_with_another_count_or_property_set_is_named() {
+    let folder = folder(3);
+    write(folder.path(), "f_1.ply", &state(1, N - 1));
+    let message = PlySequence::open(folder.path()).unwrap_err().to_string();
+    let both = message.contains("expected 7 Gaussians") && message.contains("found 6 Gaussians");
+    assert!(both && message.contains("f_1.ply") && message.contains("f_0.ply"), "{message}");
+
+    write(folder.path(), "f_1.ply", &Gaussians::zeros(N, 0));
+    let message = PlySequence::open(folder.path()).unwrap_err().to_string();
+    assert!(message.contains("f_1.ply") && message.contains("f_rest_0"), "{message}");
+}
+
+#[test]
+fn a_frame_that_changed_since_it_was_opened_is_named() {
+    let folder = folder(2);
+    let sequence = PlySequence::open(folder.path()).unwrap();
+    write(folder.path(), "f_1.ply", &state(1, N + 2));
+    let mut reader = FrameSource::open(&sequence, Ids::Range(0..N)).unwrap();
+    let message = reader.read(1, Columns::all(), &mut Gaussians::zeros(0, 1)).unwrap_err().to_string();
+    assert!(message.contains("f_1.ply") && message.contains("found 9"), "{message}");
+}
+
+#[test]
+fn other_files_are_no_frames_and_none_is_an_error() {
+    let folder = folder(2);
+    for name in ["._f_0.ply", "notes.txt", "ply"] {
+        fs::write(folder.path().join(name), b"not a frame").unwrap();
+    }
+    assert_eq!(PlySequence::open(folder.path()).unwrap().paths().len(), 2);
+    fs::create_dir(folder.path().join("more.ply")).unwrap();
+    let message = PlySequence::open(folder.path()).unwrap_err().to_string();
+    assert!(message.contains("more.ply") && message.contains("a folder"), "{message}");
+    assert_eq!(PlyFrames::open_with_gaps(folder.path(), &PlyOptions::default()).unwrap().paths().len(), 2);
+    let empty = tempfile::tempdir().unwrap();
+    assert!(PlySequence::open(empty.path()).unwrap_err().to_string().contains("no .ply file"));
+}
+
+#[test]
+fn times_that_do_not_increase_are_refused_by_frame() {
+    let folder = folder(3);
+    let with = |times: &[f64]| PlySequence::open(folder.path()).unwrap().with_times(times.to_vec());
+    assert_eq!(with(&[-1.0, 0.0, 7.5]).unwrap().info().times, [-1.0, 0.0, 7.5]);
+    assert!(with(&[0.0, 1.0, 1.0]).unwrap_err().to_string().contains("frame 1 has 1, frame 2 has 1"));
+    assert!(with(&[0.0, 2.0, 1.0]).unwrap_err().to_string().contains("frame 2 has 1"));
+    assert!(with(&[0.0, f64::NAN, 1.0]).unwrap_err().to_string().contains("frame 1 is NaN"));
+    assert!(with(&[0.0]).unwrap_err().to_string().contains("1 times were given for 3"));
+}
+
+#[test]
+fn the_digest_follows_names_and_bytes_but_not_the_folder() {
+    let (one, two) = (folder(3), folder(3));
+    let digest = |folder: &Path| PlySequence::open(folder).unwrap().digest().unwrap();
+    let before = digest(one.path());
+    assert_eq!((before.len(), &before), (32, &digest(two.path())));
+    write(two.path(), "f_2.ply", &state(1, N));
+    assert_ne!(digest(two.path()), before);
+    for name in ["f_2.ply", "f_1.ply", "f_0.ply"] {
+        fs::rename(one.path().join(name), one.path().join(name.replace('f', "g"))).unwrap();
+    }
+    assert_ne!(digest(one.path()), before);
+}

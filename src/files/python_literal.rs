@@ -1,0 +1,318 @@
+//! Python literals as text: numbers, strings, lists, tuples, dictionaries, True, False, None.
+
+use std::fmt;
+use std::ops::Range;
+use std::path::Path;
+
+use crate::error::{Error, quoted};
+
+/// Nesting beyond this is refused: each level is a stack frame.
+const MAX_DEPTH: usize = 32;
+
+/// A literal, or text that is none.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Literal {
+    None,
+    Bool(bool),
+    Int(i64),
+    Float(f64),
+    Str(String),
+    /// A list or a tuple.
+    Sequence(Vec<Literal>),
+    Dict(Vec<(Literal, Literal)>),
+    /// Balanced text that is no literal: `device(type='cuda')`, `PosixPath('x')`.
+    Opaque(String),
+}
+
+impl fmt::Display for Literal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Literal::None => write!(f, "None"),
+            Literal::Bool(true) => write!(f, "True"),
+            Literal::Bool(false) => write!(f, "False"),
+            Literal::Int(value) => write!(f, "{value}"),
+            Literal::Float(value) => write!(f, "{value}"),
+            Literal::Str(value) => write!(f, "the string {}", quoted(value)),
+            Literal::Sequence(items) => write!(f, "a list of {}", items.len()),
+            Literal::Dict(entries) => write!(f, "a dictionary of {}", entries.len()),
+            Literal::Opaque(text) => write!(f, "`{}`", text.chars().take(40).collect::<String>()),
+        }
+    }
+}
+
+/// An argument of a call.
+#[derive(Debug)]
+pub(crate) struct Argument {
+    pub(crate) name: String,
+    pub(crate) value: Literal,
+    /// Where its value stands in the text.
+    pub(crate) place: Range<usize>,
+}
+
+/// Where parsing stopped.
+#[derive(Debug, PartialEq)]
+pub(crate) struct ParseError {
+    byte: usize,
+    expected: &'static str,
+}
+
+impl ParseError {
+    /// The error as one of the file `path`, whose text is `text`.
+    pub(crate) fn in_file(self, path: &Path, text: &str) -> Error {
+        let before = &text[..self.byte];
+        let line = 1 + before.matches('\n').count();
+        let rest = &text[self.byte..];
+        let found = if rest.is_empty() {
+            "the end of the file".to_owned()
+        } else {
+            format!("`{}`", rest.chars().take(20).collect::<String>().escape_debug())
+        };
+        Error::input(path, format!("line {line}, byte {}", self.byte), self.expected, found)
+    }
+}
+
+type Parsed<T> = std::result::Result<T, ParseError>;
+
+/// Parses `name(key=value, …)` into its arguments in order.
+pub(crate) fn parse_call(text: &str, name: &'static str) -> Parsed<Vec<Argument>> {
+    let mut parser = Parser { text, at: 0 };
+    parser.space();
+    if !parser.take(name) {
+        return Err(parser.error("Namespace(…)"));
+    }
+    parser.expect("(", "`(`")?;
+    let mut keys = Vec::new();
+    while !parser.take_token(")") {
+        let key = parser.word();
+        if key.is_empty() {
+            return Err(parser.error("a key or `)`"));
+        }
+        parser.expect("=", "`=`")?;
+        parser.space();
+        let start = parser.at;
+        let value = parser.value(0)?;
+        let place = start..start + text[start..parser.at].trim_end().len();
+        keys.push(Argument { name: key.to_owned(), value, place });
+        if !parser.take_token(",") && !parser.rest().trim_start().starts_with(')') {
+            return Err(parser.error("`,` or `)`"));
+        }
+    }
+    parser.space();
+    if parser.rest().is_empty() { Ok(keys) } else { Err(parser.error("nothing after the closing `)`")) }
+}
+
+struct Parser<'a> {
+    text: &'a str,
+    /// Always at a character boundary.
+    at: usize,
+}
+
+impl<'a> Parser<'a> {
+    fn rest(&self) -> &'a str {
+        &self.text[self.at..]
+    }
+
+    fn error(&self, expected: &'static str) -> ParseError {
+        ParseError { byte: self.at, expected }
+    }
+
+    fn space(&mut self) {
+        self.at = self.text.len() - self.rest().trim_start().len();
+    }
+
+    fn take(&mut self, token: &str) -> bool {
+        let found = self.rest().starts_with(token);
+        if found {
+            self.at += token.len();
+        }
+        found
+    }
+
+    fn take_token(&mut self, token: &str) -> bool {
+        self.space();
+        self.take(token)
+    }
+
+    fn expect(&mut self, token: &str, expected: &'static str) -> Parsed<()> {
+        if self.take_token(token) { Ok(()) } else { Err(self.error(expected)) }
+    }
+
+    /// The longest run of characters that names, keywords and numbers are made of.
+    fn word(&mut self) -> &'a str {
+        self.space();
+        let rest = self.rest();
+        let end = rest.find(|c: char| !(c.is_alphanumeric() || "_.+-".contains(c))).unwrap_or(rest.len());
+        self.at += end;
+        &rest[..end]
+    }
+
+    /// A literal that ends at a separator, else the balanced text up to there.
+    fn value(&mut self, depth: usize) -> Parsed<Literal> {
+        self.space();
+        let start = self.at;
+        if depth > MAX_DEPTH {
+            return Err(self.error("at most 32 levels of nesting"));
+        }
+        match self.literal(depth) {
+            Ok(Some(literal)) if self.at_separator() => Ok(literal),
+            // An inner error is kept: going on as opaque text would hide where it is.
+            Err(error) => Err(error),
+            Ok(_) => {
+                self.at = start;
+                self.skip_balanced()?;
+                match self.text[start..self.at].trim() {
+                    "" => Err(self.error("a value")),
+                    text => Ok(Literal::Opaque(text.to_owned())),
+                }
+            }
+        }
+    }
+
+    fn at_separator(&mut self) -> bool {
+        self.space();
+        matches!(self.rest().chars().next(), None | Some(',' | ')' | ']' | '}' | ':'))
+    }
+
+    fn literal(&mut self, depth: usize) -> Parsed<Option<Literal>> {
+        Ok(match self.rest().chars().next() {
+            Some('\'' | '"') => Some(Literal::Str(self.string()?)),
+            Some('[') => Some(Literal::Sequence(self.sequence("]", depth)?)),
+            Some('(') => Some(Literal::Sequence(self.sequence(")", depth)?)),
+            Some('{') => self.dict(depth)?,
+            _ => match self.word() {
+                "None" => Some(Literal::None),
+                "True" => Some(Literal::Bool(true)),
+                "False" => Some(Literal::Bool(false)),
+                word => number(word),
+            },
+        })
+    }
+
+    fn sequence(&mut self, close: &str, depth: usize) -> Parsed<Vec<Literal>> {
+        self.at += 1;
+        let mut items = Vec::new();
+        while !self.take_token(close) {
+            items.push(self.value(depth + 1)?);
+            if !self.take_token(",") && !self.rest().starts_with(close) {
+                return Err(self.error("`,` or the closing bracket"));
+            }
+        }
+        Ok(items)
+    }
+
+    /// None for a set, which is no literal this program reads.
+    fn dict(&mut self, depth: usize) -> Parsed<Option<Literal>> {
+        self.at += 1;
+        let mut entries = Vec::new();
+        while !self.take_token("}") {
+            let key = self.value(depth + 1)?;
+            if !self.take_token(":") {
+                return if matches!(self.rest().chars().next(), Some(',' | '}')) {
+                    Ok(None)
+                } else {
+                    Err(self.error("`:`"))
+                };
+            }
+            entries.push((key, self.value(depth + 1)?));
+            if !self.take_token(",") && !self.rest().starts_with('}') {
+                return Err(self.error("`,` or `}`"));
+            }
+        }
+        Ok(Some(Literal::Dict(entries)))
+    }
+
+    fn string(&mut self) -> Parsed<String> {
+        let open = self.at;
+        let unterminated = ParseError { byte: open, expected: "a string with a closing quote" };
+        let mut chars = self.rest().char_indices();
+        let Some((_, quote)) = chars.next() else { return Err(unterminated) };
+        let mut value = String::new();
+        while let Some((i, c)) = chars.next() {
+            if c == quote {
+                self.at = open + i + 1;
+                return Ok(value);
+            }
+            if c != '\\' {
+                value.push(c);
+                continue;
+            }
+            let bad = ParseError { byte: open + i, expected: "a Python escape sequence" };
+            let digits = match chars.next() {
+                None => return Err(unterminated),
+                Some((_, 'n')) => {
+                    value.push('\n');
+                    0
+                }
+                Some((_, 't')) => {
+                    value.push('\t');
+                    0
+                }
+                Some((_, 'r')) => {
+                    value.push('\r');
+                    0
+                }
+                Some((_, 'x')) => 2,
+                Some((_, 'u')) => 4,
+                Some((_, 'U')) => 8,
+                Some((_, c @ ('\\' | '\'' | '"'))) => {
+                    value.push(c);
+                    0
+                }
+                // Python keeps an unknown escape as it is written.
+                Some((_, c)) => {
+                    value.extend(['\\', c]);
+                    0
+                }
+            };
+            if digits > 0 {
+                let mut code = 0u32;
+                for _ in 0..digits {
+                    let digit = chars.next().and_then(|(_, c)| c.to_digit(16));
+                    let Some(digit) = digit else { return Err(bad) };
+                    code = code << 4 | digit;
+                }
+                // A lone surrogate (a path that was not UTF-8) has no char.
+                value.push(char::from_u32(code).unwrap_or(char::REPLACEMENT_CHARACTER));
+            }
+        }
+        Err(unterminated)
+    }
+
+    /// Moves to the next `,`, `:`, `=` or closing bracket that belongs to the enclosing construct.
+    fn skip_balanced(&mut self) -> Parsed<()> {
+        let mut open = Vec::new();
+        while let Some(c) = self.rest().chars().next() {
+            match c {
+                '\'' | '"' => {
+                    self.string()?;
+                    continue;
+                }
+                '(' => open.push(')'),
+                '[' => open.push(']'),
+                '{' => open.push('}'),
+                ')' | ']' | '}' => match open.pop() {
+                    None => return Ok(()),
+                    Some(close) if close == c => {}
+                    Some(_) => return Err(self.error("brackets that match")),
+                },
+                // `=` would be the next key after a forgotten comma: skipping it would lose that key.
+                ',' | ':' | '=' if open.is_empty() => return Ok(()),
+                _ => {}
+            }
+            self.at += c.len_utf8();
+        }
+        if open.is_empty() { Ok(()) } else { Err(self.error("a closing bracket")) }
+    }
+}
+
+/// An integer or a float as Python prints it; an integer beyond i64 becomes a float.
+fn number(word: &str) -> Option<Literal> {
+    let digits = word.trim_start_matches(['+', '-']);
+    if matches!(digits, "inf" | "nan") {
+        return word.parse().ok().map(Literal::Float);
+    }
+    if !digits.starts_with(|c: char| c.is_ascii_digit() || c == '.') {
+        return None;
+    }
+    word.parse().map(Literal::Int).or_else(|_| word.parse().map(Literal::Float)).ok()
+}

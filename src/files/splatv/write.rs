@@ -1,0 +1,229 @@
+//! Gaussians on cubic paths to a `.splatv` ([`crate::files::splatv`] says what stands where).
+//!
+//! Memory: one row. Halves are rounded to the nearest, bytes downwards, as splaTV does.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use half::f16;
+use serde_json::{Value, json};
+
+use crate::error::{Error, Result};
+use crate::files::accuracy::{Accuracy, Drawn};
+use crate::files::cameras::virtual_rig;
+use crate::files::splatv::{MAGIC, ROW_BYTES, Row, TEXELS, WORDS};
+use crate::model::RobustBox;
+use crate::model::{Camera, Column};
+
+/// Of the cameras around a scene one that is neither at its top nor at its bottom.
+const WELL_PLACED: usize = 4;
+/// Widths of a window in time after which an opacity of 1 has fallen to 1/255.
+const SEEN_WIDTHS: f64 = 2.36;
+/// Texels of a Gaussian.
+const TEXELS_EACH: usize = 4;
+
+/// The words that a viewer reads of `row`. What no half holds becomes the largest that it does; NaN becomes 0.
+pub fn words(row: &Row) -> [u32; WORDS] {
+    let half = |value: f32| {
+        let most = f16::MAX.to_f32();
+        let held = if value.is_nan() { 0.0 } else { value.clamp(-most, most) };
+        u32::from(f16::from_f32(held).to_bits())
+    };
+    let pair = |low: f32, high: f32| half(low) | half(high) << 16;
+    // `as` truncates, saturates and turns NaN into 0.
+    let byte = |value: f64| u32::from((255.0 * value) as u8);
+    let Row { position, motion: m, rotation: q, omega: o, scale: s, rgb: [r, g, b], opacity, centre, width } = *row;
+    let [x, y, z] = position.map(f32::to_bits);
+    let colour = byte(r) | byte(g) << 8 | byte(b) << 16 | byte(opacity) << 24;
+    [
+        x,
+        y,
+        z,
+        pair(q[0], q[1]),
+        pair(q[2], q[3]),
+        pair(s[0], s[1]),
+        pair(s[2], 0.0),
+        colour,
+        pair(m[0], m[1]),
+        pair(m[2], m[3]),
+        pair(m[4], m[5]),
+        pair(m[6], m[7]),
+        pair(m[8], 0.0),
+        pair(o[0], o[1]),
+        pair(o[2], o[3]),
+        pair(centre, width),
+    ]
+}
+
+/// Measures what a viewer reads of `row` against `row` itself, as Gaussian `id`. Rounding of its path counts as far from its
+/// center as it is seen.
+pub fn measure(row: &Row, id: usize, to: &mut Accuracy) {
+    let held = Row::of_words(&words(row));
+    let drawn = |of: &Row| Drawn {
+        position: of.position.map(f64::from),
+        scale: of.scale.map(f64::from),
+        opacity: of.opacity,
+        color: of.rgb,
+    };
+    let (wanted, mut found) = (drawn(row), drawn(&held));
+    let time = (SEEN_WIDTHS * f64::from(row.width)).min(1.0);
+    for axis in 0..3 {
+        let off = |k: usize| f64::from(row.motion[3 * k + axis] - held.motion[3 * k + axis]) * time.powi(k as i32 + 1);
+        found.position[axis] += (0..3).map(off).map(f64::abs).sum::<f64>();
+    }
+    to.add(id, &wanted, &found);
+}
+
+/// A camera as the file lists it: `rotation` has the rows of camera to world.
+pub fn camera(camera: &Camera) -> Value {
+    let to_world = camera.rotation.transpose();
+    let position = -(to_world * camera.translation);
+    let rotation: Vec<[f64; 3]> = (0..3).map(|row| to_world.row(row).to_array()).collect();
+    json!({
+        "id": 0, "img_name": "0", "width": camera.width, "height": camera.height, "position": position.to_array(),
+        "rotation": rotation, "fy": camera.fy, "fx": camera.fx,
+    })
+}
+
+/// The cameras of a file that none come with: one that sees most of what is at `positions`.
+pub fn seen_whole(positions: &Column) -> Value {
+    let found = RobustBox::from_positions(positions);
+    virtual_rig(found.middle, found.extent()).cameras.get(WELL_PLACED).map_or(json!([]), |of| json!([camera(of)]))
+}
+
+/// Writes `rows`, `count` of them, as the file at `path`, which a viewer opens at the first of `cameras`.
+///
+/// # Errors
+/// A failed write.
+pub fn write(path: &Path, count: usize, rows: impl Iterator<Item = [u32; WORDS]>, cameras: &Value) -> Result<()> {
+    let height = (TEXELS_EACH * count).div_ceil(TEXELS).max(1);
+    let size = TEXELS * height * ROW_BYTES / TEXELS_EACH;
+    let text = json!([{
+        "type": "splat", "size": size, "texwidth": TEXELS, "texheight": height, "cameras": cameras,
+    }]);
+    let text = text.to_string();
+    let write = |out: &mut dyn Write| {
+        out.write_all(&MAGIC.to_le_bytes())?;
+        out.write_all(&(text.len() as u32).to_le_bytes())?;
+        out.write_all(text.as_bytes())?;
+        for row in rows {
+            row.iter().try_for_each(|word| out.write_all(&word.to_le_bytes()))?;
+        }
+        let padding = [0; ROW_BYTES];
+        (count..size / ROW_BYTES).try_for_each(|_| out.write_all(&padding))?;
+        out.flush()
+    };
+    let mut out = BufWriter::with_capacity(1 << 18, File::create(path).map_err(Error::io("create", path))?);
+    write(&mut out).map_err(Error::io("write", path))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::files::splatv::Splatv;
+
+    /// A row of values that halves and bytes hold.
+    fn row(seed: u16) -> Row {
+        let value = |k: u16| f16::from_bits(0x3000 + (seed.wrapping_mul(31).wrapping_add(k * 977)) % 0x1000).to_f32();
+        let byte = |k: u16| f64::from((seed.wrapping_mul(7).wrapping_add(k)) % 255 + 1) / 255.0 + 1e-4;
+        Row {
+            position: [value(0), -3.75 - f32::from(seed), 1e-3],
+            motion: std::array::from_fn(|k| -value(k as u16)),
+            rotation: std::array::from_fn(|k| value(20 + k as u16)),
+            omega: std::array::from_fn(|k| value(30 + k as u16)),
+            scale: std::array::from_fn(|k| value(40 + k as u16)),
+            rgb: std::array::from_fn(|k| byte(k as u16)),
+            opacity: byte(9),
+            centre: value(50),
+            width: value(51),
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read_and_padding_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("some.splatv");
+        for count in [1, 1024, 1025] {
+            let rows: Vec<Row> = (0..count).map(row).collect();
+            write(&path, rows.len(), rows.iter().map(words), &json!([{"id": 0}])).unwrap();
+            let read = Splatv::open(&path).unwrap();
+            assert_eq!((read.count(), read.cameras()[0]["id"].as_u64()), (count as usize, Some(0)));
+            let bytes = std::fs::metadata(&path).unwrap().len();
+            assert!(
+                bytes > 65536 * u64::from(count.div_ceil(1024))
+                    && bytes < 65536 * u64::from(count.div_ceil(1024)) + 512
+            );
+            for (i, expected) in rows.iter().enumerate() {
+                let found = Row::of_words(&read.words(i));
+                let close = |a: f64, b: f64| (a - b).abs() <= 1.0 / 255.0;
+                assert!(
+                    found.rgb.iter().zip(expected.rgb).all(|(&a, b)| close(a, b))
+                        && close(found.opacity, expected.opacity)
+                );
+                assert_eq!(Row { rgb: expected.rgb, opacity: expected.opacity, ..found }, *expected);
+                assert_eq!(words(&Row { rgb: expected.rgb, opacity: expected.opacity, ..found }), read.words(i));
+            }
+        }
+    }
+
+    #[test]
+    fn what_no_half_holds_is_the_largest_that_it_does() {
+        let wild = Row { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
+        let found = Row::of_words(&words(&wild));
+        assert_eq!((&found.motion[..3], found.width), (&[65504.0, -65504.0, 0.0][..], 65504.0));
+        assert_eq!(words(&Row { rgb: [-1.0, 2.0, 0.5], ..row(1) })[7] & 0xffffff, 0x7f_ff_00);
+    }
+
+    #[test]
+    fn a_camera_is_where_it_looks_from() {
+        let from = glam::DVec3::new(1.0, -4.0, 2.0);
+        let made = camera(&Camera::look_at(from, glam::DVec3::ZERO, 1.0, (8, 6)));
+        for (c, expected) in from.to_array().into_iter().enumerate() {
+            assert!((made["position"][c].as_f64().unwrap() - expected).abs() < 1e-12, "{made}");
+            // The third column is the view direction.
+            let forward = made["rotation"][c][2].as_f64().unwrap();
+            assert!((forward + expected / from.length()).abs() < 1e-12, "{made}");
+        }
+    }
+
+    #[test]
+    fn a_file_cut_anywhere_is_refused_by_what_is_missing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("some.splatv");
+        write(&path, 3, (0..3).map(|k| words(&row(k))), &json!([])).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for length in (0..200).chain((200..whole.len()).step_by(997)) {
+            std::fs::write(&path, &whole[..length]).unwrap();
+            let message = Splatv::open(&path).expect_err("cut").to_string();
+            assert!(message.contains("some.splatv") && message.contains("bytes"), "{length}: {message}");
+        }
+        for (from, to, said) in [
+            ("\"splat\"", "\"other\"", "entry of type"),
+            ("\"texheight\":1", "\"texheight\":7", "size"),
+            ("\"texwidth\":4096", "\"texwidth\":-4.5", "texwidth"),
+            ("[{", "{{", "JSON"),
+        ] {
+            let text = String::from_utf8_lossy(&whole[..200]).into_owned();
+            let at = text.find(from).unwrap();
+            let mut wrong = whole.clone();
+            let at = whole.windows(from.len()).position(|bytes| bytes == from.as_bytes()).unwrap_or(at);
+            wrong[at..at + to.len()].copy_from_slice(to.as_bytes());
+            std::fs::write(&path, &wrong).unwrap();
+            let message = Splatv::open(&path).expect_err(said).to_string();
+            assert!(message.contains(said), "{message}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_behind_the_magic_never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("some.splatv");
+            std::fs::write(&path, [&MAGIC.to_le_bytes()[..], &bytes].concat()).unwrap();
+            _ = Splatv::open(&path);
+        }
+    }
+}

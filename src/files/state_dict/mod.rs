@@ -1,0 +1,183 @@
+//! PyTorch state dicts (`.pth`): reads the tensors of a file as f32, and writes files of such tensors.
+
+mod write;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use crate::deform::{Tensor, Tensors};
+use crate::error::{Error, Result, quoted};
+use crate::files::checkpoint::{Checkpoint, MAX_DEPTH, Node, NodeId, Tensor as StoredTensor};
+use crate::limits::ReadLimit;
+pub(crate) use write::{Stored, Values, write_state_dict};
+
+/// A view may repeat its storage (stride 0), so a small file can declare any number of values. No
+/// trained state dict stores less than a quarter of what it means.
+pub(crate) const MAX_EXPANSION: u64 = 4;
+/// Maximum number of bytes of a tensor's name.
+const MAX_NAME: usize = 1024;
+/// Bytes that one tensor takes beside its name and values.
+const TENSOR_BYTES: u64 = 512;
+
+/// Reads every floating-point tensor of the state dict at `path`, widened or rounded to f32. Integer and
+/// boolean tensors are left out.
+///
+/// Memory: the tensors, at most four times the file, and the bytes of one storage; both within `memory`.
+///
+/// # Errors
+/// A file that is no state dict, is cut short or damaged, declares more values than it can hold, or takes more memory than
+/// allowed.
+pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors> {
+    let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
+    let dict = StateDict::open(path, memory)?;
+    let bytes = |tensor: &StoredTensor, width: usize| {
+        tensor.len().map_or(u64::MAX, |len| (len as u64).saturating_mul(width as u64))
+    };
+    let sum = |width: fn(&StoredTensor) -> usize| {
+        dict.tensors.values().fold(0u64, |sum, tensor| sum.saturating_add(bytes(tensor, width(tensor))))
+    };
+    let declared = sum(|tensor| tensor.kind.bytes());
+    if declared > file_bytes.saturating_mul(MAX_EXPANSION) {
+        return Err(Error::input(
+            path,
+            "",
+            format!("at most {MAX_EXPANSION} times its {file_bytes} bytes of tensors"),
+            format!("tensors of {declared} bytes"),
+        ));
+    }
+    dict.checkpoint.allow("", "its tensors", sum(|tensor| if tensor.kind.is_float() { 4 } else { 0 }))?;
+    let mut tensors = Tensors::new();
+    for (name, tensor) in &dict.tensors {
+        let place = format!("tensor {name}");
+        dict.checkpoint
+            .check_extent(tensor)
+            .map_err(|found| dict.checkpoint.wrong(&place, "values for all of its elements", found))?;
+        if tensor.kind.is_float() {
+            let data = dict.checkpoint.values(tensor, &place)?;
+            tensors.insert(name.clone(), Tensor { shape: tensor.shape.clone(), data });
+        }
+    }
+    Ok(tensors)
+}
+
+/// Returns the names of the tensors of the state dict at `path`, in order; no value is read.
+///
+/// # Errors
+/// A file that is no state dict.
+pub(crate) fn names(path: &Path, memory: ReadLimit) -> Result<Vec<String>> {
+    Ok(StateDict::open(path, memory)?.tensors.into_keys().collect())
+}
+
+/// Whether every tensor of the state dict at `path` is one that [`read_state_dict`] reads.
+///
+/// # Errors
+/// A file that is no state dict.
+pub(crate) fn is_floating(path: &Path, memory: ReadLimit) -> Result<bool> {
+    Ok(StateDict::open(path, memory)?.tensors.values().all(|tensor| tensor.kind.is_float()))
+}
+
+/// Whether the file at `path` holds a tuple of two things instead of a state dict; false for a file that cannot be read.
+pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
+    Checkpoint::open(path, memory).is_ok_and(|checkpoint| {
+        let pickle = checkpoint.pickle();
+        matches!(pickle.node(pickle.root()), Node::Tuple(parts) if parts.len() == 2)
+    })
+}
+
+/// The tensors of a checkpoint, by name. Names of nested dicts, lists and tuples are joined by dots.
+struct StateDict {
+    checkpoint: Checkpoint,
+    tensors: BTreeMap<String, StoredTensor>,
+}
+
+impl StateDict {
+    fn open(path: &Path, memory: ReadLimit) -> Result<StateDict> {
+        let checkpoint = Checkpoint::open(path, memory)?;
+        let (root, nodes) = (checkpoint.pickle().root(), checkpoint.pickle().ids().len());
+        if checkpoint.pickle().pairs(root).is_none() {
+            return Err(checkpoint
+                .wrong("data.pkl", "a state dict written by torch.save", checkpoint.describe(root))
+                .hint("save the model again with torch.save(model.state_dict(), path)"));
+        }
+        // What is shared is visited once for each of its names, which a pickle can make any number of.
+        let mut walk = Walk { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
+        walk.visit(root, &mut String::new(), 0)?;
+        let tensors = walk.found;
+        Ok(StateDict { checkpoint, tensors })
+    }
+}
+
+/// The search for tensors in a tree.
+struct Walk<'a> {
+    checkpoint: &'a Checkpoint,
+    /// Number of nodes that may still be visited.
+    left: usize,
+    name_bytes: u64,
+    found: BTreeMap<String, StoredTensor>,
+}
+
+impl Walk<'_> {
+    /// Adds the tensors at and below `id`, which is called `name`.
+    fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
+        let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());
+        self.left =
+            self.left.checked_sub(1).filter(|_| depth <= MAX_DEPTH && name.len() <= MAX_NAME).ok_or_else(|| {
+                let expected = format!("a tree of tensors with names of at most {MAX_NAME} bytes");
+                checkpoint.wrong("data.pkl", expected, "values that contain one another, or longer names")
+            })?;
+        if let Some(tensor) = checkpoint.tensor(id) {
+            self.name_bytes += name.len() as u64 + TENSOR_BYTES;
+            checkpoint.allow("data.pkl", "the list of its tensors", self.name_bytes)?;
+            self.found.insert(name.clone(), tensor);
+            return Ok(());
+        }
+        if let Some(pairs) = pickle.pairs(id) {
+            for &(key, value) in pairs {
+                let part = match pickle.node(key) {
+                    Node::Text(text) => text.to_string(),
+                    Node::Int(number, _) => number.to_string(),
+                    _ => {
+                        let place = format!("data.pkl, {}", named(name));
+                        return Err(checkpoint.wrong(&place, "names as keys", checkpoint.describe(key)));
+                    }
+                };
+                self.visit_part(value, name, &part, depth)?;
+            }
+        } else if let Some(elements) = pickle.elements(id) {
+            for (index, &element) in elements.iter().enumerate() {
+                self.visit_part(element, name, &index.to_string(), depth)?;
+            }
+        } else if let Some((callee, arguments)) = pickle.call(id) {
+            // A tensor of a kind that is not known must not be left out in silence.
+            let is_unsigned = callee == "torch._utils._rebuild_tensor_v3";
+            if !is_unsigned && arguments.iter().any(|&id| self.holds_values(id)) {
+                let place = format!("tensor {}", named(name));
+                return Err(checkpoint.wrong(&place, "a dense tensor or parameter", pickle.describe(id)));
+            }
+        }
+        Ok(())
+    }
+
+    fn visit_part(&mut self, id: NodeId, name: &mut String, part: &str, depth: u8) -> Result<()> {
+        let before = name.len();
+        if before > 0 {
+            name.push('.');
+        }
+        name.push_str(part);
+        self.visit(id, name, depth + 1)?;
+        name.truncate(before);
+        Ok(())
+    }
+
+    fn holds_values(&self, id: NodeId) -> bool {
+        matches!(self.checkpoint.pickle().node(id), Node::Outside(_)) || self.checkpoint.tensor(id).is_some()
+    }
+}
+
+fn named(name: &str) -> String {
+    if name.is_empty() { "the root".to_owned() } else { quoted(name).to_string() }
+}
+
+#[cfg(test)]
+mod tests;

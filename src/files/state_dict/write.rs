@@ -1,0 +1,299 @@
+//! Writing what `torch.save` would: a zip archive of stored entries, a pickle that names every tensor, and the values
+//! of each in an entry of its own.
+//!
+//! Data in: tensors in the layout that they are to have. Data out: a file of zip version 3 of PyTorch's format, which
+//! `torch.load` opens, with `weights_only` or without. Memory: the pickle.
+//! Source: the files that PyTorch 1.6 and later writes.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use zip::write::FileOptions;
+use zip::{CompressionMethod, DateTime, ZipWriter};
+
+use crate::error::{Error, Result};
+use crate::files::zip_output::ZipOutput;
+
+/// Where the values of a tensor begin in the file is a multiple of so many bytes, as PyTorch has it.
+const ALIGNMENT: u16 = 64;
+
+/// A tensor as a file stores it: element `i` of its `shape` is value `offset + Σ i·stride` of its storage. Strides may
+/// be 0 and elements may share values.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Stored {
+    /// Its dotted name.
+    pub(crate) name: String,
+    /// Its values.
+    pub(crate) values: Values,
+    /// Place of its first element.
+    pub(crate) offset: usize,
+    /// Extents, outermost first; empty for a scalar.
+    pub(crate) shape: Vec<usize>,
+    /// Values from an element to the next, along each extent.
+    pub(crate) stride: Vec<usize>,
+}
+
+/// The values of a tensor.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Values {
+    /// IEEE 754 binary32.
+    F32(Vec<f32>),
+    /// IEEE 754 binary16.
+    F16(Vec<f16>),
+}
+
+impl Values {
+    /// How many there are.
+    pub(crate) fn len(&self) -> usize {
+        match self {
+            Values::F32(values) => values.len(),
+            Values::F16(values) => values.len(),
+        }
+    }
+
+    /// Bytes of each.
+    pub(crate) fn width(&self) -> usize {
+        match self {
+            Values::F32(_) => size_of::<f32>(),
+            Values::F16(_) => size_of::<f16>(),
+        }
+    }
+
+    /// Name of the storage in the pickle.
+    fn class(&self) -> &'static str {
+        match self {
+            Values::F32(_) => "FloatStorage",
+            Values::F16(_) => "HalfStorage",
+        }
+    }
+
+    /// In this machine's order of bytes.
+    fn bytes(&self) -> &[u8] {
+        match self {
+            Values::F32(values) => bytemuck::cast_slice(values),
+            Values::F16(values) => bytemuck::cast_slice(values.reinterpret_cast()),
+        }
+    }
+}
+
+impl Stored {
+    /// `values` one after the other, the last extent fastest.
+    pub(crate) fn dense(name: String, shape: Vec<usize>, values: Values) -> Stored {
+        let mut stride = vec![1; shape.len()];
+        for axis in (1..shape.len()).rev() {
+            stride[axis - 1] = stride[axis] * shape[axis].max(1);
+        }
+        Stored { name, values, offset: 0, shape, stride }
+    }
+}
+
+/// Writes a state dict of `tensors`, in their order.
+///
+/// # Errors
+/// A failed write.
+pub(crate) fn write_state_dict(path: &Path, tensors: &[Stored]) -> Result<()> {
+    let write = || {
+        let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path)?)));
+        // The pickle first, and all in one folder: by its name readers know the others.
+        add(&mut archive, "data.pkl", &pickle(tensors))?;
+        add(&mut archive, "byteorder", if cfg!(target_endian = "big") { b"big" } else { b"little" })?;
+        for (key, tensor) in tensors.iter().enumerate() {
+            add(&mut archive, &format!("data/{key}"), tensor.values.bytes())?;
+        }
+        add(&mut archive, "version", b"3\n")?;
+        archive.finish()?.close()
+    };
+    write().map_err(Error::io("write", path))
+}
+
+fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &[u8]) -> io::Result<()> {
+    let options = FileOptions::default()
+        .compression_method(CompressionMethod::Stored)
+        .last_modified_time(DateTime::default())
+        .large_file(bytes.len() as u64 > u64::from(u32::MAX));
+    archive.start_file_aligned(format!("archive/{name}"), options, ALIGNMENT)?;
+    archive.write_all(bytes)
+}
+
+/// The pickle, of protocol 2, of an ordered dictionary of the tensors by name. Value storages are called by number.
+fn pickle(tensors: &[Stored]) -> Vec<u8> {
+    const DICTIONARY: &[u8] = b"ccollections\nOrderedDict\n)R";
+    let mut out = [b"\x80\x02", DICTIONARY, b"("].concat();
+    for (key, tensor) in tensors.iter().enumerate() {
+        text(&mut out, &tensor.name);
+        out.extend(b"ctorch._utils\n_rebuild_tensor_v2\n(");
+        // Its storage: kind, class, key, device, how many values.
+        out.extend(b"(");
+        text(&mut out, "storage");
+        out.extend(format!("ctorch\n{}\n", tensor.values.class()).bytes());
+        text(&mut out, &key.to_string());
+        text(&mut out, "cpu");
+        number(&mut out, tensor.values.len());
+        out.extend(b"tQ");
+        number(&mut out, tensor.offset);
+        for extents in [&tensor.shape, &tensor.stride] {
+            out.extend(b"(");
+            extents.iter().for_each(|&extent| number(&mut out, extent));
+            out.extend(b"t");
+        }
+        // No gradient is wanted of it, and no hook is called.
+        out.extend([b"\x89", DICTIONARY, b"tR"].concat());
+    }
+    out.extend(b"u.");
+    out
+}
+
+fn text(out: &mut Vec<u8>, text: &str) {
+    out.push(b'X');
+    out.extend((text.len() as u32).to_le_bytes());
+    out.extend(text.bytes());
+}
+
+/// The shortest of the ways in which a pickle has whole numbers.
+fn number(out: &mut Vec<u8>, number: usize) {
+    match number {
+        0..=0xFF => out.extend([b'K', number as u8]),
+        0x100..=0xFFFF => out.extend([b'M', number as u8, (number >> 8) as u8]),
+        0x1_0000..=0x7FFF_FFFF => {
+            out.push(b'J');
+            out.extend((number as i32).to_le_bytes());
+        }
+        // Nine bytes, the last of which is 0: never negative.
+        _ => {
+            out.extend([0x8A, 9]);
+            out.extend((number as u64).to_le_bytes());
+            out.push(0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use proptest::prelude::*;
+
+    use super::super::read_state_dict;
+    use super::*;
+
+    /// The element at `index`, by the definition.
+    fn element(tensor: &Stored, index: &[usize]) -> f32 {
+        let at = tensor.offset + index.iter().zip(&tensor.stride).map(|(i, stride)| i * stride).sum::<usize>();
+        match &tensor.values {
+            Values::F32(values) => values[at],
+            Values::F16(values) => values[at].to_f32(),
+        }
+    }
+
+    /// Every element, the last index fastest.
+    fn elements(tensor: &Stored) -> Vec<f32> {
+        let mut indices = vec![Vec::new()];
+        for &extent in &tensor.shape {
+            indices = indices.into_iter().flat_map(|at| (0..extent).map(move |i| [&at[..], &[i]].concat())).collect();
+        }
+        indices.iter().map(|index| element(tensor, index)).collect()
+    }
+
+    /// Of any shape and strides over a storage with some values before and behind.
+    fn tensor() -> impl Strategy<Value = Stored> {
+        let extents = proptest::collection::vec((1..5usize, 0..7usize), 0..4);
+        (extents, 0..4usize, 0..3usize, any::<bool>(), any::<u64>()).prop_map(
+            |(extents, offset, spare, narrow, seed)| {
+                let (shape, stride): (Vec<usize>, Vec<usize>) = extents.into_iter().unzip();
+                let last = shape.iter().zip(&stride).map(|(extent, stride)| (extent - 1) * stride).sum::<usize>();
+                let bits =
+                    (0..offset + last + 1 + spare).map(|i| (seed ^ i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+                let values = match narrow {
+                    true => Values::F16(bits.map(|bits| f16::from_bits((bits >> 48) as u16)).collect()),
+                    false => Values::F32(bits.map(|bits| f32::from_bits((bits >> 32) as u32)).collect()),
+                };
+                Stored { name: String::new(), values, offset, shape, stride }
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn any_tensors_read_back_as_themselves(mut tensors in proptest::collection::vec(tensor(), 0..6)) {
+            tensors.iter_mut().enumerate().for_each(|(k, tensor)| tensor.name = format!("net.{k}.weight ✓"));
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("a.pth");
+            write_state_dict(&path, &tensors).unwrap();
+            let read = read_state_dict(&path, crate::limits::ReadLimit::NONE).unwrap();
+            prop_assert_eq!(read.len(), tensors.len());
+            for tensor in &tensors {
+                let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+                // Any NaN is a NaN: widening may change which.
+                let plain = |values: Vec<f32>| {
+                    bits(&values.into_iter().map(|x| if x.is_nan() { f32::NAN } else { x }).collect::<Vec<_>>())
+                };
+                let found = &read[&tensor.name];
+                prop_assert_eq!(&found.shape, &tensor.shape);
+                prop_assert_eq!(plain(found.data.clone()), plain(elements(tensor)));
+            }
+        }
+    }
+
+    /// Of an archive the name, the place and the bytes of every entry, read by the format's own description.
+    fn entries(bytes: &[u8]) -> Vec<(String, usize, Vec<u8>)> {
+        let word = |at: usize| u16::from_le_bytes([bytes[at], bytes[at + 1]]) as usize;
+        let long = |at: usize| word(at) | word(at + 2) << 16;
+        let end = bytes.len() - 22;
+        assert_eq!(&bytes[end..end + 4], b"PK\x05\x06");
+        let (count, mut at) = (word(end + 10), long(end + 16));
+        let mut found = Vec::new();
+        for _ in 0..count {
+            assert_eq!(&bytes[at..at + 4], b"PK\x01\x02");
+            assert_eq!((word(at + 10), long(at + 20)), (0, long(at + 24)), "stored as it is");
+            let (name, extra, comment) = (word(at + 28), word(at + 30), word(at + 32));
+            let local = long(at + 42);
+            let start = local + 30 + word(local + 26) + word(local + 28);
+            let text = String::from_utf8(bytes[at + 46..at + 46 + name].to_vec()).unwrap();
+            found.push((text, start, bytes[start..start + long(at + 24)].to_vec()));
+            at += 46 + name + extra + comment;
+        }
+        found
+    }
+
+    #[test]
+    fn entries_are_named_ordered_and_aligned_as_pytorch_has_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.pth");
+        let of = |name: &str, values| Stored::dense(name.to_owned(), vec![3], values);
+        let half = [1.0, -2.0, 0.25].map(f16::from_f32).to_vec();
+        write_state_dict(&path, &[of("a", Values::F32(vec![1.0, 2.0, 3.0])), of("b", Values::F16(half))]).unwrap();
+        let found = entries(&fs::read(&path).unwrap());
+        let names: Vec<&str> = found.iter().map(|entry| entry.0.as_str()).collect();
+        let expected = ["data.pkl", "byteorder", "data/0", "data/1", "version"].map(|name| format!("archive/{name}"));
+        assert_eq!(names, expected);
+        assert!(found.iter().all(|entry| entry.1 % 64 == 0), "{found:?}");
+        assert_eq!(found[3].2, [0x00, 0x3C, 0x00, 0xC0, 0x00, 0x34]);
+        assert_eq!((&found[1].2[..], &found[4].2[..]), (&b"little"[..], &b"3\n"[..]));
+    }
+
+    #[test]
+    fn a_pickle_is_these_bytes() {
+        let values = Values::F16(vec![f16::ZERO; 300]);
+        let tensor = Stored { name: "w".to_owned(), values, offset: 7, shape: vec![2, 70_000], stride: vec![0, 0] };
+        let expected = [
+            &b"\x80\x02ccollections\nOrderedDict\n)R("[..],
+            b"X\x01\0\0\0wctorch._utils\n_rebuild_tensor_v2\n(",
+            b"(X\x07\0\0\0storagectorch\nHalfStorage\nX\x01\0\0\x000X\x03\0\0\0cpuM\x2C\x01tQ",
+            b"K\x07(K\x02J\x70\x11\x01\0t(K\0K\0t\x89ccollections\nOrderedDict\n)RtR",
+            b"u.",
+        ];
+        assert_eq!(pickle(&[tensor]), expected.concat());
+        let mut large = Vec::new();
+        number(&mut large, 1 << 31);
+        assert_eq!(large, [0x8A, 9, 0, 0, 0, 0x80, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn a_write_that_fails_names_the_file() {
+        let error = write_state_dict(Path::new("nowhere/a.pth"), &[]).unwrap_err().to_string();
+        assert!(error.contains("nowhere/a.pth"), "{error}");
+    }
+}

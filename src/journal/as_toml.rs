@@ -1,0 +1,72 @@
+//! Summaries as a part of what a work folder keeps.
+
+use serde::de::{DeserializeOwned, Error as _};
+use serde::ser::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// A summary that is stored as text. The binary format of a work folder has no optional fields; summaries, made for JSON, do.
+/// TOML has them too, and unlike JSON holds NaN and infinities.
+#[derive(Debug)]
+pub(crate) struct AsToml<T>(pub(crate) T);
+
+impl<T: Serialize> Serialize for AsToml<T> {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        toml::to_string(&self.0).map_err(S::Error::custom)?.serialize(to)
+    }
+}
+
+impl<'de, T: DeserializeOwned> Deserialize<'de> for AsToml<T> {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(from)?;
+        toml::from_str(&text).map(AsToml).map_err(D::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::journal::Journal;
+    use crate::journal::records::{BandsSummary, FieldSummary, RefinedSummary, Saved};
+    use crate::pipeline::summary::{ArchiveSummary, GoalSummary};
+
+    fn kept<T: Serialize + DeserializeOwned>(value: T) -> T {
+        postcard::from_bytes::<AsToml<T>>(&postcard::to_stdvec(&AsToml(value)).unwrap()).unwrap().0
+    }
+
+    /// The values as text, for NaN is not equal to itself.
+    fn same<T: Serialize + DeserializeOwned + Clone + std::fmt::Debug>(value: &T) {
+        assert_eq!(format!("{:?}", kept(value.clone())), format!("{value:?}"));
+    }
+
+    #[test]
+    fn nan_and_infinity_are_read_back_as_they_were() {
+        for odd in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 0.1 + 0.2, 1e-300, -0.0] {
+            let tried = vec![(7, odd), (9, 30.0)];
+            same(&ArchiveSummary {
+                asked: odd,
+                psnr: odd,
+                level: odd,
+                loss: odd,
+                parts: None,
+                bounds: Some(BTreeMap::from([("position".to_owned(), odd)])),
+                bits: BTreeMap::new(),
+                measured: vec![("a.b \"c\"".to_owned(), odd, 1.0, odd)],
+            });
+            let (name, held_pictures) = ("min_psnr".to_owned(), vec!["t000_between".to_owned()]);
+            same(&GoalSummary { name, asked: 30.0, searched: odd, held: odd, held_pictures, tried: tried.clone() });
+            let mut journal = Journal::default();
+            journal.leave_out("a", "b");
+            journal.spare("c", "d", Saved::Stage { seconds: odd, reads: 2.0 });
+            journal.spare("e", "f", Saved::Values { bytes: 1 << 50 });
+            journal.notes.push("several\nlines, 40.1 dB".to_owned());
+            journal.field =
+                Some(FieldSummary { half: true, pictures: 3, rounding: odd, result: Some(odd), least: odd });
+            journal.bands = Some(BandsSummary { sh_degree: 2, pictures: 3, tried, result: odd, least: odd });
+            journal.refined = Some(RefinedSummary { pictures: 3, before: odd, result: odd });
+            let shown = format!("{journal:?}");
+            assert_eq!(format!("{:?}", kept(journal)), shown);
+        }
+    }
+}

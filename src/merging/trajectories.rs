@@ -1,0 +1,250 @@
+//! Positions and opacities of some Gaussians in a scratch file, in an order of their own: what is read together lies
+//! together, so that a piece is read without the rest.
+//!
+//! The source is read once, block of Gaussians by block of Gaussians in the order of ids, some frames at a time:
+//! what holds tiles decodes each once if they span no more frames, and opening a file costs once per block.
+//! The file is read by the calling thread with plain reads: it has no index and leaves no mapped pages, either of which
+//! would grow with the number of frames.
+//!
+//! The file: x, y, z and opacity logit of every Gaussian at the first frame, `[N, 4]`; then for every block of F frames,
+//! of which the last may be shorter, what varies of these, `[N, F, W]` with W = 4, 3 or 1, or nothing. All f32 as this
+//! machine has them.
+//!
+//! Memory while gathering, per Gaussian: 8 bytes, and what varies of 16 for each of F frames; for every thread two
+//! blocks of as many frames.
+
+use std::ops::Range;
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use crate::cache::{Spill, Spilling};
+use crate::error::Result;
+use crate::model::{Columns, Gaussians};
+use crate::outputs::container::FRAME_BLOCK;
+use crate::passes::BLOCK;
+use crate::progress::Progress;
+use crate::source::{FrameSource, Ids, Wanted};
+
+/// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
+pub(crate) type Moment = [f32; 4];
+
+/// The columns of a [`Moment`].
+pub(crate) const NEEDED: Columns = Columns::POSITION.union(Columns::OPACITY);
+
+/// Gaussians between two that are wanted which are rather read than skipped.
+const GAP: u32 = 32;
+/// Gaussians read at a time, at most.
+const RUN: u32 = 2048;
+
+/// Trajectories in a nameless file that lasts as long as this.
+pub(crate) struct Trajectories {
+    file: Spill,
+    count: usize,
+    frames: usize,
+    /// Frames of a block.
+    block: usize,
+    /// Which numbers of a moment vary.
+    varying: Range<usize>,
+}
+
+impl Trajectories {
+    /// Gathers the Gaussians `ids` of `source`, all different and in that order, in a file in `folder`. Takes at most
+    /// `frames_together` frames at a time.
+    ///
+    /// # Errors
+    /// Those of reading `source` and of writing the file, which is gone then.
+    pub(crate) fn gather(
+        source: &dyn FrameSource,
+        ids: &[u32],
+        frames_together: usize,
+        folder: &Path,
+    ) -> Result<Trajectories> {
+        let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
+        let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
+        places.par_sort_unstable();
+        let mut file = Spilling::new(folder)?;
+        let block = frames_together.clamp(1, FRAME_BLOCK);
+        let progress = Progress::new("merge", "frames", frames as u64);
+        let mut values = Vec::new();
+        if frames > 0 {
+            take(source, &places, 0..1, NEEDED, &mut values)?;
+            file.write(bytemuck::cast_slice(&values))?;
+        }
+        for start in (0..frames).step_by(block).take_while(|_| !columns.is_empty()) {
+            let of_block = start..frames.min(start + block);
+            take(source, &places, of_block.clone(), columns, &mut values)?;
+            file.write(bytemuck::cast_slice(&values))?;
+            progress.advance(of_block.len() as u64);
+        }
+        let file = file.finish()?;
+        let varying = numbers(columns);
+        Ok(Trajectories { file, count: ids.len(), frames, block, varying })
+    }
+
+    /// Shows the moments of the Gaussians at `places` (increasing) frame after frame; only once if none varies.
+    ///
+    /// Memory: of every one its moment, what varies of it for the frames of a block, and a bounded buffer.
+    ///
+    /// # Errors
+    /// Those of reading the file.
+    pub(crate) fn play(&self, places: &[u32], mut show: impl FnMut(&[Moment])) -> Result<()> {
+        if self.frames == 0 {
+            return Ok(());
+        }
+        let mut now: Vec<Moment> = vec![Moment::default(); places.len()];
+        self.read(0, 4, places, bytemuck::cast_slice_mut(&mut now))?;
+        if self.varying.is_empty() {
+            show(&now);
+            return Ok(());
+        }
+        let (width, mut values) = (self.varying.len(), Vec::new());
+        for start in (0..self.frames).step_by(self.block) {
+            let frames = self.block.min(self.frames - start);
+            values.resize(places.len() * frames * width, 0.0);
+            let first = self.count * (4 + start * width);
+            self.read(first, frames * width, places, &mut values)?;
+            for frame in 0..frames {
+                for (now, values) in now.iter_mut().zip(values.chunks_exact(frames * width)) {
+                    now[self.varying.clone()].copy_from_slice(&values[frame * width..][..width]);
+                }
+                show(&now);
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads rows of `width` numbers at `places` of a table that begins with number `first` of the file.
+    fn read(&self, first: usize, width: usize, places: &[u32], mut out: &mut [f32]) -> Result<()> {
+        let mut values: Vec<f32> = Vec::new();
+        for near in places.chunk_by(|a, b| b - a <= GAP && a / RUN == b / RUN) {
+            let low = near[0] as usize;
+            let rows = near[near.len() - 1] as usize + 1 - low;
+            values.resize(rows * width, 0.0);
+            self.file.read(4 * (first + low * width) as u64, bytemuck::cast_slice_mut(&mut values))?;
+            let (of_run, rest) = out.split_at_mut(near.len() * width);
+            for (to, &place) in of_run.chunks_exact_mut(width).zip(near) {
+                to.copy_from_slice(&values[(place as usize - low) * width..][..width]);
+            }
+            out = rest;
+        }
+        Ok(())
+    }
+}
+
+/// The numbers of a [`Moment`] that `columns` are.
+fn numbers(columns: Columns) -> Range<usize> {
+    let start = if columns.contains(Columns::POSITION) { 0 } else { 3 };
+    start..if columns.contains(Columns::OPACITY) { 4 } else { 3 }
+}
+
+/// Reads `frames` of `columns` of the Gaussians (id, place), which come by id, into `values`: `[N, frames, W]` by place.
+fn take(
+    source: &dyn FrameSource,
+    places: &[(u32, u32)],
+    frames: Range<usize>,
+    columns: Columns,
+    values: &mut Vec<f32>,
+) -> Result<()> {
+    let width = columns.width(0);
+    values.resize(places.len() * frames.len() * width, 0.0);
+    let wanted = Wanted::of(frames.clone());
+    let read = |block: &[(u32, u32)]| -> Result<Vec<Gaussians>> {
+        let ids: Vec<u32> = block.iter().map(|&(id, _)| id).collect();
+        let mut reader = source.open(Ids::List(&ids))?;
+        reader.expect(&wanted);
+        let at = |frame| {
+            let mut state = Gaussians::zeros(0, source.info().sh_degree);
+            reader.read(frame, columns, &mut state)?;
+            Ok(state)
+        };
+        frames.clone().map(at).collect()
+    };
+    // One batch of blocks at a time bounds what waits to be put in its place.
+    for batch in places.chunks(2 * rayon::current_num_threads() * BLOCK) {
+        let blocks: Vec<Vec<Gaussians>> = batch.par_chunks(BLOCK).map(read).collect::<Result<_>>()?;
+        for (block, states) in batch.chunks(BLOCK).zip(&blocks) {
+            for (frame, state) in states.iter().enumerate() {
+                let planes = columns.iter().flat_map(|column| state.column(column).planes().chunks_exact(block.len()));
+                for (c, plane) in planes.enumerate() {
+                    for (&(_, place), &value) in block.iter().zip(plane) {
+                        values[(place as usize * states.len() + frame) * width + c] = value;
+                    }
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+    use crate::model::SequenceInfo;
+    use crate::source::BlockReader;
+
+    /// A scene that says of fewer columns that they vary, and keeps the others as they are at frame 0.
+    struct Still(Scene, SequenceInfo);
+
+    impl Still {
+        fn new(varying: Columns) -> Still {
+            let scene = Scene::new(3000, 7);
+            let info = SequenceInfo { varying, ..scene.info().clone() };
+            Still(scene, info)
+        }
+    }
+
+    impl FrameSource for Still {
+        fn info(&self) -> &SequenceInfo {
+            &self.1
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(StillReader { reader: self.0.open(ids)?, varying: self.1.varying }))
+        }
+    }
+
+    struct StillReader<'a> {
+        reader: Box<dyn BlockReader + 'a>,
+        varying: Columns,
+    }
+
+    impl BlockReader for StillReader<'_> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            self.reader.read(0, want, out)?;
+            self.reader.read(frame, want & self.varying, out)
+        }
+    }
+
+    fn moments(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Vec<Moment> {
+        let mut state = Gaussians::zeros(0, source.info().sh_degree);
+        source.open(Ids::List(ids)).unwrap().read(frame, NEEDED, &mut state).unwrap();
+        let moment = |i| {
+            let [x, y, z] = state.position.row(i);
+            [x, y, z, state.opacity_logit.plane(0)[i]]
+        };
+        (0..ids.len()).map(moment).collect()
+    }
+
+    #[test]
+    fn played_trajectories_are_those_of_the_source_whatever_varies_and_however_many_frames_are_taken_together() {
+        let folder = tempfile::tempdir().unwrap();
+        let ids: Vec<u32> = (0..2500).map(|k| (k * 1171 + 5) % 3000).collect();
+        // Neighbours, gaps narrow and wide, both ends.
+        let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
+        let of_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
+        for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {
+            let source = Still::new(varying);
+            for frames_together in [1, 3, usize::MAX] {
+                let gathered = Trajectories::gather(&source, &ids, frames_together, folder.path()).unwrap();
+                let mut shown = Vec::new();
+                gathered.play(&places, |moments| shown.push(moments.to_vec())).unwrap();
+                let frames = if varying.is_empty() { 1 } else { 7 };
+                let expected: Vec<Vec<Moment>> = (0..frames).map(|t| moments(&source, &of_places, t)).collect();
+                assert!(shown == expected, "{varying:?} vary, {frames_together} frames together");
+            }
+        }
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "scratch files are left");
+    }
+}

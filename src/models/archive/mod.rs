@@ -1,0 +1,207 @@
+//! Archives (`.gsz`) as a family: what one holds, decoded into a scratch folder, is an input of its own kind.
+//!
+//! Specified in `format/ARCHIVE.md`. No name in an archive is ever a path: which files come of it is decided here.
+
+pub(super) mod files;
+
+use std::fs;
+use std::io::Read;
+use std::path::Path;
+
+use xxhash_rust::xxh3::xxh3_128;
+
+use files::{CFG_ARGS, ITERATION, write_cloud};
+
+use super::family::{ColumnInfo, Entry, Family, OpenOptions, Residence, Timing};
+use super::size::Size;
+use super::{four_d_gaussians, ply_sequence};
+use crate::archive::{self, Content, Parts};
+use crate::error::{Error, Result};
+use crate::files::atomic::ScratchFolder;
+use crate::files::open::open_file;
+use crate::limits::{Limits, ReadLimit};
+use crate::model::Gaussians;
+use crate::outputs::kind::OutputKind;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::FrameSource;
+
+/// An archive.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a .gsz",
+    recognises: |found| found.is_file_of(&archive::MAGIC, "gsz"),
+    open: |path, options| Ok(Box::new(Archive::open(path, options)?)),
+};
+
+/// Reads an archive; gives also how many of its bytes are for what.
+///
+/// # Errors
+/// Whatever is wrong with it; more than `memory` takes.
+pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, Parts)> {
+    archive::decode(&load(path, memory)?, path, memory)
+}
+
+/// Reads the bytes of the archive at `path`. Its head is checked before the rest is read.
+fn load(path: &Path, memory: ReadLimit) -> Result<Vec<u8>> {
+    let failed = |error| Error::io("read", path)(error);
+    let mut file = open_file(path)?;
+    let whole = file.metadata().map_err(failed)?.len();
+    let mut bytes = Vec::new();
+    file.by_ref().take(archive::HEAD as u64).read_to_end(&mut bytes).map_err(failed)?;
+    archive::check_head(&bytes, whole, path, memory)?;
+    // The head is part of the checked length.
+    bytes.reserve_exact((whole - bytes.len() as u64) as usize);
+    file.take(whole - bytes.len() as u64).read_to_end(&mut bytes).map_err(failed)?;
+    Ok(bytes)
+}
+
+/// Writes what an archive, read from `path`, holds, as it was: into the folder `to` the files of a model, or a single
+/// PLY to the new file `to`.
+///
+/// # Errors
+/// Contents that make up no model; a failed write.
+pub fn unpack(content: &Content, path: &Path, to: &Path) -> Result<()> {
+    let Some(cfg_args) = content.files.get(CFG_ARGS) else { return write_cloud(content, path, to) };
+    let number = content.files.get(ITERATION).and_then(|text| std::str::from_utf8(text).ok()?.parse::<u32>().ok());
+    let Some(iteration) = number else {
+        return Err(Error::input(path, ITERATION, "the number of a training iteration", "none"));
+    };
+    let folder = four_d_gaussians::iteration_folder(to, iteration);
+    fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
+    let config = to.join(CFG_ARGS);
+    fs::write(&config, cfg_args).map_err(Error::io("write", &config))?;
+    four_d_gaussians::write_field(&content.tensors, &folder.join("deformation.pth"))?;
+    write_cloud(content, path, &folder.join("point_cloud.ply"))
+}
+
+/// Whether what an archive holds is a folder.
+pub fn is_folder(content: &Content) -> bool {
+    content.files.contains_key(CFG_ARGS)
+}
+
+/// An open archive.
+struct Archive {
+    /// What it holds, as files in `scratch`.
+    inner: Box<dyn Family>,
+    scratch: ScratchFolder,
+    digest: String,
+    size: Size,
+}
+
+impl Archive {
+    fn open(path: &Path, options: &OpenOptions) -> Result<Archive> {
+        options.refuse_for(path)?;
+        let bytes = load(path, options.memory)?;
+        let (content, parts) = archive::decode(&bytes, path, options.memory)?;
+        let digest = format!("{:032x}", xxh3_128(&bytes));
+        drop(bytes);
+        let folder = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
+        let scratch = ScratchFolder::new(&folder)?;
+        let inner: Box<dyn Family> = if is_folder(&content) {
+            unpack(&content, path, scratch.path())?;
+            drop(content);
+            (four_d_gaussians::ENTRY.open)(scratch.path(), options)?
+        } else {
+            let file = scratch.path().join("cloud.ply");
+            unpack(&content, path, &file)?;
+            drop(content);
+            (ply_sequence::FILE.open)(&file, options)?
+        };
+        Ok(Archive { inner, scratch, digest, size: parts.into() })
+    }
+}
+
+impl Family for Archive {
+    fn kind(&self) -> &'static str {
+        "gsz archive"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self.inner.source()
+    }
+
+    fn digest(&self) -> Result<String> {
+        Ok(self.digest.clone())
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        Ok(self.size.whole())
+    }
+
+    fn size(&self) -> Result<Size> {
+        Ok(self.size)
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        self.inner.size_written(kind, path)
+    }
+
+    fn stored_bytes(&self) -> Result<u64> {
+        self.inner.stored_bytes()
+    }
+
+    fn residence(&self) -> Residence {
+        self.inner.residence()
+    }
+
+    fn timing(&self) -> Timing {
+        self.inner.timing()
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        let Archive { inner, scratch, digest, size } = *self;
+        Ok(Box::new(Archive { inner: inner.with_times(times)?, scratch, digest, size }))
+    }
+
+    fn data_folder(&self) -> Option<&str> {
+        self.inner.data_folder()
+    }
+
+    fn background(&self) -> Option<[f32; 3]> {
+        self.inner.background()
+    }
+
+    fn canonical(&self) -> Option<&Gaussians> {
+        self.inner.canonical()
+    }
+
+    fn columns(&self) -> Result<Vec<ColumnInfo>> {
+        self.inner.columns()
+    }
+
+    fn own_output(&self) -> OutputKind {
+        self.inner.own_output()
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        self.inner.check_output(kind, path)
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        self.inner.solve(clusters, reference, rule)
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.reduced(reduction)
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        self.inner.write(reduction, kind, path, limits)
+    }
+
+    fn can_round_field(&self) -> Result<bool> {
+        self.inner.can_round_field()
+    }
+
+    fn needs_all_bands(&self) -> Option<&'static str> {
+        self.inner.needs_all_bands()
+    }
+
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        self.inner.content(reduction)
+    }
+
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.showing(content)
+    }
+}

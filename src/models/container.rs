@@ -1,0 +1,116 @@
+//! Containers (`.gseq`) as a family.
+
+use gseq::{Encoding, Reader, TileId};
+
+use super::family::{ColumnInfo, Entry, Family, Residence, Timing};
+use super::linked::Linked;
+use super::size::bytes_of;
+use crate::error::{Error, Result, ShowPath};
+use crate::files::container::Container;
+use crate::source::FrameSource;
+
+/// A container.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a .gseq",
+    recognises: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
+    open: |path, options| {
+        let container = Container::open_within(path, options.memory)?;
+        options.refuse_for(path)?;
+        if options.link.is_asked() && container.info().times.len() > 1 {
+            let joins = options.link.joins();
+            return Ok(Box::new(Linked::anew(&container, "linked gseq container", joins, &options.ply())?));
+        }
+        Ok(Box::new(container))
+    },
+};
+
+impl Family for Container {
+    fn kind(&self) -> &'static str {
+        "gseq container"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        Ok(Container::digest(self))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_of([self.path()])
+    }
+
+    fn may_be_linked(&self) -> bool {
+        true
+    }
+
+    fn stands_in_frames(&self) -> bool {
+        true
+    }
+
+    fn residence(&self) -> Residence {
+        let layout = self.reader().layout();
+        // The tiles decide what is decoded together.
+        Residence {
+            gaussian_block: layout.gaussian_block.into(),
+            columns: layout.columns.len() as u64,
+            decoded: self.decoded_bytes(),
+            ..Residence::of_tiles(layout.frame_block.into())
+        }
+    }
+
+    fn hold_decoded(&self) {
+        Container::hold_decoded(self, self.decoded_bytes());
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Stamped
+    }
+
+    fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn Family>> {
+        Err(Error::usage(format!("{}: a container says itself when its frames are", self.path().shown())))
+    }
+
+    fn columns(&self) -> Result<Vec<ColumnInfo>> {
+        columns(self.reader())
+    }
+}
+
+fn columns(reader: &Reader) -> Result<Vec<ColumnInfo>> {
+    let layout = reader.layout();
+    let mut out = Vec::new();
+    for (column, spec) in layout.columns.iter().enumerate() {
+        let mut found = ColumnInfo {
+            name: spec.name.clone(),
+            width: spec.width,
+            max_error: spec.max_error,
+            tiles: 0,
+            constant_tiles: 0,
+            raw_tiles: 0,
+            stored_bytes: 0,
+            raw_bytes: 4 * u64::from(spec.width) * layout.gaussians * reader.frames() as u64,
+            min: None,
+            max: None,
+        };
+        for gaussian_block in 0..layout.gaussian_blocks() {
+            let mut last_offset = None;
+            for frame_block in 0..reader.frame_blocks() {
+                let tile = reader.tile_info(TileId { column: column as u32, gaussian_block, frame_block })?;
+                found.tiles += 1;
+                found.constant_tiles += usize::from(tile.constant);
+                found.raw_tiles += usize::from(tile.encoding == Encoding::Raw);
+                if last_offset != Some(tile.offset) {
+                    found.stored_bytes += tile.stored_bytes;
+                }
+                last_offset = Some(tile.offset);
+                if tile.stats.min <= tile.stats.max {
+                    found.min = Some(found.min.map_or(tile.stats.min, |min| min.min(tile.stats.min)));
+                    found.max = Some(found.max.map_or(tile.stats.max, |max| max.max(tile.stats.max)));
+                }
+            }
+        }
+        out.push(found);
+    }
+    Ok(out)
+}

@@ -1,0 +1,296 @@
+//! Model folders with a `deform` folder in them: a canonical cloud, and a network that deforms it.
+//!
+//! `cfg_args`, `cameras.json`, `point_cloud/iteration_K/point_cloud.ply`, `deform/iteration_K/deform.pth`. A family of
+//! such folders gives the law by which the network's outputs become states ([`Deforming`]); files, proxies and writing are
+//! the same. The result is a folder of the same layout with a smaller cloud: the network stays byte for byte as it was, and
+//! so does the configuration, but for the SH degree where that is lower.
+
+mod arguments;
+mod paths;
+mod proxies;
+#[cfg(test)]
+mod tests;
+
+use std::fs;
+use std::path::Path;
+
+pub(super) use arguments::Arguments;
+use paths::Paths;
+pub(super) use paths::{has_network, names_of_network};
+
+use super::family::{Family, OpenOptions, Residence, Timing};
+use super::files::copy;
+use super::four_d_gaussians::cfg_args::read_for_degree;
+use super::law::{Law, Model, solve};
+use super::size::{Size, bytes_below, bytes_of};
+use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::deform::Tensors;
+use crate::error::{Error, Result};
+use crate::files::cameras::Clock;
+use crate::files::ply::write::{out_rows, write_like};
+use crate::files::ply::{Encoding, Ply, read_plane};
+use crate::limits::Limits;
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
+use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::outputs::kind::OutputKind;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::FrameSource;
+
+/// Smallest scale that has a logarithm here.
+pub(super) const LEAST_SCALE: f64 = 1e-7;
+
+/// A law by which what a network says becomes states.
+pub(super) trait Deforming: Law {
+    /// What the family is called.
+    const KIND: &'static str;
+    /// Whether a rotation is made unit before what the network says is added to it.
+    const NORMALISES: bool;
+
+    /// Bytes that one Gaussian takes once it is prepared.
+    fn bytes_per_gaussian(&self) -> usize;
+
+    /// Bytes that it holds however many Gaussians there are, beside the network.
+    fn bytes(&self) -> usize {
+        0
+    }
+
+    /// Seconds of one processor that a state takes, about.
+    fn seconds_per_state(&self) -> f64;
+}
+
+/// What a family is made from.
+pub(super) struct Parts<'a> {
+    pub(super) arguments: &'a Arguments,
+    pub(super) tensors: &'a Tensors,
+    /// The file that `tensors` are of.
+    pub(super) file: &'a Path,
+    /// Planes `fea_*` of the cloud.
+    pub(super) features: usize,
+    /// The cloud.
+    pub(super) cloud: &'a Path,
+}
+
+/// An open model folder.
+pub(super) struct Folder<L> {
+    paths: Paths,
+    model: Model<L>,
+    source_path: Option<String>,
+    white_background: bool,
+    tensor_bytes: u64,
+    notes: Vec<String>,
+}
+
+impl<L: Deforming + 'static> Folder<L> {
+    /// Opens the model at `root`; `make` gives its law, and what a person should know of it.
+    ///
+    /// # Errors
+    /// Files that are missing; what is wrong with one of them.
+    pub(super) fn open(
+        root: &Path,
+        options: &OpenOptions,
+        make: impl FnOnce(&Parts<'_>) -> Result<(L, Vec<String>)>,
+    ) -> Result<Box<dyn Family>> {
+        let paths = Paths::locate(root, options.iteration)?;
+        let arguments = Arguments::read(&paths.cfg_args)?;
+        let tensors = paths.tensors(options.memory)?;
+        let ply = Ply::open_with(&paths.point_cloud, &options.ply())?;
+        let raw = raw(&ply)?;
+        let (features, file, cloud) = (raw.own.width(), &*paths.network, &*paths.point_cloud);
+        let parts = Parts { arguments: &arguments, tensors: &tensors, file, features, cloud };
+        let (law, notes) = make(&parts)?;
+        let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
+        let source_path = arguments.get("source_path").string()?;
+        let white_background = arguments.get("white_background").bool(false)?;
+        let model = Model::new(law, raw, ply.sh_degree());
+        Ok(Box::new(Folder { paths, model, source_path, white_background, tensor_bytes: 4 * values as u64, notes }))
+    }
+
+    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    fn cfg_args(&self, sh_degree: usize) -> Result<String> {
+        read_for_degree(&self.paths.cfg_args, self.model.info().sh_degree, sh_degree)
+    }
+
+    /// Writes what is left as a folder at `path`.
+    fn write_folder(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+        let to = Paths::of(path, self.paths.iteration);
+        for file in [&to.point_cloud, &to.network] {
+            let folder = file.parent().unwrap_or(path);
+            fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+        }
+        fs::write(&to.cfg_args, self.cfg_args(reduction.sh_degree)?).map_err(Error::io("write", &to.cfg_args))?;
+        copy(&self.paths.network, &to.network)?;
+        let cameras = self.paths.root.join("cameras.json");
+        if cameras.is_file() {
+            copy(&cameras, &path.join("cameras.json"))?;
+        }
+        let none = Gaussians::zeros(0, self.model.info().sh_degree);
+        let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
+        let mut rows = out_rows(reduction);
+        for cluster in &reduction.clusters {
+            // A proxy has the features of its heaviest member.
+            rows[cluster.output as usize].source = heaviest(cluster);
+        }
+        let template = Ply::open(&self.paths.point_cloud)?;
+        write_like(&template, &rows, proxies, &reduction.change, reduction.sh_degree, &to.point_cloud)
+    }
+}
+
+/// The member of most weight, the first of several.
+fn heaviest(cluster: &Cluster) -> u32 {
+    let first = (cluster.leader, f64::NEG_INFINITY);
+    cluster.members.iter().fold(first, |most, &member| if member.1 > most.1 { member } else { most }).0
+}
+
+/// The parameters of a cloud, with its planes `fea_0`, `fea_1`, ….
+fn raw(ply: &Ply) -> Result<Raw> {
+    let count = ply.count();
+    let gaussians = ply.whole()?;
+    let find = |k: usize| ply.properties().iter().find(|property| property.name == format!("fea_{k}"));
+    let features: Vec<_> = (0..).map_while(find).collect();
+    let mut own = Column::zeros(features.len(), count);
+    let big_endian = ply.header().encoding == Encoding::BigEndian;
+    for (k, property) in features.into_iter().enumerate() {
+        let plane = own.plane_mut(k);
+        for (row, value) in plane.iter_mut().enumerate() {
+            read_plane(ply.row(row), &[0], property, big_endian, std::slice::from_mut(value));
+        }
+    }
+    // What a network reads, or what is decomposed.
+    let read = [&gaussians.position, &gaussians.rotation, &gaussians.log_scale, &own];
+    for (column, name) in read.into_iter().zip(["x y z", "rot", "scale", "fea"]) {
+        if let Some(at) = column.planes().iter().position(|value| !value.is_finite()) {
+            let (row, value) = (at % count, column.planes()[at]);
+            return Err(Error::input(
+                ply.path(),
+                format!("Gaussian {row}, {name}"),
+                "a finite number",
+                value.to_string(),
+            )
+            .hint("drop this Gaussian, or save the model anew"));
+        }
+    }
+    Ok(Raw { gaussians, own })
+}
+
+/// Of a model's files that a renderer opens.
+fn size_of(paths: &Paths) -> Result<Size> {
+    let (cloud, field) = (bytes_of([&*paths.point_cloud])?, bytes_of([&*paths.network])?);
+    Ok(Size { cloud, field, rest: bytes_of([&*paths.cfg_args])?, ..Size::default() })
+}
+
+impl<L: Deforming + 'static> Family for Folder<L> {
+    fn kind(&self) -> &'static str {
+        L::KIND
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        &self.model
+    }
+
+    fn digest(&self) -> Result<String> {
+        self.paths.digest()
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        Ok(self.size()?.whole())
+    }
+
+    fn size(&self) -> Result<Size> {
+        size_of(&self.paths)
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind {
+            OutputKind::Model => size_of(&Paths::of(path, self.paths.iteration)),
+            _ => Ok(Size::of_frames(bytes_below(path)?)),
+        }
+    }
+
+    fn residence(&self) -> Residence {
+        let law = self.model.law();
+        let features = 4 * self.model.raw().own.width() as u64;
+        let whole = state_bytes(self.model.info().sh_degree, Columns::all()) + features;
+        Residence {
+            per_gaussian: whole,
+            // Normals and the like stand beside the values.
+            opening: whole + 24,
+            // A copy of the parameters, what is prepared of them, and what a block adds to them.
+            reader: 2 * whole + law.bytes_per_gaussian() as u64 + 128,
+            reduced: 2 * whole,
+            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64 + 36,
+            file: whole + 24,
+            // Tensors as they are read and as they are used.
+            fixed: 2 * self.tensor_bytes + law.bytes() as u64,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+            seconds_per_state: law.seconds_per_state(),
+            decoded: 0,
+        }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Continuous
+    }
+
+    /// The network was trained with times as cameras give them.
+    fn clock(&self) -> Clock {
+        Clock::Given
+    }
+
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        self.model = self.model.with_times(times)?;
+        Ok(self)
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.notes.clone()
+    }
+
+    fn data_folder(&self) -> Option<&str> {
+        self.source_path.as_deref()
+    }
+
+    fn background(&self) -> Option<[f32; 3]> {
+        self.white_background.then_some([1.0; 3])
+    }
+
+    fn canonical(&self) -> Option<&Gaussians> {
+        Some(&self.model.raw().gaussians)
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::Model
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Model => Ok(()),
+            _ => check_output(self.model.info().times.len(), kind, path),
+        }
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        solve(&self.model, clusters, reference, rule, |clusters| proxies::propose(&self.model, clusters, rule))
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.reduced(reduction)))
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        let mut notes = match kind {
+            OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?,
+        };
+        let left = Columns::all().difference(self.model.law().movable());
+        if !reduction.change.is_empty() && !left.is_empty() {
+            notes.push(
+                "sizes and rotations were not refined: this model's covariances are not those of its quaternions"
+                    .to_owned(),
+            );
+        }
+        Ok(notes)
+    }
+}

@@ -1,0 +1,233 @@
+//! Proxies of Gaussians that a network deforms.
+//!
+//! What the network adds depends on where a Gaussian is, so a place is chosen and not averaged: of the places of the heaviest
+//! members and their mean the one that moves most like the members' moment match, improved by Gauss-Newton steps. Size and
+//! rotation are then what is wanted less what the network makes of them there, on average.
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+
+use super::{Deforming, LEAST_SCALE, heaviest};
+use crate::error::Result;
+use crate::merging::merged::MergedSequence;
+use crate::model::{Columns, Gaussians, Raw, logit, opacity};
+use crate::models::law::Model;
+use crate::passes::gather_all;
+use crate::recipe::Merge;
+use crate::reduction::Cluster;
+use crate::source::{Deformation, FrameSource};
+
+/// Frames at which places are compared, and over which sizes and rotations are averaged.
+const SAMPLED_FRAMES: usize = 16;
+/// Members whose places are tried.
+const TRIED: usize = 4;
+/// Steps towards a better place.
+const STEPS: usize = 2;
+/// Turns towards a better size and rotation.
+const TURNS: usize = 3;
+/// What a step adds to the diagonal, of its mean: where all frames move alike the matrix is well behaved, and elsewhere a
+/// shorter step is a better one.
+const DAMPING: f64 = 1e-3;
+
+/// Parameters that move most like the members of each of `clusters`, a row for each.
+pub(super) fn propose<L: Deforming>(model: &Model<L>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+    let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+    let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
+    let wanted = MergedSequence::new(model, &leaders, members, rule);
+    let count = model.info().times.len();
+    let sampled = count.min(SAMPLED_FRAMES);
+    let frames: Vec<usize> =
+        (0..sampled).map(|k| if sampled < 2 { 0 } else { k * (count - 1) / (sampled - 1) }).collect();
+    let of_frame = |(k, &frame): (usize, &usize)| {
+        let constant = if k == 0 { Columns::SH } else { Columns::empty() };
+        gather_all(&wanted, frame, Columns::all().difference(Columns::SH) | constant)
+    };
+    let wanted: Vec<Gaussians> = frames.iter().enumerate().map(of_frame).collect::<Result<_>>()?;
+
+    let (mut tried, mut of_cluster) = (Vec::new(), Vec::new());
+    let mut features = Vec::new();
+    for cluster in clusters {
+        let first = tried.len();
+        let mut by_weight = cluster.members.clone();
+        by_weight.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        by_weight.truncate(TRIED);
+        tried.extend(by_weight.into_iter().map(|(id, _)| id));
+        // The last one is moved to the mean.
+        tried.push(cluster.leader);
+        of_cluster.push(first..tried.len());
+        features.resize(tried.len(), heaviest(cluster));
+    }
+    let mut places = model.raw().pick(&tried);
+    places.own = model.raw().own.pick(&features);
+    for (cluster, rows) in clusters.iter().zip(&of_cluster) {
+        let mut mean = DVec3::ZERO;
+        for &(id, weight) in &cluster.members {
+            mean += weight * place(&model.raw().gaussians, id as usize);
+        }
+        places.gaussians.position.set_row(rows.end - 1, mean.as_vec3().to_array());
+    }
+    let of_place: Vec<usize> = (0..clusters.len()).flat_map(|c| of_cluster[c].clone().map(move |_| c)).collect();
+    let off = off(model, &places, &frames, |k, row| place(&wanted[k], of_place[row]))?;
+    let best: Vec<u32> = of_cluster
+        .iter()
+        .map(|rows| rows.clone().fold(rows.start, |best, row| if off[row] < off[best] { row } else { best }) as u32)
+        .collect();
+    let mut made = places.pick(&best);
+    let mut least: Vec<f64> = best.iter().map(|&row| off[row as usize]).collect();
+
+    for _ in 0..STEPS {
+        let better = step(model, &made, &frames, &wanted)?;
+        let found = self::off(model, &better, &frames, |k, row| place(&wanted[k], row))?;
+        for (row, (least, found)) in least.iter_mut().zip(found).enumerate() {
+            if found < *least {
+                *least = found;
+                made.set_row(row, &better, row);
+            }
+        }
+    }
+    shape(model, &mut made, &leaders, &frames, &wanted)?;
+    Ok(made)
+}
+
+/// Where a Gaussian is.
+fn place(state: &Gaussians, row: usize) -> DVec3 {
+    DVec3::from(state.position.row::<3>(row).map(f64::from))
+}
+
+/// For every row of `raw` the sum of its squared distances from where it is wanted.
+fn off<L: Deforming>(
+    model: &Model<L>,
+    raw: &Raw,
+    frames: &[usize],
+    wanted: impl Fn(usize, usize) -> DVec3,
+) -> Result<Vec<f64>> {
+    let (mut off, mut state) = (vec![0.0; raw.len()], Gaussians::zeros(0, 0));
+    for (k, &frame) in frames.iter().enumerate() {
+        Deformation::state(model, frame, raw, Columns::POSITION, &mut state)?;
+        for (row, off) in off.iter_mut().enumerate() {
+            *off += (place(&state, row) - wanted(k, row)).length_squared();
+        }
+    }
+    Ok(off)
+}
+
+/// One Gauss-Newton step of every place.
+fn step<L: Deforming>(model: &Model<L>, raw: &Raw, frames: &[usize], wanted: &[Gaussians]) -> Result<Raw> {
+    let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
+    let mut state = Gaussians::zeros(0, 0);
+    for (&frame, wanted) in frames.iter().zip(wanted) {
+        Deformation::state(model, frame, raw, Columns::POSITION, &mut state)?;
+        let slopes = Deformation::jacobian(model, frame, raw, Columns::POSITION)?;
+        let slopes = slopes.column(Columns::POSITION);
+        for (row, (matrix, vector)) in sums.iter_mut().enumerate() {
+            // Plane 3·i + j is component i by j: rows of the matrix, columns of its transpose.
+            let transposed = DMat3::from_cols_array(&slopes.row::<9>(row).map(f64::from));
+            *matrix += transposed * transposed.transpose();
+            *vector += transposed * (place(wanted, row) - place(&state, row));
+        }
+    }
+    let mut better = raw.clone();
+    for (row, (matrix, vector)) in sums.into_iter().enumerate() {
+        let mean = (matrix.x_axis.x + matrix.y_axis.y + matrix.z_axis.z) / 3.0;
+        let by = (matrix + DMat3::from_diagonal(DVec3::splat(DAMPING * mean))).inverse() * vector;
+        if by.is_finite() {
+            let moved = place(&raw.gaussians, row) + by;
+            better.gaussians.position.set_row(row, moved.as_vec3().to_array());
+        }
+    }
+    Ok(better)
+}
+
+/// Sets everything but the place: from the leader's on, by what is wanted less what is there, on average. Where what the
+/// network says is added that is what is wanted less that, at once; where more comes of it, as of quaternions that are not
+/// unit, it takes some turns. The best turn stays.
+fn shape<L: Deforming>(
+    model: &Model<L>,
+    made: &mut Raw,
+    leaders: &[u32],
+    frames: &[usize],
+    wanted: &[Gaussians],
+) -> Result<()> {
+    let own = &model.raw().gaussians;
+    (made.gaussians.rotation, made.gaussians.log_scale) = (own.rotation.pick(leaders), own.log_scale.pick(leaders));
+    (made.gaussians.opacity_logit, made.gaussians.sh) = (own.opacity_logit.pick(leaders), own.sh.pick(leaders));
+    let (mut best, mut least) = (made.clone(), vec![f64::INFINITY; made.len()]);
+    let share = 1.0 / frames.len().max(1) as f64;
+    for turn in 0..=TURNS {
+        let mut all = vec![Wanting::default(); made.len()];
+        let mut state = Gaussians::zeros(0, own.sh_degree());
+        for (&frame, wanted) in frames.iter().zip(wanted) {
+            Deformation::state(model, frame, made, Columns::all(), &mut state)?;
+            all.par_iter_mut().enumerate().for_each(|(row, sum)| sum.add(wanted, &state, row));
+            if wanted.sh.len() == made.len() {
+                // Harmonics are wanted at one frame: they change at all others as they do there.
+                for c in 0..state.sh.width() {
+                    let more = wanted.sh.plane(c).iter().zip(state.sh.plane(c)).map(|(to, from)| to - from);
+                    made.gaussians.sh.plane_mut(c).iter_mut().zip(more).for_each(|(of, more)| *of += more);
+                }
+            }
+        }
+        for (row, sum) in all.iter().enumerate() {
+            if sum.off < least[row] {
+                least[row] = sum.off;
+                best.set_row(row, made, row);
+            }
+            if turn < TURNS {
+                sum.give::<L>(share, &mut made.gaussians, row);
+            }
+        }
+    }
+    // Opacities and harmonics are right from the first turn on.
+    (made.gaussians.rotation, made.gaussians.log_scale) = (best.gaussians.rotation, best.gaussians.log_scale);
+    Ok(())
+}
+
+/// What one row lacks, summed over frames.
+#[derive(Clone, Copy, Default)]
+struct Wanting {
+    scale: [f64; 3],
+    rotation: [f64; 4],
+    opacity: f64,
+    /// Squares of what is lacking, of logarithms of scales and of unit quaternions.
+    off: f64,
+}
+
+impl Wanting {
+    /// Adds what `state` lacks of `wanted`.
+    fn add(&mut self, wanted: &Gaussians, state: &Gaussians, row: usize) {
+        let [to, from] = [wanted, state].map(|state| state.log_scale.row::<3>(row).map(f64::from));
+        for c in 0..3 {
+            self.scale[c] += to[c].exp() - from[c].exp();
+            self.off += (to[c] - from[c]).powi(2);
+        }
+        let [to, from] = [wanted, state].map(|state| state.rotation.row::<4>(row).map(f64::from));
+        let [wide, long] = [to, from].map(|q| q.iter().map(|x| x * x).sum::<f64>().sqrt());
+        let sign = 1f64.copysign((0..4).map(|c| to[c] * from[c]).sum());
+        for c in 0..4 {
+            let lacks = sign * to[c] / wide - from[c] / long;
+            self.rotation[c] += long * lacks;
+            self.off += lacks * lacks;
+        }
+        let [to, from] = [wanted, state].map(|state| opacity(state.opacity_logit.plane(0)[row]));
+        self.opacity += to - from;
+    }
+
+    /// Gives it, on average, to parameters.
+    fn give<L: Deforming>(&self, share: f64, to: &mut Gaussians, row: usize) {
+        let scale = to.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
+        let scale = [0, 1, 2].map(|c| (scale[c] + share * self.scale[c]).max(LEAST_SCALE).ln() as f32);
+        to.log_scale.set_row(row, scale);
+        let own = to.rotation.row::<4>(row).map(f64::from);
+        // What is added to a quaternion that is made unit first counts by its length.
+        let long = if L::NORMALISES { own.iter().map(|x| x * x).sum::<f64>().sqrt() } else { 1.0 };
+        let rotation = [0, 1, 2, 3].map(|c| (own[c] + long * share * self.rotation[c]) as f32);
+        if rotation.iter().all(|x| x.is_finite()) {
+            to.rotation.set_row(row, rotation);
+        }
+        let alpha = (opacity(to.opacity_logit.plane(0)[row]) + share * self.opacity).clamp(1e-6, 1.0 - 1e-6);
+        // An opacity that is right keeps its bits.
+        if self.opacity != 0.0 {
+            to.opacity_logit.set_row(row, [logit(alpha) as f32]);
+        }
+    }
+}

@@ -1,0 +1,185 @@
+//! Dynamic3DGaussians as a family: explicit trajectories in a `params.npz`.
+//!
+//! The result is a folder with a `params.npz` of the same arrays in the same order and types; what stays of them keeps its
+//! bytes.
+
+mod params;
+mod proxies;
+
+use std::path::{Path, PathBuf};
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::family::{Entry, Family, Residence, Timing};
+use super::size::bytes_of;
+use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::error::Result;
+use crate::files::digest::hash_file;
+use crate::files::npz::write::write_like;
+use crate::limits::Limits;
+use crate::model::{Columns, Gaussians, SH_C0, colour};
+use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::outputs::kind::OutputKind;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::{FrameSource, Ids};
+use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
+use proxies::Settled;
+
+/// What a model's file is called.
+const FILE: &str = "params.npz";
+
+/// A model's file, or its folder.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a Dynamic3DGaussians params.npz",
+    recognises: |found| {
+        let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
+        match found.is_folder {
+            true => found.path.join(FILE).is_file(),
+            false => named(found.path),
+        }
+    },
+    open: |path, options| {
+        options.refuse_for(path)?;
+        let file = if path.is_dir() { path.join(FILE) } else { path.to_owned() };
+        let scratch = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
+        Ok(Box::new(Params::open(&file, &scratch)?))
+    },
+};
+
+impl Family for Params {
+    fn kind(&self) -> &'static str {
+        "Dynamic3DGaussians model"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        hash_file(&self.path(), &mut hash)?;
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_of([&*self.path()])
+    }
+
+    fn residence(&self) -> Residence {
+        Residence {
+            per_gaussian: 0,
+            opening: 0,
+            reader: 8,
+            // Sizes and opacities of proxies, and which they are.
+            reduced: state_bytes(0, Columns::all()) + 16,
+            jacobian: 0,
+            file: 0,
+            fixed: 0,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+            seconds_per_state: 2e-8,
+            decoded: 0,
+        }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Numbered
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        Ok(Box::new(Params::with_times(*self, times)?))
+    }
+
+    /// Pictures were taken before black.
+    fn background(&self) -> Option<[f32; 3]> {
+        Some([0.0; 3])
+    }
+
+    fn class(&self, id: u32) -> u8 {
+        u8::from(self.is_foreground(id as usize).unwrap_or(false))
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::Model
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Model => Ok(()),
+            _ => check_output(self.info().times.len(), kind, path),
+        }
+    }
+
+    fn solve(&self, clusters: &[Cluster], _: Reference, rule: &Merge) -> Result<Proxies> {
+        proxies::solve(self, clusters, rule)
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(proxies::reduced(self, reduction))
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        match kind {
+            OutputKind::Model => self.write_params(reduction, path.join(FILE)).map(|()| Vec::new()),
+            _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
+        }
+    }
+}
+
+impl Params {
+    /// Writes what is left as the file `path`.
+    fn write_params(&self, reduction: &Reduction, path: PathBuf) -> Result<()> {
+        let settled = Settled::new(self, reduction);
+        let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
+        let (mut proxies, mut state) = (settled.open(Ids::List(&places))?, Gaussians::zeros(0, 0));
+        let by = &reduction.change.0;
+        write_like(
+            self.npz(),
+            &reduction.kept,
+            Params::axis,
+            |name, frame, values| {
+                let column = match name {
+                    MEANS => Columns::POSITION,
+                    ROTATIONS => Columns::ROTATION,
+                    COLOURS => Columns::SH,
+                    LOG_SCALES => Columns::LOG_SCALE,
+                    OPACITIES => Columns::OPACITY,
+                    // Segments are the leader's.
+                    _ => return Ok(Vec::new()),
+                };
+                let (width, is_colour) = (column.width(0), column == Columns::SH);
+                if !places.is_empty() {
+                    proxies.read(frame, column, &mut state)?;
+                }
+                let mut changed = places.clone();
+                for (proxy, &place) in places.iter().enumerate() {
+                    for c in 0..width {
+                        let value = state.column(column).plane(c)[proxy];
+                        values[place as usize * width + c] = if is_colour { colour(value) as f32 } else { value };
+                    }
+                }
+                let by = by.column(column);
+                for row in 0..by.len() {
+                    let mut differs = false;
+                    for c in 0..width.min(by.width()) {
+                        let more = by.plane(c)[row];
+                        if more != 0.0 {
+                            differs = true;
+                            values[row * width + c] += if is_colour { (SH_C0 * f64::from(more)) as f32 } else { more };
+                        }
+                    }
+                    if differs {
+                        changed.push(row as u32);
+                    }
+                }
+                Ok(changed)
+            },
+            &path,
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests;

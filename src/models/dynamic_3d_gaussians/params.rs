@@ -1,0 +1,193 @@
+//! `params.npz` of Dynamic3DGaussians: where every Gaussian is at every frame, how it is turned and coloured; its size and
+//! opacity once for all.
+//!
+//! Arrays, of T frames and N Gaussians: `means3D` [T, N, 3], scene units; `unnorm_rotations` [T, N, 4], wxyz of any length;
+//! `rgb_colors` [T, N, 3], a colour from all sides; `log_scales` [N, 3]; `logit_opacities` [N, 1]; `seg_colors` [N, 3], red
+//! above ½ in the foreground. Further ones are no matter of a picture. Source: `load_scene_data` of the authors' visualiser.
+
+use std::path::{Path, PathBuf};
+
+use crate::error::{Error, Result};
+use crate::files::npz::write::Axis;
+use crate::files::npz::{Entry, Floats, Npz};
+use crate::model::{Columns, Gaussians, SequenceInfo, harmonic};
+use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
+
+pub(super) const MEANS: &str = "means3D";
+pub(super) const ROTATIONS: &str = "unnorm_rotations";
+pub(super) const COLOURS: &str = "rgb_colors";
+pub(super) const LOG_SCALES: &str = "log_scales";
+pub(super) const OPACITIES: &str = "logit_opacities";
+const SEGMENTS: &str = "seg_colors";
+
+/// Above it a segment's red is foreground.
+const FOREGROUND: f32 = 0.5;
+
+/// An open model.
+#[derive(Debug)]
+pub(super) struct Params {
+    npz: Npz,
+    info: SequenceInfo,
+    means: Floats,
+    rotations: Floats,
+    colours: Floats,
+    log_scales: Floats,
+    opacities: Floats,
+    segments: Option<Floats>,
+    states: Count,
+}
+
+impl Params {
+    /// Opens `path`. Frame i of T has time i / (T − 1). What is compressed or no f32 is decoded into `scratch`.
+    ///
+    /// # Errors
+    /// No archive; arrays that are missing or of another shape; a static model.
+    pub(super) fn open(path: &Path, scratch: &Path) -> Result<Params> {
+        let npz = Npz::open(path)?;
+        let [frames, count] = match npz.entry(MEANS).map(|entry| &entry.shape[..]) {
+            Some(&[frames, count, 3]) if frames > 0 => [frames, count],
+            Some(&[_, _]) if npz.entry("cam_unnorm_rots").is_some() => {
+                return Err(Error::input(path, MEANS, "shape [T, N, 3]", "a static map of SplaTAM")
+                    .hint("export it as a PLY in the 3DGS layout, and give that"));
+            }
+            found => {
+                let found = found.map_or("no such array".to_owned(), |shape| format!("{shape:?}"));
+                return Err(Error::input(path, MEANS, "shape [T, N, 3], T at least 1", found));
+            }
+        };
+        let said = |shape: &[usize]| format!("shape {shape:?}");
+        let has_segments = npz.entry(SEGMENTS).is_some();
+        let expected: [(&str, &[usize]); 6] = [
+            (MEANS, &[frames, count, 3]),
+            (ROTATIONS, &[frames, count, 4]),
+            (COLOURS, &[frames, count, 3]),
+            (LOG_SCALES, &[count, 3]),
+            (OPACITIES, &[count, 1]),
+            (SEGMENTS, &[count, 3]),
+        ];
+        let expected = &expected[..if has_segments { 6 } else { 5 }];
+        // All shapes and types, before any array is decoded.
+        for &(name, shape) in expected {
+            if let Some(entry) = npz.entry(name).filter(|entry| entry.shape != shape) {
+                return Err(Error::input(path, name, said(shape), said(&entry.shape))
+                    .hint(format!("{MEANS} has {frames} frames of {count} Gaussians: all arrays must")));
+            }
+        }
+        npz.check_floats(&expected.iter().map(|&(name, _)| name).collect::<Vec<_>>())?;
+        let floats = |name: &str| npz.floats(name, scratch);
+        let segments = has_segments.then(|| floats(SEGMENTS)).transpose()?;
+        let varying = Columns::POSITION | Columns::ROTATION | Columns::SH;
+        let last = frames.saturating_sub(1).max(1) as f64;
+        let info = SequenceInfo {
+            count,
+            times: (0..frames).map(|frame| frame as f64 / last).collect(),
+            sh_degree: 0,
+            varying: if frames > 1 { varying } else { Columns::empty() },
+        };
+        Ok(Params {
+            means: floats(MEANS)?,
+            rotations: floats(ROTATIONS)?,
+            colours: floats(COLOURS)?,
+            log_scales: floats(LOG_SCALES)?,
+            opacities: floats(OPACITIES)?,
+            segments,
+            npz,
+            info,
+            states: Count::default(),
+        })
+    }
+
+    /// The same frames at other times.
+    ///
+    /// # Errors
+    /// A number of times other than T; times that are not finite or do not increase.
+    pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<Params> {
+        self.info = self.info.with_times(times)?;
+        Ok(self)
+    }
+
+    /// The file.
+    pub(super) fn npz(&self) -> &Npz {
+        &self.npz
+    }
+
+    /// The file's path.
+    pub(super) fn path(&self) -> PathBuf {
+        self.npz.path().to_owned()
+    }
+
+    /// Whether a Gaussian is part of the foreground; none where the model does not say.
+    pub(super) fn is_foreground(&self, id: usize) -> Option<bool> {
+        self.segments.as_ref().map(|segments| segments.row::<1>(3 * id)[0] > FOREGROUND)
+    }
+
+    /// Along which axis Gaussians are counted in an array.
+    pub(super) fn axis(entry: &Entry) -> Axis {
+        match entry.name.as_str() {
+            MEANS | ROTATIONS | COLOURS => Axis::Second,
+            LOG_SCALES | OPACITIES | SEGMENTS => Axis::First,
+            _ => Axis::None,
+        }
+    }
+}
+
+impl FrameSource for Params {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        if let Some(id) = ids.iter().find(|&id| id >= self.info.count) {
+            return Err(Error::usage(format!("Gaussian {id} was asked for, of {}", self.info.count)));
+        }
+        Ok(Box::new(Block { params: self, ids: ids.iter().collect() }))
+    }
+
+    fn reads(&self) -> Reads {
+        let states = self.states.get();
+        Reads { states, ..Reads::default() }
+    }
+}
+
+/// Some Gaussians of a model.
+struct Block<'a> {
+    params: &'a Params,
+    ids: Vec<usize>,
+}
+
+impl BlockReader for Block<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let Params { info, means, rotations, colours, log_scales, opacities, states, .. } = self.params;
+        if frame >= info.times.len() {
+            return Err(Error::usage(format!("frame {frame} was asked for, of {}", info.times.len())));
+        }
+        means.check()?;
+        states.add(self.ids.len() as u64);
+        out.columns_mut(want).for_each(|column| column.resize(self.ids.len()));
+        for (row, &id) in self.ids.iter().enumerate() {
+            let at = frame * info.count + id;
+            for column in want.iter() {
+                match column {
+                    Columns::POSITION => out.position.set_row(row, means.row::<3>(3 * at)),
+                    Columns::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
+                    Columns::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
+                    Columns::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
+                    _ => out.sh.set_row(row, colours.row::<3>(3 * at).map(|colour| harmonic(colour.into()))),
+                }
+            }
+        }
+        let (first, last) = (self.ids.iter().min().copied(), self.ids.iter().max().copied());
+        if let (Some(first), Some(last)) = (first, last) {
+            for (floats, width, row) in [
+                (means, 3, frame * info.count),
+                (rotations, 4, frame * info.count),
+                (colours, 3, frame * info.count),
+                (log_scales, 3, 0),
+                (opacities, 1, 0),
+            ] {
+                floats.touched(width * (row + first)..width * (row + last + 1));
+            }
+        }
+        Ok(())
+    }
+}

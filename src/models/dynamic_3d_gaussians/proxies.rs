@@ -1,0 +1,132 @@
+//! Proxies of a model whose Gaussians move, turn and change their colour freely, but keep their size and opacity.
+//!
+//! A proxy's path, turn and colour are the moment match of its members at every frame; its size and opacity are their
+//! means along time.
+
+use super::params::Params;
+use crate::error::Result;
+use crate::merging::merged::MergedSequence;
+use crate::model::{Columns, Gaussians, SequenceInfo, logit, opacity};
+use crate::models::trajectories::merged;
+use crate::passes::{Changed, gather_all};
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction};
+use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
+
+/// Frames over which sizes and opacities are averaged.
+const SAMPLED_FRAMES: usize = 16;
+/// What does not change with time.
+const CONSTANT: Columns = Columns::LOG_SCALE.union(Columns::OPACITY);
+
+/// Sizes and opacities of the proxies of `clusters`, as rows of [`Proxies::raw`]: the geometric means of the sizes, the means
+/// of the opacities.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &Merge) -> Result<Proxies> {
+    let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+    let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
+    let proxies = MergedSequence::new(params, &leaders, members, merge);
+    let frames = params.info().times.len();
+    let sampled = frames.min(SAMPLED_FRAMES);
+    let mut sums = vec![[0.0; 4]; clusters.len()];
+    for k in 0..sampled {
+        let state = gather_all(&proxies, k * frames / sampled, CONSTANT)?;
+        for (row, sum) in sums.iter_mut().enumerate() {
+            let sizes = state.log_scale.row::<3>(row).map(f64::from);
+            let values = [sizes[0], sizes[1], sizes[2], opacity(state.opacity_logit.row::<1>(row)[0])];
+            sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+        }
+    }
+    let mut raw = Gaussians::zeros(clusters.len(), 0);
+    for (row, sum) in sums.iter().enumerate() {
+        let [a, b, c, visible] = sum.map(|sum| sum / sampled as f64);
+        raw.log_scale.set_row(row, [a, b, c].map(|size| size as f32));
+        raw.opacity_logit.set_row(row, [logit(visible) as f32]);
+    }
+    Ok(Proxies { raw: Some(raw.into()), ..Proxies::default() })
+}
+
+/// The frames of what `reduction` leaves of `params`.
+pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a Reduction) -> Box<dyn FrameSource + 'a> {
+    Box::new(Changed::new(
+        Box::new(Settled::new(params, reduction)),
+        &reduction.change,
+        &reduction.course,
+        reduction.sh_degree,
+    ))
+}
+
+/// A merged sequence whose proxies have the sizes and opacities that were solved for.
+pub(super) struct Settled<'a> {
+    merged: MergedSequence<'a>,
+    reduction: &'a Reduction,
+    info: SequenceInfo,
+}
+
+impl<'a> Settled<'a> {
+    pub(super) fn new(params: &'a Params, reduction: &'a Reduction) -> Settled<'a> {
+        let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
+        Settled { merged: merged(params, reduction), reduction, info }
+    }
+
+    /// Which of the Gaussians `places` are proxies: row, and number of the proxy.
+    fn proxies(&self, places: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
+        let clusters = &self.reduction.clusters;
+        let mut by_output: Vec<(u32, usize)> =
+            clusters.iter().enumerate().map(|(proxy, cluster)| (cluster.output, proxy)).collect();
+        by_output.sort_unstable();
+        let found = |place: usize| by_output.binary_search_by_key(&(place as u32), |&(output, _)| output).ok();
+        places.enumerate().filter_map(|(row, place)| Some((row, by_output[found(place)?].1))).collect()
+    }
+
+    fn reader<'b>(&'b self, reader: Box<dyn BlockReader + 'b>, ids: Ids<'_>) -> Box<dyn BlockReader + 'b> {
+        let raw = self.reduction.proxies.raw.as_ref().map(|raw| &raw.gaussians);
+        Box::new(SettledReader { reader, proxies: self.proxies(ids.iter()), raw })
+    }
+}
+
+impl FrameSource for Settled<'_> {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        Ok(self.reader(self.merged.open(ids.clone())?, ids))
+    }
+
+    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        let opened = self.merged.open_all(wanted)?;
+        Some(opened.map(|reader| self.reader(reader, Ids::Range(0..self.info.count))))
+    }
+
+    fn reads(&self) -> Reads {
+        self.merged.reads()
+    }
+}
+
+struct SettledReader<'a> {
+    reader: Box<dyn BlockReader + 'a>,
+    proxies: Vec<(usize, usize)>,
+    raw: Option<&'a Gaussians>,
+}
+
+impl BlockReader for SettledReader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        self.reader.read(frame, want, out)?;
+        let Some(raw) = self.raw else { return Ok(()) };
+        for &(row, proxy) in &self.proxies {
+            if want.contains(Columns::LOG_SCALE) {
+                out.log_scale.set_row(row, raw.log_scale.row::<3>(proxy));
+            }
+            if want.contains(Columns::OPACITY) {
+                out.opacity_logit.set_row(row, raw.opacity_logit.row::<1>(proxy));
+            }
+        }
+        Ok(())
+    }
+
+    fn expect(&mut self, wanted: &Wanted) {
+        self.reader.expect(wanted);
+    }
+}

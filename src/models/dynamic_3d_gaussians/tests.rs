@@ -1,0 +1,228 @@
+use std::fs::{self, File};
+
+use npyz::WriterBuilder;
+use npyz::npz::NpzWriter;
+use proptest::prelude::*;
+use zip::CompressionMethod;
+use zip::write::FileOptions;
+
+use super::*;
+use crate::models;
+use crate::models::OpenOptions;
+use crate::passes::gather_all;
+use crate::recipe::Recipe;
+use crate::reduction::Change;
+
+/// Arrays of a model, by name: shape and values.
+type Arrays = Vec<(&'static str, Vec<u64>, Vec<f32>)>;
+
+/// Three frames of five Gaussians, the last two in the foreground.
+fn arrays() -> Arrays {
+    let ramp = |n: usize, from: f32, by: f32| (0..n).map(|i| from + by * (i % 17) as f32).collect::<Vec<f32>>();
+    vec![
+        ("means3D", vec![3, 5, 3], ramp(45, -1.0, 0.1)),
+        ("rgb_colors", vec![3, 5, 3], ramp(45, -0.05, 0.07)),
+        ("seg_colors", vec![5, 3], [vec![0.0; 9], vec![1.0; 6]].concat()),
+        ("unnorm_rotations", vec![3, 5, 4], ramp(60, 0.5, 0.03)),
+        ("logit_opacities", vec![5, 1], ramp(5, -1.0, 0.5)),
+        ("log_scales", vec![5, 3], ramp(15, -4.0, 0.1)),
+        ("cam_m", vec![2, 3], ramp(6, 0.0, 0.01)),
+    ]
+}
+
+fn write(path: &Path, arrays: &Arrays, method: CompressionMethod) {
+    let mut npz = NpzWriter::new(File::create(path).unwrap());
+    for (name, shape, values) in arrays {
+        let options = FileOptions::default().compression_method(method);
+        let array = npz.array::<f32>(name, options).unwrap().default_dtype().shape(shape);
+        let mut array = array.begin_nd().unwrap();
+        array.extend(values.iter().copied()).unwrap();
+        array.finish().unwrap();
+    }
+}
+
+fn open(path: &Path) -> Result<Box<dyn Family>> {
+    models::open(path, &OpenOptions { scratch: path.parent().map(Path::to_owned), ..OpenOptions::default() })
+}
+
+fn message(path: &Path) -> String {
+    open(path).err().expect("it must be refused").to_string()
+}
+
+fn states(family: &dyn Family) -> Vec<Gaussians> {
+    let source = family.source();
+    (0..source.info().times.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
+}
+
+#[test]
+fn states_are_the_arrays_values_compressed_or_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let [stored, small] = ["params.npz", "small.npz"].map(|name| folder.path().join(name));
+    write(&stored, &arrays(), CompressionMethod::Stored);
+    write(&small, &arrays(), CompressionMethod::Deflated);
+    let model = open(folder.path()).unwrap();
+    assert_eq!((model.kind(), model.source().info().count), ("Dynamic3DGaussians model", 5));
+    assert_eq!(model.source().info().times, [0.0, 0.5, 1.0]);
+    let (found, arrays) = (states(&*model), arrays());
+    for (frame, state) in found.iter().enumerate() {
+        for id in 0..5 {
+            let at = frame * 5 + id;
+            assert_eq!(state.position.row::<3>(id), arrays[0].2[3 * at..][..3]);
+            assert_eq!(state.rotation.row::<4>(id), arrays[3].2[4 * at..][..4]);
+            assert_eq!(state.opacity_logit.row::<1>(id), arrays[4].2[id..][..1]);
+            assert_eq!(state.log_scale.row::<3>(id), arrays[5].2[3 * id..][..3]);
+            let colours = state.sh.row::<3>(id).map(colour);
+            colours
+                .iter()
+                .zip(&arrays[1].2[3 * at..])
+                .for_each(|(a, b)| assert!((a - f64::from(*b)).abs() < 1e-7, "{a} {b}"));
+        }
+    }
+    assert_eq!(states(&*open(&small).unwrap()), found);
+    assert_eq!((0..5).map(|id| model.class(id)).collect::<Vec<_>>(), [0, 0, 0, 1, 1]);
+}
+
+#[test]
+fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
+    for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("params.npz");
+        write(&path, &arrays(), method);
+        let model = open(&path).unwrap();
+        let rule = Recipe::preset("default").unwrap().merge;
+        let result = folder.path().join("result");
+        let limits = Limits::NONE;
+        let written = |reduction: &Reduction| {
+            _ = fs::remove_dir_all(&result);
+            fs::create_dir(&result).unwrap();
+            model.write(reduction, OutputKind::Model, &result, &limits).unwrap();
+            fs::read(result.join(FILE)).unwrap()
+        };
+        let of = |name: &str| {
+            let mut npz = npyz::npz::NpzArchive::open(result.join(FILE)).unwrap();
+            let array = npz.by_name(name).unwrap().unwrap();
+            (array.shape().to_vec(), array.into_vec::<f32>().unwrap())
+        };
+        written(&Reduction::pruned(vec![1, 4], &rule));
+        for (name, shape, values) in arrays() {
+            let (found_shape, found) = of(name);
+            let (outer, width) =
+                (if shape.len() == 3 { shape[0] as usize } else { 1 }, *shape.last().unwrap() as usize);
+            let expected: Vec<f32> = match name {
+                "cam_m" => values,
+                _ => {
+                    let row = |frame: usize, id: usize| values[(frame * 5 + id) * width..][..width].to_vec();
+                    (0..outer).flat_map(|frame| [row(frame, 1), row(frame, 4)].concat()).collect()
+                }
+            };
+            assert_eq!(found_shape.iter().product::<u64>(), expected.len() as u64, "{name}");
+            let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            assert_eq!(bits(&found), bits(&expected), "{name}");
+        }
+        // All of them: the bytes of every array, and the same file each time.
+        let all = Reduction::pruned((0..5).collect(), &rule);
+        assert_eq!(written(&all), written(&all));
+        assert_eq!(states(&*open(&result).unwrap()), states(&*model));
+    }
+}
+
+#[test]
+fn merged_and_changed_ones_read_back_as_they_were_shown() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("params.npz");
+    write(&path, &arrays(), CompressionMethod::Stored);
+    let model = open(&path).unwrap();
+    let rule = Recipe::preset("default").unwrap().merge;
+    let cluster = Cluster { output: 1, leader: 3, members: vec![(3, 0.75), (4, 0.25)] };
+    let proxies = model.solve(std::slice::from_ref(&cluster), Reference::default(), &rule).unwrap();
+    let mut by = Gaussians::zeros(3, 0);
+    by.position.set_row(0, [0.5, 0.0, -0.25]);
+    by.sh.set_row(2, [0.1, 0.2, 0.0]);
+    let pruned = Reduction::pruned(vec![0, 3, 4], &rule);
+    let reduction = Reduction { clusters: vec![cluster], proxies, change: Change(by), ..pruned };
+    let shown = model.reduced(&reduction).unwrap();
+    let result = folder.path().join("result");
+    fs::create_dir(&result).unwrap();
+    model.write(&reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+    let read = open(&result).unwrap();
+    for (frame, state) in states(&*read).iter().enumerate() {
+        let expected = gather_all(&*shown, frame, Columns::all()).unwrap();
+        for column in Columns::all().iter() {
+            let pairs = state.column(column).planes().iter().zip(expected.column(column).planes());
+            pairs.for_each(|(a, b)| assert!((a - b).abs() < 1e-6, "{} {a} {b}", column.name()));
+        }
+        // The weighted mean of where its members are.
+        let at = |id: usize| gather_all(model.source(), frame, Columns::all()).unwrap().position.row::<3>(id);
+        let mean: [f32; 3] = std::array::from_fn(|c| 0.75 * at(3)[c] + 0.25 * at(4)[c]);
+        let found = state.position.row::<3>(1);
+        (0..3).for_each(|c| assert!((found[c] - mean[c]).abs() < 1e-6, "{found:?} {mean:?}"));
+    }
+    assert!(!shown.info().varying.intersects(Columns::LOG_SCALE | Columns::OPACITY));
+}
+
+#[test]
+fn what_is_wrong_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("params.npz");
+    let said = |change: &dyn Fn(&mut Arrays)| {
+        let mut arrays = arrays();
+        change(&mut arrays);
+        write(&path, &arrays, CompressionMethod::Stored);
+        message(&path)
+    };
+    let missing = said(&|arrays| drop(arrays.remove(3)));
+    assert!(missing.contains("unnorm_rotations") && missing.contains("params.npz"), "{missing}");
+    let fewer = said(&|arrays| {
+        arrays[5].1 = vec![4, 3];
+        arrays[5].2.truncate(12);
+    });
+    assert!(fewer.contains("log_scales") && fewer.contains("[5, 3]") && fewer.contains("[4, 3]"), "{fewer}");
+    let flat = said(&|arrays| {
+        arrays[0].1 = vec![15, 3];
+        arrays.push(("cam_unnorm_rots", vec![1], vec![0.0]));
+    });
+    assert!(flat.contains("SplaTAM"), "{flat}");
+    let none = said(&|arrays| {
+        arrays[0].1 = vec![0, 5, 3];
+        arrays[0].2.clear();
+    });
+    assert!(none.contains("T at least 1"), "{none}");
+    write(&path, &arrays(), CompressionMethod::Stored);
+    let times = open(&path).unwrap().with_times(vec![0.0, 1.0]).err().unwrap().to_string();
+    assert!(times.contains("2 times") && times.contains("3 frames"), "{times}");
+}
+
+#[test]
+fn a_file_cut_anywhere_is_refused_and_shapes_that_overflow_are_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("params.npz");
+    write(&path, &arrays(), CompressionMethod::Stored);
+    let whole = fs::read(&path).unwrap();
+    for length in (0..whole.len()).step_by(7) {
+        fs::write(&path, &whole[..length]).unwrap();
+        message(&path);
+    }
+    let at = whole.windows(8).position(|bytes| bytes == b"(3, 5, 3").unwrap();
+    let mut wide = whole.clone();
+    wide[at..at + 8].copy_from_slice(b"(9999999");
+    fs::write(&path, &wide).unwrap();
+    message(&path);
+}
+
+proptest! {
+    #[test]
+    fn flipped_bytes_never_panic(flips in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4)) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("params.npz");
+        write(&path, &arrays(), CompressionMethod::Deflated);
+        let mut bytes = fs::read(&path).unwrap();
+        for (at, to) in flips {
+            let at = at.index(bytes.len());
+            bytes[at] = to;
+        }
+        fs::write(&path, bytes).unwrap();
+        if let Ok(model) = open(&path) {
+            states(&*model);
+        }
+    }
+}

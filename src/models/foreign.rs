@@ -1,0 +1,102 @@
+//! Models that are known and not read: what they are, and the way that works.
+//!
+//! What renders at any time a PLY or a frame stream can hold; so every message says to write one.
+
+use std::path::Path;
+
+use super::family::Entry;
+use crate::error::Error;
+use crate::files::checkpoint::{Checkpoint, Pickle};
+use crate::limits::ReadLimit;
+
+/// The way that works with every renderer.
+const WAY: &str = "write its frames as PLY files, one per frame and all with the same Gaussians in the same order, or as a \
+                   frame stream, with its own renderer, and give those";
+
+/// A checkpoint of another kind, or a folder of one.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "",
+    recognises: |found| match found.is_folder {
+        true => in_folder(found.path).is_some(),
+        false => found.is_checkpoint(),
+    },
+    open: |path, options| {
+        let what = if path.is_dir() { in_folder(path).unwrap_or(UNKNOWN) } else { in_file(path, options.memory)? };
+        Err(Error::input(path, "", "a model of a family that is read", what).hint(WAY))
+    },
+};
+
+const UNKNOWN: &str = "a checkpoint of another kind, such as Ex4DGS, Gaussian-Flow, MEGA or OMG4 write";
+const ROTOR: &str = "a 4D-Rotor model of nerfstudio";
+
+/// What a folder is, by names that no other family's has.
+fn in_folder(folder: &Path) -> Option<&'static str> {
+    let has = |name: &str| folder.join(name).exists();
+    if has("nerfstudio_models") {
+        return Some(ROTOR);
+    }
+    if has("NTC.pth") || has("frame000001/NTC.pth") {
+        return Some("a 3DGStream model, of a network per frame");
+    }
+    None
+}
+
+/// What a checkpoint is, by its tree.
+///
+/// # Errors
+/// A file that is no checkpoint.
+fn in_file(path: &Path, memory: ReadLimit) -> crate::error::Result<&'static str> {
+    let checkpoint = Checkpoint::open(path, memory)?;
+    let pickle = checkpoint.pickle();
+    let has = |name: &str| pickle.item(pickle.root(), name).is_some();
+    let named = |part: &str| names(pickle).any(|name| name.contains(part));
+    Ok(match () {
+        () if has("pipeline") && named("gauss_params.scales_t") => ROTOR,
+        () if has("pipeline") => "a nerfstudio model",
+        () if named("hash_encoder") || named("encoding.embeddings") => "a network of hash grids, as Grid4D's",
+        () => UNKNOWN,
+    })
+}
+
+/// Names of tensors, of dicts in the root and in its values.
+fn names(pickle: &Pickle) -> impl Iterator<Item = &str> {
+    let root = pickle.root();
+    let inner = pickle.items(root).into_iter().flatten().map(|(_, id)| id);
+    let parts = pickle.elements(root).unwrap_or_default().iter().copied();
+    [root].into_iter().chain(inner).chain(parts).filter_map(|id| pickle.items(id)).flatten().map(|(name, _)| name)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::files::checkpoint::made::{Made, named, tensor};
+    use crate::models;
+    use crate::models::OpenOptions;
+
+    #[test]
+    fn others_are_named_with_the_way_that_works() {
+        let folder = tempfile::tempdir().unwrap();
+        let said = |path: &Path| models::open(path, &OpenOptions::default()).err().unwrap().to_string();
+        let file = folder.path().join("step-000029999.ckpt");
+        let one = || Made::Tensor(tensor(0, &[1], &[0.0]));
+        let pipeline = |name| Made::Dict(named(vec![("pipeline", Made::Dict(named(vec![(name, one())])))]));
+        for (made, expected) in [
+            (pipeline("_model.gauss_params.scales_t"), "4D-Rotor"),
+            (pipeline("_model.gauss_params.means"), "nerfstudio"),
+            (Made::Tuple(vec![Made::Ordered(named(vec![("hash_encoder.params", one())]))]), "Grid4D"),
+            (Made::Int(7), "another kind"),
+        ] {
+            fs::write(&file, made.file()).unwrap();
+            let message = said(&file);
+            let parts = ["step-000029999.ckpt", expected, "PLY", "frame stream"];
+            assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
+        for (name, expected) in [("a/nerfstudio_models", "4D-Rotor"), ("b/frame000001/NTC.pth", "3DGStream")] {
+            fs::create_dir_all(folder.path().join(name)).unwrap();
+            let message = said(&folder.path().join(&name[..1]));
+            assert!(message.contains(expected) && message.contains("PLY"), "{message}");
+        }
+    }
+}

@@ -1,0 +1,466 @@
+//! `cfg_args` of a 4DGaussians model: the text of a Python `Namespace(...)`, parsed and never evaluated.
+
+use std::path::Path;
+
+use crate::deform::{FieldConfig, Tensors};
+use crate::error::{Error, Result};
+use crate::model::Columns;
+
+use crate::files::open::read_small;
+use crate::files::python_literal::{Literal, parse_call};
+
+/// Larger than any namespace an argument parser prints.
+const MAX_BYTES: u64 = 1 << 20;
+/// What is called in it.
+pub(in crate::models) const NAME: &str = "Namespace";
+const SH_DEGREE: &str = "sh_degree";
+
+/// The hyper-parameters of a model, with the defaults of the original where `cfg_args` lacks a key.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelConfig {
+    /// Largest degree of the spherical harmonics; default 3.
+    pub sh_degree: i64,
+    /// Folder of the data set the model was trained on.
+    pub source_path: Option<String>,
+    /// Background is white rather than black; default false.
+    pub white_background: bool,
+    /// Width of the network; default 64. The tensors' shapes outrank it.
+    pub net_width: i64,
+    /// Layers of the trunk; default 1, and 0 behaves as 1. The tensors' shapes outrank it.
+    pub defor_depth: i64,
+    /// Spatial resolution of each level as a multiple; default `[1, 2, 4, 8]`. The tensors' shapes outrank it.
+    pub multires: Vec<i64>,
+    /// Resolution of the planes along x, y, z, t at level multiple 1; default `[64, 64, 64, 25]`.
+    /// The tensors' shapes outrank it.
+    pub resolution: Vec<i64>,
+    /// Channels of a plane; default 32. The tensors' shapes outrank it.
+    pub channels: i64,
+    /// Half size of the field's initial box; default 1.6. The stored box outranks it.
+    pub bounds: f64,
+    /// No position head.
+    pub no_dx: bool,
+    /// No scale head.
+    pub no_ds: bool,
+    /// No rotation head.
+    pub no_dr: bool,
+    /// No opacity head; default true.
+    pub no_do: bool,
+    /// No spherical-harmonics head; default true.
+    pub no_dshs: bool,
+    /// The network reads positions instead of planes.
+    pub no_grid: bool,
+    /// A head masks the raw parameters.
+    pub static_mlp: bool,
+    /// A voxel grid masks the raw parameters.
+    pub empty_voxel: bool,
+    /// Frequency of the features' sine and cosine; default 0, none.
+    pub grid_pe: i64,
+    /// The rotation delta multiplies.
+    pub apply_rotation: bool,
+}
+
+impl ModelConfig {
+    /// Reads the `cfg_args` file at `path`.
+    pub fn read(path: &Path) -> Result<Self> {
+        Self::parse(&read(path)?, path)
+    }
+
+    /// Parses the text of `cfg_args`; `path` is for error messages.
+    ///
+    /// Keys this program does not need may hold anything, written in any syntax that keeps its
+    /// brackets and quotes balanced.
+    pub fn parse(text: &str, path: &Path) -> Result<Self> {
+        let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+        let get = |name: &'static str| {
+            // Python would refuse a repeated keyword; of a hand-edited file take the last one.
+            keys.iter()
+                .rev()
+                .find(|key| key.name == name)
+                .map_or(Key { name, value: &Literal::None, path }, |found| Key { name, value: &found.value, path })
+        };
+        let planes = get("kplanes_config");
+        let config = ModelConfig {
+            sh_degree: get(SH_DEGREE).int(3)?,
+            source_path: get("source_path").string()?,
+            white_background: get("white_background").bool(false)?,
+            net_width: get("net_width").int(64)?,
+            defor_depth: get("defor_depth").int(1)?,
+            multires: get("multires").ints(&[1, 2, 4, 8])?,
+            resolution: planes.entry("resolution")?.ints(&[64, 64, 64, 25])?,
+            channels: planes.entry("output_coordinate_dim")?.int(32)?,
+            bounds: get("bounds").float(1.6)?,
+            no_dx: get("no_dx").bool(false)?,
+            no_ds: get("no_ds").bool(false)?,
+            no_dr: get("no_dr").bool(false)?,
+            no_do: get("no_do").bool(true)?,
+            no_dshs: get("no_dshs").bool(true)?,
+            no_grid: get("no_grid").bool(false)?,
+            static_mlp: get("static_mlp").bool(false)?,
+            empty_voxel: get("empty_voxel").bool(false)?,
+            grid_pe: get("grid_pe").int(0)?,
+            apply_rotation: get("apply_rotation").bool(false)?,
+        };
+        Ok(config)
+    }
+
+    /// A note for what it says of the network and the weights do not have; of both the weights are believed.
+    pub(super) fn contradicted_by(&self, tensors: &Tensors) -> Vec<String> {
+        const TRUNK: &str = "deformation_net.feature_out.";
+        const GRIDS: &str = "deformation_net.grid.grids.";
+        let side =
+            |name: String, axis: usize| -> Option<i64> { tensors.get(&name)?.shape.get(axis).map(|&side| side as i64) };
+        let count =
+            |name: &dyn Fn(usize) -> String| (0..).take_while(|&k| tensors.contains_key(&name(k))).count() as i64;
+        let mut found = vec![
+            ("net_width", self.net_width, side(format!("{TRUNK}0.weight"), 0)),
+            (
+                "defor_depth",
+                self.defor_depth.max(1),
+                Some(count(&|k| format!("{TRUNK}{}.weight", 2 * k))).filter(|&some| some > 0),
+            ),
+        ];
+        if !self.no_grid {
+            let least = |list: &[i64]| list.first().copied().unwrap_or(1);
+            let x = self.resolution.first().copied().unwrap_or(0) * least(&self.multires);
+            // Planes xy, xz, xt, yz, yt, zt, the first axis last.
+            found.extend([
+                (
+                    "multires (levels)",
+                    self.multires.len() as i64,
+                    Some(count(&|k| format!("{GRIDS}{k}.0"))).filter(|&some| some > 0),
+                ),
+                ("output_coordinate_dim", self.channels, side(format!("{GRIDS}0.0"), 1)),
+                ("resolution along x", x, side(format!("{GRIDS}0.0"), 3)),
+                ("resolution along t", self.resolution.get(3).copied().unwrap_or(0), side(format!("{GRIDS}0.2"), 2)),
+            ]);
+        }
+        let differs = |(what, said, there): (&str, i64, Option<i64>)| {
+            let there = there.filter(|&there| there != said)?;
+            Some(format!(
+                "cfg_args says {what} = {said}, the weights in deformation.pth have {there}: the weights are believed"
+            ))
+        };
+        found.into_iter().filter_map(differs).collect()
+    }
+
+    /// What decides the evaluation of the deformation field.
+    pub fn field(&self) -> FieldConfig {
+        let off = [
+            (self.no_dx, Columns::POSITION),
+            (self.no_ds, Columns::LOG_SCALE),
+            (self.no_dr, Columns::ROTATION),
+            (self.no_do, Columns::OPACITY),
+            (self.no_dshs, Columns::SH),
+        ];
+        FieldConfig {
+            active: off.iter().filter(|(off, _)| !off).fold(Columns::empty(), |set, &(_, column)| set | column),
+            static_mlp: self.static_mlp,
+            empty_voxel: self.empty_voxel,
+            grid_pe: self.grid_pe,
+            no_grid: self.no_grid,
+            apply_rotation: self.apply_rotation,
+        }
+    }
+}
+
+/// Returns the text of the `cfg_args` file at `path`.
+pub(in crate::models) fn read(path: &Path) -> Result<String> {
+    let bytes = read_small(path, MAX_BYTES, "a cfg_args")?;
+    String::from_utf8(bytes).map_err(|error| {
+        let valid = error.utf8_error().valid_up_to();
+        Error::input(path, format!("byte {valid}"), "UTF-8 text", "a byte that is not")
+    })
+}
+
+/// `text`, that of `path`, with harmonics of `degree`, and all other bytes as they were. Where it does not say the degree,
+/// that comes first.
+pub(in crate::models) fn with_sh_degree(text: &str, degree: usize, path: &Path) -> Result<String> {
+    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let (place, value) = match keys.iter().rev().find(|key| key.name == SH_DEGREE) {
+        Some(key) => (key.place.clone(), degree.to_string()),
+        None => {
+            let start = text.find('(').map_or(text.len(), |bracket| bracket + 1);
+            let separator = if keys.is_empty() { "" } else { ", " };
+            (start..start, format!("{SH_DEGREE}={degree}{separator}"))
+        }
+    };
+    Ok([&text[..place.start], &value, &text[place.end..]].concat())
+}
+
+/// Returns the text of the `cfg_args` file at `path` of a model with SH degree `own`, for a result with SH degree `degree`:
+/// as it is unless the degree becomes lower.
+pub(in crate::models) fn read_for_degree(path: &Path, own: usize, degree: usize) -> Result<String> {
+    let text = read(path)?;
+    if degree < own { with_sh_degree(&text, degree, path) } else { Ok(text) }
+}
+
+/// Returns `text`, the content of `path`, for an archive, which is made to be sent: without folders of the machine the
+/// model was trained on. The strings of `source_path` and `model_path`, and all strings that are absolute paths, become
+/// their last names; every other byte stays.
+pub(in crate::models) fn without_folders(text: &str, path: &Path) -> Result<String> {
+    let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
+    let (mut out, mut end) = (String::with_capacity(text.len()), 0);
+    for key in &keys {
+        out += &text[end..key.place.start];
+        out += &without_paths(&text[key.place.clone()], ["source_path", "model_path"].contains(&key.name.as_str()));
+        end = key.place.end;
+    }
+    Ok(out + &text[end..])
+}
+
+/// Returns a Python expression whose strings are their last names: `all` of them, else those that are absolute paths.
+fn without_paths(expression: &str, all: bool) -> String {
+    let mut out = String::with_capacity(expression.len());
+    let mut rest = expression;
+    while let Some(start) = rest.find(['\'', '"']) {
+        let quote = rest[start..].chars().next().unwrap_or('"');
+        let content = &rest[start + 1..];
+        let mut is_escaped = false;
+        let end = content.find(|c: char| {
+            let ends = c == quote && !is_escaped;
+            is_escaped = c == '\\' && !is_escaped;
+            ends
+        });
+        // Text that ends within a string is no string.
+        let Some(end) = end else { break };
+        let string = &content[..end];
+        let is_absolute = string.starts_with(['/', '~', '\\']) || string.get(1..2) == Some(":");
+        let last = string.trim_end_matches(['/', '\\']).rsplit(['/', '\\']).next().unwrap_or_default();
+        out += &rest[..=start];
+        match all || is_absolute {
+            true => out.extend(last.chars().filter(|&c| c != quote)),
+            false => out += string,
+        }
+        out.push(quote);
+        rest = &content[end + 1..];
+    }
+    out + rest
+}
+
+/// One key and its value; `None` stands for a missing key too, and takes the default.
+#[derive(Clone, Copy)]
+pub(in crate::models) struct Key<'a> {
+    pub(in crate::models) name: &'static str,
+    pub(in crate::models) value: &'a Literal,
+    pub(in crate::models) path: &'a Path,
+}
+
+impl<'a> Key<'a> {
+    pub(in crate::models) fn wrong(&self, expected: &str) -> Error {
+        Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
+    }
+
+    pub(in crate::models) fn bool(&self, default: bool) -> Result<bool> {
+        match self.value {
+            Literal::None => Ok(default),
+            Literal::Bool(value) => Ok(*value),
+            Literal::Int(value @ (0 | 1)) => Ok(*value == 1),
+            _ => Err(self.wrong("True or False")),
+        }
+    }
+
+    /// Python's `True` is the integer 1; `grid_pe=False` is written by some forks.
+    pub(in crate::models) fn int(&self, default: i64) -> Result<i64> {
+        match self.value {
+            Literal::None => Ok(default),
+            Literal::Int(value) => Ok(*value),
+            Literal::Bool(value) => Ok(i64::from(*value)),
+            _ => Err(self.wrong("an integer")),
+        }
+    }
+
+    pub(in crate::models) fn float(&self, default: f64) -> Result<f64> {
+        match self.value {
+            Literal::None => Ok(default),
+            Literal::Float(value) => Ok(*value),
+            Literal::Int(value) => Ok(*value as f64),
+            _ => Err(self.wrong("a number")),
+        }
+    }
+
+    pub(in crate::models) fn string(&self) -> Result<Option<String>> {
+        match self.value {
+            Literal::None => Ok(None),
+            Literal::Str(value) => Ok(Some(value.clone())),
+            _ => Err(self.wrong("a string")),
+        }
+    }
+
+    fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
+        match self.value {
+            Literal::None => Ok(default.to_vec()),
+            Literal::Sequence(items) => items.iter().map(|value| Key { value, ..*self }.int(0)).collect::<Result<_>>(),
+            _ => Err(self.wrong("a list of integers")),
+        }
+    }
+
+    /// The value of `name` in this dictionary.
+    fn entry(&self, name: &'static str) -> Result<Key<'a>> {
+        let value = match self.value {
+            Literal::None => &Literal::None,
+            Literal::Dict(entries) => entries
+                .iter()
+                .find(|(key, _)| matches!(key, Literal::Str(key) if key == name))
+                .map_or(&Literal::None, |(_, value)| value),
+            _ => return Err(self.wrong("a dictionary")),
+        };
+        Ok(Key { name, value, path: self.path })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn archives_keep_no_folder_of_the_training_machine() {
+        let text = r#"Namespace(sh_degree=3, source_path='/home/eve/secret/data/', model_path="output\\run 1", images='images/2x',
+ extra={'a': ['/home/eve/secret/x', 1]}, posix=PosixPath('/home/eve/it\'s'), w='C:\\secret\\y', eval=True)"#;
+        let expected = r#"Namespace(sh_degree=3, source_path='data', model_path="run 1", images='images/2x',
+ extra={'a': ['x', 1]}, posix=PosixPath('s'), w='y', eval=True)"#;
+        let found = without_folders(text, Path::new("cfg_args")).unwrap();
+        assert_eq!(found, expected);
+        assert_eq!(without_folders(&found, Path::new("cfg_args")).unwrap(), expected);
+        let plain = "Namespace(sh_degree=3, source_path='', eval=True)";
+        assert_eq!(without_folders(plain, Path::new("cfg_args")).unwrap(), plain);
+    }
+
+    fn parse(text: &str) -> Result<ModelConfig> {
+        ModelConfig::parse(text, Path::new("model/cfg_args"))
+    }
+
+    fn refusal(text: &str) -> String {
+        parse(text).expect_err("must be refused").to_string()
+    }
+
+    #[test]
+    fn a_namespace_as_the_original_prints_it_is_read() {
+        let config = parse(
+            "Namespace(sh_degree=2, source_path='data/lego', eval=True, white_background=True, net_width=128, \
+             defor_depth=0, bounds=1.6, plane_tv_weight=0.0001, time_smoothness_weight=1e-05, \
+             kplanes_config={'grid_dimensions': 2, 'input_coordinate_dim': 4, 'output_coordinate_dim': 16, \
+             'resolution': [64, 64, 64, 150]}, multires=[1, 2], no_dx=False, no_do=False, no_dshs=False, \
+             static_mlp=True, grid_pe=2, apply_rotation=True)",
+        )
+        .unwrap();
+        assert_eq!(
+            config,
+            ModelConfig {
+                sh_degree: 2,
+                source_path: Some("data/lego".into()),
+                white_background: true,
+                net_width: 128,
+                defor_depth: 0,
+                multires: vec![1, 2],
+                resolution: vec![64, 64, 64, 150],
+                channels: 16,
+                bounds: 1.6,
+                no_dx: false,
+                no_ds: false,
+                no_dr: false,
+                no_do: false,
+                no_dshs: false,
+                no_grid: false,
+                static_mlp: true,
+                empty_voxel: false,
+                grid_pe: 2,
+                apply_rotation: true,
+            }
+        );
+        assert_eq!(config.field().active, Columns::all());
+    }
+
+    #[test]
+    fn missing_keys_take_the_defaults_of_the_original() {
+        let config = parse("Namespace()").unwrap();
+        assert_eq!((config.net_width, config.defor_depth, config.sh_degree), (64, 1, 3));
+        assert_eq!(config.field().active, Columns::POSITION | Columns::LOG_SCALE | Columns::ROTATION);
+        assert_eq!(config, parse("Namespace(source_path=None, unknown=3)\n").unwrap());
+    }
+
+    #[test]
+    fn keys_not_needed_may_hold_any_balanced_text() {
+        let config = parse(
+            "Namespace(a=device(type='cu,d)a', index=0), b=PosixPath('/x'), c=<function f at 0x7f>, d={1, 2}, \
+             e=[None, -1.5e-3, (1,), {}], f=np.float64(0.5), g=range(0, 3), h=b'x', i=lambda, net_width=32)",
+        )
+        .unwrap();
+        assert_eq!(config.net_width, 32);
+    }
+
+    #[test]
+    fn strings_keep_their_escapes() {
+        let path = |text: &str| parse(&format!("Namespace(source_path={text})")).unwrap().source_path.unwrap();
+        assert_eq!(path(r"'C:\\data\\it\'s'"), r"C:\data\it's");
+        assert_eq!(path(r#""it's""#), "it's");
+        assert_eq!(path(r"'\x41\u00e9\U0001F600\n'"), "Aé😀\n");
+        assert_eq!(path("'данные, (1)'"), "данные, (1)");
+    }
+
+    #[test]
+    fn another_degree_changes_no_other_byte() {
+        for (text, expected) in [
+            ("Namespace(sh_degree=3)", "Namespace(sh_degree=1)"),
+            (
+                "Namespace(a='sh_degree=3, (', b={'sh_degree': 3}, sh_degree = 3 , my_sh_degree=3)\n",
+                "Namespace(a='sh_degree=3, (', b={'sh_degree': 3}, sh_degree = 1 , my_sh_degree=3)\n",
+            ),
+            (" Namespace (net_width=64)", " Namespace (sh_degree=1, net_width=64)"),
+            ("Namespace()", "Namespace(sh_degree=1)"),
+        ] {
+            let found = with_sh_degree(text, 1, Path::new("cfg_args")).unwrap();
+            assert_eq!(found, expected);
+            assert_eq!(parse(&found).unwrap(), ModelConfig { sh_degree: 1, ..parse(text).unwrap() });
+        }
+        assert!(with_sh_degree("Namespace(a=", 1, Path::new("cfg_args")).unwrap_err().to_string().contains("byte 12"));
+    }
+
+    #[test]
+    fn a_value_of_the_wrong_type_is_named() {
+        for (text, parts) in [
+            ("Namespace(net_width='64')", ["key net_width", "an integer", "the string \"64\""]),
+            ("Namespace(no_dx=2)", ["key no_dx", "True or False", "2"]),
+            ("Namespace(multires=[1, 'a'])", ["key multires", "an integer", "\"a\""]),
+            ("Namespace(kplanes_config=[1])", ["key kplanes_config", "a dictionary", "a list of 1"]),
+            ("Namespace(bounds=device(type='cpu'))", ["key bounds", "a number", "device(type='cpu')"]),
+        ] {
+            let message = refusal(text);
+            assert!(parts.iter().all(|part| message.contains(part)), "{text}: {message}");
+        }
+    }
+
+    #[test]
+    fn malformed_text_is_refused_with_its_line_and_byte() {
+        for (text, place, expected) in [
+            ("", "line 1, byte 0", "Namespace"),
+            ("{'a': 1}", "line 1, byte 0", "Namespace"),
+            ("Namespace(a=1,\nb=[1, 2", "line 2, byte 22", "closing bracket"),
+            ("Namespace(a=1\nb=2)", "line 2, byte 15", "`,` or `)`"),
+            ("Namespace(a=)", "byte 12", "a value"),
+            ("Namespace(a='x)", "byte 12", "closing quote"),
+            ("Namespace(a=1) b", "byte 15", "nothing after"),
+            (r"Namespace(a='\xzz')", "byte 13", "escape"),
+        ] {
+            let message = refusal(text);
+            assert!(message.contains(place) && message.contains(expected), "{text:?}: {message}");
+        }
+    }
+
+    #[test]
+    fn nesting_is_bounded() {
+        assert!(refusal(&format!("Namespace(a={})", "[".repeat(100_000))).contains("32 levels"));
+        // Opaque text nests without a stack frame per level.
+        parse(&format!("Namespace(a=f{}{})", "(".repeat(100_000), ")".repeat(100_000))).unwrap();
+    }
+
+    #[test]
+    fn no_cut_or_changed_byte_panics() {
+        let text = r"Namespace(a=-1.5e-3, b={'k': [1, (2,)], 'é': '\x41'}, c=f('x'), no_dx=True)";
+        for end in (0..=text.len()).filter(|&end| text.is_char_boundary(end)) {
+            let _ = parse(&text[..end]);
+            for other in ['\'', '(', ')', '{', ']', ':', ',', '\\', '\0', 'é', '-'] {
+                let _ = parse(&format!("{}{other}{}", &text[..end], &text[end..]));
+            }
+        }
+    }
+}

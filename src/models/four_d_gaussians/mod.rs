@@ -1,0 +1,297 @@
+//! 4DGaussians model folders as a family: a canonical cloud, and a field that deforms it.
+//!
+//! The result is a folder of the same layout with a smaller point cloud. The configuration stays byte for byte as it
+//! was, but for the SH degree where that is lower; so does the field, or its tensors keep their names and shapes and take
+//! fewer bytes.
+
+pub(super) mod cfg_args;
+mod model_folder;
+mod proxies;
+mod small_field;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
+use super::family::{Entry, Family, Residence, Timing};
+use super::files::copy;
+use super::law::left;
+use super::size::{Size, bytes_below, bytes_of};
+use super::trajectories::{state_bytes, write_sequence};
+use crate::archive::{Content, Role};
+use crate::deform::{Field, FieldConfig, Tensor, Tensors};
+use crate::error::{Error, Result, ShowPath};
+use crate::files::ply::Ply;
+use crate::files::ply::write::{out_rows, write_like};
+use crate::files::state_dict::{Stored, Values, is_floating, read_state_dict, write_state_dict};
+use crate::limits::Limits;
+use crate::model::{Columns, Gaussians, Jacobian};
+use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::outputs::kind::OutputKind;
+use crate::recipe::{Merge, Precision};
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::{Deformation, FrameSource};
+pub use model_folder::ModelFolder;
+
+/// A model folder.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a 4DGaussians model folder",
+    recognises: |found| {
+        found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
+    },
+    open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
+};
+
+impl Family for ModelFolder {
+    fn kind(&self) -> &'static str {
+        "4DGaussians model"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        self.paths().digest()
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        Ok(self.size()?.whole())
+    }
+
+    /// Without `deformation_table.pth` and `deformation_accum.pth`: no renderer needs them, and no result has them.
+    fn size(&self) -> Result<Size> {
+        let paths = self.paths();
+        size_of(&paths.point_cloud, &paths.deformation, &paths.cfg_args)
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind {
+            OutputKind::Model => {
+                let folder = iteration_folder(path, self.paths().iteration);
+                size_of(&folder.join("point_cloud.ply"), &folder.join("deformation.pth"), &path.join("cfg_args"))
+            }
+            OutputKind::Ply => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            // Neither archive nor .splatv is written here.
+            _ => Ok(Size::of_frames(bytes_below(path)?)),
+        }
+    }
+
+    fn residence(&self) -> Residence {
+        let whole = state_bytes(self.info().sh_degree, Columns::all());
+        Residence {
+            per_gaussian: whole,
+            // Normals and the like stand beside the values.
+            opening: whole + 24,
+            // A copy of the canonical values, what is prepared of them, and their changes.
+            reader: 2 * whole + self.field().bytes_per_gaussian() as u64 + 128,
+            // The canonical values of what is left, and while they are made once more.
+            reduced: 2 * whole,
+            jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
+            file: whole + 24,
+            // Tensors as they are read and as they are used.
+            fixed: 2 * self.tensor_bytes(),
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+            // `benches/deform.rs`, by the size of the network.
+            seconds_per_state: 1e-7 + 2e-11 * self.field().multiplications() as f64,
+            decoded: 0,
+        }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Continuous
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        Ok(Box::new(ModelFolder::with_times(*self, times)?))
+    }
+
+    fn notes(&self) -> Vec<String> {
+        ModelFolder::notes(self).to_vec()
+    }
+
+    fn data_folder(&self) -> Option<&str> {
+        self.config().source_path.as_deref()
+    }
+
+    fn background(&self) -> Option<[f32; 3]> {
+        self.config().white_background.then_some([1.0; 3])
+    }
+
+    fn canonical(&self) -> Option<&Gaussians> {
+        Some(ModelFolder::canonical(self))
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::Model
+    }
+
+    fn check_output(&self, _: OutputKind, _: &Path) -> Result<()> {
+        Ok(())
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        proxies::solve(self, clusters, reference, rule)
+    }
+
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        let paths = self.paths();
+        if !self.can_round_field()? {
+            return Err(Error::usage(format!(
+                "an archive holds tensors of 32-bit and 16-bit floating-point numbers: {} has others",
+                paths.deformation.shown()
+            )));
+        }
+        let tensors = read_state_dict(&paths.deformation, self.memory())?;
+        let role = |(name, tensor): (&String, &Tensor)| {
+            let role = match role(self.config().field(), name) {
+                // No level that is read.
+                Role::Plane(_) | Role::TimePlane(_) if !matches!(tensor.shape[..], [1, _, _, _]) => Role::Exact,
+                role => role,
+            };
+            (name.clone(), role)
+        };
+        let first = self.info().times.first().copied().unwrap_or(0.0).min(0.0);
+        let last = self.info().times.last().copied().unwrap_or(1.0).max(1.0);
+        let cloud = left(self.stored(), reduction).gaussians;
+        let cfg_args = self.cfg_args(cloud.sh_degree())?;
+        let cfg_args = cfg_args::without_folders(&cfg_args, &paths.cfg_args)?.into_bytes();
+        let mut content = Content {
+            cloud,
+            field: tensors.iter().map(role).collect(),
+            tensors,
+            times: [first as f32, last as f32],
+            ..Content::default()
+        };
+        add_cloud(&mut content, &Ply::open(&paths.point_cloud)?, reduction.kept.iter().copied())?;
+        content.files.insert(CFG_ARGS.to_owned(), cfg_args);
+        content.files.insert(ITERATION.to_owned(), paths.iteration.to_string().into_bytes());
+        Ok(content)
+    }
+
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        let field =
+            Field::new(&content.tensors, self.config().field(), self.info().sh_degree, &self.paths().deformation)?;
+        Ok(Box::new(self.with_canonical(content.cloud.clone()).with_field(field)))
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        let model = self.with_canonical(left(self.stored(), reduction).gaussians);
+        Ok(Box::new(match reduction.field {
+            Precision::Exact => model,
+            Precision::Half => model.rounded()?,
+        }))
+    }
+
+    fn can_round_field(&self) -> Result<bool> {
+        is_floating(&self.paths().deformation, self.memory())
+    }
+
+    fn needs_all_bands(&self) -> Option<&'static str> {
+        self.field().active().contains(Columns::SH).then_some("the field's SH head adds to all of them")
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        let mut notes = Vec::new();
+        let paths = self.paths();
+        match kind {
+            OutputKind::Model => {
+                let folder = iteration_folder(path, paths.iteration);
+                fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
+                let config = path.join("cfg_args");
+                fs::write(&config, self.cfg_args(reduction.sh_degree)?).map_err(Error::io("write", &config))?;
+                self.write_field(reduction.field, &folder.join("deformation.pth"))?;
+                self.write_cloud(reduction, &folder.join("point_cloud.ply"))?;
+                let training = [&paths.deformation_table, &paths.deformation_accum].into_iter().flatten();
+                let bytes = bytes_of(training.map(PathBuf::as_path))?;
+                if bytes > 0 {
+                    notes.push(format!(
+                        "deformation_table.pth and deformation_accum.pth, {bytes} bytes that only training reads, were \
+                         left out, and count on neither side"
+                    ));
+                }
+            }
+            OutputKind::Ply => self.write_cloud(reduction, path)?,
+            OutputKind::Archive => return Err(Error::usage("an archive is made of a content")),
+            _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?),
+        }
+        Ok(notes)
+    }
+}
+
+impl ModelFolder {
+    /// Returns the text of `cfg_args` with the SH degree up to `sh_degree`.
+    fn cfg_args(&self, sh_degree: usize) -> Result<String> {
+        cfg_args::read_for_degree(&self.paths().cfg_args, self.info().sh_degree, sh_degree)
+    }
+
+    /// Writes the field's state dict.
+    fn write_field(&self, precision: Precision, path: &Path) -> Result<()> {
+        let own = &self.paths().deformation;
+        match precision {
+            Precision::Exact => copy(own, path),
+            Precision::Half => {
+                let from_zero = self.info().times.iter().all(|&time| time >= 0.0);
+                write_state_dict(path, &small_field::stored(&read_state_dict(own, self.memory())?, from_zero))
+            }
+        }
+    }
+
+    /// Writes the canonical cloud of what is left with the properties and comments that the model's has.
+    fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+        let none = Gaussians::zeros(0, self.info().sh_degree);
+        let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
+        let template = Ply::open(&self.paths().point_cloud)?;
+        write_like(&template, &out_rows(reduction), proxies, &reduction.change, reduction.sh_degree, path)
+    }
+}
+
+/// The folder of a training iteration in the model at `root`.
+pub(super) fn iteration_folder(root: &Path, iteration: u32) -> PathBuf {
+    root.join("point_cloud").join(format!("iteration_{iteration}"))
+}
+
+/// Of a model's files.
+fn size_of(cloud: &Path, field: &Path, configuration: &Path) -> Result<Size> {
+    let (cloud, field, rest) = (bytes_of([cloud])?, bytes_of([field])?, bytes_of([configuration])?);
+    Ok(Size { cloud, field, rest, ..Size::default() })
+}
+
+/// What a tensor is to the evaluation of a field.
+fn role(config: FieldConfig, name: &str) -> Role {
+    let Some(name) = name.strip_prefix("deformation_net.") else { return Role::Unread };
+    let part = name.split('.').next().unwrap_or_default();
+    let reads = |is_read: bool, as_what: Role| if is_read { as_what } else { Role::Unread };
+    match part {
+        "grid" if config.no_grid => Role::Unread,
+        "grid" => match name.rsplit('.').next() {
+            Some("0") => Role::Plane([0, 1]),
+            Some("1") => Role::Plane([0, 2]),
+            Some("2") => Role::TimePlane(0),
+            Some("3") => Role::Plane([1, 2]),
+            Some("4") => Role::TimePlane(1),
+            Some("5") => Role::TimePlane(2),
+            _ => Role::Exact,
+        },
+        "feature_out" => Role::Weights,
+        "pos_deform" => reads(config.active.contains(Columns::POSITION), Role::Weights),
+        "scales_deform" => reads(config.active.contains(Columns::LOG_SCALE), Role::Weights),
+        "rotations_deform" => reads(config.active.contains(Columns::ROTATION), Role::Weights),
+        "opacity_deform" => reads(config.active.contains(Columns::OPACITY), Role::Weights),
+        "shs_deform" => reads(config.active.contains(Columns::SH), Role::Weights),
+        "static_mlp" => reads(config.static_mlp, Role::Weights),
+        "empty_voxel" => reads(config.empty_voxel, Role::Exact),
+        // Of a version that this one does not know.
+        _ => Role::Exact,
+    }
+}
+
+/// Writes the tensors of a field as the file that they are read from.
+pub(super) fn write_field(tensors: &Tensors, path: &Path) -> Result<()> {
+    let stored = tensors
+        .iter()
+        .map(|(name, tensor)| Stored::dense(name.clone(), tensor.shape.clone(), Values::F32(tensor.data.clone())));
+    write_state_dict(path, &stored.collect::<Vec<_>>())
+}

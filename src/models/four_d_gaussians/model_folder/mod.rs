@@ -1,0 +1,319 @@
+//! A 4DGaussians model folder as a sequence of frames.
+//!
+//! Data in: `cfg_args`, `point_cloud/iteration_K/{point_cloud.ply, deformation.pth}`, time stamps.
+//! Data out: states of any Gaussians at any frame. Memory: the canonical cloud (44 + 12·(d+1)² bytes
+//! per Gaussian), the field's tensors, and per open reader the canonical rows again plus
+//! [`Field::bytes_per_gaussian`].
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use xxhash_rust::xxh3::Xxh3;
+
+use crate::deform::{Deltas, Field, Prepared, Scratch};
+use crate::error::{Error, Result};
+use crate::limits::ReadLimit;
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
+use crate::passes::{BLOCK, InBlocks, Parts};
+use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, Reads, Wanted};
+
+use super::cfg_args::ModelConfig;
+use super::small_field::rounded;
+use crate::files::digest::hash_file;
+use crate::files::ply::{Ply, PlyOptions};
+use crate::files::state_dict::read_state_dict;
+use crate::models::iterations::iteration as iteration_folder;
+
+/// The files of a model folder.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ModelPaths {
+    /// The model folder.
+    pub root: PathBuf,
+    /// K of `iteration_K`.
+    pub iteration: u32,
+    /// `<root>/cfg_args`.
+    pub cfg_args: PathBuf,
+    /// The canonical cloud.
+    pub point_cloud: PathBuf,
+    /// The deformation field's state dict.
+    pub deformation: PathBuf,
+    /// `deformation_table.pth`, if there is one.
+    pub deformation_table: Option<PathBuf>,
+    /// `deformation_accum.pth`, if there is one.
+    pub deformation_accum: Option<PathBuf>,
+}
+
+impl ModelPaths {
+    /// Finds the files of the model at `root`: of `iteration`, or of the largest one.
+    ///
+    /// # Errors
+    /// A folder or file that is missing; optional files may be.
+    pub fn locate(root: &Path, iteration: Option<u32>) -> Result<Self> {
+        let clouds = root.join("point_cloud");
+        let (iteration, folder) = iteration_folder(&clouds, iteration)?;
+        let optional = |name: &str| Some(folder.join(name)).filter(|path| path.exists());
+        let paths = ModelPaths {
+            root: root.to_owned(),
+            iteration,
+            cfg_args: root.join("cfg_args"),
+            point_cloud: folder.join("point_cloud.ply"),
+            deformation: folder.join("deformation.pth"),
+            deformation_table: optional("deformation_table.pth"),
+            deformation_accum: optional("deformation_accum.pth"),
+        };
+        for path in paths.required() {
+            if !path.is_file() {
+                return Err(Error::input(path, "", "a file of the model folder", "none")
+                    .hint("a 4DGaussians model folder holds cfg_args and point_cloud/iteration_K/{point_cloud.ply, deformation.pth}"));
+            }
+        }
+        Ok(paths)
+    }
+
+    /// The files a model cannot do without, in the order the digest reads them.
+    fn required(&self) -> [&Path; 3] {
+        [&self.point_cloud, &self.deformation, &self.cfg_args]
+    }
+
+    /// xxh3-128 over the bytes of point cloud, deformation and `cfg_args`, as 32 hex digits.
+    pub fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        self.required().into_iter().try_for_each(|path| hash_file(path, &mut hash))?;
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+}
+
+/// A trained 4DGaussians model: a canonical cloud and the field that deforms it.
+///
+/// The model is continuous in time; [`ModelFolder::with_times`] says which instants are its frames.
+#[derive(Debug, Clone)]
+pub struct ModelFolder {
+    paths: ModelPaths,
+    config: ModelConfig,
+    canonical: Arc<Raw>,
+    field: Arc<Field>,
+    tensor_bytes: u64,
+    info: SequenceInfo,
+    states: Count,
+    notes: Vec<String>,
+    memory: ReadLimit,
+}
+
+impl ModelFolder {
+    /// Reads configuration and field of the model at `paths` within `memory`; `canonical` is its point cloud, of
+    /// `sh_degree`. The sequence has no frames yet.
+    pub fn with_cloud(paths: ModelPaths, canonical: Gaussians, sh_degree: usize, memory: ReadLimit) -> Result<Self> {
+        let config = ModelConfig::read(&paths.cfg_args)?;
+        let tensors = read_state_dict(&paths.deformation, memory)?;
+        let notes = config.contradicted_by(&tensors);
+        let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
+        let tensor_bytes = (values * size_of::<f32>()) as u64;
+        let field = Field::new(&tensors, config.field(), sh_degree, &paths.deformation)?;
+        let info = SequenceInfo { count: canonical.len(), times: Vec::new(), sh_degree, varying: field.active() };
+        let (canonical, field, states) = (Arc::new(canonical.into()), Arc::new(field), Count::default());
+        Ok(ModelFolder { paths, config, canonical, field, tensor_bytes, info, states, notes, memory })
+    }
+
+    /// What `cfg_args` and the weights say differently, and which of them is believed.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// Opens the model at `root`: of `iteration`, or of the largest one. The sequence has no frames yet.
+    pub fn open(root: &Path, iteration: Option<u32>) -> Result<Self> {
+        Self::open_with(root, iteration, &PlyOptions::default())
+    }
+
+    /// [`ModelFolder::open`] with the limits of `options`.
+    pub fn open_with(root: &Path, iteration: Option<u32>, options: &PlyOptions) -> Result<Self> {
+        let paths = ModelPaths::locate(root, iteration)?;
+        let ply = Ply::open_with(&paths.point_cloud, options)?;
+        Self::with_cloud(paths, ply.whole()?, ply.sh_degree(), options.memory)
+    }
+
+    /// Memory that reading the files of the model again may take.
+    pub(super) fn memory(&self) -> ReadLimit {
+        self.memory
+    }
+
+    /// The same field and frames with other Gaussians; of another SH degree only where no head deforms colour.
+    pub fn with_canonical(&self, canonical: Gaussians) -> Self {
+        let (count, sh_degree) = (canonical.len(), canonical.sh_degree());
+        let info = SequenceInfo { count, sh_degree, ..self.info.clone() };
+        ModelFolder { canonical: Arc::new(canonical.into()), info, ..self.clone() }
+    }
+
+    /// The same model with the field that it has once that is stored in half precision.
+    ///
+    /// # Errors
+    /// A field that cannot be read any more.
+    pub(super) fn rounded(self) -> Result<Self> {
+        let (path, degree) = (&self.paths.deformation, self.info.sh_degree);
+        let field = Field::new(&rounded(read_state_dict(path, self.memory)?), self.config.field(), degree, path)?;
+        Ok(ModelFolder { field: Arc::new(field), ..self })
+    }
+
+    /// The same model with another field, of the same configuration.
+    pub fn with_field(self, field: Field) -> Self {
+        ModelFolder { field: Arc::new(field), ..self }
+    }
+
+    /// The same model with frames at `times`.
+    ///
+    /// # Errors
+    /// Times that are not finite or not strictly increasing; the error names the frames.
+    pub fn with_times(mut self, times: Vec<f64>) -> Result<Self> {
+        self.info = self.info.at(times)?;
+        Ok(self)
+    }
+
+    /// The model's files.
+    pub fn paths(&self) -> &ModelPaths {
+        &self.paths
+    }
+
+    /// The model's hyper-parameters.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// The raw parameters of every Gaussian, before any deformation.
+    pub fn canonical(&self) -> &Gaussians {
+        &self.canonical.gaussians
+    }
+
+    /// The deformation field.
+    pub fn field(&self) -> &Field {
+        &self.field
+    }
+
+    /// Bytes of the values of the field's tensors in single precision.
+    pub(super) fn tensor_bytes(&self) -> u64 {
+        self.tensor_bytes
+    }
+
+    fn time_of(&self, frame: usize) -> Result<f64> {
+        let times = &self.info.times;
+        let missing = || Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len()));
+        times.get(frame).copied().ok_or_else(missing)
+    }
+
+    /// What the field would change at `time` about Gaussians at canonical `position` `[N, 3]`, which
+    /// need not be Gaussians of this model. [`Deltas::solve`] turns a wanted state into raw parameters.
+    pub fn deltas_at(&self, position: &Column, time: f64) -> Result<Deltas> {
+        let prepared = self.field.prepare(position);
+        let mut deltas = Deltas::new(self.info.sh_degree);
+        self.field.deltas(&prepared, time, Columns::all(), &mut Scratch::default(), &mut deltas)?;
+        Ok(deltas)
+    }
+}
+
+impl FrameSource for ModelFolder {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let count = self.info.count;
+        if let Some(id) = ids.iter().find(|&id| id >= count) {
+            return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
+        }
+        let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
+        for column in Columns::all().iter() {
+            let (from, to) = (self.canonical().column(column), raw.column_mut(column));
+            for c in 0..from.width() {
+                let plane = from.plane(c);
+                to.plane_mut(c).iter_mut().zip(ids.iter()).for_each(|(to, id)| *to = plane[id]);
+            }
+        }
+        Ok(Box::new(FieldReader {
+            model: self,
+            prepared: self.field.prepare(&raw.position),
+            raw,
+            scratch: Scratch::default(),
+            deltas: Deltas::new(self.info.sh_degree),
+        }))
+    }
+
+    /// Nothing is decoded together, so that nothing is gained by what readers of all Gaussians would keep.
+    fn open_all(&self, _: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+        Some(Ok(Box::new(InBlocks::new(self))))
+    }
+
+    fn deformation(&self) -> Option<&dyn Deformation> {
+        Some(self)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads { states: self.states.get(), ..Reads::default() }
+    }
+}
+
+/// Blocks at once.
+impl Deformation for ModelFolder {
+    fn stored(&self) -> &Raw {
+        &self.canonical
+    }
+
+    /// Under a mask, which counts as constant, moving a position is worse than leaving it where it is.
+    fn movable(&self) -> Columns {
+        if self.field.has_mask() { Columns::all().difference(Columns::POSITION) } else { Columns::all() }
+    }
+
+    fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let time = self.time_of(frame)?;
+        let ids: Vec<u32> = (0..stored.len() as u32).collect();
+        let nothing = || Gaussians::zeros(0, self.info.sh_degree);
+        let parts = Parts::of(out, want, ids.len());
+        ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
+            || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
+            |(raw, state, scratch, deltas), (ids, parts)| {
+                for column in (want | Columns::POSITION).iter() {
+                    *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
+                }
+                self.field.deltas(&self.field.prepare(&raw.position), time, want, scratch, deltas)?;
+                deltas.apply(raw, want, state);
+                parts.write(state, want);
+                Ok::<_, Error>(())
+            },
+        )
+    }
+
+    fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian> {
+        let time = self.time_of(frame)?;
+        let ids: Vec<u32> = (0..stored.len() as u32).collect();
+        let of_block = |ids: &[u32]| {
+            let mut raw = Gaussians::zeros(0, self.info.sh_degree);
+            for column in (want & Columns::ROTATION | Columns::POSITION).iter() {
+                *raw.column_mut(column) = stored.gaussians.column(column).pick(ids);
+            }
+            self.field.jacobian(&raw, time, want)
+        };
+        let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;
+        Ok(Jacobian::joined(&blocks, ids.len()))
+    }
+}
+
+struct FieldReader<'a> {
+    model: &'a ModelFolder,
+    raw: Gaussians,
+    prepared: Prepared,
+    scratch: Scratch,
+    deltas: Deltas,
+}
+
+impl BlockReader for FieldReader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let time = self.model.time_of(frame)?;
+        if !want.is_empty() {
+            self.model.states.add(self.raw.len() as u64);
+        }
+        self.model.field.deltas(&self.prepared, time, want, &mut self.scratch, &mut self.deltas)?;
+        self.deltas.apply(&self.raw, want, out);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests;

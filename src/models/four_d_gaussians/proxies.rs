@@ -1,0 +1,184 @@
+//! Proxies of a model with a deformation field: raw parameters whose state at the reference frame is
+//! the merged one (method.md, section 5.6).
+
+use super::ModelFolder;
+use crate::deform::Deltas;
+use crate::error::Result;
+use crate::merging::proxy::merge_state;
+use crate::model::{Columns, Gaussians};
+use crate::passes::{BLOCK, gather};
+use crate::recipe::{Merge, Placement};
+use crate::reduction::{Cluster, Proxies, Reference};
+use crate::source::FrameSource;
+
+/// Frames at which proxies are compared with their members.
+const SAMPLED_FRAMES: usize = 16;
+
+/// Raw parameters of the proxies of `clusters`: their states at the reference frame minus the field's
+/// deltas at their leaders' canonical positions.
+///
+/// A proxy placed at the mean is moved by the field there, not by its members' field. One that strays
+/// further than `max_drift` from its members goes back to its leader's canonical position, its shape about
+/// the mean unchanged; so does one for which no raw parameters exist, with all of its leader's parameters.
+pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, merge: &Merge) -> Result<Proxies> {
+    let leaders: Vec<u32> = all.iter().map(|cluster| cluster.leader).collect();
+    let of_leaders = model.canonical().pick(&leaders);
+    let mut raw = of_leaders.clone();
+    let mut notes = Vec::new();
+    if leaders.is_empty() {
+        return Ok(Proxies { raw: Some(raw.into()), notes, ..Proxies::default() });
+    }
+    // At the leader, the canonical position is the leader's to the bit, and so is the path.
+    let solved = match merge.placement {
+        Placement::Mean => Columns::all(),
+        Placement::Leader => Columns::all().difference(Columns::POSITION),
+    };
+    for (clusters, first) in all.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
+        let of_leaders = model.canonical().pick(&leaders[first..first + clusters.len()]);
+        let deltas = model.deltas_at(&of_leaders.position, model.info().times[reference.frame])?;
+        let states = merged_states(model, reference, clusters, merge)?;
+        let mut of_block = of_leaders.clone();
+        deltas.solve(&with_leader_lengths(&deltas, &of_leaders, states), solved, &mut of_block);
+        raw.write_rows(first, &of_block);
+    }
+    let unsolved = restore_unsolved(&mut raw, &of_leaders);
+    if unsolved > 0 {
+        notes.push(format!("{unsolved} proxies kept their leader's parameters: the field's mask leaves no others"));
+    }
+    let mut placements = vec![merge.placement; leaders.len()];
+    let mut deviations = deviations(model, reference, all, &raw, &placements)?;
+    let tolerance = merge.max_drift * merge.length_unit.in_scene_units(reference.extent);
+    let strayed: Vec<usize> = (0..leaders.len()).filter(|&i| deviations[i] > tolerance).collect();
+    if merge.placement == Placement::Mean && !strayed.is_empty() {
+        for &proxy in &strayed {
+            raw.position.set_row::<3>(proxy, of_leaders.position.row(proxy));
+            placements[proxy] = Placement::Leader;
+        }
+        notes.push(format!("{} proxies strayed from their members and were placed at their leaders", strayed.len()));
+        deviations = self::deviations(model, reference, all, &raw, &placements)?;
+    }
+    let deviation = deviations.into_iter().reduce(f64::max);
+    Ok(Proxies { raw: Some(raw.into()), deviation, notes, ..Proxies::default() })
+}
+
+/// States of the proxies of `clusters` at the reference frame.
+fn merged_states(model: &ModelFolder, reference: Reference, clusters: &[Cluster], merge: &Merge) -> Result<Gaussians> {
+    let mut states = Gaussians::zeros(clusters.len(), model.info().sh_degree);
+    let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
+    let of_members = gather(model, &ids, reference.frame, Columns::all())?;
+    let mut rows = 0..;
+    for (proxy, cluster) in clusters.iter().enumerate() {
+        let members: Vec<(u32, f64)> =
+            cluster.members.iter().zip(rows.by_ref()).map(|(&(_, weight), row)| (row, weight)).collect();
+        let leader = cluster.members.iter().position(|&(id, _)| id == cluster.leader).unwrap_or(0);
+        merge_state(&members, &of_members, members[leader].0, merge, Columns::all()).write(
+            Columns::all(),
+            proxy,
+            &mut states,
+        );
+    }
+    Ok(states)
+}
+
+/// The merged states with rotations as long as their leaders' at that frame: the field adds its change of
+/// rotation to the raw quaternion, so how far it turns depends on the length.
+fn with_leader_lengths(deltas: &Deltas, of_leaders: &Gaussians, mut states: Gaussians) -> Gaussians {
+    let mut leaders = Gaussians { rotation: of_leaders.rotation.clone(), ..Gaussians::default() };
+    deltas.apply(of_leaders, Columns::ROTATION, &mut leaders);
+    for row in 0..states.len() {
+        let length = leaders.rotation.row::<4>(row).iter().map(|x| x * x).sum::<f32>().sqrt();
+        // A leader without a direction leaves the proxy its unit quaternion.
+        if length > 0.0 && length.is_finite() {
+            states.rotation.set_row(row, states.rotation.row::<4>(row).map(|x| x * length));
+        }
+    }
+    states
+}
+
+/// Gives rows with a value that is not finite the leader's parameters; counts them.
+fn restore_unsolved(raw: &mut Gaussians, leaders: &Gaussians) -> usize {
+    let columns: Vec<Columns> = Columns::all().iter().collect();
+    let planes = |state: &Gaussians, row: usize| -> Vec<f32> {
+        columns
+            .iter()
+            .flat_map(|&column| {
+                let column = state.column(column);
+                (0..column.width()).map(|c| column.plane(c)[row]).collect::<Vec<f32>>()
+            })
+            .collect()
+    };
+    let unsolved: Vec<usize> = (0..raw.len()).filter(|&row| planes(raw, row).iter().any(|x| !x.is_finite())).collect();
+    for &row in &unsolved {
+        for &column in &columns {
+            for c in 0..leaders.column(column).width() {
+                raw.column_mut(column).plane_mut(c)[row] = leaders.column(column).plane(c)[row];
+            }
+        }
+    }
+    unsolved.len()
+}
+
+/// For every proxy how far, at most over sampled frames, it is from where it should be: at the mean, from
+/// the weighted mean of its members; at the leader, from its offset to that mean at the reference frame.
+fn deviations(
+    model: &ModelFolder,
+    reference: Reference,
+    clusters: &[Cluster],
+    raw: &Gaussians,
+    placements: &[Placement],
+) -> Result<Vec<f64>> {
+    let frames = model.info().times.len();
+    let proxies = model.with_canonical(raw.clone());
+    let places: Vec<u32> = (0..raw.len() as u32).collect();
+    let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
+    let offsets = |frame: usize| -> Result<Vec<[f64; 3]>> {
+        let of_proxies = gather(&proxies, &places, frame, Columns::POSITION)?.position;
+        let of_members = gather(model, &ids, frame, Columns::POSITION)?.position;
+        let mut row = 0;
+        Ok(clusters
+            .iter()
+            .enumerate()
+            .map(|(proxy, cluster)| {
+                let mut offset = of_proxies.row::<3>(proxy).map(f64::from);
+                for &(_, weight) in &cluster.members {
+                    let member = of_members.row::<3>(row).map(f64::from);
+                    (0..3).for_each(|axis| offset[axis] -= weight * member[axis]);
+                    row += 1;
+                }
+                offset
+            })
+            .collect())
+    };
+    let mut wanted = offsets(reference.frame)?;
+    for (offset, _) in wanted.iter_mut().zip(placements).filter(|(_, placement)| **placement == Placement::Mean) {
+        *offset = [0.0; 3];
+    }
+    let mut largest = vec![0.0f64; raw.len()];
+    for frame in sampled(frames) {
+        for (largest, (now, then)) in largest.iter_mut().zip(offsets(frame)?.iter().zip(&wanted)) {
+            let change = (0..3).map(|axis| (now[axis] - then[axis]).powi(2)).sum::<f64>().sqrt();
+            *largest = largest.max(change);
+        }
+    }
+    Ok(largest)
+}
+
+/// At most [`SAMPLED_FRAMES`] of `frames`, evenly spread, first and last among them.
+fn sampled(frames: usize) -> impl Iterator<Item = usize> {
+    let count = frames.min(SAMPLED_FRAMES);
+    (0..count).map(move |k| if count < 2 { 0 } else { k * (frames - 1) / (count - 1) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sampled_frames_hold_both_ends_and_no_other_twice() {
+        assert_eq!(sampled(0).count(), 0);
+        assert_eq!(sampled(1).collect::<Vec<_>>(), [0]);
+        assert_eq!(sampled(5).collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
+        let many: Vec<usize> = sampled(1000).collect();
+        assert!(many.len() == SAMPLED_FRAMES && many[0] == 0 && many[15] == 999);
+    }
+}

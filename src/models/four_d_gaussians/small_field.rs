@@ -1,0 +1,189 @@
+//! The field's state dict in fewer bytes: half precision, what is constant once, and of time planes only what is read.
+//!
+//! Data in: the tensors of a state dict. Data out: tensors of the same names and shapes, as a file stores them; the
+//! original's loader copies them into its own parameters of single precision. Memory: the tensors once more.
+
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use half::vec::HalfFloatVecExt;
+
+use crate::deform::{Tensor, Tensors, rows_before_zero};
+use crate::files::state_dict::{MAX_EXPANSION, Stored, Values};
+
+/// Tensors of fewer values keep theirs: biases, the ends of heads and the field's box take next to no bytes, and
+/// whatever passes through the field passes through them.
+const FEW: usize = 1024;
+/// Root mean square error of a tensor in half precision, as a part of its own: what rounding makes at most of values
+/// within range. Values too large or too small for half precision make more.
+const MOST_ERROR: f64 = 1.0 / 2048.0;
+
+/// `tensors` with the values that they have once they are stored in half precision.
+pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
+    for tensor in tensors.values_mut() {
+        if let Some(halves) = halves(tensor) {
+            tensor.data = halves.to_f32_vec();
+        }
+    }
+    tensors
+}
+
+/// `tensors` in as few bytes as that takes; of time planes only what times from 0 on read, if that is all there are
+/// (`from_zero`): elements that are never read then share the values of others.
+pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<Stored> {
+    let pack = |shares: bool| -> Vec<Stored> {
+        let pack = |(name, tensor): (&String, &Tensor)| match shares {
+            true => packed(name, tensor, from_zero),
+            false => Stored::dense(name.clone(), tensor.shape.clone(), values(tensor, &tensor.data)),
+        };
+        tensors.iter().map(pack).collect()
+    };
+    let small = pack(true);
+    let bytes = |values: usize, of: &Stored| (values * of.values.width()) as u64;
+    let kept: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
+    let meant: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
+    // What means more than a reader lets a file mean is written out.
+    if meant > MAX_EXPANSION * kept { pack(false) } else { small }
+}
+
+/// One tensor.
+fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> Stored {
+    let is_first = |value: &f32| value.to_bits() == tensor.data[0].to_bits();
+    if tensor.data.len() > 1 && tensor.data.iter().all(is_first) {
+        let dense = Stored::dense(name.to_owned(), tensor.shape.clone(), values(tensor, &tensor.data[..1]));
+        return Stored { stride: vec![0; tensor.shape.len()], ..dense };
+    }
+    let dense = |data| Stored::dense(name.to_owned(), tensor.shape.clone(), values(tensor, data));
+    let unread = if from_zero { rows_before_zero(name, &tensor.shape) } else { 0 };
+    let &[_, _, rows, columns] = &tensor.shape[..] else { return dense(&tensor.data) };
+    if unread == 0 {
+        return dense(&tensor.data);
+    }
+    // Every channel's first rows lie where the last ones of the channel before lie; the first channel's are its own.
+    let mut data = tensor.data[..unread * columns].to_vec();
+    for channel in tensor.data.chunks_exact(rows * columns) {
+        data.extend(&channel[unread * columns..]);
+    }
+    let mut stored = dense(&data);
+    stored.stride[1] = (rows - unread) * columns;
+    stored.stride[0] = data.len();
+    stored
+}
+
+/// `data`, some of the values of `tensor`, in the precision that these are stored in.
+fn values(tensor: &Tensor, data: &[f32]) -> Values {
+    match halves(tensor) {
+        Some(_) => Values::F16(Vec::from_f32_slice(data)),
+        None => Values::F32(data.to_vec()),
+    }
+}
+
+/// The values of a tensor in half precision, unless it is small or they lose too much.
+fn halves(tensor: &Tensor) -> Option<Vec<f16>> {
+    let halves = Vec::<f16>::from_f32_slice(&tensor.data);
+    let square = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>();
+    let error = square(&mut tensor.data.iter().zip(&halves).map(|(x, half)| f64::from(*x) - half.to_f64()));
+    let all = square(&mut tensor.data.iter().map(|&x| f64::from(x)));
+    // False of what is not finite.
+    (halves.len() >= FEW && error <= MOST_ERROR.powi(2) * all).then_some(halves)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A tensor of values between −1 and 1, no two the same.
+    fn tensor(shape: &[usize], scale: f32) -> Tensor {
+        let count: usize = shape.iter().product();
+        let data = (0..count).map(|i| scale * ((i as f32 * 0.618_034).fract() - 0.5)).collect();
+        Tensor { shape: shape.to_vec(), data }
+    }
+
+    /// What a reader makes of it, by the definition of strides.
+    fn read(stored: &Stored) -> Tensor {
+        let mut data = vec![stored.offset];
+        for (&extent, &stride) in stored.shape.iter().zip(&stored.stride) {
+            data = data.into_iter().flat_map(|at| (0..extent).map(move |i| at + i * stride)).collect();
+        }
+        let value = |at: usize| match &stored.values {
+            Values::F32(values) => values[at],
+            Values::F16(values) => values[at].to_f32(),
+        };
+        Tensor { shape: stored.shape.clone(), data: data.into_iter().map(value).collect() }
+    }
+
+    const TIME: &str = "deformation_net.grid.grids.1.4";
+
+    #[test]
+    fn rows_of_time_that_are_read_keep_their_values_and_the_others_take_no_bytes() {
+        for rows in [1, 2, 25, 50] {
+            let plane = tensor(&[1, 16, rows, 8], 1.0);
+            let tensors = Tensors::from([(TIME.to_owned(), plane.clone())]);
+            let unread = rows_before_zero(TIME, &plane.shape);
+            assert_eq!(unread, (rows - 1) / 2);
+            let [small, whole] = [true, false].map(|from_zero| stored(&tensors, from_zero).remove(0));
+            assert_eq!(whole.values.len(), plane.data.len());
+            assert_eq!(small.values.len(), plane.data.len() - 15 * unread * 8);
+            let expected = &rounded(tensors)[TIME].data;
+            assert_eq!(&read(&whole).data, expected);
+            let found = read(&small).data;
+            for (k, (found, expected)) in found.iter().zip(expected).enumerate() {
+                assert!(found == expected || k / 8 % rows < unread, "row {} of {rows}", k / 8 % rows);
+            }
+        }
+        assert_eq!(rows_before_zero("deformation_net.grid.grids.1.3", &[1, 16, 50, 8]), 0);
+        assert_eq!(rows_before_zero(TIME, &[16, 50, 8]), 0);
+    }
+
+    #[test]
+    fn what_half_precision_cannot_hold_stays_and_so_does_what_is_small() {
+        let few = tensor(&[FEW - 1], 1.0);
+        let mut large = tensor(&[64, 32], 1.0);
+        large.data[77] = 65_520.0;
+        let mut odd = tensor(&[64, 32], 1.0);
+        odd.data[5] = f32::NAN;
+        let tiny = tensor(&[64, 32], 1e-6);
+        let fits = tensor(&[64, 32], 1.0);
+        let mut almost_all = tensor(&[64, 32], 1.0);
+        almost_all.data[9] = 1e-7;
+        for (what, tensor, halved) in [
+            ("few", few, false),
+            ("large", large, false),
+            ("odd", odd, false),
+            ("tiny", tiny, false),
+            ("fits", fits, true),
+            ("one that is tiny", almost_all, true),
+        ] {
+            let stored = packed(what, &tensor, true);
+            assert_eq!(matches!(stored.values, Values::F16(_)), halved, "{what}");
+            let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<u32>>();
+            if !halved {
+                assert_eq!(bits(&read(&stored).data), bits(&tensor.data), "{what}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_constant_is_stored_once_as_long_as_the_file_may_mean_so_much() {
+        let constant = Tensor { shape: vec![40, 50], data: vec![0.1; 2000] };
+        let zeros = |sign: f32| Tensor { shape: vec![2], data: vec![0.0, sign * 0.0] };
+        let tensors = |more: usize| {
+            let more = ("weight".to_owned(), tensor(&[more], 1.0));
+            Tensors::from([("constant".to_owned(), constant.clone()), more])
+        };
+        assert_eq!(packed("b", &zeros(1.0), true).values.len(), 1);
+        assert_eq!(packed("b", &zeros(-1.0), true).values.len(), 2, "the sign of a zero is a value");
+        let small = stored(&tensors(2000), true);
+        assert_eq!((small[0].values.len(), &small[0].stride), (1, &vec![0, 0]));
+        assert_eq!(read(&small[0]), rounded(tensors(2000))["constant"]);
+        let whole = stored(&tensors(10), true);
+        assert_eq!(whole[0].values.len(), 2000);
+        assert_eq!(read(&whole[0]), rounded(tensors(10))["constant"]);
+    }
+
+    #[test]
+    fn rounding_twice_is_rounding_once() {
+        let tensors = Tensors::from([("a".to_owned(), tensor(&[80, 90], 3.0)), ("b".to_owned(), tensor(&[9], 3.0))]);
+        let once = rounded(tensors);
+        assert_eq!(rounded(once.clone()), once);
+    }
+}

@@ -1,0 +1,149 @@
+//! Gaussians that move along straight lines and fade with the distance in time.
+//!
+//! dt = t − times; x = means + velocities·dt; opacity = max(σ(o)·exp(−½(dt/s)²), 1e-4), s = max(exp(durations), 0.02) + 1e-8.
+//! Source: `compute_positions_at_time`, `compute_temporal_opacity` of FreeTimeGsVanilla. Its viewer has neither bound.
+
+use xxhash_rust::xxh3::Xxh3;
+
+use crate::error::Result;
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
+use crate::models::in_checkpoint::Merging;
+use crate::models::in_checkpoint::linear::{Line, match_all};
+use crate::models::law::window::{faded, odds, slope};
+use crate::models::law::{Law, Model, copy_stored};
+use crate::recipe::Merge;
+use crate::reduction::Cluster;
+
+/// Planes of [`Raw::own`]: centre in time, logarithm of the standard deviation, velocity.
+pub(super) const TIME: usize = 0;
+pub(super) const DURATION: usize = 1;
+pub(super) const VELOCITY: usize = 2;
+/// How many there are.
+pub(super) const OWN: usize = 5;
+
+/// Least standard deviation, and what is added to it.
+const DEVIATION: [f64; 2] = [0.02, 1e-8];
+/// Least opacity, and its logit.
+const OPACITY: f64 = 1e-4;
+
+/// The law of the family.
+#[derive(Debug)]
+pub(super) struct FreeTime;
+
+/// 1/(2s²), and exp(−o).
+#[derive(Debug)]
+pub(super) struct Windows {
+    rates: Vec<f64>,
+    odds: Vec<f64>,
+}
+
+fn deviation(duration: f32) -> f64 {
+    f64::from(duration).exp().max(DEVIATION[0]) + DEVIATION[1]
+}
+
+fn rate(duration: f32) -> f64 {
+    0.5 / deviation(duration).powi(2)
+}
+
+fn least() -> f64 {
+    (OPACITY / (1.0 - OPACITY)).ln()
+}
+
+impl Law for FreeTime {
+    type Prepared = Windows;
+
+    fn prepare(&self, raw: &Raw) -> Windows {
+        let rates = raw.own.plane(DURATION).iter().map(|&duration| rate(duration)).collect();
+        Windows { rates, odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect() }
+    }
+
+    fn varying(&self) -> Columns {
+        Columns::POSITION | Columns::OPACITY
+    }
+
+    fn movable(&self) -> Columns {
+        Columns::all()
+    }
+
+    #[inline(always)]
+    fn state(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns, out: &mut Gaussians) -> Result<()> {
+        copy_stored(raw, want.difference(self.varying()), out);
+        let centres = raw.own.plane(TIME);
+        if want.contains(Columns::POSITION) {
+            for c in 0..3 {
+                let (from, velocity) = (raw.gaussians.position.plane(c), raw.own.plane(VELOCITY + c));
+                let to = out.position.plane_mut(c).iter_mut().zip(from).zip(velocity).zip(centres);
+                to.for_each(|(((to, &x), &v), &centre)| {
+                    *to = (f64::from(x) + f64::from(v) * (time - f64::from(centre))) as f32;
+                });
+            }
+        }
+        if want.contains(Columns::OPACITY) {
+            let least = least();
+            let to = out.opacity_logit.plane_mut(0).iter_mut().zip(centres).zip(&windows.rates).zip(&windows.odds);
+            to.for_each(|(((to, &centre), &rate), &odds)| {
+                let exponent = -rate * (time - f64::from(centre)).powi(2);
+                *to = faded(odds, exponent).max(least) as f32;
+            });
+        }
+        Ok(())
+    }
+
+    fn jacobian(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns) -> Result<Jacobian> {
+        let mut jacobian = Jacobian::default();
+        if want.contains(Columns::OPACITY) {
+            let least = least();
+            let centres = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.odds);
+            let slopes = centres.map(|((&centre, &rate), &odds)| {
+                let exponent = -rate * (time - f64::from(centre)).powi(2);
+                if exponent < least || faded(odds, exponent) <= least { 0.0 } else { slope(odds, exponent) as f32 }
+            });
+            *jacobian.column_mut(Columns::OPACITY) = Column::from_planes(1, slopes.collect());
+        }
+        Ok(jacobian)
+    }
+}
+
+impl Merging for FreeTime {
+    fn proposed(model: &Model<FreeTime>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+        let raw = model.raw();
+        let line = |id: u32| {
+            let id = id as usize;
+            Line {
+                position: raw.gaussians.position.row::<3>(id).map(f64::from),
+                velocity: [0, 1, 2].map(|c| f64::from(raw.own.plane(VELOCITY + c)[id])),
+                centre: raw.own.plane(TIME)[id].into(),
+                deviation: deviation(raw.own.plane(DURATION)[id]),
+            }
+        };
+        let fades = |line: &Line, time: f64| (-0.5 * ((time - line.centre) / line.deviation).powi(2)).exp();
+        let mut sh = vec![Vec::new(); clusters.len()];
+        let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
+            // The same at every frame.
+            if sh[seen.proxy].is_empty() {
+                let of = &seen.state.sh;
+                sh[seen.proxy] = (0..of.width()).map(|c| of.plane(c)[seen.row]).collect();
+            }
+        })?;
+        let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+        let mut proxies = raw.pick(&leaders);
+        for (row, (matched, sh)) in matched.iter().zip(&sh).enumerate() {
+            let line = matched.line;
+            let Raw { gaussians, own } = &mut proxies;
+            gaussians.position.set_row(row, line.position.map(|x| x as f32));
+            own.plane_mut(TIME)[row] = line.centre as f32;
+            own.plane_mut(DURATION)[row] = (line.deviation - DEVIATION[1]).max(DEVIATION[0]).ln() as f32;
+            (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = line.velocity[c] as f32);
+            let Some((opacity, covariance)) = matched.seen else { continue };
+            let like = gaussians.rotation.row::<4>(row).map(f64::from);
+            let (scales, rotation) = scale_rotation(covariance, like);
+            gaussians.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
+            gaussians.rotation.set_row(row, rotation.map(|q| q as f32));
+            gaussians.opacity_logit.set_row(row, [opacity]);
+            sh.iter().enumerate().for_each(|(c, &value)| gaussians.sh.plane_mut(c)[row] = value);
+        }
+        Ok(proxies)
+    }
+
+    fn follow(&self, _: &mut Xxh3) {}
+}

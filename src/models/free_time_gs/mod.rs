@@ -1,0 +1,165 @@
+//! Checkpoints of gsplat, static or of FreeTimeGS.
+//!
+//! In: `ckpts/ckpt_K.pt` of a result's folder, or the file: `{"step", "splats": state dict, "optimizers": {name: Adam state}}`.
+//! `splats` has `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length, `opacities` [N] logit, `sh0` [N, 1, 3],
+//! `shN` [N, K, 3]; of FreeTimeGS also `times` [N, 1], `durations` [N, 1] log, `velocities` [N, 3]. Out: the same checkpoint with
+//! fewer rows. Cameras are those of the trainer's parser: it normalises the world, and does not store how.
+
+mod law;
+
+use std::path::{Path, PathBuf};
+
+use super::family::{Entry, Family, OpenOptions};
+use super::in_checkpoint::still::Still;
+use super::in_checkpoint::{About, InCheckpoint, Plane, Reading, count_of, numbered};
+use crate::error::{Error, Result, quoted};
+use crate::files::checkpoint::{Checkpoint, NodeId};
+use crate::limits::ReadLimit;
+use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
+use law::{DURATION, FreeTime, OWN, TIME, VELOCITY};
+
+/// Where a result's folder has its checkpoints.
+const FOLDER: &str = "ckpts";
+
+/// A checkpoint, or the folder of a result.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a gsplat checkpoint",
+    recognises: |found| match found.is_folder {
+        true => !checkpoints(found.path).is_empty(),
+        false => found.is_checkpoint() && splats_in(found.path, found.memory),
+    },
+    open: |path, options| {
+        let (root, file, notes) = match path.is_dir() {
+            true => {
+                let (file, notes) = choose(path, options)?;
+                (Some(path.to_owned()), file, notes)
+            }
+            false => {
+                options.refuse_for(path)?;
+                (None, path.to_owned(), Vec::new())
+            }
+        };
+        open(About { root, file, notes, ..About::default() }, options)
+    },
+};
+
+/// The checkpoints of a result's folder, or of that of its checkpoints.
+fn checkpoints(path: &Path) -> Vec<(u32, PathBuf)> {
+    let of = |folder: &Path| {
+        let (mut one, first) = (numbered(folder, "ckpt_", ".pt"), numbered(folder, "ckpt_", "_rank0.pt"));
+        one.extend(first);
+        one.sort();
+        one
+    };
+    let inner = of(&path.join(FOLDER));
+    if inner.is_empty() { of(path) } else { inner }
+}
+
+/// The one that `options` name, or the last.
+fn choose(path: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)> {
+    let found = checkpoints(path);
+    let names = || found.iter().map(|(k, _)| k.to_string()).collect::<Vec<_>>().join(", ");
+    let chosen = match options.iteration {
+        Some(k) => found.iter().find(|(number, _)| *number == k),
+        None => found.last(),
+    };
+    let expected = || options.iteration.map_or("a checkpoint".to_owned(), |k| format!("a checkpoint ckpt_{k}.pt"));
+    let (_, file) = chosen.ok_or_else(|| Error::input(path, FOLDER, expected(), names()))?;
+    let second = file.to_string_lossy().replace("_rank0.pt", "_rank1.pt");
+    if second != file.to_string_lossy() && Path::new(&second).exists() {
+        return Err(Error::input(file, "", "a model in one file", "one of several ranks")
+            .hint("join their tensors along the first axis with torch.cat, and save the checkpoint again"));
+    }
+    let name = file.file_name().unwrap_or_default().to_string_lossy();
+    let note = format!("{} checkpoints: {name} is read (--iteration)", found.len());
+    Ok((file.clone(), if found.len() > 1 && options.iteration.is_none() { vec![note] } else { Vec::new() }))
+}
+
+/// Whether the checkpoint at `path` has Gaussians as gsplat names them.
+fn splats_in(path: &Path, memory: ReadLimit) -> bool {
+    let Ok(checkpoint) = Checkpoint::open(path, memory) else { return false };
+    let pickle = checkpoint.pickle();
+    pickle.item(pickle.root(), "splats").is_some_and(|splats| pickle.item(splats, "means").is_some())
+}
+
+fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
+    let checkpoint = Checkpoint::open(&about.file, options.memory)?;
+    let pickle = checkpoint.pickle();
+    let Some(splats) = pickle.item(pickle.root(), "splats") else {
+        let found = checkpoint.describe(pickle.root());
+        return Err(checkpoint.wrong("data.pkl", "a dict with \"splats\"", found));
+    };
+    let missing = |name: &str| checkpoint.wrong(&place(name), "a tensor of this name", checkpoint.describe(splats));
+    let find = |name: &'static str| pickle.item(splats, name).ok_or_else(|| missing(name));
+    if let Some(name) = ["accels", "jerks"].into_iter().find(|name| pickle.item(splats, name).is_some()) {
+        return Err(checkpoint
+            .wrong(&place(name), "straight motion", "a further term of a polynomial, of a fork")
+            .hint("write its frames as PLY files or as a frame stream with its own renderer, and give those"));
+    }
+    if let Some(name) = ["features", "colors"].into_iter().find(|name| pickle.item(splats, name).is_some()) {
+        return Err(checkpoint
+            .wrong(&place(name), "sh0 and shN", "colours of an appearance network")
+            .hint("train without --app_opt, or write its frames as PLY files with its own renderer"));
+    }
+    let names = ["means", "scales", "quats", "opacities", "sh0", "shN"];
+    let nodes = names.iter().map(|name| find(name)).collect::<Result<Vec<NodeId>>>()?;
+    let moves = pickle.item(splats, "velocities").is_some();
+    let own = if moves {
+        ["times", "durations", "velocities"].iter().map(|name| find(name)).collect::<Result<_>>()?
+    } else {
+        Vec::new()
+    };
+    let optimizers = pickle.item(pickle.root(), "optimizers");
+    let mut beside = Vec::new();
+    for (_, state) in optimizers.and_then(|id| pickle.items(id)).into_iter().flatten() {
+        let state = pickle.item(state, "state").and_then(|id| pickle.pairs(id));
+        for (_, of_parameter) in state.into_iter().flatten() {
+            beside.extend(pickle.items(*of_parameter).into_iter().flatten().map(|(_, id)| id));
+        }
+    }
+    let count = count_of(&checkpoint, nodes[0], &place("means"))?;
+    let rest = checkpoint.float_tensor(nodes[5], &place("shN"))?;
+    let bands = rest.shape.get(1).map(|bands| bands + 1);
+    let Some(degree) = (0..=HIGHEST_DEGREE).find(|&degree| bands == Some(sh_coefficients(degree))) else {
+        return Err(checkpoint.wrong(
+            &place("shN"),
+            "shape [N, 0, 3], [N, 3, 3], [N, 8, 3] or [N, 15, 3]",
+            rest.describe(),
+        ));
+    };
+    let bands = sh_coefficients(degree);
+    let mut reading = Reading::new(checkpoint, count, degree, if moves { OWN } else { 0 })?;
+    let planes = [
+        (Columns::POSITION, &[3][..], 0, 3),
+        (Columns::LOG_SCALE, &[3], 0, 3),
+        (Columns::ROTATION, &[4], 0, 4),
+        (Columns::OPACITY, &[], 0, 1),
+        (Columns::SH, &[1, 3], 0, 3),
+        (Columns::SH, &[bands - 1, 3], 3, 3 * (bands - 1)),
+    ];
+    for ((name, id), (column, row, skipped, width)) in names.iter().zip(nodes).zip(planes) {
+        reading.read(id, &place(name), row, Plane::of(column, skipped, width))?;
+    }
+    let of_own = [("times", &[1][..], TIME, 1), ("durations", &[1], DURATION, 1), ("velocities", &[3], VELOCITY, 3)];
+    for (id, (name, row, first, width)) in own.into_iter().zip(of_own) {
+        reading.read(id, &place(name), row, Plane::own(first, width))?;
+    }
+    beside.into_iter().for_each(|id| reading.beside(id));
+    Ok(match moves {
+        true => {
+            let about = About { kind: "FreeTimeGS checkpoint", seconds_per_state: 3e-8, ..about };
+            Box::new(InCheckpoint::new(reading, FreeTime, about)?)
+        }
+        false => {
+            let about = About { kind: "gsplat checkpoint", seconds_per_state: 1e-8, ..about };
+            Box::new(InCheckpoint::new(reading, Still, about)?)
+        }
+    })
+}
+
+fn place(name: &str) -> String {
+    format!("splats[{}]", quoted(name))
+}
+
+#[cfg(test)]
+mod tests;

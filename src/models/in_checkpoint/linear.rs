@@ -1,0 +1,183 @@
+//! Proxies of Gaussians that move along straight lines and fade with the distance in time.
+//!
+//! Paths blend exactly: members re-centred to the proxy's time, then their weighted means, so that the proxy is at the weighted
+//! mean of its members at every time. Windows blend by their moments; each counts by its weight and by how long it lasts. Shape
+//! and opacity follow from the moment matches of the members at frames (least squares). Source: method.md, section 5.6, for
+//! the match at a frame.
+
+use crate::error::Result;
+use crate::merging::merged::MergedSequence;
+use crate::model::{Columns, Gaussians, logit, opacity};
+use crate::passes::{BLOCK, gather_all};
+use crate::recipe::Merge;
+use crate::reduction::Cluster;
+use crate::source::FrameSource;
+
+/// Most frames at which proxies are matched.
+const SAMPLED_FRAMES: usize = 48;
+/// Where less than this is left of a proxy nothing is matched.
+const SEEN: f64 = 1e-4;
+/// Opacities of proxies lie between these: their logits stay small.
+const OPACITIES: [f64; 2] = [1e-3, 1.0 - 1e-4];
+
+/// A straight path with a window: x(t) = position + velocity·(t − centre), exp(−½((t − centre)/deviation)²).
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(in crate::models) struct Line {
+    pub(in crate::models) position: [f64; 3],
+    pub(in crate::models) velocity: [f64; 3],
+    pub(in crate::models) centre: f64,
+    pub(in crate::models) deviation: f64,
+}
+
+impl Line {
+    /// What stands for `members`, each with a weight; they sum to 1.
+    pub(in crate::models) fn blended(members: &[(f64, Line)]) -> Line {
+        let lasting: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
+        let mean = |of: &dyn Fn(&Line) -> f64| {
+            members.iter().map(|(weight, line)| weight * line.deviation / lasting * of(line)).sum::<f64>()
+        };
+        let centre = mean(&|line| line.centre);
+        let variance = mean(&|line| line.deviation.powi(2) + (line.centre - centre).powi(2));
+        let sum = |of: &dyn Fn(&Line) -> f64| members.iter().map(|(weight, line)| weight * of(line)).sum::<f64>();
+        Line {
+            position: [0, 1, 2].map(|c| sum(&|line| line.position[c] + line.velocity[c] * (centre - line.centre))),
+            velocity: [0, 1, 2].map(|c| sum(&|line| line.velocity[c])),
+            centre,
+            deviation: variance.sqrt(),
+        }
+    }
+}
+
+/// A proxy as its members are over frames.
+#[derive(Debug, Clone)]
+pub(in crate::models) struct Matched {
+    pub(in crate::models) line: Line,
+    /// Opacity at the centre of its window, as a logit, and covariance (xx xy xz yy yz zz); none where no frame shows it.
+    pub(in crate::models) seen: Option<(f32, [f64; 6])>,
+}
+
+/// A proxy at a frame, as its members are there.
+pub(in crate::models) struct Seen<'a> {
+    /// Which proxy.
+    pub(in crate::models) proxy: usize,
+    pub(in crate::models) line: &'a Line,
+    pub(in crate::models) time: f64,
+    /// How much the frame counts.
+    pub(in crate::models) weight: f64,
+    pub(in crate::models) state: &'a Gaussians,
+    /// Its row there.
+    pub(in crate::models) row: usize,
+}
+
+/// The proxies of `clusters`, whose members have the lines `line_of` and windows that let `fades` through. Every frame at
+/// which one is seen is shown to `see`, with the columns `wanted`.
+///
+/// # Errors
+/// Frames that cannot be evaluated.
+pub(in crate::models) fn match_all(
+    source: &dyn FrameSource,
+    clusters: &[Cluster],
+    rule: &Merge,
+    line_of: impl Fn(u32) -> Line,
+    fades: impl Fn(&Line, f64) -> f64,
+    wanted: Columns,
+    mut see: impl FnMut(Seen<'_>),
+) -> Result<Vec<Matched>> {
+    let times = &source.info().times;
+    let sampled = times.len().min(SAMPLED_FRAMES);
+    let frames: Vec<usize> = (0..sampled).map(|k| (2 * k + 1) * times.len() / (2 * sampled)).collect();
+    let wanted = wanted | Columns::ROTATION | Columns::LOG_SCALE | Columns::OPACITY;
+    let mut matched = Vec::with_capacity(clusters.len());
+    for (chunk, first) in clusters.chunks(BLOCK).zip((0..).step_by(BLOCK)) {
+        let leaders: Vec<u32> = chunk.iter().map(|cluster| cluster.leader).collect();
+        let members = chunk.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
+        let merged = MergedSequence::new(source, &leaders, members, rule);
+        let line = |cluster: &Cluster| {
+            Line::blended(&cluster.members.iter().map(|&(id, weight)| (weight, line_of(id))).collect::<Vec<_>>())
+        };
+        let lines: Vec<Line> = chunk.iter().map(line).collect();
+        let mut sums = vec![Sums::default(); chunk.len()];
+        for &frame in &frames {
+            let (time, state) = (times[frame], gather_all(&merged, frame, wanted)?);
+            for (row, (line, sums)) in lines.iter().zip(&mut sums).enumerate() {
+                let (m, alpha) = (fades(line, time), opacity(state.opacity_logit.row::<1>(row)[0]));
+                let weight = m * alpha;
+                if weight > SEEN {
+                    sums.add(m, alpha, &state, row);
+                    see(Seen { proxy: first + row, line, time, weight, state: &state, row });
+                }
+            }
+        }
+        matched.extend(lines.iter().zip(&sums).map(|(&line, sums)| Matched { line, seen: sums.mean() }));
+    }
+    Ok(matched)
+}
+
+/// Sums over frames.
+#[derive(Debug, Clone, Default)]
+struct Sums {
+    /// Σ m·α and Σ m².
+    product: f64,
+    square: f64,
+    /// Σ of covariances, each by m·α.
+    covariance: [f64; 6],
+}
+
+impl Sums {
+    fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
+        self.product += m * alpha;
+        self.square += m * m;
+        let scales = state.log_scale.row::<3>(row).map(|x| f64::from(x).exp());
+        let of = covariance(scales, state.rotation.row::<4>(row).map(f64::from));
+        self.covariance.iter_mut().zip(of).for_each(|(sum, of)| *sum += m * alpha * of);
+    }
+
+    /// Opacity and covariance.
+    fn mean(&self) -> Option<(f32, [f64; 6])> {
+        let visible = (self.product / self.square).clamp(OPACITIES[0], OPACITIES[1]);
+        let found = (logit(visible) as f32, self.covariance.map(|sum| sum / self.product));
+        (self.product > 0.0).then_some(found)
+    }
+}
+
+/// R diag(s)² Rᵀ, xx xy xz yy yz zz, of a quaternion wxyz of any length but 0, which counts as the identity.
+pub(in crate::models) fn covariance(scales: [f64; 3], quaternion: [f64; 4]) -> [f64; 6] {
+    let length = quaternion.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let [w, x, y, z] = if length > 0.0 { quaternion.map(|c| c / length) } else { [1.0, 0.0, 0.0, 0.0] };
+    let rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ];
+    let entry = |i: usize, j: usize| (0..3).map(|k| rows[i][k] * rows[j][k] * scales[k].powi(2)).sum();
+    [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_blended_path_is_the_weighted_mean_of_its_members_at_every_time() {
+        let line = |k: f64| Line {
+            position: [k, 1.0 - k * k, 0.3],
+            velocity: [0.2 * k, -1.0 / (1.0 + k), 5.0],
+            centre: 0.1 * k,
+            deviation: 0.05 + 0.02 * k,
+        };
+        let members = [(0.5, line(1.0)), (0.2, line(2.5)), (0.3, line(-0.7))];
+        let blended = Line::blended(&members);
+        for k in 0..20 {
+            let time = -0.5 + 0.1 * f64::from(k);
+            for c in 0..3 {
+                let at = |line: &Line| line.position[c] + line.velocity[c] * (time - line.centre);
+                let mean: f64 = members.iter().map(|(weight, line)| weight * at(line)).sum();
+                assert!((at(&blended) - mean).abs() < 1e-12, "{time} {c}: {} {mean}", at(&blended));
+            }
+        }
+        // One alone, and one beside its like, are themselves.
+        assert_eq!(Line::blended(&[(1.0, line(2.0))]), line(2.0));
+        let twice = Line::blended(&[(0.25, line(2.0)), (0.75, line(2.0))]);
+        assert!((twice.deviation - line(2.0).deviation).abs() < 1e-15 && (twice.centre - 0.2).abs() < 1e-15);
+    }
+}

@@ -1,0 +1,48 @@
+//! Gaussians that do not change.
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::Merging;
+use crate::error::Result;
+use crate::merging::merged::MergedSequence;
+use crate::model::{Columns, Gaussians, Raw};
+use crate::models::law::{Law, Model, copy_stored};
+use crate::passes::gather_all;
+use crate::recipe::Merge;
+use crate::reduction::Cluster;
+
+/// States are what is stored.
+#[derive(Debug)]
+pub(in crate::models) struct Still;
+
+impl Law for Still {
+    type Prepared = ();
+
+    fn prepare(&self, _: &Raw) {}
+
+    fn varying(&self) -> Columns {
+        Columns::empty()
+    }
+
+    fn movable(&self) -> Columns {
+        Columns::all()
+    }
+
+    fn state(&self, _: f64, raw: &Raw, (): &(), want: Columns, out: &mut Gaussians) -> Result<()> {
+        copy_stored(raw, want, out);
+        Ok(())
+    }
+}
+
+impl Merging for Still {
+    fn proposed(model: &Model<Still>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+        let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+        let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
+        let merged = MergedSequence::new(model, &leaders, members, rule);
+        let mut raw = model.raw().pick(&leaders);
+        raw.gaussians = gather_all(&merged, 0, Columns::all())?;
+        Ok(raw)
+    }
+
+    fn follow(&self, _: &mut Xxh3) {}
+}

@@ -1,0 +1,64 @@
+//! Proxies in a family's own parameters, held to what their members do.
+
+use super::{Law, Model};
+use crate::error::Result;
+use crate::fit::SEEN;
+use crate::merging::merged::MergedSequence;
+use crate::model::{Columns, Raw, opacity};
+use crate::passes::gather_all;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reference};
+use crate::source::FrameSource;
+
+/// Furthest that a proxy's opacity may be from that of its members' moment match, at any frame.
+const MOST_OPACITY: f64 = 0.1;
+
+/// The proxies `propose`d for `clusters`, a row for each; those whose state strays at any frame from the moment match
+/// of their members, in position by more than `max_drift` or in opacity by more than .1, are refused.
+///
+/// # Errors
+/// Frames that cannot be evaluated.
+pub(in crate::models) fn solve<L: Law>(
+    model: &Model<L>,
+    clusters: &[Cluster],
+    reference: Reference,
+    rule: &Merge,
+    propose: impl FnOnce(&[Cluster]) -> Result<Raw>,
+) -> Result<Proxies> {
+    if clusters.is_empty() {
+        return Ok(Proxies::default());
+    }
+    let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+    let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
+    let wanted = MergedSequence::new(model, &leaders, members, rule);
+    let made = model.with_raw(propose(clusters)?);
+    let drift = rule.max_drift * rule.length_unit.in_scene_units(reference.extent);
+    let mut furthest = vec![0.0f64; clusters.len()];
+    let mut strays = vec![false; clusters.len()];
+    let compared = Columns::POSITION | Columns::OPACITY;
+    for frame in 0..model.info().times.len() {
+        let (wanted, made) = (gather_all(&wanted, frame, compared)?, gather_all(&made, frame, compared)?);
+        for proxy in 0..clusters.len() {
+            let [a, b] = [&wanted, &made].map(|state| opacity(state.opacity_logit.row::<1>(proxy)[0]));
+            if a.max(b) < SEEN {
+                continue;
+            }
+            let [to, from] = [&wanted, &made].map(|state| state.position.row::<3>(proxy).map(f64::from));
+            let distance = to.iter().zip(from).map(|(to, from)| (to - from).powi(2)).sum::<f64>().sqrt();
+            // False of what is not finite.
+            strays[proxy] |= !(distance <= drift && (a - b).abs() <= MOST_OPACITY);
+            furthest[proxy] = furthest[proxy].max(distance);
+        }
+    }
+    let refused: Vec<usize> = (0..clusters.len()).filter(|&proxy| strays[proxy]).collect();
+    let stays = furthest.iter().zip(&strays).filter(|(_, strays)| !**strays).map(|(furthest, _)| *furthest);
+    let mut notes = Vec::new();
+    if !refused.is_empty() {
+        notes.push(format!(
+            "{} of {} groups that would merge were left to their leaders: no Gaussian of this model moves as they do",
+            refused.len(),
+            clusters.len()
+        ));
+    }
+    Ok(Proxies { raw: Some(made.raw().clone()), refused, deviation: stays.reduce(f64::max), notes })
+}

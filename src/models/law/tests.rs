@@ -1,0 +1,116 @@
+use super::*;
+use crate::model::Gaussians;
+use crate::passes::{gather, gather_all};
+use crate::recipe::Recipe;
+use crate::reduction::{Change, Cluster, Reference};
+
+/// x(t) = x + v·t with velocities of a family's own, and opacities that fade by a rate of its own.
+#[derive(Debug)]
+struct Straight;
+
+impl Law for Straight {
+    type Prepared = Vec<f32>;
+
+    fn prepare(&self, raw: &Raw) -> Vec<f32> {
+        raw.own.plane(3).to_vec()
+    }
+
+    fn varying(&self) -> Columns {
+        Columns::POSITION | Columns::OPACITY
+    }
+
+    fn movable(&self) -> Columns {
+        Columns::POSITION
+    }
+
+    fn state(&self, time: f64, raw: &Raw, fading: &Vec<f32>, want: Columns, out: &mut Gaussians) -> Result<()> {
+        for column in want.iter() {
+            *out.column_mut(column) = raw.gaussians.column(column).clone();
+        }
+        if want.contains(Columns::POSITION) {
+            for c in 0..3 {
+                let velocity = raw.own.plane(c);
+                out.position.plane_mut(c).iter_mut().zip(velocity).for_each(|(x, v)| *x += v * time as f32);
+            }
+        }
+        if want.contains(Columns::OPACITY) {
+            out.opacity_logit.plane_mut(0).iter_mut().zip(fading).for_each(|(o, f)| *o -= f * time as f32);
+        }
+        Ok(())
+    }
+}
+
+/// More than two blocks of Gaussians, each with values of its own.
+fn model() -> Model<Straight> {
+    let count = 2 * BLOCK + 77;
+    let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(4, count) };
+    let noise = |column: &mut Column, step: f32| {
+        column.planes_mut().iter_mut().enumerate().for_each(|(k, x)| *x = (k as f32 * step).fract());
+    };
+    raw.gaussians.columns_mut(Columns::all()).for_each(|column| noise(column, 0.618_034));
+    noise(&mut raw.own, 0.754_878);
+    Model::new(Straight, raw, 0).with_times(vec![0.0, 0.5, 2.0]).unwrap()
+}
+
+#[test]
+fn the_same_gaussian_at_the_same_frame_has_the_same_bits_however_it_is_read() {
+    let model = model();
+    let all = gather_all(&model, 2, Columns::all()).unwrap();
+    let ids: Vec<u32> = (0..model.info().count as u32).rev().step_by(2).collect();
+    let mut some = Gaussians::zeros(0, 0);
+    model.open(Ids::List(&ids)).unwrap().read(2, Columns::all(), &mut some).unwrap();
+    assert_eq!(some, all.pick(&ids));
+    assert_eq!(gather(&model, &ids, 2, Columns::all()).unwrap(), some);
+    let mut stored = Gaussians::zeros(0, 0);
+    Deformation::state(&model, 2, model.stored(), Columns::all(), &mut stored).unwrap();
+    assert_eq!(stored, all);
+    let id = BLOCK + 5;
+    let [x, v] = [model.raw().gaussians.position.row::<3>(id), model.raw().own.row::<3>(id)];
+    assert_eq!(all.position.row(id), [x[0] + 2.0 * v[0], x[1] + 2.0 * v[1], x[2] + 2.0 * v[2]]);
+    assert!(model.open(Ids::Range(0..model.info().count + 1)).is_err() && gather_all(&model, 3, Columns::SH).is_err());
+}
+
+#[test]
+fn what_is_left_has_its_own_values_proxies_in_their_places_and_its_changes() {
+    let (model, rule) = (model(), Recipe::preset("default").unwrap().merge);
+    let mut reduction = Reduction::pruned(vec![3, 8, 11], &rule);
+    reduction.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
+    reduction.proxies.raw = Some(model.raw().pick(&[20]));
+    let mut by = Gaussians { position: Column::zeros(3, 3), ..Gaussians::default() };
+    by.position.set_row(2, [1.0, 0.0, 0.0]);
+    reduction.change = Change(by);
+    let reduced = model.reduced(&reduction);
+    let mut expected = model.raw().pick(&[3, 20, 11]);
+    expected.gaussians.position.plane_mut(0)[2] += 1.0;
+    assert_eq!(reduced.raw(), &expected);
+    assert_eq!((reduced.info().count, &reduced.info().times), (3, &model.info().times));
+}
+
+#[test]
+fn proxies_that_stray_at_any_frame_are_refused() {
+    let (model, mut rule) = (model(), Recipe::preset("default").unwrap().merge);
+    rule.max_drift = 0.1;
+    let reference = Reference { frame: 0, extent: 1.0 };
+    let drift = 0.1 * rule.length_unit.in_scene_units(1.0);
+    // Each of a single Gaussian: what it is is known.
+    let cluster = |output: u32, id: u32| Cluster { output, leader: id, members: vec![(id, 1.0)] };
+    let clusters: Vec<Cluster> = (0..4).map(|k| cluster(k, 10 * k + 1)).collect();
+    let ids: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+    let proposed = |change: fn(&mut Raw, f64)| {
+        let mut raw = model.raw().pick(&ids);
+        change(&mut raw, drift);
+        solve(&model, &clusters, reference, &rule, |_| Ok(raw)).unwrap()
+    };
+    let as_is = proposed(|_, _| ());
+    assert!(as_is.refused.is_empty() && as_is.notes.is_empty() && as_is.deviation.unwrap() < 1e-5);
+    // Too fast for the last frame, at twice the time, only; far off at once; nowhere; fading too slowly.
+    let off = proposed(|raw, drift| {
+        raw.own.plane_mut(0)[0] += 0.6 * drift as f32;
+        raw.own.plane_mut(0)[1] += 0.4 * drift as f32;
+        raw.gaussians.position.plane_mut(1)[2] = f32::NAN;
+        raw.own.plane_mut(3)[3] += 1.0;
+    });
+    assert_eq!(off.refused, [0, 2, 3]);
+    assert!((off.deviation.unwrap() / drift - 0.8).abs() < 1e-3, "{:?} of {drift}", off.deviation);
+    assert_eq!(off.notes.len(), 1);
+}

@@ -1,0 +1,55 @@
+//! Opacities that fade with the distance in time.
+//!
+//! α = σ(o)·m with m = exp(e), e ≤ 0: as a logit ln α − ln(1 − α) = e − ln(exp(−o) + 1 − m), in f64 without loss where α is
+//! near 0 or near 1.
+
+use crate::model::functions::{exp_m1, ln};
+
+/// Logits beyond it say no more.
+pub(in crate::models) const MOST: f64 = 40.0;
+
+/// exp(−o) of a stored logit.
+pub(in crate::models) fn odds(logit: f32) -> f64 {
+    (-f64::from(logit)).exp()
+}
+
+/// The logit of σ(o)·exp(`exponent`), from [`odds`] of o, within ±[`MOST`]. Without a branch, so that loops run in vectors.
+#[inline(always)]
+pub(in crate::models) fn faded(odds: f64, exponent: f64) -> f64 {
+    // The opacity is no larger than m.
+    let exponent = if exponent < -MOST { -MOST } else { exponent };
+    let logit = exponent - ln(odds - exp_m1(exponent));
+    let logit = if logit > MOST { MOST } else { logit };
+    if logit < -MOST { -MOST } else { logit }
+}
+
+/// ∂ [`faded`] / ∂ o; 0 where it does not change.
+pub(in crate::models) fn slope(odds: f64, exponent: f64) -> f64 {
+    let logit = faded(odds, exponent);
+    if logit.abs() < MOST { odds / (odds - exponent.exp_m1()) } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_faded_logit_is_that_of_the_product() {
+        for logit in [-9.0f32, -3.0, 0.0, 2.0, 12.0] {
+            for exponent in [0.0, -1e-9, -0.1, -1.0, -3.0, -20.0] {
+                let alpha = (1.0 / (1.0 + (-f64::from(logit)).exp())) * f64::exp(exponent);
+                let got = faded(odds(logit), exponent);
+                let again = 1.0 / (1.0 + (-got).exp());
+                assert!((again / alpha - 1.0).abs() < 1e-12, "{logit} {exponent}: {again} {alpha}");
+                let [above, below] = [1e-3f32, -1e-3].map(|by| faded(odds(logit + by), exponent));
+                let by = f64::from(logit + 1e-3) - f64::from(logit - 1e-3);
+                let expected = (above - below) / by;
+                let slope = slope(odds(logit), exponent);
+                assert!((slope - expected).abs() < 1e-6, "{logit} {exponent}: {slope} {expected}");
+            }
+        }
+        // Ends, and what lies beyond them.
+        assert_eq!([faded(odds(800.0), 0.0), faded(odds(-800.0), 0.0), faded(1.0, -1e300)], [MOST, -MOST, -MOST]);
+        assert_eq!([slope(odds(800.0), 0.0), slope(odds(-800.0), 0.0), slope(1.0, -1e300)], [0.0; 3]);
+    }
+}

@@ -1,0 +1,180 @@
+//! Frames that came another way than as files, kept as files and then linked like files: a stream of frames that do not know
+//! one another (format/STREAM.md, version 2), or what says which Gaussian is which and is linked all the same.
+//!
+//! Memory while they arrive: a frame; of a container up to 128 MiB of what is seen, and a tile of every column and thread.
+//! On the disk, in a folder without a name, every frame as PLY.
+
+use std::io::Read;
+use std::ops::Range;
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::memory::TOGETHER_BYTES;
+use super::{Arrived, Linked};
+use crate::error::{Error, Result};
+use crate::files::atomic::ScratchFolder;
+use crate::files::frame_stream::FrameStream;
+use crate::files::ply::PlyOptions;
+use crate::files::ply::write::write_inria;
+use crate::files::ply_frames::PlyFrames;
+use crate::fit::SEEN;
+use crate::model::{Columns, Gaussians, opacity};
+use crate::models::Family;
+use crate::models::trajectories::state_bytes;
+use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
+use crate::progress::Progress;
+use crate::source::{FrameSource, Ids, Wanted};
+
+/// Files of frames that are arriving, and their times.
+struct Arriving {
+    folder: ScratchFolder,
+    times: Vec<f64>,
+    /// Bytes of what they are read from, and of the largest as it is read.
+    beside: u64,
+    largest: u64,
+}
+
+impl Arriving {
+    fn new(scratch: &Path, beside: u64) -> Result<Arriving> {
+        Ok(Arriving { folder: ScratchFolder::new(scratch)?, times: Vec::new(), beside, largest: 0 })
+    }
+
+    fn push(&mut self, time: f64, state: &Gaussians) -> Result<()> {
+        write_inria(state, &[], &self.folder.path().join(format!("frame_{:05}.ply", self.times.len())))?;
+        self.times.push(time);
+        self.largest = self.largest.max(state.len() as u64 * state_bytes(state.sh_degree(), Columns::all()));
+        Ok(())
+    }
+
+    /// Links them: a `kind` of input of `bytes`, called `name` in messages.
+    fn link(
+        self,
+        kind: &'static str,
+        name: &Path,
+        bytes: u64,
+        why: &str,
+        joins: bool,
+        options: &PlyOptions,
+    ) -> Result<Linked> {
+        let linked = Linked::open(PlyFrames::open(self.folder.path(), options)?, name, why, joins, options)?;
+        let memory = self.beside + 2 * self.largest;
+        let arrived = Some(Arrived { _folder: self.folder, kind, bytes, memory });
+        Ok(Linked { info: linked.info.with_times(self.times)?, arrived, ..linked })
+    }
+}
+
+impl Linked {
+    /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`.
+    ///
+    /// # Errors
+    /// What is wrong with the stream; none but the end of it; a failed write.
+    pub fn receive(
+        mut stream: FrameStream<impl Read>,
+        name: &Path,
+        joins: bool,
+        options: &PlyOptions,
+    ) -> Result<Linked> {
+        let mut arriving = Arriving::new(&options.scratch, 0)?;
+        let mut state = Gaussians::zeros(0, stream.header().sh_degree);
+        let progress = Progress::counting("receive", "frames");
+        while let Some(time) = stream.next_frame(&mut state)? {
+            arriving.push(time, &state)?;
+            progress.advance(1);
+        }
+        drop(progress);
+        if arriving.times.is_empty() {
+            return Err(Error::input(name, "", "at least one frame", "the end of the stream"));
+        }
+        let why = "the stream does not say which Gaussian is which";
+        arriving.link("linked frame stream", name, stream.received(), why, joins, options)
+    }
+
+    /// Links what `input` shows, which says itself which Gaussian is which, and lives that are one if `joins`: in each frame
+    /// those that any picture may show. `kind` says what that is.
+    ///
+    /// # Errors
+    /// A frame that cannot be read; a failed write.
+    pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, options: &PlyOptions) -> Result<Linked> {
+        let (source, info) = (input.source(), input.source().info());
+        let seen = count_seen(source)?;
+        let state = state_bytes(info.sh_degree, Columns::all());
+        let residence = input.residence();
+        let tile = residence.gaussian_block.min(info.count as u64) * residence.frame_block;
+        let decoding = tile * (state + 3 * state_bytes(info.sh_degree, Columns::SH));
+        let unpacked = TOGETHER_BYTES.min(state * seen.iter().sum::<u64>());
+        let mut arriving = Arriving::new(&options.scratch, unpacked + rayon::current_num_threads() as u64 * decoding)?;
+        let progress = Progress::new("unpack", "frames", info.times.len() as u64);
+        let mut start = 0;
+        while start < seen.len() {
+            let mut bytes = 0;
+            let more = seen[start..].iter().take_while(|&&seen| {
+                bytes += state * seen;
+                bytes <= TOGETHER_BYTES
+            });
+            let together = start..start + more.count().max(1);
+            start = together.end;
+            let blocks = unpack(source, together.clone())?;
+            for (at, frame) in together.enumerate() {
+                let mut whole = Gaussians::zeros(seen[frame] as usize, info.sh_degree);
+                let mut first = 0;
+                for block in &blocks {
+                    whole.write_rows(first, &block[at]);
+                    first += block[at].len();
+                }
+                arriving.push(info.times[frame], &whole)?;
+                progress.advance(1);
+            }
+        }
+        drop(progress);
+        arriving.link(kind, Path::new(kind), input.bytes()?, "as asked", joins, options)
+    }
+}
+
+/// Blocks of Gaussians of `source`, as they are read.
+fn blocks(source: &dyn FrameSource) -> impl IndexedParallelIterator<Item = Range<usize>> {
+    let count = source.info().count;
+    (0..count.div_ceil(GAUSSIAN_BLOCK)).into_par_iter().map(move |block| of_block(count, block))
+}
+
+/// Rows of `state` that any picture may show.
+fn seen(state: &Gaussians) -> Vec<u32> {
+    let opacities = (0u32..).zip(state.opacity_logit.plane(0));
+    opacities.filter(|&(_, &logit)| opacity(logit) >= SEEN).map(|(row, _)| row).collect()
+}
+
+/// How many are [seen] in each frame of `source`.
+fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
+    let frames = source.info().times.len();
+    let count = |range: Range<usize>| -> Result<Vec<u64>> {
+        let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, 0));
+        (0..frames)
+            .map(|frame| {
+                reader.read(frame, Columns::OPACITY, &mut state)?;
+                Ok(seen(&state).len() as u64)
+            })
+            .collect()
+    };
+    let add = |mut a: Vec<u64>, b: Vec<u64>| {
+        a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        Ok(a)
+    };
+    blocks(source).map(count).try_reduce(|| vec![0; frames], add)
+}
+
+/// Those of every block that are [seen] in each of `frames`.
+fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
+    let wanted = Wanted::of(frames.clone());
+    let unpack = |range: Range<usize>| {
+        let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, source.info().sh_degree));
+        reader.expect(&wanted);
+        frames
+            .clone()
+            .map(|frame| {
+                reader.read(frame, Columns::all(), &mut state)?;
+                Ok(state.pick(&seen(&state)))
+            })
+            .collect()
+    };
+    blocks(source).map(unpack).collect()
+}

@@ -1,0 +1,143 @@
+//! Which lives are made one and what is held along them, and what that costs in pictures.
+
+use std::ops::Range;
+use std::path::Path;
+
+use super::memory::LOOKED_AT;
+use super::steady::{Bound, Steady, Sums};
+use super::tracks::Tracks;
+use crate::error::Result;
+use crate::files::cameras::virtual_rig;
+use crate::metrics::psnr;
+use crate::model::RobustBox;
+use crate::model::{Columns, Gaussians};
+use crate::render::Renderer;
+use crate::tracking::{Joiner, Linker};
+
+/// Pictures with joined lives are at least as near to those of lives apart, and those with what is held to those without, dB.
+const LEAST_DB: f64 = 40.0;
+/// Views of each frame that is looked at.
+const VIEWS: usize = 3;
+/// What may change along a track and be held: no more than trainers leave between lives, or half of that.
+const BOUNDS: [Bound; 2] = [Bound { colour: 0.04, other: 0.02 }, Bound { colour: 0.02, other: 0.01 }];
+
+/// Joins the lives of `tracks` that `joiner` has seen as loosely as pictures allow, if any may be; gives what a person should
+/// know of that.
+///
+/// # Errors
+/// A frame that cannot be read.
+pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut Tracks) -> Result<Option<String>> {
+    let (before, median_length) = (tracks.count(), tracks.lengths()?.median());
+    let mut note = None;
+    for (of_tracks, count) in joiner.finish(linker) {
+        if count == before {
+            continue;
+        }
+        tracks.join(of_tracks, count);
+        let psnr = cost(tracks)?;
+        if psnr.is_none_or(|psnr| psnr >= LEAST_DB) {
+            let cost = within(psnr.unwrap_or(f64::INFINITY));
+            let lives = format!("{before} lives of {median_length} frames in the median");
+            return Ok(Some(format!("{lives} were joined to these tracks: {cost}")));
+        }
+        tracks.part();
+        let psnr = psnr.unwrap_or_default();
+        note =
+            Some(format!("lives that may be one stay apart: with joined ones pictures stay within {psnr:.1} dB only"));
+    }
+    Ok(note)
+}
+
+/// Holds what hardly changes along `tracks` at its mean, within the largest of [`BOUNDS`] that pictures allow, if any; gives
+/// what a person should know of that.
+///
+/// # Errors
+/// A frame that cannot be read; a failed write to `scratch`.
+pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>> {
+    let first = tracks.first();
+    for bound in BOUNDS {
+        // Tracks are numbered by their births.
+        let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
+        let steady = Steady::of(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
+        let parts = steady.parts();
+        if parts == [0.0; 4] {
+            return Ok(None);
+        }
+        let frames: Vec<u32> = (0..tracks.frames().paths().len() as u32).collect();
+        let states = |tracks: &Tracks, frame: usize| {
+            tracks.states(&tracks.frames().frame(frame)?, &tracks.rows(frame, 0..tracks.count())?)
+        };
+        let before = looked_at(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
+        tracks.hold(Some(steady));
+        let after = looked_at(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
+        let psnr = likeness(&before, &after);
+        if psnr >= LEAST_DB {
+            let [colours, scales, rotations, opacities] = parts.map(|part| format!("{:.0}%", 100.0 * part));
+            let Bound { colour, other } = bound;
+            return Ok(Some(format!(
+                "what hardly changes along a track is held: {colours} of the colours (within {colour}), {scales} of the \
+                 scales, {rotations} of the rotations and {opacities} of the opacities (within {other}): {}",
+                within(psnr)
+            )));
+        }
+        tracks.hold(None);
+    }
+    Ok(None)
+}
+
+/// Sums along the tracks of `range`, none of which is there before the frame `born`.
+fn sums(tracks: &Tracks, born: usize, range: Range<usize>) -> Result<Sums> {
+    let sh_degree = tracks.frames().sh_degree();
+    let (mut sums, mut state) = (Sums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
+    for frame in born..tracks.frames().paths().len() {
+        let rows = tracks.rows(frame, range.clone())?;
+        for at in tracks.blended(&tracks.frames().frame(frame)?, &rows, &mut state)? {
+            sums.add(rows[at].track as usize - range.start, &state, at);
+        }
+    }
+    Ok(sums)
+}
+
+/// PSNR of pictures of joined lives against those of lives apart, where any are blended.
+fn cost(tracks: &Tracks) -> Result<Option<f64>> {
+    let frames = tracks.lengths()?.blended;
+    if frames.is_empty() {
+        return Ok(None);
+    }
+    let (mut apart, mut joined) = (Vec::new(), Vec::new());
+    for frame in looked_at(&frames) {
+        let ply = tracks.frames().frame(frame)?;
+        let mut all = Gaussians::zeros(0, tracks.frames().sh_degree());
+        ply.gaussians(0..ply.count(), Columns::all(), &mut all)?;
+        apart.push(all);
+        joined.push(tracks.states(&ply, &tracks.rows(frame, 0..tracks.count())?)?);
+    }
+    Ok(Some(likeness(&apart, &joined)))
+}
+
+/// Some of `frames`, evenly spread.
+fn looked_at(frames: &[u32]) -> impl Iterator<Item = usize> {
+    let count = frames.len().min(LOOKED_AT);
+    (0..count).map(move |k| frames[(2 * k + 1) * frames.len() / (2 * count)] as usize)
+}
+
+/// PSNR of pictures of `b` against those of `a`, frame by frame: the mean of some views around the scene.
+fn likeness(a: &[Gaussians], b: &[Gaussians]) -> f64 {
+    let mut renderer = Renderer::on_all_threads();
+    let mut found = Vec::new();
+    for (a, b) in a.iter().zip(b) {
+        let around = RobustBox::from_positions(&a.position);
+        let rig = virtual_rig(around.middle, around.extent());
+        for view in 0..VIEWS {
+            let camera = &rig.cameras[view * rig.cameras.len() / VIEWS];
+            let [a, b] = [a, b].map(|state| renderer.render(state, camera, [0.0; 3]));
+            found.push(psnr(&a, &b));
+        }
+    }
+    found.iter().sum::<f64>() / found.len() as f64
+}
+
+/// `psnr` in words.
+fn within(psnr: f64) -> String {
+    if psnr.is_finite() { format!("pictures stay within {psnr:.1} dB") } else { "no picture changes".to_owned() }
+}

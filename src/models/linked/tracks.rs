@@ -1,0 +1,455 @@
+//! Which row of which file is which track, and what follows: every track at every frame.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use gseq::Compression;
+
+use super::memory::Sizes;
+use super::steady::{Means, Steady};
+use crate::cache::{Spill, Spilling};
+use crate::error::{Result, ShowPath};
+use crate::files::ply::{Ply, PlyOptions};
+use crate::files::ply_frames::PlyFrames;
+use crate::model::{Columns, Gaussians, SequenceInfo};
+use crate::outputs::container::{ContainerWriter, GAUSSIAN_BLOCK, Lives};
+use crate::progress::Progress;
+use crate::source::{BlockReader, FrameSource, Ids};
+use crate::tracking::{Joiner, Linker, blend};
+
+/// Opacity logit of a track where it is not: an opacity of 4·10⁻¹⁸.
+const NOT_THERE: f32 = -40.0;
+
+/// A row of a frame's file, and its track.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Row {
+    pub(super) track: u32,
+    pub(super) row: u32,
+}
+
+/// A frame in which a track is, and the row there.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct At {
+    pub(super) frame: u32,
+    row: u32,
+}
+
+/// Frames, and the track of every row of them. Where lives are joined, several rows of a frame may be of one track.
+pub(super) struct Tracks {
+    frames: PlyFrames,
+    count: usize,
+    /// Most tracks of `of_rows` that might go on at a frame.
+    living: usize,
+    /// Of every track of `of_rows` the one it is part of, if lives are joined.
+    lives: Option<Vec<u32>>,
+    /// What is held along tracks, if anything is.
+    steady: Option<Steady>,
+    /// Where each track is first.
+    births: Vec<At>,
+    /// Tracks of the rows of all frames, one after the other, and where those of each frame begin.
+    of_rows: Spill,
+    starts: Vec<u64>,
+}
+
+/// For how long tracks are there.
+pub(super) struct Lengths {
+    /// Frames of each.
+    of_tracks: Vec<u32>,
+    /// Frames in which several rows are of one.
+    pub(super) blended: Vec<u32>,
+}
+
+impl Lengths {
+    /// Frames that tracks are there, in the median.
+    pub(super) fn median(mut self) -> u32 {
+        let middle = self.of_tracks.len() / 2;
+        if self.of_tracks.is_empty() { 0 } else { *self.of_tracks.select_nth_unstable(middle).1 }
+    }
+}
+
+/// What linking found.
+pub(super) struct Found {
+    states: u64,
+    /// Frames that begin something new.
+    cuts: Vec<usize>,
+    /// Links that nobody can tell.
+    doubtful: usize,
+}
+
+impl Found {
+    /// Things a person should know, of the `tracks` that were made of it.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn notes(&self, tracks: &Tracks) -> Result<Vec<String>> {
+        let mut notes = vec![format!(
+            "{} Gaussians of {} frames are {} tracks, of {} frames in the median",
+            self.states,
+            tracks.frames.paths().len(),
+            tracks.count,
+            tracks.lengths()?.median()
+        )];
+        if self.doubtful > 0 {
+            notes.push(format!(
+                "{} links could not be told from others: what they would have led to begins a new track",
+                self.doubtful
+            ));
+        }
+        if let Some(&first) = self.cuts.first() {
+            let name = tracks.frames.paths()[first].file_name().unwrap_or_default().shown();
+            notes.push(match self.cuts.len() {
+                1 => format!("a cut: {name} shows nothing of the frame before, all tracks end there"),
+                cuts => format!("{cuts} cuts, the first at {name}: such a frame shows nothing of the one before, all tracks end there"),
+            });
+        }
+        Ok(notes)
+    }
+}
+
+impl Tracks {
+    /// Links `frames`, called `name` in messages, which `joiner` looks at too.
+    ///
+    /// # Errors
+    /// A frame that cannot be read; more memory than `options` allow; a failed write.
+    pub(super) fn link(
+        frames: PlyFrames,
+        name: &Path,
+        mut joiner: Option<&mut Joiner>,
+        options: &PlyOptions,
+    ) -> Result<(Tracks, Found, Linker)> {
+        let scratch = &*options.scratch;
+        let of_frame = frames.counts().iter().copied().max().unwrap_or(0);
+        let (mut linker, mut living) = (Linker::default(), 0);
+        let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
+        let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
+        let mut state = Gaussians::zeros(0, frames.sh_degree());
+        let progress = Progress::new("link", "frames", frames.paths().len() as u64);
+        for frame in 0..frames.paths().len() {
+            // Before a frame is read at least its own Gaussians are counted as tracks.
+            let linked = births.len().max(of_frame as usize) as u64;
+            let sizes =
+                Sizes { of_frame: of_frame.into(), sh_degree: frames.sh_degree(), linked, living: living as u64 };
+            options.memory.check(name, &format!("frame {frame}"), "linking the frames", sizes.opening())?;
+            let ply = frames.frame(frame)?;
+            ply.gaussians(0..ply.count(), Columns::all(), &mut state)?;
+            let linked = linker.link(&state);
+            living = living.max(linker.may_go_on());
+            if let Some(joiner) = &mut joiner {
+                joiner.see(&linker);
+            }
+            if linked.is_cut {
+                cuts.push(frame);
+            }
+            doubtful += linked.doubtful;
+            for (row, &track) in linked.tracks.iter().enumerate() {
+                // Those that begin here are numbered in the order of their rows.
+                if track as usize == births.len() {
+                    births.push(At { frame: frame as u32, row: row as u32 });
+                }
+            }
+            spilling.write(bytemuck::cast_slice(&linked.tracks))?;
+            end += linked.tracks.len() as u64;
+            starts.push(end);
+            progress.advance(1);
+        }
+        let tracks = Tracks {
+            count: births.len(),
+            living,
+            frames,
+            lives: None,
+            steady: None,
+            births,
+            of_rows: spilling.finish()?,
+            starts,
+        };
+        Ok((tracks, Found { states: end, cuts, doubtful }, linker))
+    }
+
+    /// Makes `count` tracks of what is there, of each the one that `of_tracks` says.
+    pub(super) fn join(&mut self, of_tracks: Vec<u32>, count: usize) {
+        (self.lives, self.count) = (Some(of_tracks), count);
+    }
+
+    /// Holds along tracks what `steady` says, or nothing.
+    pub(super) fn hold(&mut self, steady: Option<Steady>) {
+        self.steady = steady;
+    }
+
+    /// What is held along tracks, if anything is.
+    pub(super) fn steady(&self) -> Option<&Steady> {
+        self.steady.as_ref()
+    }
+
+    /// Takes back what was joined.
+    pub(super) fn part(&mut self) {
+        (self.lives, self.count) = (None, self.births.len());
+    }
+
+    /// For how long tracks are there.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn lengths(&self) -> Result<Lengths> {
+        let mut lengths = Lengths { of_tracks: vec![0; self.count], blended: Vec::new() };
+        let mut last = vec![u32::MAX; self.count];
+        for frame in 0..self.frames.paths().len() {
+            let mut is_blended = false;
+            for track in self.of_frame(frame)? {
+                let before = std::mem::replace(&mut last[track as usize], frame as u32);
+                is_blended |= before == frame as u32;
+                lengths.of_tracks[track as usize] += u32::from(before != frame as u32);
+            }
+            if is_blended {
+                lengths.blended.push(frame as u32);
+            }
+        }
+        Ok(lengths)
+    }
+
+    /// The tracks of the rows of a frame.
+    fn of_frame(&self, frame: usize) -> Result<Vec<u32>> {
+        let mut tracks = vec![0u32; (self.starts[frame + 1] - self.starts[frame]) as usize];
+        self.of_rows.read(4 * self.starts[frame], bytemuck::cast_slice_mut(&mut tracks))?;
+        if let Some(lives) = &self.lives {
+            tracks.iter_mut().for_each(|track| *track = lives[*track as usize]);
+        }
+        Ok(tracks)
+    }
+
+    /// Where each track is first, in the order of frames.
+    pub(super) fn first(&self) -> Vec<At> {
+        match &self.lives {
+            None => self.births.clone(),
+            // Lives are numbered by their beginnings.
+            Some(lives) => {
+                let mut first = Vec::with_capacity(self.count);
+                for (&life, &birth) in lives.iter().zip(&self.births) {
+                    if life as usize == first.len() {
+                        first.push(birth);
+                    }
+                }
+                first
+            }
+        }
+    }
+
+    /// What memory depends on.
+    pub(super) fn sizes(&self) -> Sizes {
+        Sizes {
+            of_frame: self.frames.counts().iter().copied().max().unwrap_or(0).into(),
+            sh_degree: self.frames.sh_degree(),
+            linked: self.births.len() as u64,
+            living: self.living as u64,
+        }
+    }
+
+    /// The files.
+    pub(super) fn frames(&self) -> &PlyFrames {
+        &self.frames
+    }
+
+    /// Number of tracks.
+    pub(super) fn count(&self) -> usize {
+        self.count
+    }
+
+    /// The rows of a frame that are of `tracks`, by their tracks.
+    pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<Row>> {
+        let rows = self.of_frame(frame)?.into_iter().enumerate();
+        let rows = rows.map(|(row, track)| Row { track, row: row as u32 });
+        let mut rows: Vec<Row> = rows.filter(|row| tracks.contains(&(row.track as usize))).collect();
+        rows.sort_unstable();
+        Ok(rows)
+    }
+
+    /// Reads `rows`, which are by track, of a frame's `file` into `state`, those of one track blended in the place of the
+    /// first; gives the first of each.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn blended(&self, file: &Ply, rows: &[Row], state: &mut Gaussians) -> Result<Vec<usize>> {
+        let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
+        file.gather(&Ids::List(&of_file), Columns::all(), state)?;
+        let mut firsts = Vec::with_capacity(rows.len());
+        let mut at = 0;
+        for of_track in rows.chunk_by(|a, b| a.track == b.track) {
+            if of_track.len() > 1 {
+                blend(state, &Vec::from_iter(at..at + of_track.len()));
+            }
+            firsts.push(at);
+            at += of_track.len();
+        }
+        Ok(firsts)
+    }
+
+    /// The tracks of `rows`, which are by track, in the states they have in the frame of `file`: blended, and held where they
+    /// are steady.
+    ///
+    /// # Errors
+    /// A failed read.
+    pub(super) fn states(&self, file: &Ply, rows: &[Row]) -> Result<Gaussians> {
+        let mut state = Gaussians::zeros(0, self.frames.sh_degree());
+        let firsts = self.blended(file, rows, &mut state)?;
+        let mut states = state.pick(&firsts.iter().map(|&first| first as u32).collect::<Vec<u32>>());
+        if let Some(steady) = &self.steady {
+            let tracks: Vec<u32> = firsts.iter().map(|&first| rows[first].track).collect();
+            steady.means(&tracks)?.hold((0..tracks.len()).map(|at| (at, at)), &mut states);
+        }
+        Ok(states)
+    }
+
+    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbours, so that where a
+    /// block of them is not there yet, or no longer, nothing is written.
+    pub(super) fn pack(&self, path: &Path) -> Result<()> {
+        let mut held = self.first();
+        let (times, degree) = (self.frames.times(), self.frames.sh_degree());
+        let compression = Compression::Zstd(1);
+        let together = self.sizes().frame_block();
+        let mut writer = ContainerWriter::create(path, self.count, degree, together, compression, BTreeMap::new())?;
+        let progress = Progress::new("pack", "frames", times.len() as u64);
+        let mut was_still = vec![false; self.count.div_ceil(GAUSSIAN_BLOCK)];
+        for start in (0..times.len()).step_by(together) {
+            let of_block = start..times.len().min(start + together);
+            let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
+            let rows: Vec<Vec<Row>> =
+                of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;
+            let mut lives: Vec<Lives> =
+                was_still.iter().map(|&still| if still { Lives::Repeating } else { Lives::Still }).collect();
+            for row in rows.iter().flatten() {
+                lives[row.track as usize / GAUSSIAN_BLOCK] = Lives::New;
+            }
+            let info = SequenceInfo {
+                count: self.count,
+                times: times[of_block.clone()].to_vec(),
+                sh_degree: degree,
+                varying: Columns::all(),
+            };
+            let block = FrameBlock { info, tracks: self, start, files: &files, rows: &rows, held: &held };
+            writer.append_lives(&block, 0..of_block.len(), &times[of_block.clone()], &lives)?;
+            for (frame, rows) in of_block.clone().zip(&rows) {
+                for row in rows {
+                    held[row.track as usize] = At { frame: frame as u32, row: row.row };
+                }
+            }
+            was_still = lives.iter().map(|lives| *lives != Lives::New).collect();
+            progress.advance(of_block.len() as u64);
+        }
+        writer.finish()
+    }
+}
+
+/// All tracks at the frames of a block.
+struct FrameBlock<'a> {
+    info: SequenceInfo,
+    tracks: &'a Tracks,
+    /// The first of the frames.
+    start: usize,
+    files: &'a [Ply],
+    /// By track, of each of them.
+    rows: &'a [Vec<Row>],
+    /// Where each track was last before them, or will be first.
+    held: &'a [At],
+}
+
+impl FrameSource for FrameBlock<'_> {
+    fn info(&self) -> &SequenceInfo {
+        &self.info
+    }
+
+    fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+        let ids: Vec<usize> = ids.iter().collect();
+        let range = ids.first().map_or(0..0, |&first| first..first + ids.len());
+        let tracks: Vec<u32> = range.clone().map(|track| track as u32).collect();
+        let means = self.tracks.steady.as_ref().map(|steady| steady.means(&tracks)).transpose()?;
+        let [state, part] = [range.len(), 0].map(|len| Gaussians::zeros(len, self.info.sh_degree));
+        let mut reader = Reader { block: self, range, next: 0, means, state, part };
+        reader.begin()?;
+        Ok(Box::new(reader))
+    }
+}
+
+impl FrameBlock<'_> {
+    /// Writes the tracks of `range` as they are held before the first of the frames.
+    fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
+        let mut by_frame: Vec<(At, usize)> = self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
+        by_frame.sort_by_key(|(at, i)| (at.frame, *i));
+        let mut part = Gaussians::zeros(0, self.info.sh_degree);
+        for of_frame in by_frame.chunk_by(|(a, _), (b, _)| a.frame == b.frame) {
+            let frame = of_frame[0].0.frame as usize;
+            let rows: Vec<u32> = of_frame.iter().map(|(at, _)| at.row).collect();
+            let opened;
+            let ply = match frame.checked_sub(self.start).and_then(|at| self.files.get(at)) {
+                Some(ply) => ply,
+                None => {
+                    opened = self.tracks.frames.frame(frame)?;
+                    &opened
+                }
+            };
+            ply.gather(&Ids::List(&rows), Columns::all(), &mut part)?;
+            scatter(&part, of_frame.iter().map(|&(_, i)| i).enumerate(), state);
+        }
+        Ok(())
+    }
+}
+
+/// Tracks that follow one another, frame by frame.
+struct Reader<'a> {
+    block: &'a FrameBlock<'a>,
+    range: Range<usize>,
+    /// The frame that `state` is to become.
+    next: usize,
+    /// What is held of `range`.
+    means: Option<Means>,
+    state: Gaussians,
+    part: Gaussians,
+}
+
+impl Reader<'_> {
+    /// Goes to what is before the first of the frames.
+    fn begin(&mut self) -> Result<()> {
+        self.block.hold(self.range.clone(), &mut self.state)?;
+        if let Some(means) = &self.means {
+            means.hold((0..self.range.len()).map(|at| (at, at)), &mut self.state);
+        }
+        self.next = 0;
+        Ok(())
+    }
+}
+
+impl BlockReader for Reader<'_> {
+    fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+        if frame + 1 < self.next {
+            self.begin()?;
+        }
+        while self.next <= frame {
+            let rows = &self.block.rows[self.next];
+            let first = rows.partition_point(|row| (row.track as usize) < self.range.start);
+            let rows = &rows[first..];
+            let rows = &rows[..rows.partition_point(|row| (row.track as usize) < self.range.end)];
+            self.state.opacity_logit.planes_mut().fill(NOT_THERE);
+            let firsts = self.block.tracks.blended(&self.block.files[self.next], rows, &mut self.part)?;
+            let place = |first: usize| rows[first].track as usize - self.range.start;
+            scatter(&self.part, firsts.iter().map(|&first| (first, place(first))), &mut self.state);
+            if let Some(means) = &self.means {
+                means.hold(firsts.iter().map(|&first| (place(first), place(first))), &mut self.state);
+            }
+            self.next += 1;
+        }
+        for column in want.iter() {
+            out.column_mut(column).clone_from(self.state.column(column));
+        }
+        Ok(())
+    }
+}
+
+/// Writes rows of `part` to `state`, of each pair of `places` the first to the second.
+fn scatter(part: &Gaussians, places: impl Iterator<Item = (usize, usize)> + Clone, state: &mut Gaussians) {
+    for column in Columns::all().iter() {
+        let (from, to) = (part.column(column), state.column_mut(column));
+        for c in 0..to.width() {
+            let (from, to) = (from.plane(c), to.plane_mut(c));
+            places.clone().for_each(|(row, place)| to[place] = from[row]);
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! Model formats: each can be recognized, read as frames, reduced and written back.
+//!
+//! A family is one module here and one line of `FAMILIES`; outside its module nobody asks which one it is.
+
+pub mod archive;
+mod container;
+mod deform_folder;
+mod deformable_3d_gaussians;
+mod dynamic_3d_gaussians;
+mod family;
+mod files;
+mod foreign;
+mod four_d_gaussians;
+mod free_time_gs;
+mod in_checkpoint;
+mod iterations;
+mod law;
+mod linked;
+mod native_4d_gaussians;
+mod ply_sequence;
+mod sc_gs;
+pub mod size;
+mod spacetime_gaussians;
+mod static_3d_gaussians;
+pub mod stream;
+pub mod trajectories;
+
+use std::fs;
+use std::io::Read;
+use std::path::Path;
+
+use deform_folder::Arguments;
+pub use family::{ColumnInfo, Conventions, Family, Link, OpenOptions, Residence, Timing};
+pub use four_d_gaussians::ModelFolder;
+pub use linked::Linked;
+pub use size::Size;
+
+use crate::error::{Error, Result, ShowPath};
+use crate::files::open::open_file;
+use family::{Entry, Found};
+
+/// Every family that lies in files; the first that recognises a path opens it.
+const FAMILIES: [Entry; 14] = [
+    spacetime_gaussians::ENTRY,
+    spacetime_gaussians::SPLATV,
+    sc_gs::ENTRY,
+    deformable_3d_gaussians::ENTRY,
+    native_4d_gaussians::ENTRY,
+    free_time_gs::ENTRY,
+    foreign::ENTRY,
+    static_3d_gaussians::ENTRY,
+    four_d_gaussians::ENTRY,
+    dynamic_3d_gaussians::ENTRY,
+    ply_sequence::FOLDER,
+    ply_sequence::FILE,
+    container::ENTRY,
+    archive::ENTRY,
+];
+
+/// Colour behind the scene that a model was trained with in whose folder `cameras` is, or which it is: white where the
+/// `cfg_args` there says so, as those of 3DGS and of what derives from it do; none where it does not, or cannot be read.
+pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
+    let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };
+    let arguments = Arguments::read(&folder.join("cfg_args")).ok()?;
+    arguments.get("white_background").bool(false).ok()?.then_some([1.0; 3])
+}
+
+/// Opens a path by what is there. Frames of a family that is continuous in time are still to be chosen.
+///
+/// # Errors
+/// Nothing there, or of no family; whatever is wrong with it.
+pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
+    let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
+    let mut head = Vec::new();
+    if !is_folder {
+        let file = open_file(path)?;
+        file.take(16).read_to_end(&mut head).map_err(Error::io("read", path))?;
+    }
+    if is_folder {
+        refuse_inside_a_model(path)?;
+    }
+    let found = Found { path, is_folder, head, memory: options.memory };
+    match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
+        Some(entry) => (entry.open)(path, options),
+        None => {
+            let expected = FAMILIES.iter().map(|entry| entry.expected).filter(|expected| !expected.is_empty());
+            let expected: Vec<&str> = expected.collect();
+            Err(Error::input(path, "", expected.join(", "), "another kind of file"))
+        }
+    }
+}
+
+/// Refuses a folder inside a model folder, naming that one.
+fn refuse_inside_a_model(path: &Path) -> Result<()> {
+    // A `.` has no name of its own.
+    let Ok(real) = fs::canonicalize(path) else { return Ok(()) };
+    let iteration = |folder: &Path| folder.file_name()?.to_str()?.strip_prefix("iteration_")?.parse::<u32>().ok();
+    let is_clouds = |folder: &Path| folder.file_name().is_some_and(|name| name == "point_cloud");
+    // A PLY that stands for itself in such a folder is a model of its own.
+    let is_part = |folder: &Path| {
+        folder.join("deformation.pth").exists() || spacetime_gaussians::is_marked(&folder.join("point_cloud.ply"))
+    };
+    let (below, number) = match (iteration(&real), real.parent()) {
+        (Some(number), Some(clouds)) if is_clouds(clouds) && is_part(&real) => (2, Some(number)),
+        _ if is_clouds(&real) => (1, None),
+        _ => return Ok(()),
+    };
+    let Some(root) = real.ancestors().nth(below).filter(|root| root.join("cfg_args").exists()) else { return Ok(()) };
+    let option = number.map_or_else(String::new, |number| format!(" --iteration {number}"));
+    Err(Error::input(path, "", "a model folder", "a folder inside of one")
+        .hint(format!("give the folder above: {}{option}", root.shown())))
+}

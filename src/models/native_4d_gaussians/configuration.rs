@@ -1,0 +1,121 @@
+//! What files beside a checkpoint say of how it was trained: `cfg_args`, and the YAML that training was given, where somebody put
+//! it there: it is not saved with the model.
+
+use std::path::Path;
+
+use crate::error::{Error, Result, quoted};
+use crate::files::python_literal::{Literal, parse_call};
+use crate::files::text::read_text;
+use crate::models::four_d_gaussians::cfg_args;
+use crate::models::in_checkpoint::texts_in;
+
+/// What matters of it.
+#[derive(Debug, Default)]
+pub(super) struct Configuration {
+    pub(super) source_path: Option<String>,
+    pub(super) white_background: bool,
+    pub(super) prefilter: f64,
+    /// L, and the file that says so.
+    pub(super) time_duration: Option<(f64, String)>,
+}
+
+impl Configuration {
+    /// That of the model in `root`.
+    ///
+    /// # Errors
+    /// Files that cannot be read, or not understood; such that do not agree.
+    pub(super) fn read(root: &Path) -> Result<Configuration> {
+        let mut found = Configuration { time_duration: time_duration(root)?, ..Configuration::default() };
+        let path = root.join("cfg_args");
+        if !path.is_file() {
+            return Ok(found);
+        }
+        let text = cfg_args::read(&path)?;
+        let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(&path, &text))?;
+        for argument in arguments {
+            match (argument.name.as_str(), argument.value) {
+                ("source_path", Literal::Str(path)) => found.source_path = Some(path),
+                ("white_background", Literal::Bool(is_white)) => found.white_background = is_white,
+                ("prefilter_var", Literal::Float(variance)) => found.prefilter = variance,
+                _ => (),
+            }
+        }
+        Ok(found)
+    }
+}
+
+/// L of the configurations in `root`.
+fn time_duration(root: &Path) -> Result<Option<(f64, String)>> {
+    let mut found: Option<(f64, String)> = None;
+    for path in texts_in(root) {
+        // Others may be of anything.
+        let Ok(text) = read_text(&path, 1 << 20) else { continue };
+        let Some(span) = span(&text) else { continue };
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let wrong = |expected: String, found: String| Err(Error::input(&path, "key time_duration", expected, found));
+        let length = match span[..] {
+            [start, end] => start.parse::<f64>().ok().zip(end.parse::<f64>().ok()).map(|(start, end)| end - start),
+            _ => None,
+        };
+        let Some(length) = length.filter(|length| length.is_finite() && *length > 0.0) else {
+            return wrong("two times such as [0.0, 10.0]".to_owned(), quoted(&span.join(", ")).to_string());
+        };
+        match &found {
+            Some((other, file)) if *other != length => {
+                return wrong(format!("{other}, as in {file}"), length.to_string());
+            }
+            _ => found = Some((length, name)),
+        }
+    }
+    Ok(found)
+}
+
+/// What stands in the list `time_duration` of a YAML, in one line or below one another.
+fn span(text: &str) -> Option<Vec<&str>> {
+    let mut lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim_end());
+    let after = lines.find_map(|line| line.strip_prefix("time_duration:"))?.trim();
+    Some(match after.is_empty() {
+        true => lines.map_while(|line| line.trim_start().strip_prefix('-')).map(str::trim).collect(),
+        false => after.trim_matches(['[', ']']).split(',').map(str::trim).collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn a_span_is_found_however_its_list_is_written() {
+        for (text, expected) in [
+            ("gaussian_dim: 4\ntime_duration: [0.0, 10.0] # seconds\nModelParams:\n", Some(vec!["0.0", "10.0"])),
+            ("time_duration:\n- -0.5\n  - 0.5\nrot_4d: True\n", Some(vec!["-0.5", "0.5"])),
+            ("time_duration: soon\n", Some(vec!["soon"])),
+            ("ModelParams:\n  time_duration: [0, 1]\n", None),
+        ] {
+            assert_eq!(span(text), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn configurations_beside_a_model_say_its_length_or_what_is_wrong() {
+        let root = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| fs::write(root.path().join(name), text).unwrap();
+        let read = || time_duration(root.path());
+        assert_eq!(read().unwrap(), None);
+        write("config.yaml", "time_duration: [-1, 1.5]\n");
+        write("notes.yml", "of: something else\n");
+        assert_eq!(read().unwrap(), Some((2.5, "config.yaml".to_owned())));
+        for (text, parts) in [
+            ("time_duration: [0, 1]\n", ["2.5, as in config.yaml", "1"]),
+            ("time_duration: [1, 1]\n", ["two times", "1, 1"]),
+            ("time_duration: 3\n", ["two times", "3"]),
+        ] {
+            write("notes.yml", text);
+            let message = read().unwrap_err().to_string();
+            assert!(message.contains("notes.yml, key time_duration"), "{message}");
+            assert!(parts.iter().all(|part| message.contains(part)), "{parts:?} are not in {message}");
+        }
+    }
+}

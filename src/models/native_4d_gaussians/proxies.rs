@@ -1,0 +1,144 @@
+//! Proxies of Gaussians of four dimensions: a slice for all times and a window make one again.
+//!
+//! From the match of the slices (a line, Σ, a window of deviation s): Σ₄ = [[Σ + vvᵀs², vs²], [vᵀs², s²]], whose axes are two
+//! quaternions. Harmonics refer to the proxy's own centre: what its members show at frames is fitted by 1, cos and cos of the
+//! double (least squares, with a ridge on the waves).
+
+use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
+use super::rotation::{decomposed, quaternions};
+use crate::error::Result;
+use crate::model::{Columns, Raw, scale_rotation};
+use crate::models::in_checkpoint::linear::{Line, match_all};
+use crate::models::law::Model;
+use crate::recipe::Merge;
+use crate::reduction::Cluster;
+
+/// Part of the frames' weight that holds waves near 0 where frames do not tell them from the constant.
+const RIDGE: f64 = 1e-3;
+
+/// Raw parameters of the proxies of `clusters`.
+///
+/// # Errors
+/// Frames that cannot be evaluated.
+pub(super) fn proposed(model: &Model<Native>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+    let (raw, law) = (model.raw(), model.law());
+    let line = |id: u32| {
+        let slice = law.slice(raw, id as usize);
+        Line {
+            position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
+            velocity: slice.velocity,
+            centre: raw.own.plane(TIME)[id as usize].into(),
+            deviation: slice.variance.sqrt(),
+        }
+    };
+    let fades = |line: &Line, time: f64| law.marginal(time, line.centre, line.deviation.powi(2));
+    let mut fits = vec![Fit::default(); clusters.len()];
+    let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
+        let [first, second] = law.waves(seen.time, seen.line.centre);
+        let of = &seen.state.sh;
+        let values = (0..of.width()).map(|c| f64::from(of.plane(c)[seen.row]));
+        fits[seen.proxy].add(seen.weight, [1.0, first, second], values);
+    })?;
+    let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
+    let mut proxies = raw.pick(&leaders);
+    for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
+        let Some((opacity, covariance)) = matched.seen else { continue };
+        let Raw { gaussians, own } = &mut proxies;
+        let Line { position, velocity, centre, deviation } = matched.line;
+        let variance = deviation.powi(2);
+        gaussians.position.set_row(row, position.map(|x| x as f32));
+        gaussians.opacity_logit.set_row(row, [opacity]);
+        own.plane_mut(TIME)[row] = centre as f32;
+        if law.turns {
+            let [xx, xy, xz, yy, yz, zz] = covariance;
+            let space = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+            let velocity = [velocity[0], velocity[1], velocity[2], 1.0];
+            let mut whole = [0, 1, 2, 3].map(|i| [0, 1, 2, 3].map(|j| velocity[i] * velocity[j] * variance));
+            (0..3).for_each(|i| (0..3).for_each(|j| whole[i][j] += space[i][j]));
+            let (scales, rotation) = decomposed(&whole);
+            let [l, r] = quaternions(&rotation, law.flipped);
+            let [x, y, z, along] = scales.map(|scale| scale.ln() as f32);
+            gaussians.log_scale.set_row(row, [x, y, z]);
+            gaussians.rotation.set_row(row, l.map(|q| q as f32));
+            own.plane_mut(SCALING_T)[row] = along;
+            (0..4).for_each(|c| own.plane_mut(ROTATION_R + c)[row] = r[c] as f32);
+        } else {
+            let (scales, rotation) = scale_rotation(covariance, gaussians.rotation.row::<4>(row).map(f64::from));
+            gaussians.log_scale.set_row(row, scales.map(|scale| scale.ln() as f32));
+            gaussians.rotation.set_row(row, rotation.map(|q| q as f32));
+            own.plane_mut(SCALING_T)[row] = variance.ln() as f32;
+        }
+        for (c, [constant, waves @ ..]) in fit.solve(law.terms).enumerate() {
+            gaussians.sh.plane_mut(c)[row] = constant as f32;
+            (0..law.terms).for_each(|term| own.plane_mut(TERMS + term * TERM + c)[row] = waves[term] as f32);
+        }
+    }
+    Ok(proxies)
+}
+
+/// Sums of a least-squares fit of many values by the same three functions.
+#[derive(Debug, Clone, Default)]
+struct Fit {
+    normal: [[f64; 3]; 3],
+    by_value: Vec<[f64; 3]>,
+}
+
+impl Fit {
+    fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
+        self.by_value.resize(values.len(), [0.0; 3]);
+        for (i, row) in self.normal.iter_mut().enumerate() {
+            row.iter_mut().zip(basis).for_each(|(sum, of)| *sum += weight * basis[i] * of);
+        }
+        for (sums, value) in self.by_value.iter_mut().zip(values) {
+            sums.iter_mut().zip(basis).for_each(|(sum, of)| *sum += weight * of * value);
+        }
+    }
+
+    /// Coefficients of each value, of the constant and of the first `terms` waves.
+    fn solve(&self, terms: usize) -> impl Iterator<Item = [f64; 3]> {
+        let mut normal = self.normal;
+        let ridge = RIDGE * normal[0][0];
+        for (i, row) in normal.iter_mut().enumerate() {
+            row[i] += if i > 0 { ridge } else { 0.0 };
+            if i > terms {
+                *row = [0.0; 3];
+                row[i] = 1.0;
+            }
+        }
+        let inverse = glam::DMat3::from_cols_array_2d(&normal).transpose().inverse();
+        self.by_value.iter().map(move |&[a, b, c]| {
+            let of = [a, if terms > 0 { b } else { 0.0 }, if terms > 1 { c } else { 0.0 }];
+            (inverse * glam::DVec3::from(of)).to_array()
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waves_are_found_where_frames_show_them_and_small_where_they_do_not() {
+        let wave = |k: i32, centre: f64| {
+            let turn = std::f64::consts::TAU * (centre - 0.05 * f64::from(k));
+            [1.0, turn.cos(), (2.0 * turn).cos()]
+        };
+        let (mut whole, mut short) = (Fit::default(), Fit::default());
+        for k in 0..20 {
+            let basis = wave(k, 0.3);
+            let value = 0.7 - 0.4 * basis[1] + 0.2 * basis[2];
+            whole.add(0.5, basis, [value, -value].into_iter());
+        }
+        let found: Vec<[f64; 3]> = whole.solve(2).collect();
+        for (got, expected) in found[0].iter().zip([0.7, -0.4, 0.2]) {
+            assert!((got - expected).abs() < 2e-3, "{found:?}");
+        }
+        // A single frame: the constant is all that it says.
+        short.add(0.5, wave(6, 0.3), [0.7].into_iter());
+        let [[constant, first, second]] = short.solve(2).collect::<Vec<_>>()[..] else { panic!("one value") };
+        assert!((constant + first + second - 0.7).abs() < 1e-9 && first.abs() < 1e-2 && second.abs() < 1e-2);
+        // Terms that the model has not are not made.
+        let [got, _] = whole.solve(0).collect::<Vec<_>>()[..] else { panic!("two values") };
+        assert_eq!(got[1..], [0.0, 0.0]);
+    }
+}

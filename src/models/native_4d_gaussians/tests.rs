@@ -1,0 +1,354 @@
+use std::fs;
+use std::path::Path;
+
+use glam::{DMat3, DMat4, DVec4};
+
+use super::*;
+use crate::files::checkpoint::made::{Made, MadeTensor, named, tensor};
+use crate::limits::Limits;
+use crate::limits::ReadLimit;
+use crate::model::{Gaussians, opacity};
+use crate::models;
+use crate::models::Conventions;
+use crate::models::OpenOptions;
+use crate::models::in_checkpoint::linear::covariance;
+use crate::outputs::kind::OutputKind;
+use crate::passes::gather_all;
+use crate::recipe::Recipe;
+use crate::reduction::{Change, Cluster, Reduction, Reference};
+
+const COUNT: usize = 6;
+const TIMES: [f64; 5] = [0.0, 0.3, 0.5, 1.1, 1.9];
+
+/// As good as noise, from -½ to ½.
+fn noise(n: usize, seed: f64) -> Vec<f32> {
+    (0..n).map(|i| ((i as f64 * 0.754_877 + seed * 0.569_84).fract() - 0.5) as f32).collect()
+}
+
+/// The parameters of a made model, in the capture's order.
+fn parameters(turns: bool) -> Vec<(usize, MadeTensor)> {
+    let add = |values: Vec<f32>, by: f32| values.into_iter().map(|x| x + by).collect::<Vec<f32>>();
+    let (n, shape) = (COUNT, |row: &[usize]| [&[COUNT], row].concat());
+    let right: (&[usize], usize) = if turns { (&[4], 4) } else { (&[0], 0) };
+    let of: [(usize, &[usize], Vec<f32>); 9] = [
+        (1, &[3], noise(3 * n, 1.0)),
+        (2, &[1, 3], noise(3 * n, 2.0)),
+        (3, &[47, 3], noise(141 * n, 3.0)),
+        (4, &[3], add(noise(3 * n, 4.0), -2.0)),
+        (5, &[4], add(noise(4 * n, 5.0), 0.2)),
+        (6, &[1], noise(n, 6.0)),
+        (13, &[1], add(noise(n, 7.0), 0.8)),
+        (14, &[1], add(noise(n, 8.0), -1.0)),
+        (15, right.0, noise(right.1 * n, 9.0)),
+    ];
+    of.into_iter().enumerate().map(|(k, (i, row, values))| (i, tensor(k, &shape(row), &values))).collect()
+}
+
+fn capture(turns: bool) -> Vec<Made> {
+    let mut parts = vec![Made::None; MOVING];
+    let mut state = Vec::new();
+    for (k, (i, tensor)) in parameters(turns).into_iter().enumerate() {
+        let adam = |seed: f64, storage: usize| MadeTensor {
+            storage,
+            ..self::tensor(0, &tensor.shape, &noise(tensor.bytes.len() / 4, seed))
+        };
+        let of_state = named(vec![
+            ("step", Made::Int(3)),
+            ("exp_avg", Made::Tensor(adam(11.0 + k as f64, 20 + k))),
+            ("exp_avg_sq", Made::Tensor(adam(31.0 + k as f64, 40 + k))),
+        ]);
+        state.push((Made::Int(k as i64), Made::Dict(of_state)));
+        parts[i] = Made::Parameter(tensor);
+    }
+    parts[0] = Made::Int(3);
+    parts[7] = Made::Tensor(tensor(60, &[COUNT], &noise(COUNT, 50.0)));
+    (8..11).for_each(|i| parts[i] = Made::Tensor(tensor(60 + i, &[COUNT, 1], &noise(COUNT, i as f64))));
+    let groups = named(vec![("state", Made::Dict(state)), ("param_groups", Made::List(vec![]))]);
+    parts[11] = Made::Dict(groups);
+    parts[12] = Made::Float(2.5);
+    parts[16] = Made::Bool(turns);
+    parts[18] = Made::Int(2);
+    parts
+}
+
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Place {
+        Place(tempfile::tempdir().unwrap())
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    /// A folder with these parts as its checkpoint.
+    fn put(&self, parts: Vec<Made>) -> PathBuf {
+        let root = self.path("model");
+        fs::create_dir_all(&root).unwrap();
+        fs::write(root.join("chkpnt30000.pth"), Made::Tuple(vec![Made::Tuple(parts), Made::Int(30_000)]).file())
+            .unwrap();
+        fs::write(root.join("cfg_args"), "Namespace(white_background=True, source_path='data')").unwrap();
+        root
+    }
+
+    fn written(&self, model: &dyn Family, reduction: &Reduction) -> PathBuf {
+        let result = self.path("result");
+        _ = fs::remove_dir_all(&result);
+        fs::create_dir(&result).unwrap();
+        model.write(reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+        result
+    }
+}
+
+fn open_as(path: &Path, rot4d_unflipped: bool) -> Result<Box<dyn Family>> {
+    let conventions = Conventions { time_duration: Some(2.0), rot4d_unflipped };
+    models::open(path, &OpenOptions { conventions, ..OpenOptions::default() })?.with_times(TIMES.to_vec())
+}
+
+fn open(path: &Path) -> Box<dyn Family> {
+    open_as(path, false).unwrap()
+}
+
+fn states(model: &dyn Family) -> Vec<Gaussians> {
+    (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Columns::all()).unwrap()).collect()
+}
+
+fn floats(tensor: &MadeTensor, row: usize) -> Vec<f64> {
+    let width = tensor.shape[1..].iter().product::<usize>();
+    let values = tensor.bytes.as_chunks::<4>().0[row * width..][..width].iter();
+    values.map(|&bytes| f64::from(f32::from_le_bytes(bytes))).collect()
+}
+
+fn rule() -> crate::recipe::Merge {
+    Recipe::preset("default").unwrap().merge
+}
+
+/// A row, by way of the inverse: the covariance of a slice is that of the block of the inverse of Σ₄ for space. The rotation by
+/// what it does to the axes as quaternions.
+fn check(parameters: &[(usize, MadeTensor)], flipped: bool, row: usize, time: f64, state: &Gaussians) {
+    let of = |i: usize| floats(&parameters.iter().find(|part| part.0 == i).unwrap().1, row);
+    let unit = |q: Vec<f64>| DVec4::from_slice(&q).normalize().to_array();
+    let (l, r) = (unit(of(5)), unit(of(15)));
+    let hamilton = |[a, b, c, d]: [f64; 4], [p, q, r, s]: [f64; 4]| {
+        [
+            a * p - b * q - c * r - d * s,
+            a * q + b * p + c * s - d * r,
+            a * r - b * s + c * p + d * q,
+            a * s + b * r - c * q + d * p,
+        ]
+    };
+    let back = |[a, b, c, d]: [f64; 4]| if flipped { [d, c, b, a] } else { [a, b, c, d] };
+    let axis = |i: usize| {
+        let mut axis = [0.0; 4];
+        axis[i] = 1.0;
+        DVec4::from(back(hamilton(hamilton(l, back(axis)), [r[0], -r[1], -r[2], -r[3]])))
+    };
+    let turn = DMat4::from_cols(axis(0), axis(1), axis(2), axis(3));
+    let scales = [of(4), of(14)].concat();
+    let squares = DMat4::from_diagonal(DVec4::from_slice(&scales).map(|x| (2.0 * x).exp()));
+    let whole = turn * squares * turn.transpose();
+    let slice = DMat3::from_mat4(whole.inverse()).inverse();
+    let (dt, variance) = (time - of(13)[0], whole.col(3)[3]);
+    for c in 0..3 {
+        let expected = of(1)[c] + whole.col(3)[c] / variance * dt;
+        let got = f64::from(state.position.plane(c)[row]);
+        assert!((got - expected).abs() < 1e-6, "position {c}: {got} {expected}");
+    }
+    let got = covariance(
+        state.log_scale.row::<3>(row).map(|x| f64::from(x).exp()),
+        state.rotation.row::<4>(row).map(f64::from),
+    );
+    let expected =
+        [slice.col(0)[0], slice.col(1)[0], slice.col(2)[0], slice.col(1)[1], slice.col(2)[1], slice.col(2)[2]];
+    let most = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
+    got.iter().zip(expected).for_each(|(a, b)| assert!((a - b).abs() < 2e-6 * most, "{got:?} {expected:?}"));
+    let m = (-0.5 * dt * dt / variance).exp();
+    let expected = if m > 0.05 { m / (1.0 + (-of(6)[0]).exp()) } else { 0.0 };
+    let got = opacity(state.opacity_logit.plane(0)[row]);
+    assert!((got - expected).abs() < 2e-7, "opacity {got} {expected}");
+    let angle = std::f64::consts::TAU * -dt / 2.0;
+    let harmonics = [of(2), of(3)].concat();
+    for c in 0..48 {
+        let expected = harmonics[c] + angle.cos() * harmonics[48 + c] + (2.0 * angle).cos() * harmonics[96 + c];
+        let got = f64::from(state.sh.plane(c)[row]);
+        assert!((got - expected).abs() < 5e-7, "harmonic {c}: {got} {expected}");
+    }
+}
+
+#[test]
+fn states_are_slices_of_four_dimensions_in_both_conventions() {
+    let place = Place::new();
+    let root = place.put(capture(true));
+    for unflipped in [false, true] {
+        let model = open_as(&root, unflipped).unwrap();
+        assert_eq!((model.kind(), model.background()), ("4D Gaussian Splatting checkpoint", Some([1.0; 3])));
+        for (state, time) in states(&*model).iter().zip(TIMES) {
+            (0..COUNT).for_each(|row| check(&parameters(true), !unflipped, row, time, state));
+        }
+    }
+    // Some are cut off, and some are not.
+    let cut = |x: &&f32| **x == -40.0;
+    let of = states(&*open(&root));
+    let cuts: usize = of.iter().map(|state| state.opacity_logit.planes().iter().filter(cut).count()).sum();
+    assert!((1..TIMES.len() * COUNT - 1).contains(&cuts), "{cuts}");
+}
+
+#[test]
+fn without_a_rotation_of_four_dimensions_time_stands_alone() {
+    let place = Place::new();
+    let parts = parameters(false);
+    let model = open(&place.put(capture(false)));
+    let of = |i: usize, row: usize| floats(&parts.iter().find(|part| part.0 == i).unwrap().1, row);
+    for (state, time) in states(&*model).iter().zip(TIMES) {
+        for row in 0..COUNT {
+            assert_eq!(state.position.row::<3>(row).map(f64::from).to_vec(), of(1, row));
+            assert_eq!(state.log_scale.row::<3>(row).map(f64::from).to_vec(), of(4, row));
+            let m = (-0.5 * (time - of(13, row)[0]).powi(2) / of(14, row)[0].exp()).exp();
+            let expected = if m > 0.05 { m / (1.0 + (-of(6, row)[0]).exp()) } else { 0.0 };
+            assert!((opacity(state.opacity_logit.plane(0)[row]) - expected).abs() < 2e-7);
+        }
+    }
+}
+
+#[test]
+fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
+    let place = Place::new();
+    let model = open(&place.put(capture(true)));
+    let whole = states(&*model);
+    let result = place.written(&*model, &Reduction::pruned(vec![1, 4, 5], &rule()));
+    let left = states(&*open(&result));
+    left.iter().zip(&whole).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[1, 4, 5])));
+    assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(place.path("model/cfg_args")).unwrap());
+    let checkpoints = [place.path("model"), result]
+        .map(|root| Checkpoint::open(&root.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap());
+    let [before, after] = checkpoints.each_ref().map(|checkpoint| checkpoint.tensors().collect::<Vec<_>>());
+    // Nine parameters, two values that training keeps of each, four of its statistics.
+    assert_eq!((before.len(), after.len()), (31, 31));
+    for (b, a) in before.iter().zip(&after) {
+        assert_eq!(a.shape, [&[3], &b.shape[1..]].concat());
+        let width = b.shape[1..].iter().product::<usize>();
+        let [b, a] = [(b, 0), (a, 1)].map(|(tensor, k)| checkpoints[k].floats(tensor, "").unwrap());
+        let rows: Vec<f32> = [1, 4, 5].iter().flat_map(|row| b[row * width..][..width].to_vec()).collect();
+        assert_eq!(a, rows);
+    }
+}
+
+#[test]
+fn merged_and_changed_ones_read_back_as_they_were_shown() {
+    let place = Place::new();
+    // The second is the first again, but for its opacity.
+    let mut parts = capture(true);
+    for (i, mut tensor) in parameters(true) {
+        let width = tensor.bytes.len() / COUNT;
+        tensor.bytes.copy_within(0..width, width);
+        parts[i] = Made::Parameter(tensor);
+    }
+    let model = open(&place.put(parts));
+    let cluster = Cluster { output: 0, leader: 0, members: vec![(0, 0.6), (1, 0.4)] };
+    let reference = Reference { frame: 2, extent: 10.0 };
+    let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
+    assert!(proxies.refused.is_empty(), "{proxies:?}");
+    let pruned = Reduction::pruned(vec![0, 3, 4], &rule());
+    let mut by = Gaussians::zeros(3, 0);
+    by.position.set_row(2, [0.5, 0.0, -0.25]);
+    by.sh.set_row(1, [0.1, 0.2, 0.0]);
+    let by = Gaussians { rotation: Default::default(), log_scale: Default::default(), ..by };
+    let reduction = Reduction { clusters: vec![cluster], proxies, change: Change(by), ..pruned };
+    let shown = model.reduced(&reduction).unwrap();
+    let result = place.written(&*model, &reduction);
+    let whole = states(&*model);
+    for (frame, state) in states(&*open(&result)).iter().enumerate() {
+        assert_eq!(*state, gather_all(&*shown, frame, Columns::all()).unwrap());
+        // Two alike move as one of them.
+        let [got, expected] = [(state, 0), (&whole[frame], 1)].map(|(state, row)| state.position.row::<3>(row));
+        (0..3).for_each(|c| assert!((got[c] - expected[c]).abs() < 2e-6, "{got:?} {expected:?}"));
+        let moved = state.position.row::<1>(2)[0] - whole[frame].position.row::<1>(4)[0];
+        assert!((moved - 0.5).abs() < 1e-6, "{moved}");
+    }
+    // What training kept of it does not belong to it any more.
+    let checkpoint = Checkpoint::open(&result.join("chkpnt30000.pth"), ReadLimit::NONE).unwrap();
+    let average = checkpoint.tensors().find(|tensor| tensor.storage == "20").unwrap();
+    let values = checkpoint.floats(&average, "").unwrap();
+    assert!(values[..3] == [0.0; 3] && values[3..].iter().all(|x| *x != 0.0), "{values:?}");
+}
+
+#[test]
+fn a_static_capture_is_a_static_model() {
+    let place = Place::new();
+    let moving = capture(false);
+    let order = [0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 11, 12];
+    let mut parts: Vec<Made> = order.iter().map(|&i| moving[i].clone()).collect();
+    parts[3] = Made::Parameter(tensor(2, &[COUNT, 15, 3], &noise(45 * COUNT, 3.0)));
+    let root = place.put(parts);
+    let model = models::open(&root, &OpenOptions::default()).unwrap();
+    assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
+    let state = gather_all(model.source(), 0, Columns::all()).unwrap();
+    assert_eq!(f64::from(state.sh.plane(5)[2]), floats(&tensor(0, &[COUNT, 45], &noise(45 * COUNT, 3.0)), 2)[2]);
+    let result = place.written(&*model, &Reduction::pruned(vec![2], &rule()));
+    let left = models::open(&result, &OpenOptions::default()).unwrap();
+    assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), state.pick(&[2]));
+}
+
+#[test]
+fn the_best_checkpoint_is_read_or_the_one_that_is_named() {
+    let place = Place::new();
+    let root = place.put(capture(true));
+    fs::copy(root.join("chkpnt30000.pth"), root.join("chkpnt_best.pth")).unwrap();
+    let notes = models::open(&root, &OpenOptions::default()).unwrap().notes();
+    assert!(notes.iter().any(|note| note.contains("chkpnt_best.pth is read")), "{notes:?}");
+    assert!(notes.iter().any(|note| note.contains("--time-duration")), "{notes:?}");
+    let of = |iteration| models::open(&root, &OpenOptions { iteration: Some(iteration), ..OpenOptions::default() });
+    assert!(of(30_000).unwrap().notes().iter().all(|note| !note.contains("best")));
+    let error = of(7).err().unwrap().to_string();
+    assert!(error.contains("chkpnt7.pth") && error.contains("chkpnt30000.pth"), "{error}");
+    // The period that is guessed follows from the times.
+    let at = |times: Vec<f64>| models::open(&root, &OpenOptions::default()).unwrap().with_times(times).unwrap().notes();
+    assert!(at(vec![0.0, 1.0]).iter().any(|note| note.contains("every 1 ")), "{:?}", at(vec![0.0]));
+    assert!(at(vec![0.0, 1.5]).iter().any(|note| note.contains("every 10 ")));
+}
+
+#[test]
+fn what_is_wrong_is_named() {
+    let place = Place::new();
+    let said = |change: &dyn Fn(&mut Vec<Made>)| {
+        let mut parts = capture(true);
+        change(&mut parts);
+        open_as(&place.put(parts), false).err().expect("must be refused").to_string()
+    };
+    type Wrong = fn(&mut Vec<Made>);
+    let cases: [(Wrong, &[&str]); 8] = [
+        (|parts| parts[4] = Made::None, &["capture[4] (scaling)", "None"]),
+        (|parts| parts[4] = Made::Parameter(tensor(3, &[5, 3], &noise(15, 0.0))), &["(scaling)", "[6, 3]", "[5, 3]"]),
+        (|parts| parts[13] = Made::Parameter(tensor(6, &[COUNT], &noise(COUNT, 0.0))), &["(t)", "[6, 1]", "[6]"]),
+        (|parts| parts[6] = Made::Parameter(tensor(5, &[COUNT, 1], &[f32::NAN; COUNT])), &["(opacity)", "NaN"]),
+        (
+            |parts| parts[3] = Made::Parameter(tensor(2, &[COUNT, 7, 3], &noise(21 * COUNT, 0.0))),
+            &["(features_rest)", "33"],
+        ),
+        (|parts| parts[16] = Made::Int(1), &["(rot_4d)", "True or False", "1"]),
+        (
+            |parts| {
+                let long = MadeTensor {
+                    class: "LongStorage",
+                    width: 8,
+                    bytes: vec![0; 48 * COUNT],
+                    ..tensor(1, &[COUNT, 1, 3], &[])
+                };
+                parts[2] = Made::Parameter(long);
+            },
+            &["(features_dc)", "int64"],
+        ),
+        (|parts| parts.truncate(15), &["tuple of 15", "19"]),
+    ];
+    for (change, expected) in cases {
+        let message = said(&change);
+        assert!(expected.iter().chain(&["chkpnt30000.pth"]).all(|part| message.contains(part)), "{message}");
+    }
+    let whole = fs::read(place.put(capture(true)).join("chkpnt30000.pth")).unwrap();
+    for length in (0..whole.len()).step_by(997) {
+        fs::write(place.path("model/chkpnt30000.pth"), &whole[..length]).unwrap();
+        let message = open_as(&place.path("model"), false).err().unwrap().to_string();
+        assert!(message.contains("chkpnt30000.pth"), "{message}");
+    }
+}

@@ -1,0 +1,219 @@
+//! Frames in PLY files: a folder with one for each, or a single one. Where they do not say which Gaussian is which, they
+//! are [linked](super::linked).
+//!
+//! What is written back has the properties, comments and names that the files had.
+
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+
+use super::archive::files::add_cloud;
+use super::family::{Entry, Family, Link, OpenOptions, Residence, Timing};
+use super::linked::Linked;
+use super::size::bytes_of;
+use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
+use crate::archive::Content;
+use crate::error::Result;
+use crate::files::names::shown_name;
+use crate::files::ply::write::{out_rows, write_like};
+use crate::files::ply_frames::PlyFrames;
+use crate::files::ply_sequence::PlySequence;
+use crate::limits::Limits;
+use crate::model::{Columns, Gaussians};
+use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::outputs::kind::OutputKind;
+use crate::passes::{HeldFrames, gather_all};
+use crate::progress::Progress;
+use crate::reduction::Reduction;
+use crate::source::{FrameSource, Ids};
+use crate::tracking::{Identity, identity};
+
+/// A folder with one PLY per frame.
+pub(super) const FOLDER: Entry = Entry {
+    expected: "a folder of PLY files",
+    recognises: |found| found.is_folder,
+    open: |path, options| {
+        let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
+        open_frames(by(path, &options.ply())?, path, options)
+    },
+};
+
+/// One PLY.
+pub(super) const FILE: Entry = Entry {
+    expected: "a .ply",
+    recognises: |found| found.is_file_of(b"ply", "ply"),
+    open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
+};
+
+/// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
+fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
+    options.refuse_for(path)?;
+    let order = match options.link {
+        _ if frames.paths().len() == 1 => Order::Believed,
+        link if link.is_asked() => Order::Lost("as asked".to_owned()),
+        Link::Auto => order(&frames)?,
+        _ => Order::Believed,
+    };
+    match order {
+        Order::Believed => Ok(Box::new(PlySequence::new(frames)?)),
+        Order::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
+        Order::Lost(why) => Ok(Box::new(Linked::open(frames, path, &why, options.link.joins(), &options.ply())?)),
+    }
+}
+
+/// Pairs of frames whose order is measured.
+const MEASURED: usize = 5;
+
+/// Whether the order of frames tells which Gaussian is which.
+enum Order {
+    /// Nobody looked.
+    Believed,
+    /// It does, as the note says.
+    Kept(String),
+    /// It does not, and why.
+    Lost(String),
+}
+
+/// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighbouring frames, of five that
+/// are evenly spread.
+fn order(frames: &PlyFrames) -> Result<Order> {
+    if let Some(other) = frames.other_count() {
+        let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
+        return Ok(Order::Lost(format!("{name} has {} Gaussians, the first {}", counts[other], counts[0])));
+    }
+    let pairs = frames.paths().len() - 1;
+    let mut found = Vec::new();
+    for k in 0..pairs.min(MEASURED) {
+        let first = k * pairs / pairs.min(MEASURED);
+        let state = |frame: usize| -> Result<Gaussians> {
+            let mut state = Gaussians::zeros(0, frames.sh_degree());
+            frames.frame(frame)?.gaussians(0..frames.counts()[frame] as usize, Columns::all(), &mut state)?;
+            Ok(state)
+        };
+        found.push(identity(&state(first)?, &state(first + 1)?));
+    }
+    let lost = found.iter().filter(|identity| !identity.holds).count();
+    let is_lost = 2 * lost > found.len();
+    let Some(Identity { moved, apart, unlike, strangers, .. }) = found.iter().find(|found| found.holds != is_lost)
+    else {
+        return Ok(Order::Believed);
+    };
+    let apart = format!("({moved:.1} sizes, {apart:.1})");
+    Ok(match is_lost {
+        true => Order::Lost(format!(
+            "those of the same place are as far apart as strangers {apart} or look as different ({unlike:.2}, {strangers:.2})"
+        )),
+        false => Order::Kept(format!(
+            "frames are in one order: those of the same place are nearer than strangers {apart} and look more alike \
+             ({unlike:.2}, {strangers:.2})"
+        )),
+    })
+}
+
+impl Family for PlySequence {
+    fn kind(&self) -> &'static str {
+        "PLY frames"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        self
+    }
+
+    fn digest(&self) -> Result<String> {
+        PlySequence::digest(self)
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.note().map(str::to_owned).into_iter().collect()
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_of(self.paths().iter().map(PathBuf::as_path))
+    }
+
+    fn stands_in_frames(&self) -> bool {
+        true
+    }
+
+    fn archives_frames(&self) -> bool {
+        self.paths().len() > 1
+    }
+
+    fn residence(&self) -> Residence {
+        Residence {
+            per_gaussian: 0,
+            opening: 0,
+            reader: 4,
+            reduced: 0,
+            jacobian: 0,
+            // Normals and the like stand beside the values.
+            file: state_bytes(self.info().sh_degree, Columns::all()) + 24,
+            fixed: 0,
+            frame_block: 0,
+            gaussian_block: GAUSSIAN_BLOCK as u64,
+            columns: 0,
+            seconds_per_state: 1e-7,
+            decoded: 0,
+        }
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Numbered
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        Ok(Box::new(PlySequence::with_times(*self, times)?))
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Archive => Ok(()),
+            _ => check_output(self.paths().len(), kind, path),
+        }
+    }
+
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        let mut content = Content { times: [0.0, 1.0], ..Content::default() };
+        content.cloud = gather_all(&*self.reduced(reduction)?, 0, Columns::all())?;
+        add_cloud(&mut content, &self.frame(0)?, reduction.kept.iter().copied())?;
+        Ok(content)
+    }
+
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        let (count, degree) = (content.cloud.len(), content.cloud.sh_degree());
+        let mut frames = HeldFrames::new(count, degree, Columns::empty(), content.cloud.clone());
+        self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));
+        Ok(Box::new(frames))
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        match kind {
+            OutputKind::Ply | OutputKind::PlySequence => write_files(self, reduction, kind, path).map(|()| Vec::new()),
+            _ => write_trajectories(self, reduction, kind, path, limits),
+        }
+    }
+}
+
+/// Writes every frame's file again with the properties, comments and names it had.
+fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, path: &Path) -> Result<()> {
+    let result = merged(sequence, reduction);
+    let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
+    let rows = out_rows(reduction);
+    let progress = Progress::new("emit", "frames", sequence.paths().len() as u64);
+    let write = |&frame: &usize| {
+        let mut proxies = Gaussians::zeros(0, sequence.info().sh_degree);
+        result.open(Ids::List(&places))?.read(frame, Columns::all(), &mut proxies)?;
+        let template = sequence.frame(frame)?;
+        let target = match (kind, template.path().file_name()) {
+            (OutputKind::PlySequence, Some(name)) => path.join(name),
+            _ => path.to_owned(),
+        };
+        let change = reduction.change_at(frame, sequence.paths().len());
+        write_like(&template, &rows, &proxies, &change, reduction.sh_degree, &target)?;
+        progress.advance(1);
+        Ok(())
+    };
+    // A batch at a time: a thread that waits for proxies would begin another frame.
+    let all: Vec<usize> = (0..sequence.paths().len()).collect();
+    all.chunks(rayon::current_num_threads()).try_for_each(|batch| batch.par_iter().try_for_each(write))
+}

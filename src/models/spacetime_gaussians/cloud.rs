@@ -1,0 +1,191 @@
+//! The PLY of a model: which property is which parameter.
+//!
+//! `x y z trbf_center trbf_scale nx ny nz motion_0..8 f_dc_0..(2|5) opacity scale_0..2 rot_0..3 omega_0..3 [f_t_0..2]`, in any
+//! order. The authors' loader counts properties by how their names begin, so none may be there that begins so beside these.
+//! Source: `save_ply`, `load_ply` of their code.
+
+use std::path::Path;
+
+use super::decoder::Act;
+use super::law::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
+use crate::error::{Error, Result};
+use crate::files::ply::write::{out_rows, put, value, write_rows_like};
+use crate::files::ply::{Encoding, Plane, Ply, PlyOptions, Property};
+use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
+use crate::reduction::Reduction;
+
+/// The property that no other kind of cloud has.
+pub(super) const MARK: &str = "trbf_center";
+
+/// An open PLY.
+#[derive(Debug)]
+pub(super) struct Cloud {
+    ply: Ply,
+    /// Properties of the planes of [`Raw::own`].
+    own: Vec<Property>,
+}
+
+impl Cloud {
+    /// Opens the PLY at `path`.
+    ///
+    /// # Errors
+    /// A PLY that is none of Gaussians; properties that are missing, or too many.
+    pub(super) fn open(path: &Path, options: &PlyOptions) -> Result<Cloud> {
+        let ply = Ply::open_with(path, options)?;
+        let beginning =
+            |prefix: &str| ply.properties().iter().filter(|property| property.name.starts_with(prefix)).count();
+        let features = beginning("f_dc");
+        let is_full = features > 3;
+        let counts: [(&str, &[usize]); 8] = [
+            ("f_dc", &[3, 6]),
+            ("f_t", if is_full { &[3] } else { &[0] }),
+            ("f_rest", &[0]),
+            ("motion", &[9]),
+            ("omega", &[4]),
+            ("rot", &[4]),
+            ("scale_", &[3]),
+            ("trbf_", &[2]),
+        ];
+        for (prefix, expected) in counts {
+            let found = beginning(prefix);
+            if !expected.contains(&found) {
+                let expected: Vec<String> = expected.iter().map(usize::to_string).collect();
+                let expected = format!("{} properties that begin with {prefix}", expected.join(" or "));
+                let hint = match is_full {
+                    true => "the full model of SpacetimeGaussians has f_dc_0..5 and f_t_0..2",
+                    false => "the lite model of SpacetimeGaussians has f_dc_0..2 and no f_t",
+                };
+                return Err(Error::input(path, "element vertex", expected, found.to_string()).hint(hint));
+            }
+        }
+        let own = names(is_full).into_iter().map(|name| {
+            let found = ply.properties().iter().find(|property| property.name == name).cloned();
+            found.ok_or_else(|| Error::input(path, "element vertex", format!("property {name}"), "none"))
+        });
+        Ok(Cloud { own: own.collect::<Result<_>>()?, ply })
+    }
+
+    /// Whether it is of the full model.
+    pub(super) fn is_full(&self) -> bool {
+        self.own.len() == FULL_WIDTH
+    }
+
+    /// The parameters of all Gaussians; `act` makes colours of the full model's first features.
+    ///
+    /// # Errors
+    /// A value that is no finite number; a file cut short since it was opened.
+    pub(super) fn raw(&self, act: Act) -> Result<Raw> {
+        let count = self.ply.count();
+        let mut raw = Raw { gaussians: self.ply.whole()?, own: Column::zeros(0, count) };
+        let mut own = Vec::with_capacity(self.own.len() * count);
+        for property in &self.own {
+            own.extend(self.ply.values(&property.name)?.unwrap_or_default());
+        }
+        raw.own = match own.is_empty() {
+            true => Column::zeros(self.own.len(), 0),
+            false => Column::from_planes(self.own.len(), own),
+        };
+        for column in Columns::all().iter() {
+            let names = self.ply.layout().planes(column).iter().map(|plane| match plane {
+                Plane::Property(property) => property.name.as_str(),
+                Plane::Thin => "scale_2",
+            });
+            names.enumerate().try_for_each(|(c, name)| self.check(name, raw.gaussians.column(column).plane(c)))?;
+        }
+        for (plane, property) in self.own.iter().enumerate() {
+            self.check(&property.name, raw.own.plane(plane))?;
+        }
+        paint(&mut raw, self.is_full().then_some(act));
+        Ok(raw)
+    }
+
+    /// What stands for red, green and blue of all Gaussians.
+    ///
+    /// # Errors
+    /// A file cut short since it was opened.
+    pub(super) fn colours(&self) -> Result<[Vec<f32>; 3]> {
+        let of = |name: &str| -> Result<Vec<f32>> { Ok(self.ply.values(name)?.unwrap_or_default()) };
+        Ok([of("f_dc_0")?, of("f_dc_1")?, of("f_dc_2")?])
+    }
+
+    /// Confirms that the values of a property are finite.
+    fn check(&self, name: &str, values: &[f32]) -> Result<()> {
+        match values.iter().position(|x| !x.is_finite()) {
+            Some(row) => {
+                let found = values[row].to_string();
+                Err(Error::input(self.ply.path(), format!("Gaussian {row}, {name}"), "a finite number", found)
+                    .hint("drop such Gaussians in training: one that is not drawn may still be in the file"))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Writes what `reduction` leaves, under the same header: rows as they are, but proxies in their places, and changes added.
+    ///
+    /// # Errors
+    /// A file cut short since it was opened; a failed write.
+    pub(super) fn write(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+        let (layout, rows) = (self.ply.layout(), out_rows(reduction));
+        let big_endian = self.ply.header().encoding == Encoding::BigEndian;
+        let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
+        let places = |column: Columns| layout.planes(column).iter().enumerate();
+        let columns: Vec<Columns> = Columns::all().iter().filter(|&of| of != Columns::SH || !self.is_full()).collect();
+        // A colour stands as it is, not as a harmonic.
+        let unit = |column: Columns| if column == Columns::SH { SH_C0 } else { 1.0 };
+        let zero = |column: Columns| if column == Columns::SH { 0.5 } else { 0.0 };
+        write_rows_like(
+            &self.ply,
+            &reduction.kept,
+            |name| Some(name.to_owned()),
+            path,
+            |place, bytes| {
+                for &column in &columns {
+                    for (c, plane) in places(column) {
+                        let Plane::Property(property) = plane else { continue };
+                        let change =
+                            Some(by.column(column)).filter(|by| !by.is_empty()).map_or(0.0, |by| by.plane(c)[place]);
+                        let proxy = rows[place].proxy.zip(proxies);
+                        if proxy.is_none() && change == 0.0 {
+                            continue;
+                        }
+                        let before = match proxy {
+                            Some((proxy, raw)) => {
+                                let stored = f64::from(raw.gaussians.column(column).plane(c)[proxy as usize]);
+                                zero(column) + unit(column) * stored
+                            }
+                            None => f64::from(value(bytes, property, big_endian)),
+                        };
+                        put(bytes, property, big_endian, before as f32 + (unit(column) * f64::from(change)) as f32);
+                    }
+                }
+                if let Some((proxy, raw)) = rows[place].proxy.zip(proxies) {
+                    for (plane, property) in self.own.iter().enumerate() {
+                        put(bytes, property, big_endian, raw.own.plane(plane)[proxy as usize]);
+                    }
+                }
+            },
+        )
+    }
+}
+
+/// Names of the planes of [`Raw::own`].
+fn names(is_full: bool) -> Vec<String> {
+    let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
+    let mut names: Vec<String> = vec![MARK.to_owned(), "trbf_scale".to_owned()];
+    names.extend(numbered("motion", OMEGA - MOTION).chain(numbered("omega", WIDTH - OMEGA)));
+    if is_full {
+        names.extend(numbered("f_dc", 6).chain(numbered("f_t", 3)));
+    }
+    names
+}
+
+/// Turns what stands for a colour into a harmonic: with `act`, that of the first features, else the colour itself, which
+/// stands where a harmonic would.
+fn paint(raw: &mut Raw, act: Option<Act>) {
+    for c in 0..3 {
+        let features = raw.own.width() > FEATURES;
+        let from: Vec<f32> = if features { raw.own.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
+        let colour = |x: f32| act.map_or(f64::from(x), |act| act.of(f64::from(x)));
+        raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = harmonic(colour(x)));
+    }
+}

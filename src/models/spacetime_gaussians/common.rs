@@ -1,0 +1,39 @@
+//! What a model folder and a `.splatv` have in common.
+
+use crate::error::{Error, Result};
+use crate::model::{Columns, Jacobian};
+use crate::models::family::Residence;
+use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
+use crate::outputs::container::GAUSSIAN_BLOCK;
+use crate::outputs::kind::OutputKind;
+
+/// What an open model of `width` planes of its own keeps in memory.
+pub(super) fn residence(width: usize) -> Residence {
+    let whole = state_bytes(0, Columns::all()) + 4 * width as u64;
+    Residence {
+        per_gaussian: whole,
+        opening: whole,
+        // The raw parameters again, and what is prepared of them.
+        reader: whole + 16 + 8,
+        reduced: 2 * whole,
+        jacobian: Jacobian::BYTES_PER_GAUSSIAN as u64,
+        file: whole + 24,
+        fixed: 0,
+        frame_block: 0,
+        gaussian_block: GAUSSIAN_BLOCK as u64,
+        columns: 0,
+        seconds_per_state: 4e-8,
+        decoded: 0,
+    }
+}
+
+/// Confirms that a result of several frames can be of `kind`, beside those that are made of a model's own parameters.
+pub(super) fn check_kind(kind: OutputKind, is_full: bool) -> Result<()> {
+    match kind {
+        OutputKind::Archive => Err(Error::usage(NO_ARCHIVE)),
+        OutputKind::Splatv if is_full => Err(Error::usage(
+            "a .splatv has colours, not features: it holds lite models of SpacetimeGaussians alone\n  write a model folder or a .gseq",
+        )),
+        _ => Ok(()),
+    }
+}

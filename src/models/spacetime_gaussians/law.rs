@@ -1,0 +1,172 @@
+//! How the state of a Gaussian follows from what a model stores of it: [`Motion`] and its window.
+//!
+//! [`Raw::gaussians`] has position, quaternion, log scales and opacity logit as they are stored, and the colour as harmonics of
+//! degree 0; [`Raw::own`] has the planes named here.
+
+use super::decoder::{self, Decoder};
+use super::motion::Motion;
+use crate::error::Result;
+use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
+use crate::models::law::window::{faded, odds, slope};
+use crate::models::law::{Law, Shading, copy_stored};
+
+/// Plane of the centre of the window.
+pub(super) const CENTRE: usize = 0;
+/// Plane of the natural log of its width.
+pub(super) const LOG_WIDTH: usize = 1;
+/// First of nine planes: coefficients of dt, dt², dt³, each of x, y, z.
+pub(super) const MOTION: usize = 2;
+/// First of four planes: change of the quaternion.
+pub(super) const OMEGA: usize = 11;
+/// Planes of [`Raw::own`] that every variant has.
+pub(super) const WIDTH: usize = 15;
+/// First of six planes of the full model: features that do not change, of which three are a colour before it is acted upon.
+pub(super) const FEATURES: usize = 15;
+/// First of three planes of the full model: features per unit of time.
+pub(super) const FEATURES_IN_TIME: usize = 21;
+/// Planes of [`Raw::own`] of the full model.
+pub(super) const FULL_WIDTH: usize = 24;
+
+impl Motion {
+    /// That of Gaussian `row`.
+    pub(super) fn of(raw: &Raw, row: usize) -> Motion {
+        let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
+        let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
+        Motion {
+            centre: own(CENTRE),
+            log_width: own(LOG_WIDTH),
+            path: [raw.gaussians.position.row::<3>(row).map(f64::from), path(0), path(1), path(2)],
+            rotation: raw.gaussians.rotation.row::<4>(row).map(f64::from),
+            omega: std::array::from_fn(|c| own(OMEGA + c)),
+        }
+    }
+
+    /// Makes it that of Gaussian `row`, rounded to f32.
+    pub(super) fn write(&self, raw: &mut Raw, row: usize) {
+        let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
+        own(CENTRE, self.centre);
+        own(LOG_WIDTH, self.log_width);
+        for (k, terms) in self.path[1..].iter().enumerate() {
+            terms.iter().enumerate().for_each(|(c, &term)| own(MOTION + 3 * k + c, term));
+        }
+        self.omega.iter().enumerate().for_each(|(c, &omega)| own(OMEGA + c, omega));
+        raw.gaussians.position.set_row(row, self.path[0].map(|x| x as f32));
+        raw.gaussians.rotation.set_row(row, self.rotation.map(|x| x as f32));
+    }
+}
+
+/// The law of both variants; colours of the full one are the cheap ones of [`Raw::gaussians`].
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Spacetime {
+    /// Whether colours are features that a network reads.
+    pub(super) is_full: bool,
+    /// That network, where it is known.
+    pub(super) decoder: Option<Decoder>,
+}
+
+/// What follows from a Gaussian once for all times.
+#[derive(Debug)]
+pub(super) struct Prepared {
+    /// 1 / width².
+    inverse_squared: Vec<f64>,
+    odds: Vec<f64>,
+}
+
+/// Logarithm of a window so long since its centre.
+#[inline(always)]
+fn exponent(dt: f64, inverse_squared: f64) -> f64 {
+    -dt * dt * inverse_squared
+}
+
+impl Law for Spacetime {
+    type Prepared = Prepared;
+
+    fn prepare(&self, raw: &Raw) -> Prepared {
+        Prepared {
+            inverse_squared: raw.own.plane(LOG_WIDTH).iter().map(|&log| (-2.0 * f64::from(log)).exp()).collect(),
+            odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect(),
+        }
+    }
+
+    fn varying(&self) -> Columns {
+        Columns::POSITION | Columns::ROTATION | Columns::OPACITY
+    }
+
+    /// A network reads the features of the full model: no colour leads to them.
+    fn movable(&self) -> Columns {
+        if self.is_full { Columns::all().difference(Columns::SH) } else { Columns::all() }
+    }
+
+    #[inline(always)]
+    fn state(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns, out: &mut Gaussians) -> Result<()> {
+        let (stored, own, centres) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
+        let since = |centre: &f32| time - f64::from(*centre);
+        if want.contains(Columns::POSITION) {
+            for c in 0..3 {
+                let [m1, m2, m3] = [0, 1, 2].map(|k| own.plane(MOTION + 3 * k + c));
+                let terms = stored.position.plane(c).iter().zip(m1).zip(m2).zip(m3);
+                let to = out.position.plane_mut(c).iter_mut().zip(terms).zip(centres);
+                to.for_each(|((to, (((&p0, &m1), &m2), &m3)), centre)| {
+                    let (dt, [p0, m1, m2, m3]) = (since(centre), [p0, m1, m2, m3].map(f64::from));
+                    *to = (p0 + dt * (m1 + dt * (m2 + dt * m3))) as f32;
+                });
+            }
+        }
+        if want.contains(Columns::ROTATION) {
+            for c in 0..4 {
+                let terms = stored.rotation.plane(c).iter().zip(own.plane(OMEGA + c));
+                let to = out.rotation.plane_mut(c).iter_mut().zip(terms).zip(centres);
+                to.for_each(|((to, (&start, &omega)), centre)| {
+                    *to = (f64::from(start) + since(centre) * f64::from(omega)) as f32;
+                });
+            }
+        }
+        if want.contains(Columns::OPACITY) {
+            let of = centres.iter().zip(&prepared.inverse_squared).zip(&prepared.odds);
+            out.opacity_logit.plane_mut(0).iter_mut().zip(of).for_each(|(to, ((centre, &inverse_squared), &odds))| {
+                *to = faded(odds, exponent(since(centre), inverse_squared)) as f32;
+            });
+        }
+        copy_stored(raw, want.difference(self.varying()), out);
+        Ok(())
+    }
+
+    fn jacobian(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns) -> Result<Jacobian> {
+        let mut found = Jacobian::default();
+        if want.contains(Columns::OPACITY) {
+            let centres = raw.own.plane(CENTRE);
+            let of = |row: usize| {
+                let dt = time - f64::from(centres[row]);
+                slope(prepared.odds[row], exponent(dt, prepared.inverse_squared[row])) as f32
+            };
+            *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(of).collect());
+        }
+        Ok(found)
+    }
+
+    fn shading(&self) -> Option<&dyn Shading> {
+        self.decoder.as_ref().map(|_| self as &dyn Shading)
+    }
+}
+
+impl Shading for Spacetime {
+    /// Six that do not change, and three that grow with the time since the centre.
+    fn features(&self, time: f64, raw: &Raw) -> Column {
+        let mut found = Column::zeros(decoder::FEATURES, raw.len());
+        let centres = raw.own.plane(CENTRE);
+        for plane in 0..FEATURES_IN_TIME - FEATURES {
+            found.plane_mut(plane).copy_from_slice(raw.own.plane(FEATURES + plane));
+        }
+        for c in 0..FULL_WIDTH - FEATURES_IN_TIME {
+            let by_time = raw.own.plane(FEATURES_IN_TIME + c);
+            for (row, to) in found.plane_mut(FEATURES_IN_TIME - FEATURES + c).iter_mut().enumerate() {
+                *to = ((time - f64::from(centres[row])) * f64::from(by_time[row])) as f32;
+            }
+        }
+        found
+    }
+
+    fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+        self.decoder.as_ref().map_or([0.0; 3], |decoder| decoder.colour(features, centre, ray))
+    }
+}

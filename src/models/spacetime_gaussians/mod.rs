@@ -1,0 +1,332 @@
+//! SpacetimeGaussians, lite and full, as a family: a folder as its training writes it, its PLY alone, or a `.splatv`.
+//!
+//! The result has the same layout with fewer Gaussians: rows of the PLY byte for byte, but for what merging and refining
+//! changed of them, in the family's own parameters; everything else is copied. Of the full model a renderer blends nine features
+//! and asks a network for the colour of each pixel; what is looked at here is the colour that the first three have by themselves.
+
+mod cloud;
+mod common;
+mod decoder;
+mod law;
+mod motion;
+mod proxies;
+mod splatv;
+
+use std::fs;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::family::{Entry, Family, OpenOptions, Residence, Timing};
+use super::files::copy;
+use super::iterations::iteration;
+use super::law::{Model, left, solve};
+use super::size::{Size, bytes_below, bytes_of};
+use super::trajectories::{NO_ARCHIVE, write_sequence};
+use crate::error::{Error, Result, quoted};
+use crate::files::cameras::Clock;
+use crate::files::digest::hash_file;
+use crate::files::open::open_file;
+use crate::files::python_literal::{Literal, parse_call};
+use crate::files::state_dict::read_state_dict;
+use crate::files::text::read_text;
+use crate::limits::Limits;
+use crate::model::{Raw, colour};
+use crate::outputs::kind::OutputKind;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::FrameSource;
+use cloud::{Cloud, MARK};
+use common::{check_kind, residence};
+use decoder::{Act, Decoder};
+use law::{FULL_WIDTH, Spacetime, WIDTH};
+pub(super) use splatv::SPLATV;
+
+const CLOUDS: &str = "point_cloud";
+const CLOUD: &str = "point_cloud.ply";
+const DECODER: &str = "point_cloud.pt";
+const CFG_ARGS: &str = "cfg_args";
+/// What is copied beside it, where it is there.
+const CAMERAS: &str = "cameras.json";
+
+/// A model's folder, or its PLY.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a SpacetimeGaussians model folder",
+    recognises: |found| match found.is_folder {
+        true => iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_marked(&folder.join(CLOUD))),
+        false => found.is_file_of(b"ply", "ply") && is_marked(found.path),
+    },
+    open: |path, options| Ok(Box::new(SpacetimeGaussians::open(path, options)?)),
+};
+
+/// Whether the header of the PLY at `path` has a property that only this family's has.
+pub(super) fn is_marked(path: &Path) -> bool {
+    // Enough for any header of this family; nothing of a model's values.
+    let mut head = Vec::new();
+    let read = open_file(path).is_ok_and(|file| file.take(1 << 14).read_to_end(&mut head).is_ok());
+    let header = head.windows(10).position(|bytes| bytes == b"end_header").map_or(&head[..], |end| &head[..end]);
+    read && header.windows(MARK.len()).any(|bytes| bytes == MARK.as_bytes())
+}
+
+/// The files of a model.
+#[derive(Debug, Clone)]
+struct Files {
+    cloud: PathBuf,
+    /// Of a folder: its root, and K of `iteration_K`.
+    folder: Option<(PathBuf, u32)>,
+    /// The network of the full model.
+    decoder: Option<PathBuf>,
+}
+
+impl Files {
+    fn of(path: &Path, options: &OpenOptions) -> Result<Files> {
+        if !path.is_dir() {
+            options.refuse_for(path)?;
+            return Ok(Files { cloud: path.to_owned(), folder: None, decoder: None });
+        }
+        let (number, folder) = iteration(&path.join(CLOUDS), options.iteration)?;
+        let decoder = Some(folder.join(DECODER)).filter(|path| path.exists());
+        Ok(Files { cloud: folder.join(CLOUD), folder: Some((path.to_owned(), number)), decoder })
+    }
+
+    /// A file of the folder's root, where there is one.
+    fn of_root(&self, name: &str) -> Option<PathBuf> {
+        self.folder.as_ref().map(|(root, _)| root.join(name)).filter(|path| path.is_file())
+    }
+
+    /// What a renderer opens beside the cloud.
+    fn rest(&self) -> Vec<PathBuf> {
+        self.decoder.clone().into_iter().chain(self.of_root(CFG_ARGS)).collect()
+    }
+}
+
+/// What of `cfg_args` matters here.
+#[derive(Debug, Clone, Default)]
+struct Configuration {
+    source_path: Option<String>,
+    rgb_function: Option<String>,
+    /// Frames from 0 to 1.
+    duration: Option<usize>,
+}
+
+impl Configuration {
+    fn read(path: &Path) -> Result<Configuration> {
+        let text = read_text(path, 1 << 20)?;
+        let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
+        let named = |name: &str| arguments.iter().rev().find(|argument| argument.name == name);
+        let text_of = |name: &str| match named(name).map(|argument| &argument.value) {
+            None | Some(Literal::None) => Ok(None),
+            Some(Literal::Str(text)) => Ok(Some(text.clone())),
+            Some(other) => Err(Error::input(path, format!("key {name}"), "a string", other.to_string())),
+        };
+        let duration = match named("duration").map(|argument| &argument.value) {
+            None | Some(Literal::None) => None,
+            Some(Literal::Int(frames)) if (1..=i64::from(u32::MAX)).contains(frames) => Some(*frames as usize),
+            Some(other) => {
+                return Err(Error::input(path, "key duration", "a number of frames, at least 1", other.to_string()));
+            }
+        };
+        Ok(Configuration { source_path: text_of("source_path")?, rgb_function: text_of("rgbfunction")?, duration })
+    }
+}
+
+/// An open model.
+#[derive(Debug)]
+struct SpacetimeGaussians {
+    files: Files,
+    cloud: Cloud,
+    model: Model<Spacetime>,
+    configuration: Configuration,
+    act: Act,
+    notes: Vec<String>,
+}
+
+impl SpacetimeGaussians {
+    fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
+        let files = Files::of(path, options)?;
+        let cloud = Cloud::open(&files.cloud, &options.ply())?;
+        let configuration =
+            files.of_root(CFG_ARGS).map(|path| Configuration::read(&path)).transpose()?.unwrap_or_default();
+        let mut notes = Vec::new();
+        let act = match configuration.rgb_function.as_deref() {
+            _ if !cloud.is_full() => Act::None,
+            None => {
+                notes.push(
+                    "nothing says what the model does to colours last (rgbfunction of cfg_args): sandwich".to_owned(),
+                );
+                Act::Sigmoid
+            }
+            Some(name) => Act::named(name).ok_or_else(|| {
+                let expected = "sandwich, sandwichnoact or sandwichnoactss, of a model with nine features";
+                Error::input(&path.join(CFG_ARGS), "key rgbfunction", expected, quoted(name).to_string())
+            })?,
+        };
+        let decoder = match (cloud.is_full(), &files.decoder) {
+            (true, Some(path)) => Some(Decoder::new(&read_state_dict(path, options.memory)?, act, path)?),
+            (true, None) if files.folder.is_some() => {
+                let path = files.cloud.with_file_name(DECODER);
+                return Err(Error::input(&path, "", "the network of a model with nine features", "no such file")
+                    .hint("training saves it beside point_cloud.ply; copy it too"));
+            }
+            _ => None,
+        };
+        if cloud.is_full() {
+            let cheap = "the colour that the first three of nine features have by themselves";
+            notes.push(match decoder {
+                Some(_) => format!(
+                    "what is scored, merged, refined and written as frames is by {cheap}; pictures of render, evaluate, report \
+                     and video, those that choose between merging and pruning, and what is compared with photographs are by all \
+                     nine and the network that reads them"
+                ),
+                None => format!("pictures are by {cheap}: the network that reads all of them is not beside the PLY"),
+            });
+        }
+        let raw = cloud.raw(act)?;
+        notes.extend(dark(&raw));
+        let model = Model::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
+        Ok(SpacetimeGaussians { files, cloud, model, configuration, act, notes })
+    }
+
+    /// Writes the model folder of what is left.
+    fn write_folder(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+        let number = self.files.folder.as_ref().map_or(0, |(_, number)| *number);
+        let folder = path.join(CLOUDS).join(format!("iteration_{number}"));
+        fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
+        self.cloud.write(reduction, &folder.join(CLOUD))?;
+        if let Some(decoder) = &self.files.decoder {
+            copy(decoder, &folder.join(DECODER))?;
+        }
+        let of_root = [CFG_ARGS, CAMERAS].into_iter().filter_map(|name| Some((self.files.of_root(name)?, name)));
+        of_root.into_iter().try_for_each(|(from, name)| copy(&from, &path.join(name)))
+    }
+}
+
+/// How many Gaussians have a colour that the authors' renderer adds and that others cut.
+fn dark(raw: &Raw) -> Option<String> {
+    let is_dark = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| colour(harmonic) < 0.0);
+    let count = (0..raw.len()).filter(|&row| is_dark(row)).count();
+    (count > 0).then(|| {
+        format!("{count} Gaussians have a colour below 0, which darkens in the authors' renderer and is 0 in others and here")
+    })
+}
+
+impl Family for SpacetimeGaussians {
+    fn kind(&self) -> &'static str {
+        if self.cloud.is_full() { "SpacetimeGaussians full model" } else { "SpacetimeGaussians lite model" }
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        &self.model
+    }
+
+    fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        hash_file(&self.files.cloud, &mut hash)?;
+        self.files.rest().iter().try_for_each(|path| hash_file(path, &mut hash))?;
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        Ok(self.size()?.whole())
+    }
+
+    fn size(&self) -> Result<Size> {
+        let rest = self.files.rest();
+        let (cloud, rest) = (bytes_of([&*self.files.cloud])?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+        Ok(Size { cloud, rest, ..Size::default() })
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind {
+            OutputKind::Model => Files::of(path, &OpenOptions::default()).and_then(|files| {
+                let rest = files.rest();
+                let (cloud, rest) = (bytes_of([&*files.cloud])?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+                Ok(Size { cloud, rest, ..Size::default() })
+            }),
+            OutputKind::Ply | OutputKind::Splatv => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            _ => Ok(Size::of_frames(bytes_below(path)?)),
+        }
+    }
+
+    fn residence(&self) -> Residence {
+        residence(if self.cloud.is_full() { FULL_WIDTH } else { WIDTH })
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Continuous
+    }
+
+    fn clock(&self) -> Clock {
+        Clock::Given
+    }
+
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        self.model = self.model.with_times(times)?;
+        Ok(self)
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.notes.clone()
+    }
+
+    fn data_folder(&self) -> Option<&str> {
+        self.configuration.source_path.as_deref()
+    }
+
+    fn data_frames(&self) -> Option<usize> {
+        self.configuration.duration
+    }
+
+    /// Whatever `white_background` of `cfg_args` says.
+    fn background(&self) -> Option<[f32; 3]> {
+        Some([0.0; 3])
+    }
+
+    fn own_output(&self) -> OutputKind {
+        if self.files.folder.is_some() { OutputKind::Model } else { OutputKind::Ply }
+    }
+
+    fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Model if self.files.folder.is_none() => {
+                Err(Error::usage("a PLY alone cannot be written as a model folder\n  give the folder, or write a .ply"))
+            }
+            _ => check_kind(kind, self.cloud.is_full()),
+        }
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        solve(&self.model, clusters, reference, rule, |clusters| {
+            proxies::propose(&self.model, clusters, rule, self.act)
+        })
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.reduced(reduction)))
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        match kind {
+            OutputKind::Model => self.write_folder(reduction, path)?,
+            OutputKind::Ply => self.cloud.write(reduction, path)?,
+            OutputKind::Splatv => {
+                let raw = left(self.model.raw(), reduction);
+                // Those that did not change, as they stand: there and back a last digit can be lost.
+                let (own, colours) = (&self.model.raw().gaussians.sh, self.cloud.colours()?);
+                let known = |i: usize| {
+                    let id = reduction.kept[i] as usize;
+                    let is_own = raw.gaussians.sh.row::<3>(i) == own.row::<3>(id);
+                    is_own.then(|| colours.each_ref().map(|plane| plane[id]))
+                };
+                splatv::write(&raw, known, self.files.of_root(CAMERAS).as_deref(), path)?;
+            }
+            OutputKind::Archive => return Err(Error::usage(NO_ARCHIVE)),
+            _ => return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
+        }
+        Ok(Vec::new())
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,221 @@
+//! `.splatv` as an input, and as a result of the lite model.
+//!
+//! The result of one keeps the words of what stays.
+
+use std::fs;
+use std::path::Path;
+
+use xxhash_rust::xxh3::Xxh3;
+
+use super::common::{check_kind, residence};
+use super::decoder::Act;
+use super::law::{CENTRE, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
+use super::proxies;
+use crate::error::{Error, Result};
+use crate::files::accuracy::Accuracy;
+use crate::files::cameras::Clock;
+use crate::files::digest::hash_file;
+use crate::files::json::read_json;
+use crate::files::splatv::write::{measure, seen_whole, words, write as write_file};
+use crate::files::splatv::{MAGIC, Row, Splatv};
+use crate::limits::{Limits, ReadLimit};
+use crate::model::{Column, Columns, Gaussians, Raw, colour, harmonic, logit, opacity};
+use crate::models::family::{Entry, Family, Residence, Timing};
+use crate::models::law::window::MOST;
+use crate::models::law::{Model, left, solve};
+use crate::models::size::{Size, bytes_below, bytes_of};
+use crate::models::trajectories::write_sequence;
+use crate::outputs::kind::OutputKind;
+use crate::recipe::Merge;
+use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::source::FrameSource;
+
+/// Maximum number of bytes of a list of cameras that a result gets: some seven thousand cameras.
+const MAX_LISTED: u64 = 4 << 20;
+/// Scales and widths are no less: their logs are finite.
+const LEAST_LENGTH: f64 = 1e-7;
+
+/// A `.splatv`.
+pub(in super::super) const SPLATV: Entry = Entry {
+    expected: "a .splatv",
+    recognises: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
+    open: |path, options| {
+        options.refuse_for(path)?;
+        Ok(Box::new(File::open(path, options.memory)?))
+    },
+};
+
+/// An open file.
+#[derive(Debug)]
+struct File {
+    file: Splatv,
+    model: Model<Spacetime>,
+}
+
+impl File {
+    fn open(path: &Path, memory: ReadLimit) -> Result<File> {
+        let file = Splatv::open(path)?;
+        let count = file.count();
+        let values = (Columns::all().width(0) + WIDTH) as u64;
+        memory.check(path, "its texture", "the Gaussians of the file", 4 * values * count as u64)?;
+        let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
+        for i in 0..count {
+            let row = Row::of_words(&file.words(i));
+            let numbers =
+                [&row.position[..], &row.motion, &row.rotation, &row.omega, &row.scale, &[row.centre, row.width]];
+            if let Some(x) = numbers.concat().iter().find(|x| !x.is_finite()) {
+                return Err(Error::input(path, format!("Gaussian {i}"), "finite numbers", x.to_string()));
+            }
+            set(&mut raw, i, &row);
+        }
+        Ok(File { file, model: Model::new(Spacetime { is_full: false, decoder: None }, raw, 0) })
+    }
+}
+
+/// Makes Gaussian `i` what `row` is.
+fn set(raw: &mut Raw, i: usize, row: &Row) {
+    let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
+    raw.gaussians.position.set_row(i, row.position);
+    raw.gaussians.rotation.set_row(i, row.rotation);
+    raw.gaussians.log_scale.set_row(i, row.scale.map(log));
+    raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
+    raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
+    let mut own = |plane: usize, value: f32| raw.own.plane_mut(plane)[i] = value;
+    own(CENTRE, row.centre);
+    own(LOG_WIDTH, log(row.width));
+    row.motion.into_iter().enumerate().for_each(|(k, x)| own(MOTION + k, x));
+    row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
+}
+
+/// What Gaussian `i` is as a row.
+fn row(raw: &Raw, i: usize) -> Row {
+    let own = |plane: usize| raw.own.plane(plane)[i];
+    Row {
+        position: raw.gaussians.position.row(i),
+        motion: std::array::from_fn(|k| own(MOTION + k)),
+        rotation: raw.gaussians.rotation.row(i),
+        omega: std::array::from_fn(|k| own(OMEGA + k)),
+        scale: raw.gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).exp() as f32),
+        rgb: raw.gaussians.sh.row::<3>(i).map(colour),
+        opacity: opacity(raw.gaussians.opacity_logit.row::<1>(i)[0]),
+        centre: own(CENTRE),
+        width: f64::from(own(LOG_WIDTH)).exp() as f32,
+    }
+}
+
+/// Writes `raw` to `path`, in the colours that `known` has of it, with the cameras that the file `cameras` lists as 3DGS does,
+/// else one that sees most of it.
+pub(super) fn write(
+    raw: &Raw,
+    known: impl Fn(usize) -> Option<[f32; 3]>,
+    cameras: Option<&Path>,
+    path: &Path,
+) -> Result<()> {
+    // Of many cameras none is better than another one.
+    let is_small = |path: &&Path| fs::metadata(path).is_ok_and(|found| found.len() <= MAX_LISTED);
+    let listed = cameras.filter(is_small).map(|path| read_json(path, MAX_LISTED)).transpose()?;
+    let listed = listed.filter(|cameras| !cameras[0]["rotation"].is_null());
+    let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
+    let row_of = |i: usize| {
+        let row = row(raw, i);
+        Row { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
+    };
+    let mut accuracy = Accuracy::new(&raw.gaussians.position);
+    (0..raw.len()).for_each(|i| measure(&row_of(i), i, &mut accuracy));
+    accuracy.check("a .splatv")?;
+    write_file(path, raw.len(), (0..raw.len()).map(|i| words(&row_of(i))), &cameras)
+}
+
+impl Family for File {
+    fn kind(&self) -> &'static str {
+        "splaTV model"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        &self.model
+    }
+
+    fn digest(&self) -> Result<String> {
+        let mut hash = Xxh3::new();
+        hash_file(self.file.path(), &mut hash)?;
+        Ok(format!("{:032x}", hash.digest128()))
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        bytes_of([self.file.path()])
+    }
+
+    fn size(&self) -> Result<Size> {
+        Ok(Size { cloud: self.bytes()?, ..Size::default() })
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind {
+            OutputKind::Splatv => Ok(Size { cloud: bytes_of([path])?, ..Size::default() }),
+            _ => Ok(Size::of_frames(bytes_below(path)?)),
+        }
+    }
+
+    fn residence(&self) -> Residence {
+        residence(WIDTH)
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Continuous
+    }
+
+    fn clock(&self) -> Clock {
+        Clock::Given
+    }
+
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        self.model = self.model.with_times(times)?;
+        Ok(self)
+    }
+
+    fn background(&self) -> Option<[f32; 3]> {
+        Some([0.0; 3])
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::Splatv
+    }
+
+    fn check_output(&self, kind: OutputKind, _: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Model | OutputKind::Ply => Err(Error::usage(
+                "a .splatv has halves of what a trained model has\n  write a .splatv, a .gseq or --as ply-sequence",
+            )),
+            _ => check_kind(kind, false),
+        }
+    }
+
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+        solve(&self.model, clusters, reference, rule, |clusters| {
+            proxies::propose(&self.model, clusters, rule, Act::None)
+        })
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        Ok(Box::new(self.model.reduced(reduction)))
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        if kind != OutputKind::Splatv {
+            return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held);
+        }
+        self.file.check()?;
+        let raw = left(self.model.raw(), reduction);
+        let unchanged = self.model.raw().pick(&reduction.kept);
+        let words_of = |i: usize| {
+            let (now, before) = (row(&raw, i), row(&unchanged, i));
+            if now == before { self.file.words(reduction.kept[i] as usize) } else { words(&now) }
+        };
+        let mut accuracy = Accuracy::new(&raw.gaussians.position);
+        let changed = |&i: &usize| row(&raw, i) != row(&unchanged, i);
+        (0..raw.len()).filter(changed).for_each(|i| measure(&row(&raw, i), i, &mut accuracy));
+        accuracy.check("a .splatv")?;
+        write_file(path, raw.len(), (0..raw.len()).map(words_of), self.file.cameras())?;
+        Ok(Vec::new())
+    }
+}

@@ -1,0 +1,198 @@
+//! Model folders of 3D Gaussian Splatting: a cloud that nothing deforms.
+//!
+//! In: `<root>/point_cloud/iteration_K/point_cloud.ply`, of the largest K unless one is named. Out: a folder of the same layout
+//! with fewer rows, `cfg_args` and `cameras.json`.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::family::{Entry, Family, OpenOptions, Residence, Timing};
+use super::files::copy;
+use super::four_d_gaussians::cfg_args;
+use super::iterations::iteration;
+use super::size::{Size, bytes_below, bytes_of};
+use crate::archive::Content;
+use crate::error::{Error, Result};
+use crate::files::ply_sequence::PlySequence;
+use crate::limits::Limits;
+use crate::outputs::kind::OutputKind;
+use crate::reduction::Reduction;
+use crate::source::FrameSource;
+
+const CLOUDS: &str = "point_cloud";
+const CLOUD: &str = "point_cloud.ply";
+
+/// A model folder with a cloud, and nothing that deforms it.
+pub(super) const ENTRY: Entry = Entry {
+    expected: "a 3D Gaussian Splatting model folder",
+    recognises: |found| {
+        let is_whole = |folder: &Path| folder.join(CLOUD).is_file() && !folder.join("deformation.pth").exists();
+        let whole = iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_whole(&folder));
+        found.is_folder && whole && !deforms(found.path)
+    },
+    open: |path, options| Ok(Box::new(Static::open(path, options)?)),
+};
+
+/// Whether a model's folder says that its cloud is deformed, even where the file that does it is missing.
+fn deforms(root: &Path) -> bool {
+    let arguments = cfg_args::read(&root.join("cfg_args")).unwrap_or_default();
+    root.join("deform").exists() || ["kplanes_config", "defor_depth"].iter().any(|name| arguments.contains(name))
+}
+
+/// Files of the root that a result has too.
+const BESIDE: [&str; 2] = ["cfg_args", "cameras.json"];
+
+/// A model folder.
+struct Static {
+    root: PathBuf,
+    iteration: u32,
+    cloud: PlySequence,
+}
+
+impl Static {
+    fn open(root: &Path, options: &OpenOptions) -> Result<Static> {
+        let (iteration, folder) = iteration(&root.join(CLOUDS), options.iteration)?;
+        Ok(Static {
+            root: root.to_owned(),
+            iteration,
+            cloud: PlySequence::single(&folder.join(CLOUD), &options.ply())?,
+        })
+    }
+
+    fn beside(&self) -> impl Iterator<Item = PathBuf> {
+        BESIDE.iter().map(|name| self.root.join(name)).filter(|path| path.is_file())
+    }
+
+    fn cloud_in(&self, root: &Path) -> PathBuf {
+        root.join(CLOUDS).join(format!("iteration_{}", self.iteration)).join(CLOUD)
+    }
+}
+
+impl Family for Static {
+    fn kind(&self) -> &'static str {
+        "3D Gaussian Splatting model"
+    }
+
+    fn source(&self) -> &dyn FrameSource {
+        &self.cloud
+    }
+
+    fn digest(&self) -> Result<String> {
+        self.cloud.digest()
+    }
+
+    fn bytes(&self) -> Result<u64> {
+        Ok(self.size()?.whole())
+    }
+
+    fn size(&self) -> Result<Size> {
+        let rest = self.beside().collect::<Vec<_>>();
+        let (cloud, rest) = (Family::bytes(&self.cloud)?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+        Ok(Size { cloud, rest, ..Size::default() })
+    }
+
+    fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
+        match kind {
+            OutputKind::Model => {
+                let cloud = bytes_of([&*self.cloud_in(path)])?;
+                Ok(Size { cloud, rest: bytes_below(path)?.saturating_sub(cloud), ..Size::default() })
+            }
+            _ => self.cloud.size_written(kind, path),
+        }
+    }
+
+    fn residence(&self) -> Residence {
+        self.cloud.residence()
+    }
+
+    fn timing(&self) -> Timing {
+        Timing::Numbered
+    }
+
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+        Ok(Box::new(Static { cloud: self.cloud.with_times(times)?, ..*self }))
+    }
+
+    fn own_output(&self) -> OutputKind {
+        OutputKind::Model
+    }
+
+    fn check_output(&self, kind: OutputKind, path: &Path) -> Result<()> {
+        match kind {
+            OutputKind::Model => Ok(()),
+            _ => self.cloud.check_output(kind, path),
+        }
+    }
+
+    fn needs_all_bands(&self) -> Option<&'static str> {
+        self.root.join("cfg_args").exists().then_some("cfg_args says how many there are")
+    }
+
+    fn content(&self, reduction: &Reduction) -> Result<Content> {
+        self.cloud.content(reduction)
+    }
+
+    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        self.cloud.showing(content)
+    }
+
+    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+        self.cloud.reduced(reduction)
+    }
+
+    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+        if kind != OutputKind::Model {
+            return self.cloud.write(reduction, kind, path, limits);
+        }
+        let to = self.cloud_in(path);
+        let folder = to.parent().unwrap_or(path);
+        fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+        for file in self.beside() {
+            copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
+        }
+        self.cloud.write(reduction, OutputKind::Ply, &to, limits)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::files::ply::write::write_inria;
+    use crate::model::{Columns, Gaussians};
+    use crate::models;
+    use crate::passes::gather_all;
+    use crate::recipe::Recipe;
+
+    #[test]
+    fn a_folder_without_a_field_is_a_static_model_and_is_written_as_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("model");
+        for k in [7000, 30_000] {
+            let cloud = root.join(format!("point_cloud/iteration_{k}"));
+            fs::create_dir_all(&cloud).unwrap();
+            let mut made = Gaussians::zeros(4, 3);
+            made.position.planes_mut().iter_mut().enumerate().for_each(|(i, x)| *x = i as f32 + k as f32);
+            write_inria(&made, &[], &cloud.join("point_cloud.ply")).unwrap();
+        }
+        fs::write(root.join("cfg_args"), "Namespace(sh_degree=3)").unwrap();
+        let open = |path: &Path, iteration| models::open(path, &OpenOptions { iteration, ..OpenOptions::default() });
+        let model = open(&root, None).unwrap();
+        assert_eq!((model.kind(), model.own_output()), ("3D Gaussian Splatting model", OutputKind::Model));
+        let result = folder.path().join("result");
+        fs::create_dir(&result).unwrap();
+        let reduction = Reduction::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
+        model.write(&reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
+        let [all, left] =
+            [&root, &result].map(|path| gather_all(open(path, None).unwrap().source(), 0, Columns::all()).unwrap());
+        assert_eq!(left, all.pick(&[1, 3]));
+        assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(root.join("cfg_args")).unwrap());
+        assert!(result.join("point_cloud/iteration_30000/point_cloud.ply").is_file());
+        assert_eq!(model.size_written(OutputKind::Model, &result).unwrap().whole(), bytes_below(&result).unwrap());
+        let first = gather_all(open(&root, Some(7000)).unwrap().source(), 0, Columns::POSITION).unwrap();
+        assert_eq!(first.position.row::<1>(0), [7000.0]);
+        assert!(open(&root, Some(8)).err().unwrap().to_string().contains("iteration_7000, iteration_30000"));
+        // A field that is missing is no static model.
+        fs::write(root.join("cfg_args"), "Namespace(sh_degree=3, defor_depth=1)").unwrap();
+        assert!(open(&root, None).err().unwrap().to_string().contains("deformation.pth"));
+    }
+}

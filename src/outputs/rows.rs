@@ -1,0 +1,277 @@
+//! The rows of statistics, scores and decisions as tables for people and notebooks.
+//!
+//! In: [`RowTable`]. Out: `.npz` (one array per column) or `.csv` (one line per Gaussian) with the same
+//! columns and the same values to the bit. Memory: none that grows with N. Bytes depend on the rows alone:
+//! entries of the archive are stored uncompressed, dated 1980-01-01.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use npyz::WriterBuilder;
+use npyz::npz::NpzWriter;
+use zip::write::FileOptions;
+use zip::{CompressionMethod, DateTime};
+
+use crate::error::{Error, Result};
+use crate::files::zip_output::ZipOutput;
+use crate::model::{self, Rows, Statistic};
+
+/// Everything known of N Gaussians after selection; every slice has N entries.
+#[derive(Debug, Clone, Copy)]
+pub struct RowTable<'a> {
+    /// Statistics, each a column ([`Statistic::column`]); last of all columns W, where there is one.
+    pub rows: &'a Rows,
+    /// S_static.
+    pub static_score: &'a [f64],
+    /// S_dynamic.
+    pub dynamic_score: &'a [f64],
+    /// S.
+    pub score: &'a [f64],
+    /// Whether the Gaussian survives stage 2.
+    pub keep: &'a [bool],
+}
+
+/// One column of the table.
+#[derive(Clone, Copy)]
+enum Values<'a> {
+    F64(&'a [f64]),
+    U32(&'a [u32]),
+    Bool(&'a [bool]),
+}
+
+impl Values<'_> {
+    fn len(&self) -> usize {
+        match self {
+            Values::F64(values) => values.len(),
+            Values::U32(values) => values.len(),
+            Values::Bool(values) => values.len(),
+        }
+    }
+
+    fn text(&self, id: usize) -> String {
+        match self {
+            Values::F64(values) => format!("{:?}", values[id]),
+            Values::U32(values) => values[id].to_string(),
+            Values::Bool(values) => values[id].to_string(),
+        }
+    }
+}
+
+impl RowTable<'_> {
+    /// Writes an archive that `numpy.load` opens: arrays `[N]` of float64, `life` uint32, `keep` bool.
+    ///
+    /// # Errors
+    /// Slices of different lengths; a failed write.
+    pub fn write_npz(&self, path: &Path) -> Result<()> {
+        self.check_lengths()?;
+        let file = BufWriter::new(File::create(path).map_err(Error::io("create", path))?);
+        self.npz_into(file).map_err(Error::io("write", path))
+    }
+
+    /// Writes a table with a header line: `id`, then the columns; floats as the shortest text that reads
+    /// back as the same f64 (`NaN`, `inf` where there are any), `keep` as `true` or `false`.
+    ///
+    /// # Errors
+    /// Slices of different lengths; a failed write.
+    pub fn write_csv(&self, path: &Path) -> Result<()> {
+        self.check_lengths()?;
+        let file = File::create(path).map_err(Error::io("create", path))?;
+        self.csv_into(file).map_err(Error::io("write", path))
+    }
+
+    /// The columns in order, as both formats name them.
+    fn columns(&self) -> Vec<(&'static str, Values<'_>)> {
+        let column = |of: Statistic| match of.values() {
+            model::Values::F64(values, _) => (of.column(), Values::F64(values(self.rows))),
+            model::Values::U32(values, _) => (of.column(), Values::U32(values(self.rows))),
+        };
+        let mut columns: Vec<_> = Statistic::ALL.into_iter().filter(|&of| of != Statistic::W).map(column).collect();
+        columns.extend([
+            ("static_score", Values::F64(self.static_score)),
+            ("dynamic_score", Values::F64(self.dynamic_score)),
+            ("score", Values::F64(self.score)),
+            ("keep", Values::Bool(self.keep)),
+        ]);
+        columns.extend((!self.rows.w.is_empty()).then(|| column(Statistic::W)));
+        columns
+    }
+
+    fn check_lengths(&self) -> Result<()> {
+        match self.columns().into_iter().find(|(_, values)| values.len() != self.rows.len()) {
+            None => Ok(()),
+            Some((name, values)) => {
+                let (len, rows) = (values.len(), self.rows.len());
+                Err(Error::usage(format!("column {name} has {len} values for {rows} Gaussians")))
+            }
+        }
+    }
+
+    fn npz_into(&self, out: impl Write + io::Seek) -> io::Result<()> {
+        let mut archive = NpzWriter::new(ZipOutput::new(out));
+        // 8 bytes a value and a header: beyond 4 GiB an entry needs the 64-bit form.
+        let large = self.rows.len() as u64 * 8 + 4096 > u64::from(u32::MAX);
+        let options = FileOptions::default()
+            .compression_method(CompressionMethod::Stored)
+            .last_modified_time(DateTime::default())
+            .large_file(large);
+        for (name, values) in self.columns() {
+            match values {
+                Values::F64(values) => add(&mut archive, name, options, values)?,
+                Values::U32(values) => add(&mut archive, name, options, values)?,
+                Values::Bool(values) => add(&mut archive, name, options, values)?,
+            }
+        }
+        archive.zip_writer().finish()?.close()
+    }
+
+    fn csv_into(&self, out: impl Write) -> io::Result<()> {
+        let columns = self.columns();
+        let mut out = csv::Writer::from_writer(out);
+        out.write_record(std::iter::once("id").chain(columns.iter().map(|(name, _)| *name)))?;
+        for id in 0..self.rows.len() {
+            out.write_field(id.to_string())?;
+            for (_, values) in &columns {
+                out.write_field(values.text(id))?;
+            }
+            out.write_record(None::<&[u8]>)?;
+        }
+        out.flush()
+    }
+}
+
+fn add<T, W>(archive: &mut NpzWriter<W>, name: &str, options: FileOptions, values: &[T]) -> io::Result<()>
+where
+    T: npyz::AutoSerialize + Copy,
+    W: Write + io::Seek,
+{
+    let array = archive.array::<T>(name, options)?;
+    let mut array = array.default_dtype().shape(&[values.len() as u64]).begin_nd()?;
+    array.extend(values.iter().copied())?;
+    array.finish()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::Flags;
+
+    const N: usize = 3;
+
+    fn rows() -> Rows {
+        let ramp = |by: f64| (0..N).map(|i| (i as f64 + 0.1) * by).collect::<Vec<_>>();
+        Rows {
+            d: vec![0.1, f64::NAN, 1e-300],
+            kappa: ramp(2.0),
+            v: ramp(1.0 / 3.0),
+            life: vec![0, 7, u32::MAX],
+            c: ramp(4.0),
+            w: ramp(0.2),
+            e: vec![1.0, 1e12, f64::INFINITY],
+            vis: ramp(0.3),
+            flags: vec![Flags::empty(); N],
+        }
+    }
+
+    fn with_table<R>(test: impl FnOnce(RowTable<'_>) -> R) -> R {
+        let (rows, scores, keep) = (rows(), [-0.0, 0.1 + 0.2, 5e-324], [true, false, true]);
+        test(RowTable { rows: &rows, static_score: &scores, dynamic_score: &scores, score: &scores, keep: &keep })
+    }
+
+    #[test]
+    fn npz_reads_back_bit_for_bit_and_twice_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
+        with_table(|table| {
+            table.write_npz(&a).unwrap();
+            table.write_npz(&b).unwrap();
+            assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(&b).unwrap());
+            let mut archive = npyz::npz::NpzArchive::open(&a).unwrap();
+            assert_eq!(archive.array_names().count(), table.columns().len());
+            let stamp = archive.zip_archive().by_name("D.npy").unwrap().last_modified();
+            assert_eq!((stamp.year(), stamp.month(), stamp.day()), (1980, 1, 1));
+            for (name, values) in table.columns() {
+                let array = archive.by_name(name).unwrap().unwrap();
+                assert_eq!(array.shape(), [N as u64], "{name}");
+                match values {
+                    Values::F64(values) => {
+                        let bits = |values: &[f64]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+                        assert_eq!(bits(&array.into_vec().unwrap()), bits(values), "{name}");
+                    }
+                    Values::U32(values) => assert_eq!(array.into_vec::<u32>().unwrap(), values, "{name}"),
+                    Values::Bool(values) => assert_eq!(array.into_vec::<bool>().unwrap(), values, "{name}"),
+                }
+            }
+        });
+    }
+
+    #[test]
+    fn csv_floats_read_back_bit_for_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rows.csv");
+        with_table(|table| {
+            table.write_csv(&path).unwrap();
+            let text = std::fs::read_to_string(&path).unwrap();
+            let mut lines = text.lines();
+            let header = lines.next().unwrap();
+            assert_eq!(header, "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W");
+            for (id, line) in lines.enumerate() {
+                let cells: Vec<&str> = line.split(',').collect();
+                assert_eq!(cells[0], id.to_string());
+                for (cell, (_, column)) in cells[1..].iter().zip(table.columns()) {
+                    match column {
+                        Values::F64(values) => {
+                            let read: f64 = cell.parse().unwrap();
+                            assert_eq!(read.to_bits(), values[id].to_bits(), "{cell} for {}", values[id]);
+                        }
+                        Values::U32(values) => assert_eq!(cell.parse::<u32>().unwrap(), values[id]),
+                        Values::Bool(values) => assert_eq!(cell.parse::<bool>().unwrap(), values[id]),
+                    }
+                }
+            }
+            assert_eq!(text.lines().count(), N + 1);
+        });
+    }
+
+    #[test]
+    fn csv_is_these_bytes() {
+        let mut text = Vec::new();
+        with_table(|table| table.csv_into(&mut text).unwrap());
+        let expected = "id,D,kappa,V,life,C,E,vis,static_score,dynamic_score,score,keep,W\n\
+            0,0.1,0.2,0.03333333333333333,0,0.4,1.0,0.03,-0.0,-0.0,-0.0,true,0.020000000000000004\n\
+            1,NaN,2.2,0.3666666666666667,7,4.4,1000000000000.0,0.33,\
+            0.30000000000000004,0.30000000000000004,0.30000000000000004,false,0.22000000000000003\n\
+            2,1e-300,4.2,0.7,4294967295,8.4,inf,0.63,5e-324,5e-324,5e-324,true,0.42000000000000004\n";
+        assert_eq!(String::from_utf8(text).unwrap(), expected);
+    }
+
+    #[test]
+    fn a_column_of_another_length_is_named() {
+        let rows = Rows { w: Vec::new(), ..rows() };
+        let table = RowTable {
+            rows: &rows,
+            static_score: &[0.0; N],
+            dynamic_score: &[0.0; 2],
+            score: &[0.0; N],
+            keep: &[true; N],
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rows.csv");
+        let message = table.write_csv(&path).unwrap_err().to_string();
+        assert!(message.contains("dynamic_score has 2 values for 3"), "{message}");
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn no_gaussians_give_empty_tables() {
+        let rows = Rows::default();
+        let table = RowTable { rows: &rows, static_score: &[], dynamic_score: &[], score: &[], keep: &[] };
+        let folder = tempfile::tempdir().unwrap();
+        let (npz, csv) = (folder.path().join("a.npz"), folder.path().join("a.csv"));
+        table.write_npz(&npz).unwrap();
+        table.write_csv(&csv).unwrap();
+        assert_eq!(std::fs::read_to_string(csv).unwrap().lines().count(), 1);
+        let mut archive = npyz::npz::NpzArchive::open(npz).unwrap();
+        assert!(archive.by_name("score").unwrap().unwrap().into_vec::<f64>().unwrap().is_empty());
+    }
+}

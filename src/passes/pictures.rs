@@ -1,0 +1,376 @@
+//! Making pictures of sources: the one way from a list of pictures to the states that each of them shows.
+//!
+//! Frame-major, for occlusion needs all Gaussians of a frame at once: frames are read by blocks on all threads, then
+//! the pictures of a batch of frames are handed on together, to be shared out among the threads.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::Frames;
+use super::frames::open_all;
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::model::{Camera, Column, Columns, Gaussians, Picture};
+use crate::render::{Image, blend_features, render};
+use crate::source::{BlockReader, Decoder, FrameSource, Ids, Wanted};
+
+/// Pictures of a batch for each thread: enough that the last ones to finish cost little.
+pub const PICTURES_PER_THREAD: usize = 4;
+
+/// What pictures show.
+pub struct Subject<'a> {
+    /// Where the states come from.
+    pub source: &'a dyn FrameSource,
+    /// Gaussians that readers are kept open for over all frames; none: all, read as the source likes best
+    /// ([`FrameSource::open_all`]).
+    pub ids: Option<Ids<'a>>,
+    /// Columns that are looked at; the others are empty.
+    pub columns: Columns,
+}
+
+impl<'a> Subject<'a> {
+    /// All there is to see of `source`.
+    pub fn all(source: &'a dyn FrameSource) -> Subject<'a> {
+        Subject { source, ids: None, columns: Columns::all() }
+    }
+
+    /// What decodes its features, where all Gaussians are looked at and have some.
+    fn decoder(&self) -> Option<&'a dyn Decoder> {
+        self.source.decoder().filter(|_| self.ids.is_none())
+    }
+
+    fn open(&self, wanted: &Wanted) -> Result<Box<dyn BlockReader + 'a>> {
+        Ok(match &self.ids {
+            Some(ids) => Box::new(Frames::open(self.source, ids.clone(), self.columns, wanted)?),
+            None => open_all(self.source, self.columns, wanted)?,
+        })
+    }
+}
+
+/// How much is handed on together.
+#[derive(Debug, Clone, Copy)]
+pub struct Batch {
+    /// Most frames, each with a state of every subject.
+    pub frames: usize,
+    /// Most pictures.
+    pub pictures: usize,
+    /// Most frames that a reader keeps of those decoded together.
+    pub held: usize,
+}
+
+impl Batch {
+    /// For looking at many pictures of little memory each: pictures of several frames keep all threads busy.
+    fn to_look(limits: &Limits) -> Batch {
+        let pictures = PICTURES_PER_THREAD * rayon::current_num_threads();
+        Batch { frames: limits.frames_together, pictures, held: limits.frames_held }
+    }
+
+    /// For pictures that are kept while their batch lasts: one frame, a picture for each thread.
+    pub fn of_frame(limits: &Limits) -> Batch {
+        let pictures = rayon::current_num_threads().min(limits.pictures_together);
+        Batch { frames: 1, pictures, held: limits.frames_held }
+    }
+
+    /// How many of `pictures` make up a batch.
+    fn first(&self, pictures: &[Picture]) -> usize {
+        let (mut frames, mut last) = (0, None);
+        let fits = |picture: &&Picture| {
+            frames += usize::from(last != Some(picture.frame));
+            last = Some(picture.frame);
+            frames <= self.frames.max(1)
+        };
+        pictures.iter().take(self.pictures.max(1)).take_while(fits).count()
+    }
+}
+
+/// A picture to make, with the states of `S` subjects at its frame.
+#[derive(Clone, Copy)]
+pub struct View<'a, const S: usize> {
+    /// Which picture.
+    pub picture: Picture,
+    /// What takes it.
+    pub camera: &'a Camera,
+    /// What it shows.
+    pub states: [&'a Gaussians; S],
+    /// Of subjects with features in the place of colours, what decodes them, and the features.
+    decoded: [Option<(&'a dyn Decoder, &'a Column)>; S],
+}
+
+impl<const S: usize> View<'_, S> {
+    /// The picture of the subject numbered `subject` before `background`, on all threads of the pool, as its own renderer
+    /// makes it: of one with features these are blended and decoded, and there is no background.
+    pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
+        self.render_as(subject, self.states[subject], self.features(subject), background)
+    }
+
+    /// The features of the subject numbered `subject`, where its pictures are made of some.
+    pub fn features(&self, subject: usize) -> Option<&Column> {
+        self.decoded[subject].map(|(_, features)| features)
+    }
+
+    /// [`View::render`] of that subject in another `state`, of as many Gaussians as `features`.
+    pub fn render_as(
+        &self,
+        subject: usize,
+        state: &Gaussians,
+        features: Option<&Column>,
+        background: [f32; 3],
+    ) -> Image {
+        let camera = self.camera;
+        let Some(((decoder, _), features)) = self.decoded[subject].zip(features) else {
+            return render(state, camera, background);
+        };
+        let mut image = Image { width: camera.width, height: camera.height, data: Vec::new() };
+        let values = blend_features(state, features, camera);
+        let (centre, to_world) = (camera.center().to_array().map(|x| x as f32), camera.rotation.transpose());
+        let colour = |(pixel, values): (usize, &[f32])| {
+            let [x, y] = [pixel % camera.width as usize, pixel / camera.width as usize].map(|at| at as f64 + 0.5);
+            let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
+            decoder.colour(values, centre, (to_world * ray).to_array().map(|x| x as f32))
+        };
+        let colours = values.par_chunks_exact(features.width().max(1)).enumerate().map(colour);
+        image.data = colours.collect::<Vec<[f32; 3]>>().into_flattened();
+        image
+    }
+}
+
+/// States of all subjects at a frame, to be read into again.
+struct Slot<const S: usize> {
+    frame: usize,
+    states: [Gaussians; S],
+    /// Features of subjects that have some.
+    features: [Column; S],
+}
+
+/// Hands `pictures` (by frame; cameras by their index in `cameras`) to `visit`, in order, in batches; every state is
+/// read once, and what does not vary once for each frame of a batch.
+///
+/// Memory: of each subject its reader, the frames that it keeps, and a state for every frame of a batch.
+///
+/// # Errors
+/// Frames that cannot be read; those of `visit`.
+pub fn show<const S: usize>(
+    subjects: [Subject<'_>; S],
+    cameras: &[Camera],
+    pictures: &[Picture],
+    most: Batch,
+    mut visit: impl FnMut(&[View<'_, S>]) -> Result<()>,
+) -> Result<()> {
+    let wanted = Wanted::of(pictures.iter().map(|picture| picture.frame)).holding(most.held);
+    let mut readers = Vec::with_capacity(S);
+    for subject in &subjects {
+        readers.push(subject.open(&wanted)?);
+    }
+    let mut slots: Vec<Slot<S>> = Vec::new();
+    let mut rest = pictures;
+    while !rest.is_empty() {
+        let (batch, later) = rest.split_at(most.first(rest));
+        rest = later;
+        // A frame of more pictures than a batch has: its state is there.
+        if let Some(again) = slots.iter().position(|slot| slot.frame == batch[0].frame) {
+            slots.swap(0, again);
+        }
+        for (place, of_frame) in batch.chunk_by(|a, b| a.frame == b.frame).enumerate() {
+            let frame = of_frame[0].frame;
+            let is_new = place == slots.len();
+            if is_new {
+                let states = std::array::from_fn(|k| Gaussians::zeros(0, subjects[k].source.info().sh_degree));
+                slots.push(Slot { frame, states, features: std::array::from_fn(|_| Column::default()) });
+            } else if slots[place].frame == frame {
+                continue;
+            }
+            let slot = &mut slots[place];
+            for ((subject, reader), state) in subjects.iter().zip(&mut readers).zip(&mut slot.states) {
+                let varying = subject.source.info().varying;
+                let want = if is_new { subject.columns } else { subject.columns & varying };
+                reader.read(frame, want, state)?;
+            }
+            for (subject, features) in subjects.iter().zip(&mut slot.features) {
+                if let Some(decoder) = subject.decoder() {
+                    decoder.features(frame, features)?;
+                }
+            }
+            slot.frame = frame;
+        }
+        let of_frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
+        let views: Vec<View<'_, S>> = of_frames
+            .flat_map(|(of_frame, Slot { states, features, .. })| {
+                let decoded = std::array::from_fn(|k| Some((subjects[k].decoder()?, &features[k])));
+                of_frame.iter().map(move |&picture| View {
+                    picture,
+                    camera: &cameras[picture.camera as usize],
+                    states: states.each_ref(),
+                    decoded,
+                })
+            })
+            .collect();
+        visit(&views)?;
+    }
+    Ok(())
+}
+
+/// Workers that have seen some pictures and may see more.
+///
+/// Memory per Gaussian: its reader; the columns looked at for each frame of a batch (of 4 × threads pictures at most,
+/// no more frames than [`Limits::frames_together`]); what a worker holds, one per thread but no more than
+/// [`Limits::pictures_together`].
+pub(crate) struct Workers<W> {
+    limits: Limits,
+    /// Those without a picture.
+    free: Mutex<Vec<W>>,
+}
+
+impl<W: Send> Workers<W> {
+    /// Nothing seen yet.
+    pub(crate) fn new(limits: Limits) -> Self {
+        Workers { limits, free: Mutex::default() }
+    }
+
+    /// Shows all of `pictures`, each to any one of the workers.
+    pub(crate) fn show(
+        &mut self,
+        subject: Subject<'_>,
+        cameras: &[Camera],
+        pictures: &[Picture],
+        new_worker: impl Fn() -> W + Sync,
+        see: impl Fn(&mut W, &Gaussians, &Camera) + Sync,
+    ) -> Result<()> {
+        let workers = rayon::current_num_threads().min(self.limits.pictures_together);
+        show([subject], cameras, pictures, Batch::to_look(&self.limits), |views| {
+            let next = AtomicUsize::new(0);
+            (0..workers.min(views.len())).into_par_iter().with_max_len(1).for_each(|_| {
+                let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
+                let mut worker = free.unwrap_or_else(&new_worker);
+                while let Some(&View { camera, states: [state], .. }) = views.get(next.fetch_add(1, Ordering::Relaxed))
+                {
+                    see(&mut worker, state, camera);
+                }
+                self.free.lock().unwrap_or_else(PoisonError::into_inner).push(worker);
+            });
+            Ok(())
+        })
+    }
+
+    /// The workers, in no order: fold them by what does not depend on it.
+    pub(crate) fn into_inner(self) -> Vec<W> {
+        self.free.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+    use crate::passes::gather_all;
+
+    /// `views` pictures of every frame of `frames`.
+    fn pictures(frames: &[usize], views: u32) -> Vec<Picture> {
+        let of_frame = |&frame: &usize| (0..views).map(move |view| Picture { frame, view, camera: view });
+        frames.iter().flat_map(of_frame).collect()
+    }
+
+    #[test]
+    fn every_picture_comes_once_in_order_with_the_states_of_its_frame_in_batches_of_any_size() {
+        let scene = Scene::new(1500, 9);
+        let rig = scene.rig();
+        let all = pictures(&[0, 2, 3, 7, 8], 3);
+        let expected: Vec<Gaussians> = (0..9).map(|frame| gather_all(&scene, frame, Columns::all()).unwrap()).collect();
+        for (frames, most) in [(1, 1), (1, 2), (1, 9), (2, 4), (3, 7), (9, 99), (0, 0)] {
+            let mut seen = Vec::new();
+            let batch = Batch { frames, pictures: most, held: 4 };
+            let position = Subject { source: &scene, ids: None, columns: Columns::POSITION };
+            show([Subject::all(&scene), position], &rig.cameras, &all, batch, |views| {
+                assert!(views.len() <= most.max(1), "{} pictures of at most {most}", views.len());
+                let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
+                assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
+                for View { picture, camera, states: [state, places], .. } in views {
+                    assert!(**state == expected[picture.frame], "frame {}", picture.frame);
+                    assert!(places.position == state.position && places.sh.is_empty());
+                    assert!(std::ptr::eq(*camera, &rig.cameras[picture.camera as usize]));
+                    seen.push(*picture);
+                }
+                Ok(())
+            })
+            .unwrap();
+            assert_eq!(seen, all, "{frames} frames, {most} pictures");
+        }
+    }
+
+    /// A scene whose Gaussians have features, and whose colours are the rays that pixels are seen along.
+    struct Rays(Scene);
+
+    impl FrameSource for Rays {
+        fn info(&self) -> &crate::model::SequenceInfo {
+            self.0.info()
+        }
+
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            self.0.open(ids)
+        }
+
+        fn decoder(&self) -> Option<&dyn Decoder> {
+            Some(self)
+        }
+    }
+
+    impl Decoder for Rays {
+        fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
+            *out = Column::zeros(2, self.info().count);
+            out.plane_mut(1).fill(frame as f32);
+            Ok(())
+        }
+
+        fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+            assert!(features[0].abs() < 1e-6 && features[1] >= 0.0, "{features:?}");
+            std::array::from_fn(|c| centre[c] + ray[c])
+        }
+    }
+
+    #[test]
+    fn features_are_decoded_along_the_ray_of_each_pixel_and_only_where_all_gaussians_are_looked_at() {
+        let scene = Rays(Scene::new(200, 3));
+        let rig = scene.0.rig();
+        let some: Vec<u32> = (0..200).collect();
+        let batch = Batch { frames: 2, pictures: 4, held: 4 };
+        let few = Subject { source: &scene, ids: Some(Ids::List(&some)), columns: Columns::all() };
+        show([Subject::all(&scene), few], &rig.cameras, &pictures(&[0, 2], 2), batch, |views| {
+            for view in views {
+                let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
+                assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
+                for (at, colour) in image.data.as_chunks::<3>().0.iter().enumerate() {
+                    let seen = DVec3::from(colour.map(f64::from));
+                    assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
+                    // Where the camera sees that point is the middle of the pixel.
+                    let point = camera.rotation * seen + camera.translation;
+                    let found = [camera.fx * point.x / point.z + camera.cx, camera.fy * point.y / point.z + camera.cy];
+                    let pixel = [at % camera.width as usize, at / camera.width as usize];
+                    assert!((0..2).all(|c| (found[c] - pixel[c] as f64 - 0.5).abs() < 0.02), "{found:?} {pixel:?}");
+                }
+                assert_eq!(view.render(1, [1.0; 3]), render(view.states[1], camera, [1.0; 3]));
+            }
+            Ok(())
+        })
+        .unwrap();
+    }
+
+    #[test]
+    fn a_state_is_read_once_however_many_batches_its_pictures_make_up() {
+        let scene = Scene::new(300, 6);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scene.gseq");
+        let none = Default::default();
+        crate::outputs::container::write_container(&scene, &path, gseq::Compression::Zstd(1), none, |_| ()).unwrap();
+        let container = crate::files::container::Container::open(&path).unwrap();
+        let rig = scene.rig();
+        let reads = |views: u32| {
+            let before = container.reads();
+            let batch = Batch { frames: 1, pictures: 2, held: usize::MAX };
+            show([Subject::all(&container)], &rig.cameras, &pictures(&[1, 4], views), batch, |_| Ok(())).unwrap();
+            container.reads() - before
+        };
+        assert_eq!(reads(5), reads(1));
+    }
+}

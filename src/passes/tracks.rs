@@ -1,0 +1,79 @@
+//! Every Gaussian along all frames, a block of them at a time on every thread.
+
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use crate::error::Result;
+use crate::fit::Track;
+use crate::model::{Columns, Gaussians};
+use crate::progress::Progress;
+use crate::source::{FrameSource, Ids};
+
+/// Gaussians that a thread holds along all frames.
+pub const TRACKED: usize = 64;
+
+/// What `make` makes of every Gaussian's track, in order; its frames are at `times`, of whatever clock.
+///
+/// Memory: what is made, and for every thread a reader and all states of [`TRACKED`] Gaussians.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub fn tracks<R: Send>(
+    source: &dyn FrameSource,
+    times: &[f64],
+    progress: &Progress,
+    make: impl Fn(&Track) -> R + Sync,
+) -> Result<Vec<R>> {
+    let info = source.info();
+    let of_block = |ids: Range<usize>| -> Result<Vec<R>> {
+        let mut reader = source.open(Ids::Range(ids.clone()))?;
+        let mut states: Vec<Gaussians> = Vec::with_capacity(info.times.len());
+        let mut want = Columns::all();
+        for frame in 0..info.times.len() {
+            // What does not vary is what it was.
+            let mut state = states.last().cloned().unwrap_or_else(|| Gaussians::zeros(0, info.sh_degree));
+            reader.read(frame, want, &mut state)?;
+            want = info.varying;
+            states.push(state);
+        }
+        progress.advance((ids.len() * states.len()) as u64);
+        Ok((0..ids.len()).map(|row| make(&Track::of(times, &states, row))).collect())
+    };
+    let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKED))
+        .into_par_iter()
+        .map(|block| of_block(block * TRACKED..info.count.min((block + 1) * TRACKED)))
+        .collect::<Result<_>>()?;
+    Ok(blocks.into_iter().flatten().collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+    use crate::model::opacity;
+    use crate::passes::gather_all;
+
+    #[test]
+    fn tracks_are_what_frames_say_whatever_the_number_of_threads() {
+        let scene = Scene::new(3 * TRACKED + 5, 7);
+        let progress = Progress::new("track", "states", 0);
+        let all = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| tracks(&scene, &scene.info().times, &progress, Clone::clone)).unwrap()
+        };
+        let (one, three) = (all(1), all(3));
+        assert_eq!(one.len(), scene.info().count);
+        for frame in 0..7 {
+            let state = gather_all(&scene, frame, Columns::all()).unwrap();
+            for (row, (a, b)) in one.iter().zip(&three).enumerate() {
+                assert_eq!(a.position[frame], state.position.row::<3>(row).map(f64::from));
+                assert_eq!(a.opacity[frame], opacity(state.opacity_logit.row::<1>(row)[0]));
+                assert_eq!(a.sh(frame)[2], state.sh.plane(2)[row]);
+                assert_eq!((&a.rotation, &a.position), (&b.rotation, &b.position));
+                let length: f64 = a.rotation[frame].iter().map(|x| x * x).sum();
+                assert!((length - 1.0).abs() < 1e-12);
+            }
+        }
+    }
+}

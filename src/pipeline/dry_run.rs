@@ -1,0 +1,169 @@
+//! A dry run: what a run would do, take and write, found by opening the input and by a calibration alone.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::request::{Goal, Quality, Request};
+use super::summary::CameraSummary;
+use crate::TOOL;
+use crate::budget::{Budget, Plan, Tell, Workload};
+use crate::error::{Error, Result, ShowPath};
+use crate::journal::Journal;
+use crate::journal::records::Forecast;
+use crate::journal::records::LeftOut;
+use crate::outputs::kind::OutputKind;
+use crate::pipeline::plan::Job;
+use crate::pipeline::stages::emit::beside_names;
+use crate::pipeline::stages::measure::{Outlook, Stages};
+use crate::pipeline::throughput::measured;
+use crate::scene::{InputOptions, open_scene};
+
+/// What a run would do.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Foreseen {
+    /// Program and version.
+    pub tool: String,
+    /// Always true: this is no summary of a run.
+    pub dry_run: bool,
+    /// The input's path as given.
+    pub path: String,
+    /// "4DGaussians model", "PLY sequence", ...
+    pub kind: String,
+    /// Gaussians of the input.
+    pub gaussians_in: usize,
+    /// Its frames.
+    pub frames: usize,
+    /// Degree of its spherical harmonics.
+    pub sh_degree: usize,
+    /// Bytes of the input.
+    pub bytes: u64,
+    /// From where it would be looked at.
+    pub cameras: CameraSummary,
+    /// Gaussians in the output, where they are known before; else pictures decide.
+    pub gaussians: Option<usize>,
+    /// What decides how many.
+    pub size_by: String,
+    /// Where the result would lie.
+    pub output: String,
+    /// Its kind.
+    pub output_kind: OutputKind,
+    /// What would lie there: the result, and the files in or beside it.
+    pub would_write: Vec<String>,
+    /// What it would take.
+    pub forecast: Forecast,
+    /// What would not be done, and why.
+    pub left_out: Vec<LeftOut>,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// What a run would do, without doing it: the input is opened, and some pictures of it are made to measure by.
+///
+/// # Errors
+/// Those that a run would end with before its first stage. A stream, of which nothing is known before it has passed.
+pub fn foresee(request: &Request) -> Result<Foreseen> {
+    if request.input.is_stream() {
+        return Err(Error::usage(
+            "--dry-run: what a stream would take shows only once it has passed\n  give a file or folder; --explain says \
+             how many frames there is memory for",
+        ));
+    }
+    let input = InputOptions { work: None, ..request.input.clone() };
+    let mut scene = open_scene(&input)?;
+    let outlook = Outlook::of(&scene);
+    let job = Job::within(request, outlook, &scene.workload())?;
+    job.emit.check(&[&request.input.path])?;
+    job.emit.kind.check_frames(scene.source().info().times.len(), &request.output)?;
+    scene.input.check_output(job.emit.kind, &request.output)?;
+    let needs = |work: &Workload, limits: &_| job.needs(work, limits);
+    let plan = Plan::fit(scene.workload(), Budget { tell: Tell::Nothing, ..input.memory }, needs)?;
+    scene.follow(&plan);
+    let forecast = measured(&mut scene, &plan, &job, 0)?;
+    let mut journal = Journal::default();
+    job.write_down(request, &scene.workload(), &scene.limits, &mut journal);
+    let info = scene.source().info();
+    let gaussians = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
+    let output = request.output.to_string_lossy().into_owned();
+    Ok(Foreseen {
+        tool: TOOL.to_owned(),
+        dry_run: true,
+        path: scene.path.to_string_lossy().into_owned(),
+        kind: scene.input.kind().to_owned(),
+        gaussians_in: info.count,
+        frames: info.times.len(),
+        sh_degree: info.sh_degree,
+        bytes: scene.input.bytes()?,
+        cameras: CameraSummary::of(&scene),
+        gaussians,
+        size_by: size_by(request),
+        would_write: std::iter::once(output.clone()).chain(beside_names(&request.output, job.emit.kind)).collect(),
+        output,
+        output_kind: job.emit.kind,
+        forecast,
+        left_out: journal.left_out,
+        notes: scene.notes,
+    })
+}
+
+/// What decides how many Gaussians stay.
+fn size_by(request: &Request) -> String {
+    match (&request.goal, &request.target) {
+        (Some(Goal::Quality(Quality::Psnr(least))), _) => format!("the fewest with pictures of {least} dB"),
+        (Some(Goal::Quality(_)), _) => "the fewest that lose no more against the photographs".to_owned(),
+        (Some(Goal::Bytes(most)), _) => format!("the best in {most} bytes"),
+        (None, Some(_)) => "as asked for".to_owned(),
+        (None, None) => "what the recipe keeps, which pictures decide".to_owned(),
+    }
+}
+
+impl Foreseen {
+    /// As JSON, for programs.
+    pub fn json(&self) -> String {
+        let mut text = serde_json::to_string_pretty(self).expect("plain data");
+        text.push('\n');
+        text
+    }
+
+    /// For a person.
+    pub fn text(&self) -> String {
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            out,
+            "{}: {}, {} Gaussians x {} frames, SH degree {}",
+            Path::new(&self.path).shown(),
+            self.kind,
+            self.gaussians_in,
+            self.frames,
+            self.sh_degree
+        );
+        let CameraSummary { origin, cameras, pairs } = &self.cameras;
+        let _ = writeln!(out, "cameras: {origin} ({cameras} cameras, {pairs} pictures)");
+        let _ = match self.gaussians {
+            Some(count) => {
+                let percent = 100.0 * count as f64 / self.gaussians_in.max(1) as f64;
+                writeln!(out, "would keep {count} of {} Gaussians ({percent:.1}%), {}", self.gaussians_in, self.size_by)
+            }
+            None => writeln!(out, "would keep {}", self.size_by),
+        };
+        let of: f64 = self.forecast.stages.iter().map(|stage| stage.core_seconds).sum();
+        for stage in &self.forecast.stages {
+            let part = 100.0 * stage.core_seconds / of.max(1e-9);
+            let _ = writeln!(out, "  {:<8} {part:>3.0}% of the time", stage.name);
+        }
+        for left in &self.left_out {
+            let _ = writeln!(out, "  left out: {} ({})", left.what, left.reason());
+        }
+        for note in &self.notes {
+            let _ = writeln!(out, "  note: {note}");
+        }
+        out += &self.forecast.text(Tell::Time);
+        let would_write: Vec<String> =
+            self.would_write.iter().map(|path| Path::new(path).shown().to_string()).collect();
+        let _ = writeln!(out, "would write {}", would_write.join(", "));
+        out.push_str("nothing was written (--dry-run)\n");
+        out
+    }
+}

@@ -1,0 +1,306 @@
+//! Opening a scene that is to be measured; a stream is measured as it arrives, so that it is read once.
+//!
+//! Memory of a stream: what packing it takes ([`crate::models::stream`]) and, when measuring, the accumulators of all
+//! Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each) and what [`RunningContribution`] needs.
+//!
+//! What only the end of the stream tells (time span, number of frames) is assumed meanwhile: even frames, and
+//! pictures taken at exactly the times that arrive. Where that proves wrong the packed frames are
+//! measured instead: the result is the same either way.
+
+use std::cell::OnceCell;
+use std::io::Stdin;
+
+use glam::DVec3;
+
+use crate::budget::{Budget, Plan, Tell, Workload, size};
+use crate::error::Result;
+use crate::files::cameras;
+use crate::files::frame_stream::FrameStream;
+use crate::journal::{Clock, Journal};
+use crate::model::RobustBox;
+use crate::model::{Camera, Picture, Rig, Schedule, Split};
+use crate::models::stream::{AHEAD, Streamed, frame_block};
+use crate::models::trajectories::OWN_OUTPUT;
+use crate::passes::{HeldFrames, Sampler};
+use crate::pipeline::stages::measure::{Measure, Measured, Outlook, Stages};
+use crate::pipeline::throughput::measured;
+use crate::pruning::contribution::RunningContribution;
+use crate::recipe;
+use crate::scene::{
+    InputOptions, Opened, Room, Scene, is_linked, link_stream, load_cameras, open_scene, open_stream, receiving,
+    scene_of,
+};
+use crate::source::{FrameSource, Reads};
+use crate::statistics::ScanPlan;
+use crate::statistics::pass::RunningScan;
+
+/// Opens a scene to be measured, with the limits of its budget; `plan` says what is to be done with such a scene. A
+/// stream is measured as it arrives, see [`receive_measured`]; the statistics come back then.
+///
+/// # Errors
+/// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
+pub fn open_to_measure<S: Stages>(
+    options: &InputOptions,
+    plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
+    journal: &mut Journal,
+) -> Result<(Scene, S, Option<Measured>)> {
+    let start = Clock::start();
+    let mut scene = if options.is_stream() {
+        let normalised = cameras::Clock::Normalised;
+        let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalised, None)?;
+        let stream = open_stream(options)?;
+        if !is_linked(stream.header(), options) {
+            let found = receive_measured(stream, rig, options, plan, journal)?;
+            journal.opened("receive", start, found.0.source().info().count, Reads::default());
+            return Ok(found);
+        }
+        scene_of(link_stream(stream, options, rig)?, options)?
+    } else {
+        open_scene(options)?
+    };
+    let stages = plan(Outlook::of(&scene), &scene.workload())?;
+    let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
+    scene.follow(&plan);
+    // What measuring beforehand reads is no part of the plan.
+    let reads = scene.source().reads();
+    foretell(&mut scene, &plan, &stages, 0, options, journal)?;
+    journal.opened("read", start, scene.source().info().count, reads);
+    Ok((scene, stages, None))
+}
+
+/// How many of the first stages are done by what was measured on arrival.
+pub(super) fn measured_already(arrived: &Option<Measured>) -> usize {
+    usize::from(arrived.is_some()) + arrived.iter().filter(|measured| measured.seen.is_some()).count()
+}
+
+/// Says what is to come, if anybody asked.
+fn foretell(
+    scene: &mut Scene,
+    plan: &Plan,
+    stages: &impl Stages,
+    done: usize,
+    options: &InputOptions,
+    journal: &mut Journal,
+) -> Result<()> {
+    let tell = options.memory.tell;
+    // Of a part nobody knows how much of the run it is.
+    let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
+    if tell != Tell::Nothing && !is_part {
+        let forecast = measured(scene, plan, stages, done)?;
+        crate::progress::tell(forecast.text(tell).trim_end());
+        journal.forecast = Some(forecast);
+    }
+    Ok(())
+}
+
+/// Packs a stream that `loaded` looks at into a scratch container and measures it meanwhile, if there is memory for that
+/// beside the frames held. Gives the statistics if what was assumed held.
+fn receive_measured<S: Stages>(
+    stream: FrameStream<Stdin>,
+    loaded: Option<Rig>,
+    options: &InputOptions,
+    plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
+    journal: &mut Journal,
+) -> Result<(Scene, S, Option<Measured>)> {
+    let has_cameras = loaded.is_some();
+    let count = stream.header().count;
+    let of_rig = loaded.clone().unwrap_or_else(|| cameras::virtual_rig(DVec3::ZERO, 1.0));
+    let block = frame_block(stream.header());
+    let header = *stream.header();
+    let counting = |frames| Workload::of_stream(&header, block, &of_rig, frames);
+    let work = counting(0);
+    let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
+    let Measure { scan, visible, .. } = stages.measure();
+    let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
+    let held = (block + AHEAD) as u64;
+    let fit = |tell: Tell, measuring: Option<bool>| {
+        Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
+            let mut all = vec![receiving(work, limits, held, measuring, 0)];
+            all.extend(stages.needs(work, limits));
+            all
+        })
+    };
+    let measures = fit(Tell::Nothing, Some(visible.is_some())).is_ok();
+    let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
+    if options.memory.tell == Tell::Time {
+        crate::progress::tell(&format!(
+            "memory: at most {}; nobody knows how many frames will arrive",
+            size(memory.peak())
+        ));
+    }
+    let receive = |budget: u64, measuring: Option<bool>, frames: u64| {
+        let limits = memory.limits;
+        Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
+    };
+    let mut room = Room::new(options.memory, |budget, frames| {
+        let later = Plan::closest(counting(frames), budget, |work, limits| stages.needs(work, limits));
+        later.peak().max(receive(budget, None, frames))
+    });
+    let to_measure = Room::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
+    if options.memory.tell == Tell::Plan {
+        crate::progress::tell(&format!(
+            "frames: there is memory for {}, for {to_measure} to be measured as they arrive",
+            room.most
+        ));
+    }
+    // Without cameras the rig stands around the first frame, and everything else around the rig.
+    let (rig, plan_of_scan) = (OnceCell::new(), OnceCell::new());
+    if let Some(loaded) = loaded {
+        let _ = rig.set(loaded);
+    }
+    let mut measuring: Option<Measuring<'_>> = None;
+    let streamed = Streamed::receive(stream, &options.scratch_folder(), |held| {
+        room.admit(held.len())?;
+        if room.arrived() > to_measure {
+            measuring = None;
+            return Ok(());
+        }
+        let measuring = match &mut measuring {
+            Some(measuring) => measuring,
+            none if measures => {
+                let rig: &Rig = rig.get_or_init(|| rig_around(held));
+                let plan = plan_of_scan.get_or_init(|| ScanPlan::arriving(&scan.recipe, &rig.cameras));
+                let seen = visible.map(|_| RunningContribution::new(count, scan.recipe.pixel_stride, memory.limits));
+                none.insert(Measuring::new(count, rig, options.split, plan, &scan.recipe, seen))
+            }
+            _ => return Ok(()),
+        };
+        measuring.add(held)
+    })?;
+    let rig_given = has_cameras.then(|| rig.get().cloned()).flatten();
+    let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
+    let mut scene = scene_of(opened, options)?;
+    // Now that the frames are counted.
+    let counted = Budget { tell: Tell::Nothing, ..options.memory };
+    let later = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits))?;
+    scene.follow(&later);
+    if measures && measuring.is_none() && room.arrived() > 0 {
+        let note = format!(
+            "statistics were taken from the packed frames, not as they arrived: there is memory for {to_measure} that way"
+        );
+        scene.notes.push(note);
+    }
+    let mut arrived = None;
+    if let Some(measuring) = measuring {
+        let complete = ScanPlan::new(&scan.recipe, &scene.source().info().times, &scene.schedule)?;
+        let found = match measuring.wrong(&complete, &scene) {
+            None => {
+                let found = measuring.finish(&complete);
+                // Frames were looked at with them before they turned out not to be finite.
+                match stages.measure().score.absent(&found.scanned.rows).is_empty() {
+                    true => Ok(found),
+                    false => Err("Gaussians with NaN or infinity are dropped from all frames"),
+                }
+            }
+            Some(why) => Err(why),
+        };
+        match found {
+            Ok(found) => arrived = Some(found),
+            Err(why) => {
+                let note = format!("statistics were taken from the packed frames, not as they arrived: {why}");
+                scene.notes.push(note);
+            }
+        }
+    }
+    let done = measured_already(&arrived);
+    foretell(&mut scene, &later, &stages, done, options, journal)?;
+    Ok((scene, stages, arrived))
+}
+
+/// A virtual rig around the first of the frames.
+fn rig_around(held: &HeldFrames) -> Rig {
+    let bounds = RobustBox::from_positions(held.position(0));
+    cameras::virtual_rig(bounds.middle, bounds.extent())
+}
+
+/// Statistics of the frames so far.
+struct Measuring<'a> {
+    plan: &'a ScanPlan,
+    cameras: &'a [Camera],
+    assumed: AssumedTimes<'a>,
+    /// Which cameras see the frames so far, as assumed.
+    schedule: Schedule,
+    scan: RunningScan<'a>,
+    seen: Option<(Sampler, RunningContribution)>,
+}
+
+impl<'a> Measuring<'a> {
+    fn new(
+        count: usize,
+        rig: &'a Rig,
+        split: Option<Split>,
+        plan: &'a ScanPlan,
+        scan: &recipe::Scan,
+        seen: Option<RunningContribution>,
+    ) -> Self {
+        Measuring {
+            plan,
+            cameras: &rig.cameras,
+            assumed: AssumedTimes::new(rig, split),
+            schedule: Schedule::new(rig.cameras.clone()),
+            scan: RunningScan::new(count, plan),
+            seen: seen.map(|seen| (Sampler::new(scan), seen)),
+        }
+    }
+
+    fn add(&mut self, held: &HeldFrames) -> Result<()> {
+        let new: Vec<Vec<(u32, u32)>> = held.info().times.iter().map(|&time| self.assumed.at(time)).collect();
+        new.iter().for_each(|views| self.schedule.push(1, views));
+        let cameras: Vec<Vec<&Camera>> =
+            new.iter().map(|views| views.iter().map(|&(_, camera)| &self.cameras[camera as usize]).collect()).collect();
+        self.scan.add(held, &cameras)?;
+        if let Some((sampler, seen)) = &mut self.seen {
+            let new = new.iter().enumerate();
+            let pictures: Vec<Picture> = new.flat_map(|(frame, views)| sampler.next(frame, views)).collect();
+            seen.add(held, self.cameras, &pictures, || ())?;
+        }
+        Ok(())
+    }
+
+    /// What was assumed wrongly, if anything was.
+    fn wrong(&self, complete: &ScanPlan, scene: &Scene) -> Option<&'static str> {
+        if !complete.finishes(self.plan) {
+            return Some("the frames are not evenly spaced in time");
+        }
+        (self.schedule != scene.schedule).then_some("the cameras' times are not exactly those of the frames")
+    }
+
+    fn finish(self, complete: &ScanPlan) -> Measured {
+        Measured { scanned: self.scan.finish(complete), seen: self.seen.map(|(_, seen)| seen.finish()) }
+    }
+}
+
+/// Which cameras see a frame, while the other frames are unknown: those whose pictures were taken at its very
+/// time, and those without a time.
+struct AssumedTimes<'a> {
+    rig: &'a Rig,
+    /// Places in the rig of the pictures of the split, by time, then place.
+    timed: Vec<(f64, usize)>,
+    timeless: Vec<usize>,
+    tolerance: f64,
+}
+
+impl<'a> AssumedTimes<'a> {
+    fn new(rig: &'a Rig, split: Option<Split>) -> Self {
+        let (mut timed, mut timeless) = (Vec::new(), Vec::new());
+        for (place, shot) in rig.shots.iter().enumerate() {
+            if split.is_none_or(|split| split == shot.split) {
+                match shot.time {
+                    Some(time) => timed.push((time, place)),
+                    None => timeless.push(place),
+                }
+            }
+        }
+        timed.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        AssumedTimes { rig, timed, timeless, tolerance: rig.time_tolerance() }
+    }
+
+    /// (View number, camera index) of the cameras that see a frame at `time`, in the order of the rig.
+    fn at(&self, time: f64) -> Vec<(u32, u32)> {
+        let near = self.timed.partition_point(|&(other, _)| other < time - self.tolerance);
+        let near = self.timed[near..].iter().take_while(|&&(other, _)| other <= time + self.tolerance);
+        let mut places: Vec<usize> = near.map(|&(_, place)| place).chain(self.timeless.iter().copied()).collect();
+        places.sort_unstable();
+        places.iter().map(|&place| (self.rig.shots[place].view, self.rig.shots[place].camera)).collect()
+    }
+}

@@ -1,0 +1,203 @@
+//! As many Gaussians as so many bytes hold.
+
+use serde::{Deserialize, Serialize};
+
+use crate::cache::Key;
+use crate::error::{Error, Result};
+use crate::journal::Journal;
+use crate::outputs::kind::OutputKind;
+use crate::passes::{VIEWS_AT_ONCE, spread};
+use crate::pipeline::stages::archive;
+use crate::pipeline::stages::emit::Emit;
+use crate::pruning::removal::removal_error;
+use crate::pruning::score::Scored;
+use crate::reduction::Reduction;
+use crate::scene::Scene;
+
+/// What the stage is called.
+const NAME: &str = "size";
+/// Part of the bytes that may stay free.
+const FREE: f64 = 0.01;
+/// Sizes that are written at most, to see their bytes.
+const MOST_TRIED: usize = 8;
+/// Pictures that say who goes, where the values of the best turn out larger than those of any.
+const PICTURES: usize = 48;
+
+/// So many bytes for everything that is written.
+pub(crate) struct Space<'a> {
+    /// What writes.
+    pub(crate) emit: &'a Emit,
+    /// Bytes at most.
+    pub(crate) most: u64,
+    /// Bytes of the recipe beside the result.
+    pub(crate) recipe: u64,
+}
+
+/// What fits into so many bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Fit {
+    /// Highest SH degree.
+    pub(crate) sh_degree: usize,
+    /// How many Gaussians of that degree.
+    pub(crate) gaussians: usize,
+}
+
+impl Space<'_> {
+    /// [`Space::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
+    ///
+    /// # Errors
+    /// Those of [`Space::count`].
+    pub(crate) fn fits(
+        &self,
+        scene: &Scene,
+        ids: &[u32],
+        like: &Reduction,
+        drops: bool,
+        journal: &mut Journal,
+    ) -> Result<Vec<Fit>> {
+        let info = scene.source().info();
+        let highest = like.sh_degree.min(info.sh_degree);
+        let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
+        let mut fits: Vec<Fit> = Vec::new();
+        for sh_degree in (lowest..=highest).rev() {
+            if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
+                break;
+            }
+            let like = Reduction { sh_degree, ..like.clone() };
+            fits.push(Fit { sh_degree, gaussians: self.count(scene, ids, &like, journal)? });
+        }
+        Ok(fits)
+    }
+
+    /// What bytes follow from.
+    fn key(&self, scene: &Scene, reduction: &Reduction) -> Key {
+        scene.work.key(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
+    }
+
+    /// As many of the Gaussians `ids` as fit, of any of them, with the rule and the field of `like`.
+    ///
+    /// # Errors
+    /// Not even one fits; frames that cannot be read, a failed write.
+    fn count(&self, scene: &Scene, ids: &[u32], like: &Reduction, journal: &mut Journal) -> Result<usize> {
+        let (all, most) = (ids.len(), self.most);
+        journal.kept_stage(NAME, all, scene, self.key(scene, like), |_| {
+            let bytes = |count: usize| {
+                let kept = (0..count).map(|k| ids[k * all / count]).collect();
+                let some = like.with(kept);
+                match self.emit.kind {
+                    // What lies beside it is neither stored nor sent.
+                    OutputKind::Archive => archive::bytes(scene, &some),
+                    _ => self.emit.bytes(scene, &some, self.recipe),
+                }
+            };
+            let one = 1.min(all);
+            let least = bytes(one)?;
+            if least > most {
+                return Err(Error::usage(format!(
+                    "--target-size: an output of one Gaussian has {least} bytes, nearly all of what is not Gaussians; \
+                     expected at least that, found {most}"
+                )));
+            }
+            // Sizes and their bytes: the largest that fits, and the smallest that does not.
+            let (mut fits, mut over) = ((one, least), None);
+            let (mut next, mut overs) = (all, 0);
+            for _ in 0..MOST_TRIED {
+                let found = bytes(next)?;
+                if found <= most {
+                    (fits, overs) = ((next, found), 0);
+                } else {
+                    (over, overs) = (Some((next, found)), overs + 1);
+                }
+                let Some(over) = over.filter(|over: &(usize, u64)| over.0 - fits.0 > 1) else { break };
+                if most - fits.1 <= (FREE * most as f64) as u64 {
+                    break;
+                }
+                let part = (most - fits.1) as f64 / (over.1 - fits.1).max(1) as f64;
+                // A line between both leads no further where the first few take most bytes, as those of an archive do.
+                let part = if overs > 1 { part.min(0.5) } else { part };
+                next = fits.0 + ((0.998 * part * (over.0 - fits.0) as f64) as usize).clamp(1, over.0 - fits.0 - 1);
+            }
+            Ok((fits.0, fits.0))
+        })
+    }
+
+    /// `reduction`, less those that pictures lose least with as long as it does not fit: refined values may pack worse
+    /// than those that the count was found by. Protected Gaussians stay.
+    ///
+    /// # Errors
+    /// What is protected does not fit; frames that cannot be read, a failed write.
+    pub(crate) fn shrink(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        mut reduction: Reduction,
+        journal: &mut Journal,
+    ) -> Result<Reduction> {
+        let key = self.key(scene, &reduction).and(&scored.protected);
+        journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+            let bytes = |reduction: &Reduction| self.emit.bytes(scene, reduction, self.recipe);
+            let empty = bytes(&reduction.pick(&[]))?;
+            let mut tried = 0;
+            loop {
+                let found = bytes(&reduction)?;
+                if found <= self.most {
+                    let count = reduction.len();
+                    return Ok((reduction, count));
+                }
+                let protected = scored.protected.len();
+                if reduction.len() <= protected {
+                    return Err(Error::usage(format!(
+                        "--target-size: the {protected} Gaussians that are to be kept take {found} bytes with \
+                         everything beside them; expected at least that, found {}",
+                        self.most
+                    )));
+                }
+                let part = self.most.saturating_sub(empty) as f64 / found.saturating_sub(empty).max(1) as f64;
+                let left = next_size(reduction.len(), protected, part, tried);
+                tried += 1;
+                let places = self.best(scene, scored, &reduction, left)?;
+                reduction = reduction.pick(&places);
+            }
+        })
+    }
+
+    /// Places of the `count` that are protected or that pictures would lose most with.
+    fn best(&self, scene: &Scene, scored: &Scored, reduction: &Reduction, count: usize) -> Result<Vec<u32>> {
+        let result = scene.input.reduced(reduction)?;
+        let places: Vec<u32> = (0..reduction.len() as u32).collect();
+        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
+        let looked_at = (&scene.schedule.cameras[..], &pictures[..]);
+        let errors = removal_error(&*result, &places, looked_at, scene.background, 0.0, scene.limits, || ())?;
+        Ok(errors.most_missed(count, |place| scored.is_protected(reduction.kept[place])))
+    }
+}
+
+/// Returns how many of `count` Gaussians to try next where a `part` of their bytes is expected to fit, after so many sizes
+/// were `tried`. `protected` ones stay, fewer than `count`. Always fewer than `count`; after [`MOST_TRIED`] sizes at most
+/// half as many, so that bytes which follow no line end the search after at most 32 more.
+fn next_size(count: usize, protected: usize, part: f64, tried: usize) -> usize {
+    let most = if tried < MOST_TRIED { count - 1 } else { count / 2 };
+    ((0.998 * part * count as f64) as usize).min(most).max(protected)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shrinking_to_a_size_ends_whatever_the_bytes_are() {
+        for (count, part) in
+            (1..=50).chain([4_000_000_000]).flat_map(|n| [0.0, 0.5, 1.0, 1e9, f64::NAN].map(|p| (n, p)))
+        {
+            for protected in [0, count / 3, count - 1] {
+                let (mut left, mut tried) = (count, 0);
+                while left > protected {
+                    let next = next_size(left, protected, part, tried);
+                    assert!((protected..left).contains(&next), "{left} to {next}, {protected} protected, part {part}");
+                    (left, tried) = (next, tried + 1);
+                }
+                assert!(tried <= MOST_TRIED + 33, "{tried} sizes of {count} tried");
+            }
+        }
+    }
+}

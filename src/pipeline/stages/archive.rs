@@ -1,0 +1,325 @@
+//! Stage `archive`: on which grids the values of an archive lie.
+//!
+//! Noise adds up: each attribute and tensor, a group, put on its grid alone adds a squared error to the pictures that
+//! goes with the square of its step, and takes bits that go down by about one a value with every octave of it. Bits are
+//! fewest for an error where every group's error goes by how many bits an octave saves there (reverse water-filling;
+//! Cover & Thomas, "Elements of Information Theory", 10.3.3). Both are measured, the errors on pictures; then all steps
+//! together are as coarse as the pictures of the archive itself allow.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::bounds;
+use super::near::{
+    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, check_met,
+    measurable, pictures,
+};
+use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::error::{Error, Result};
+use crate::journal::Journal;
+use crate::journal::as_toml::AsToml;
+use crate::limits::{Limits, ReadLimit};
+use crate::model::Columns;
+use crate::outputs::bounds::Bounds;
+use crate::pipeline::summary::ArchiveSummary;
+use crate::reduction::Reduction;
+use crate::render;
+use crate::scene::Scene;
+
+/// What the stage is called.
+const NAME: &str = "archive";
+/// Steps are at most so many deviations of their values: beyond that nothing is left of these.
+const COARSEST: f64 = 4.0;
+/// Octaves by which grids that no picture was looked at for are taken to be coarser in the end: with this the count that
+/// fits leaves .5 and 1.2 dB to the grids of two trained models.
+const GUESSED: f64 = 3.3;
+
+/// What an archive is written from.
+#[derive(Debug, Serialize, Deserialize)]
+pub enum Archived {
+    /// A model, or a cloud.
+    Content(Encoded),
+    /// What is left of frames, within bounds.
+    Frames(Bounds),
+}
+
+/// The making of an archive.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Archive {
+    /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
+    pub psnr: Option<f64>,
+}
+
+/// A group of values with one step.
+#[derive(Debug, Clone)]
+enum Group {
+    Attribute(usize),
+    Tensor(String),
+}
+
+impl Group {
+    fn name(&self) -> &str {
+        match self {
+            Group::Attribute(k) => ATTRIBUTES[*k],
+            Group::Tensor(name) => name,
+        }
+    }
+
+    /// Steps that a deviation of its values is at first, finer than most end: where measuring begins.
+    fn first(&self) -> f64 {
+        match self {
+            Group::Attribute(0) => 512.0,
+            Group::Attribute(_) => 24.0,
+            Group::Tensor(name) if name.ends_with("bias") => 64.0,
+            Group::Tensor(_) => 16.0,
+        }
+    }
+}
+
+impl Archive {
+    /// What is left, its pictures, the archive and what it decodes to.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let whole = work.state(Columns::all());
+        let count = pictures(work.pixels);
+        // Of some forty groups in every round, and of all together.
+        let looked = count as f64 * (2.0 * HALVINGS as f64 + ROUNDS as f64 * 40.0);
+        Need {
+            stage: NAME,
+            reads: 1.0,
+            seconds: work.picturing(looked, 0.3 * work.count(), RENDER),
+            per_gaussian: vec![
+                ("states", whole),
+                ("readers", work.input.reader),
+                ("held", work.held(limits, Columns::all())),
+                ("pictures", PICTURE_ON_ALL_THREADS),
+                ("contents", 4 * whole),
+            ],
+            fixed: vec![
+                ("pictures", PIXEL * (2 * count + work.threads) * work.pixels),
+                ("strips", work.threads * render::STRIP_BYTES as u64),
+                ("fields", 4 * work.input.fixed),
+                // Of frames a few blocks.
+                ("blocks", bounds::storing(work).iter().map(|part| part.1).sum()),
+            ],
+        }
+    }
+
+    /// Makes of `reduction` what it is `asked` for.
+    ///
+    /// # Errors
+    /// An input that no archive holds, values or pictures that are not finite, frames that cannot be read, too few bytes.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        reduction: &Reduction,
+        asked: Asked,
+        journal: &mut Journal,
+    ) -> Result<(Archived, ArchiveSummary)> {
+        let key = scene.work.key(&(self.psnr, asked, reduction));
+        let (archived, AsToml(summary)) = journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
+            let (archived, summary) = match scene.input.archives_frames() {
+                true => {
+                    let left = scene.input.reduced(reduction)?;
+                    let (bounds, summary) = bounds::find(scene, &*left, self.psnr, asked)?;
+                    (Archived::Frames(bounds), summary)
+                }
+                false => {
+                    let (encoded, summary) = self.make(scene, reduction, asked)?;
+                    (Archived::Content(encoded), summary)
+                }
+            };
+            Ok(((archived, AsToml(summary)), reduction.len()))
+        })?;
+        Ok((archived, summary))
+    }
+
+    fn make(&self, scene: &Scene, reduction: &Reduction, asked: Asked) -> Result<(Encoded, ArchiveSummary)> {
+        let mut content = scene.input.content(reduction)?;
+        let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
+        let original = Looks::of(scene, scene.source())?;
+        let level = measurable(looks.psnr(scene.source())?)?;
+        let aim = Aim::of(self.psnr, asked, level);
+        let asked = aim.close(level);
+        let mut grids = Grids::of(&content);
+        let mut measured = Vec::new();
+        for _ in 0..ROUNDS {
+            measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
+        }
+        let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
+        let looked_at = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
+            let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
+            let shown = scene.input.showing(&decoded)?;
+            Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
+        };
+        let (encoded, [psnr, loss]) = match aim {
+            Aim::Bytes(most) => {
+                // The finest that fits.
+                let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
+                looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
+                    Some(best) => best,
+                    None => coarsest(encoded(BYTES_ADDED[0])?, most, reduction.len())?,
+                })?
+            }
+            Aim::Close(_) | Aim::Loss(_) => {
+                let best = bisected(ADDED, HALVINGS, |added| {
+                    Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| aim.does(found, asked)))
+                })?;
+                best.map_or_else(|| looked_at(encoded(ADDED[0])?), Ok)?
+            }
+        };
+        check_met(aim, asked, psnr)?;
+        let (parts, bits) = (encoded.parts, encoded.bits.clone());
+        Ok((encoded, ArchiveSummary { asked, psnr, level, loss, parts: Some(parts), bounds: None, bits, measured }))
+    }
+}
+
+/// Bytes of an archive of `reduction`, about: on grids, or within bounds, as they are before any picture is looked at.
+///
+/// # Errors
+/// An input that no archive holds, values that are not finite.
+pub fn bytes(scene: &Scene, reduction: &Reduction) -> Result<u64> {
+    if scene.input.archives_frames() {
+        return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
+    }
+    let content = scene.input.content(reduction)?;
+    Ok(archive::encode(&content, &Grids::of(&content).steps(GUESSED))?.bytes.len() as u64)
+}
+
+/// The coarsest archive of `gaussians` Gaussians, if it has no more than `most` bytes.
+fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
+    let least = encoded.bytes.len();
+    if least as u64 > most {
+        return Err(Error::usage(format!(
+            "--target-size: an archive of {gaussians} Gaussians has {least} bytes on the coarsest grids; expected at least \
+             that, found {most}"
+        )));
+    }
+    Ok(encoded)
+}
+
+/// The grids of all groups of a content.
+struct Grids {
+    groups: Vec<Group>,
+    /// Standard deviation of each group's values.
+    deviations: Vec<f64>,
+    /// Log2 of each group's step.
+    octaves: Vec<f64>,
+    /// What is added to steps within each tensor, by name.
+    offsets: BTreeMap<String, Vec<i8>>,
+}
+
+impl Grids {
+    fn of(content: &Content) -> Grids {
+        let groups = groups(content);
+        let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
+        let first = |(group, deviation): (&Group, &f64)| (deviation / group.first()).log2();
+        let octaves = groups.iter().zip(&deviations).map(first).collect();
+        let space = archive::space(content);
+        let offsets = archive::offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
+        Grids { groups, deviations, octaves, offsets }
+    }
+
+    /// The steps, all so many octaves coarser.
+    fn steps(&self, added: f64) -> Steps {
+        let mut steps = Steps::default();
+        for (group, octave) in self.groups.iter().zip(&self.octaves) {
+            match group {
+                Group::Attribute(k) => steps.cloud[*k] = eighths(octave + added),
+                Group::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
+            }
+        }
+        steps
+    }
+
+    fn tensor(&self, name: &str, octave: f64) -> TensorSteps {
+        TensorSteps { step: eighths(octave), channels: self.offsets.get(name).cloned().unwrap_or_default() }
+    }
+
+    /// Measures every group's squared error and bits, and has the errors go by what an octave saves, `error` all together.
+    /// Gives what was measured: name, log2 of the step, error, bits.
+    fn balance(
+        &mut self,
+        scene: &Scene,
+        looks: &Looks<'_>,
+        content: &mut Content,
+        error: f64,
+    ) -> Result<Vec<(String, f64, f64, f64)>> {
+        let errors = self.errors(scene, looks, content)?;
+        let fine = archive::encode(content, &self.steps(0.0))?.bits;
+        let coarse = archive::encode(content, &self.steps(0.5))?.bits;
+        let bits = |of: &BTreeMap<String, f64>, group: &Group| of.get(group.name()).copied().unwrap_or(0.0);
+        // Never nothing: a group that has no bits left could become coarser without end.
+        let saved =
+            |group: &Group| (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group));
+        let saved: Vec<f64> = self.groups.iter().map(saved).collect();
+        let all: f64 = saved.iter().sum();
+        let mut measured = Vec::with_capacity(self.groups.len());
+        for (g, group) in self.groups.iter().enumerate() {
+            measured.push((group.name().to_owned(), self.octaves[g], errors[g], bits(&fine, group)));
+            let by = balanced(error * saved[g] / all, errors[g]);
+            let coarsest = (COARSEST * self.deviations[g]).log2();
+            self.octaves[g] = (self.octaves[g] + by).min(coarsest);
+        }
+        Ok(measured)
+    }
+
+    /// Squared errors of pictures where one group lies on its grid and all others do not. `content` is as it was after.
+    fn errors(&self, scene: &Scene, looks: &Looks<'_>, content: &mut Content) -> Result<Vec<f64>> {
+        let space = archive::space(content);
+        let one = |(group, &octave): (&Group, &f64)| -> Result<f64> {
+            match group {
+                Group::Attribute(k) => {
+                    let before = content.cloud.clone();
+                    let mut steps = [0; ATTRIBUTES.len()];
+                    steps[*k] = eighths(octave);
+                    archive::round_cloud(&mut content.cloud, &steps, &[*k]);
+                    let found = looks.error(&*scene.input.showing(content)?);
+                    content.cloud = before;
+                    found
+                }
+                Group::Tensor(name) => {
+                    let (before, role) = (content.tensors[name].clone(), content.field[name]);
+                    let steps = self.tensor(name, octave);
+                    let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
+                    content.tensors.insert(name.clone(), rounded);
+                    let found = looks.error(&*scene.input.showing(content)?);
+                    content.tensors.insert(name.clone(), before);
+                    found
+                }
+            }
+        };
+        self.groups.iter().zip(&self.octaves).map(one).collect()
+    }
+}
+
+fn groups(content: &Content) -> Vec<Group> {
+    let attributes = 4 + content.cloud.sh_degree() + 1;
+    let tensors = content.field.iter().filter(|(_, role)| !matches!(role, Role::Exact | Role::Unread));
+    (0..attributes).map(Group::Attribute).chain(tensors.map(|(name, _)| Group::Tensor(name.clone()))).collect()
+}
+
+/// Standard deviation of a group's values.
+fn deviation(content: &Content, group: &Group) -> f64 {
+    let of = |values: &mut dyn Iterator<Item = f32>| {
+        let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
+        values.for_each(|value| {
+            let value = f64::from(value);
+            count += 1.0;
+            sum += value;
+            squares += value * value;
+        });
+        (squares / f64::max(count, 1.0) - (sum / f64::max(count, 1.0)).powi(2)).max(0.0).sqrt()
+    };
+    let found = match group {
+        Group::Tensor(name) => of(&mut content.tensors[name].data.iter().copied()),
+        Group::Attribute(k) => of(&mut archive::attribute(&content.cloud, *k)),
+    };
+    found.max(1e-9)
+}
+
+/// The grid whose step is nearest.
+fn eighths(octave: f64) -> i32 {
+    ((8.0 * octave).round() as i32).clamp(*STEPS.start(), *STEPS.end())
+}

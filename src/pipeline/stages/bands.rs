@@ -1,0 +1,146 @@
+//! Stage `bands`: the lowest SH degree of what is left with which pictures change next to nothing.
+//!
+//! Memory: a state of the original and two of what is left, and three pictures.
+
+use super::field::{PICTURES, least};
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
+use crate::error::Result;
+use crate::journal::Journal;
+use crate::journal::records::BandsSummary;
+use crate::limits::Limits;
+use crate::metrics::psnr;
+use crate::model::{Columns, Gaussians, Picture};
+use crate::outputs::kind::OutputKind;
+use crate::passes::{Batch, Subject, show, spread};
+use crate::pipeline::request::Request;
+use crate::progress::Progress;
+use crate::pruning::score::scored;
+use crate::recipe::WhichBands;
+use crate::reduction::Reduction;
+use crate::render::{self, render};
+use crate::scene::Scene;
+use crate::source::FrameSource;
+
+/// What the stage is called.
+const NAME: &str = "bands";
+
+/// What is left out where bands have to stay.
+const WHAT: &str = "fewer bands of spherical harmonics";
+
+/// The highest SH degree of a result of `scene`, asked to have harmonics up to `degree`.
+pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> usize {
+    let all = scene.source().info().sh_degree;
+    match scene.input.needs_all_bands() {
+        _ if degree >= all => all,
+        Some(why) => {
+            journal.leave_out(WHAT, why);
+            all
+        }
+        None => {
+            journal.notes.push(format!("harmonics above degree {degree} of {all} go, as asked for"));
+            degree
+        }
+    }
+}
+
+/// The bands of spherical harmonics of a result.
+#[derive(Debug, Clone)]
+pub struct Bands {
+    /// How much closer pictures stay to those with all bands than to the original's, dB.
+    pub margin: f64,
+}
+
+impl Bands {
+    /// The stage, of a run whose output may have fewer. An archive has no bytes for bands that nobody sees.
+    pub fn of(request: &Request, kind: OutputKind) -> Option<Bands> {
+        let bands = &request.recipe.bands;
+        let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
+        drops.then_some(Bands { margin: bands.bands_margin })
+    }
+
+    /// Three states, and pictures of them. A part `left` of the Gaussians stays.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let (whole, reader, held) = (work.state(Columns::all()), work.input.reader, work.held(limits, Columns::all()));
+        let per_gaussian = vec![
+            ("kept", of_left(left, 24)),
+            ("states", whole + of_left(left, 2 * whole)),
+            ("result", of_left(left, work.input.reduced)),
+            ("readers", reader + of_left(left, reader)),
+            ("held", held + of_left(left, held)),
+            ("pictures", PICTURE_ON_ALL_THREADS),
+        ];
+        let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
+        Need {
+            stage: NAME,
+            seconds: work.reading(work.count(), 2.0 * pictures as f64)
+                + work.picturing(pictures as f64, work.count(), RENDER)
+                + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
+            reads: 2.0 * work.scattered_reads(pictures, limits),
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 36 * work.pixels)],
+        }
+    }
+
+    /// `reduction` with the lowest SH degree that shows in pictures no more than it may.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        let count = reduction.len();
+        let key = scene.work.key(&(self.margin, &reduction));
+        journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, reduction, journal)?, count)))
+    }
+
+    /// [`Bands::run`] as a part of another stage.
+    pub fn drop_some(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        let all = scene.source().info().sh_degree;
+        let pictures = spread(&scene.schedule, PICTURES, 1);
+        let stay = match scene.input.needs_all_bands() {
+            _ if all == 0 => Some("colours are of degree 0"),
+            None if reduction.is_empty() || pictures.is_empty() => Some("there is nothing to be seen"),
+            why => why,
+        };
+        if let Some(why) = stay {
+            journal.leave_out(WHAT, why);
+            return Ok(reduction);
+        }
+        let source = scene.input.reduced(&reduction)?;
+        let (mut found, mut tried, mut sh_degree) = ([0.0; 2], Vec::new(), all);
+        // What a degree lacks every lower one lacks too.
+        while sh_degree > 0 && tried.len() == all - sh_degree {
+            let [result, apart] = without_bands(scene, &*source, sh_degree - 1, &pictures)?;
+            found = [result, least(result, self.margin)];
+            tried.push((sh_degree - 1, apart));
+            sh_degree -= usize::from(apart >= found[1]);
+        }
+        drop(source);
+        let [result, least] = found;
+        let found = BandsSummary { sh_degree, pictures: pictures.len(), tried, result, least };
+        if sh_degree == all {
+            journal.leave_out(WHAT, found.why());
+        }
+        journal.bands = Some(found);
+        Ok(Reduction { sh_degree, ..reduction })
+    }
+}
+
+/// Mean PSNR over `pictures` of `result` against the original, and of `result` with harmonics up to `degree` against itself
+/// with all, dB.
+fn without_bands(scene: &Scene, result: &dyn FrameSource, degree: usize, pictures: &[Picture]) -> Result<[f64; 2]> {
+    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let mut sums = [0.0; 2];
+    let subjects = [Subject::all(scene.source()), Subject::all(result)];
+    show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
+        for view in views {
+            let picture = |state: &Gaussians| render(state, view.camera, scene.background);
+            let [original, whole] = view.states.map(picture);
+            let mut state = view.states[1].clone();
+            state.drop_bands(degree);
+            sums[0] += psnr(&original, &whole);
+            sums[1] += psnr(&picture(&state), &whole);
+        }
+        progress.advance(views.len() as u64);
+        Ok(())
+    })?;
+    Ok(sums.map(|sum| sum / pictures.len() as f64))
+}

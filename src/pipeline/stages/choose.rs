@@ -1,0 +1,192 @@
+//! Stage `choose`: letting pictures choose whether to merge or to prune to one count, rendered beside the original.
+//!
+//! Merging pays on some scenes only (method.md, section 6.1).
+//! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
+
+use super::merge::Outcome;
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
+use crate::error::Result;
+use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::metrics::{decibels_text, psnr};
+use crate::model::{Columns, Picture};
+use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, View, show, spread};
+use crate::progress::Progress;
+use crate::pruning::Ranking;
+use crate::pruning::score::{Scored, scored};
+use crate::reduction::Reduction;
+use crate::render::{self, Image};
+use crate::scene::Scene;
+
+/// What the stage is called.
+const NAME: &str = "choose";
+
+/// Scoring pictures that are compared: their mean PSNR differs from that of all by less than the
+/// alternatives usually do from one another.
+const PICTURES: usize = 24;
+
+/// Pictures of a frame that are compared at a time.
+const AT_ONCE: usize = 4;
+
+/// Per Gaussian what is known of clusters, twice while alternatives are compared, and what reading members takes.
+pub(crate) const CLUSTERED: u64 = 125;
+
+/// The choice of a run.
+#[derive(Debug, Clone)]
+pub struct Choose {
+    /// Whether the size of the output is asked for.
+    pub has_target: bool,
+}
+
+impl Choose {
+    /// Both alternatives, two states of a frame, and pictures. A part `left` of the Gaussians stays.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let whole = work.state(Columns::all());
+        // Merged trajectories are read of all that merge.
+        let merging = if work.input.reduced > 0 { left } else { 1.0 };
+        let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
+        let per_gaussian = vec![
+            ("alternatives", of_left(left, 8)),
+            ("clusters", CLUSTERED),
+            ("states", whole + of_left(left, whole)),
+            ("result", of_left(left, work.input.reduced)),
+            ("readers", reader + of_left(merging, reader)),
+            ("held", held + of_left(merging, held)),
+            ("pictures", PICTURE_ON_ALL_THREADS),
+        ];
+        let together = AT_ONCE.min(limits.pictures_together) as u64;
+        let pictures = render::STRIP_BYTES as u64 + 12 * work.pixels * (1 + together);
+        let frames = (PICTURES as u64).min(work.pictures);
+        // The original, and two of about half as many Gaussians.
+        let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
+            + work.picturing(2.0 * frames as f64, 0.0, RENDER);
+        Need {
+            stage: NAME,
+            seconds: work.reading(work.count(), frames as f64) + made,
+            reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![work.arriving(), ("pictures", pictures)],
+        }
+    }
+
+    /// Compares `merged` with the first Gaussians of the ranking, as many as it has, by mean PSNR against the original on
+    /// scoring pictures; keeps the better, of equals the one without merging. Where merging loses and no target asks for
+    /// that count, the run's own number of survivors stays.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        ranked: &Ranking,
+        merged: Outcome,
+        journal: &mut Journal,
+    ) -> Result<Outcome> {
+        let reduction = &merged.reduction;
+        let count = reduction.len();
+        if reduction.clusters.is_empty() {
+            return Ok(merged);
+        }
+        let pruned = ranked.take(count);
+        let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);
+        let key = scene.work.key(&(&pruned, reduction, &pictures));
+        let [without, with]: [f64; 2] = journal
+            .kept_stage(NAME, count, scene, key, |_| Ok((mean_psnr(scene, &pruned, reduction, &pictures)?, count)))?;
+        if with > without {
+            return Ok(merged);
+        }
+        let why = format!(
+            "at the same {count} Gaussians scoring pictures keep {} without it, {with:.2} with it",
+            decibels_text(without, 2)
+        );
+        Progress::undone("merging", &why);
+        journal.leave_out("merging", why);
+        let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
+        Ok(Outcome { reduction: Reduction::pruned(kept, &reduction.rule), summary: None })
+    }
+}
+
+/// Mean PSNR of the Gaussians `pruned` and of `merged` against the original over `pictures`, dB.
+fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Picture]) -> Result<[f64; 2]> {
+    let result = scene.input.reduced(merged)?;
+    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let mut sums = [0.0; 2];
+    let pictures_together = AT_ONCE.min(scene.limits.pictures_together);
+    let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
+    let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
+    show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
+        let picture = |subject: usize, view: &View<'_, 2>| view.render(subject, scene.background);
+        let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
+        // All of one frame.
+        let state = views[0].states[0].pick(pruned);
+        let features = views[0].features(0).map(|features| features.pick(pruned));
+        for (view, expected) in views.iter().zip(&expected) {
+            sums[0] += psnr(&view.render_as(0, &state, features.as_ref(), scene.background), expected);
+            sums[1] += psnr(&picture(1, view), expected);
+        }
+        progress.advance(views.len() as u64);
+        Ok(())
+    })?;
+    Ok(sums.map(|sum| sum / pictures.len().max(1) as f64))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::stages::merge::Merge;
+    use crate::pipeline::tests::{scene, score_scene};
+    use crate::pruning::score::UserOverrides;
+    use crate::recipe::Recipe;
+
+    /// Mean PSNR over the pictures that decide.
+    fn quality(scene: &Scene, reduction: &Reduction) -> f64 {
+        mean_psnr(scene, &[], reduction, &spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE)).unwrap()[1]
+    }
+
+    /// What merging leaves of a scene, and what is chosen then.
+    fn chosen(scene: &Scene, scored: &Scored, recipe: &Recipe, target: Option<usize>) -> (Reduction, Outcome, Journal) {
+        let merge = Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
+        let (ranked, mut journal) = (scored.ranked(), Journal::default());
+        let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.order().len());
+        let merged = merge.run(scene, scored, &ranked, survivors, &mut journal).unwrap();
+        let before = merged.reduction.clone();
+        let chosen = Choose { has_target: target.is_some() }.run(scene, scored, &ranked, merged, &mut journal).unwrap();
+        (before, chosen, journal)
+    }
+
+    #[test]
+    fn what_is_chosen_has_the_same_count_and_is_never_worse_than_any_alternative() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        for target in [150, 600, 1200] {
+            let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
+            assert_eq!(chosen.reduction.len(), target);
+            let got = quality(&scene, &chosen.reduction);
+            let own = Reduction::pruned(scored.ranked().take(target), &recipe.merge);
+            for other in [&merged, &own] {
+                let expected = quality(&scene, other);
+                assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");
+            }
+            let lost = !merged.clusters.is_empty() && chosen.reduction.clusters.is_empty();
+            assert_eq!(journal.left_out.iter().any(|left| left.what == "merging"), lost);
+        }
+    }
+
+    #[test]
+    fn without_a_target_merging_that_does_not_pay_leaves_every_survivor_of_pruning() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        // Nothing is pruned, so that what is never seen is there to be dropped instead of merging the rest.
+        let mut recipe = Recipe::preset("default").unwrap();
+        recipe.select.tau_static = 0.0;
+        recipe.merge.max_color_difference = f64::INFINITY;
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        let survivors = scored.selection.counts.kept;
+        let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, None);
+        assert!(merged.len() < survivors, "nothing merged");
+        assert_eq!((chosen.reduction.len(), journal.left_out.len()), (survivors, 1));
+    }
+}

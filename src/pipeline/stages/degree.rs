@@ -1,0 +1,92 @@
+//! Stage `degree`: the SH degree at which so many bytes show most.
+//!
+//! A Gaussian of degree 3 takes as many bytes as three and a half of degree 0, and which of them pictures gain more by
+//! depends on the scene. So as many of each degree as fit are refined in a part of the steps, from the highest degree down
+//! until pictures kept apart are no closer; the best of them is refined in all.
+//!
+//! Memory: that of refining.
+
+use crate::budget::{Need, Workload};
+use crate::error::Result;
+use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::pipeline::request::{Goal, Request};
+use crate::pipeline::search::size::Fit;
+use crate::pruning::Ranking;
+use crate::pruning::score::Scored;
+use crate::recipe::WhichBands;
+use crate::reduction::Reduction;
+use crate::refinement::Refine;
+use crate::refinement::targets::Targets;
+use crate::scene::Scene;
+
+/// What the stage is called.
+const NAME: &str = "degree";
+/// Part of the steps that tells which degree is best.
+const STEPS: f64 = 0.2;
+
+/// The choice of a run.
+#[derive(Debug, Clone)]
+pub struct Degree {
+    /// How a degree is tried.
+    refine: Refine,
+}
+
+impl Degree {
+    /// The stage, of a run that is asked for so many bytes, refines (`refine`), and may drop bands.
+    pub fn of(request: &Request, refine: Option<&Refine>) -> Option<Degree> {
+        let chooses = matches!(request.goal, Some(Goal::Bytes(_))) && request.recipe.bands.bands == WhichBands::Needed;
+        refine.filter(|_| chooses).map(|refine| Degree { refine: refine.in_part(STEPS) })
+    }
+
+    /// What refining needs, once for every degree.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let need = self.refine.need(work, limits);
+        let degrees = 1.0 + work.sh_degree as f64;
+        Need { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
+    }
+
+    /// That of `fits`, of falling degrees, which is best in the manner of `like`.
+    ///
+    /// # Errors
+    /// Frames that cannot be read; a scratch file that cannot be written.
+    pub(crate) fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        ranked: &Ranking,
+        like: &Reduction,
+        fits: &[Fit],
+        journal: &mut Journal,
+    ) -> Result<Fit> {
+        let all = scored.count();
+        let key = scene.work.key(&(self.refine.key(), ranked, like, fits));
+        journal.kept_stage(NAME, all, scene, key, |journal| {
+            let targets = Targets::new(scene, self.refine.pictures)?;
+            let mut tried: Vec<(Fit, f64)> = Vec::new();
+            for &fit in fits {
+                let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());
+                let start = Reduction { sh_degree: fit.sh_degree, ..like.with(ranked.take(first)) };
+                let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
+                let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
+                tried.push((fit, psnr));
+                if is_no_better {
+                    break;
+                }
+            }
+            // Of equal ones the one with more bands.
+            let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
+            let of = |(fit, psnr): &(Fit, f64)| {
+                let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };
+                format!("{} of degree {} {psnr}", fit.gaussians, fit.sh_degree)
+            };
+            let (count, tried) = (targets.parted(false).apart.len(), tried.iter().map(of).collect::<Vec<_>>().join(", "));
+            journal.notes.push(format!(
+                "of the Gaussians that fit, those of SH degree {} show most: {count} pictures kept apart keep, dB, with {tried}, \
+                 refined in a fifth of the steps",
+                best.sh_degree
+            ));
+            Ok((best, best.gaussians))
+        })
+    }
+}

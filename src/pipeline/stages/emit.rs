@@ -1,0 +1,263 @@
+//! Stage `emit`: the smaller model and, beside it, the recipe, the index map and the summary.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::archive::Archived;
+use super::bounds;
+use super::choose::CLUSTERED;
+use crate::budget::{Need, Workload, of_left};
+use crate::error::{Error, Result};
+use crate::files::atomic::{
+    Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
+};
+use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::model::Columns;
+use crate::models::{Family, Size};
+use crate::outputs::bounds::Bounds;
+use crate::outputs::container::{FRAME_BLOCK, write_container};
+use crate::outputs::index_map::write_index_map;
+use crate::outputs::kind::OutputKind;
+use crate::pipeline::request::Request;
+use crate::pipeline::summary::Summary;
+use crate::progress::Progress;
+use crate::pruning::score::scored;
+use crate::reduction::Reduction;
+use crate::scene::Scene;
+use crate::source::FrameSource;
+
+/// What the stage is called.
+const NAME: &str = "emit";
+
+/// Part of the Gaussians that is usually left.
+const LEFT: f64 = 0.5;
+/// Seconds that a state takes to be encoded and written (`benches/pack.rs`).
+pub const ENCODING: f64 = 3.5e-7;
+
+/// Bytes of the summary and a header beside a result, at most but for long lists of files or notes.
+const BESIDE: u64 = 16 << 10;
+
+/// File beside every result: all parameters it was made with.
+pub const RECIPE: &str = "recipe.toml";
+/// File beside every result: where each Gaussian of the input went.
+pub const INDEX_MAP: &str = "index_map.npy";
+
+/// Path of a file beside the result: inside a folder, next to a file and named after it.
+pub fn beside(result: &Path, is_folder: bool, name: &str) -> PathBuf {
+    if is_folder {
+        return result.join(name);
+    }
+    let mut file = result.file_name().unwrap_or_default().to_owned();
+    file.push(".");
+    file.push(name);
+    result.with_file_name(file)
+}
+
+/// Paths of what goes with a result of `kind` named `output`.
+pub fn beside_names(output: &Path, kind: OutputKind) -> impl Iterator<Item = String> {
+    [RECIPE, INDEX_MAP, MARKER]
+        .into_iter()
+        .map(move |name| beside(output, kind.is_folder(), name).to_string_lossy().into_owned())
+}
+
+/// The writing of a run.
+#[derive(Debug, Clone)]
+pub struct Emit {
+    /// What is written.
+    pub kind: OutputKind,
+    /// Whether there may be proxies.
+    pub merges: bool,
+    output: PathBuf,
+    overwrite: Replace,
+}
+
+impl Emit {
+    /// As `request` asks, of an input whose own kind of result is `own`.
+    pub fn new(request: &Request, own: OutputKind, merges: bool) -> Emit {
+        let kind = OutputKind::of(&request.output, request.kind, own);
+        Emit { kind, merges, output: request.output.clone(), overwrite: request.overwrite }
+    }
+
+    /// Confirms, before any work, that the result and what goes beside it can be written by a run that reads `inputs`.
+    ///
+    /// # Errors
+    /// Outputs that are there already, or cannot be; see [`check_target`].
+    pub fn check(&self, inputs: &[&Path]) -> Result<()> {
+        if self.kind.is_folder() {
+            return check_target(&self.output, Kind::Folder, inputs, self.overwrite);
+        }
+        check_targets(&self.output, &self.companions(), inputs, self.overwrite)
+    }
+
+    /// Paths of the files beside a result that is a file.
+    fn companions(&self) -> [PathBuf; 3] {
+        [MARKER, RECIPE, INDEX_MAP].map(|name| beside(&self.output, false, name))
+    }
+
+    /// Folder in which the recipe of the result will lie.
+    pub fn recipe_folder(&self) -> PathBuf {
+        if self.kind.is_folder() {
+            return self.output.clone();
+        }
+        self.output.parent().map(Path::to_owned).unwrap_or_default()
+    }
+
+    /// What is left, a part `left` of the Gaussians, and buffers of what is written.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let whole = work.state(Columns::all());
+        let is_solved = work.input.reduced > 0;
+        let mut per_gaussian =
+            [scored(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
+        let within = if self.kind == OutputKind::Archive { bounds::storing(work) } else { Vec::new() };
+        let mut fixed = if within.is_empty() { work.writing() } else { within };
+        match self.kind {
+            OutputKind::Gseq if self.merges && !is_solved => {
+                // Of each that is merged and of each that comes of it the frames of a block, and a state.
+                let mixed = Columns::all().difference(Columns::SH) | work.varying;
+                let waiting = work.held(&Limits::NONE, Columns::all()) + FRAME_BLOCK as u64 * work.state(mixed);
+                let together = (limits.gaussians_together as u64).min(work.gaussians);
+                per_gaussian.push(("members", CLUSTERED));
+                fixed.push(("merged", together * (waiting + 2 * whole + work.input.reader + 24)));
+            }
+            OutputKind::Gseq => (),
+            // A file to be like, its rows and the proxies among them for each thread, or one state and what it is made of.
+            _ => {
+                // Merged trajectories are read of all that merge.
+                let merging = if is_solved { left } else { 1.0 };
+                per_gaussian.push(("readers", of_left(merging, work.input.reader)));
+                per_gaussian.push(("held", of_left(merging, work.held(limits, Columns::all()))));
+                let rows = of_left(left, work.threads * (work.input.file + 2 * whole));
+                per_gaussian.push(("files", work.input.file + rows));
+                per_gaussian.push(("members", CLUSTERED));
+            }
+        }
+        if self.kind == OutputKind::Model {
+            // A field's tensors as they are read and as they are stored.
+            fixed.push(("field", work.input.fixed));
+        }
+        // Of a family that is solved only sequences take states; of others, merged ones are read part by part.
+        let parts = match self.kind {
+            OutputKind::Gseq if self.merges => work.gaussians.div_ceil(limits.gaussians_together as u64).max(1),
+            _ => 1,
+        };
+        let reads = match is_solved && !self.kind.holds_frames() {
+            true => 0.0,
+            false => parts as f64 * work.scattered_reads(work.frames, limits),
+        };
+        let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
+        let left = LEFT * work.count();
+        let seconds = work.reading(left, frames) + left * frames * ENCODING;
+        Need { stage: NAME, reads, seconds, per_gaussian, fixed }
+    }
+
+    /// Bytes of everything that is written of `reduction` with a recipe of so many; made in a scratch folder, and removed.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, a failed write.
+    pub fn bytes(&self, scene: &Scene, reduction: &Reduction, recipe: u64) -> Result<u64> {
+        let folder = ScratchFolder::new(&scene.scratch)?;
+        let path = folder.path().join("result");
+        let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits)?;
+        let beside = BESIDE + recipe + size_of::<i64>() as u64 * scene.source().info().count as u64;
+        Ok(written + beside)
+    }
+
+    /// Writes the result and the files beside it. They get their names at the end: a folder in one step, a file after the
+    /// files beside it. `summarise` is told the size of the result.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, a failed write; nothing is left behind then.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        reduction: &Reduction,
+        (map, archive): (&[Option<u32>], Option<&Archived>),
+        recipe: &str,
+        mut journal: Journal,
+        summarise: impl FnOnce(Journal, Size) -> Summary,
+    ) -> Result<Summary> {
+        let mut write = |path: &Path| -> Result<Size> {
+            journal.stage(NAME, reduction.len(), scene.source(), |journal| {
+                let size = match archive {
+                    Some(Archived::Content(encoded)) => {
+                        fs::write(path, &encoded.bytes).map_err(Error::io("write", path))?;
+                        encoded.parts.into()
+                    }
+                    Some(Archived::Frames(bounds)) => {
+                        write_within(&*scene.input.reduced(reduction)?, *bounds, path)?;
+                        Size::of_frames(fs::metadata(path).map_err(Error::io("read", path))?.len())
+                    }
+                    None => {
+                        journal.notes.extend(scene.input.write(reduction, self.kind, path, &scene.limits)?);
+                        scene.input.size_written(self.kind, path)?
+                    }
+                };
+                journal.notes.extend(size.why_larger_than(&scene.input.size()?));
+                Ok((size, reduction.len()))
+            })
+        };
+        let target = self.output.as_path();
+        if self.kind.is_folder() {
+            let staged = StagedFolder::new(target, self.overwrite)?;
+            let size = write(staged.path())?;
+            write_text(&staged.path().join(RECIPE), recipe)?;
+            write_index_map(map, &staged.path().join(INDEX_MAP))?;
+            let summary = summarise(journal, size);
+            write_text(&staged.path().join(MARKER), &summary.json())?;
+            staged.commit()?;
+            return Ok(summary);
+        }
+        let staged = StagedFiles::new(target, self.companions().to_vec(), self.overwrite)?;
+        let [marker, recipe_file, index_map] = [0, 1, 2].map(|index| staged.companion(index));
+        let size = write(staged.path())?;
+        write_text(&recipe_file, recipe)?;
+        write_index_map(map, &index_map)?;
+        let summary = summarise(journal, size);
+        write_text(&marker, &summary.json())?;
+        staged.commit()?;
+        Ok(summary)
+    }
+}
+
+/// Writes `reduction` as a result of `kind`, without anything beside it; gives its bytes.
+///
+/// # Errors
+/// Frames that cannot be read, a failed write.
+pub fn write_alone(
+    input: &dyn Family,
+    reduction: &Reduction,
+    kind: OutputKind,
+    path: &Path,
+    limits: &Limits,
+) -> Result<u64> {
+    if kind.is_folder() {
+        fs::create_dir(path).map_err(Error::io("create", path))?;
+    }
+    input.write(reduction, kind, path, limits)?;
+    Ok(input.size_written(kind, path)?.whole())
+}
+
+/// Writes a container within `bounds`.
+fn write_within(source: &dyn FrameSource, bounds: Bounds, path: &Path) -> Result<()> {
+    let info = source.info();
+    let progress = Progress::new(NAME, "states", (info.count * info.times.len()) as u64);
+    write_container(source, path, bounds::packing(bounds), BTreeMap::new(), |done| progress.advance(done))
+}
+
+fn write_text(path: &Path, text: &str) -> Result<()> {
+    fs::write(path, text).map_err(Error::io("write", path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_beside_results_of_other_kinds_do_not_collide() {
+        assert_eq!(beside(Path::new("a/small"), true, "summary.json"), Path::new("a/small/summary.json"));
+        assert_eq!(beside(Path::new("a/small.ply"), false, "summary.json"), Path::new("a/small.ply.summary.json"));
+        assert_eq!(beside(Path::new("small.gseq"), false, "summary.json"), Path::new("small.gseq.summary.json"));
+    }
+}

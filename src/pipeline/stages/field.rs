@@ -1,0 +1,130 @@
+//! Stage `field`: half precision for the field of what is left, where pictures say that next to nothing is lost by it.
+//!
+//! Memory: two states of one frame, and two pictures.
+
+use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
+use crate::error::Result;
+use crate::journal::Journal;
+use crate::journal::records::FieldSummary;
+use crate::limits::Limits;
+use crate::metrics::psnr;
+use crate::model::{Columns, Picture};
+use crate::outputs::kind::OutputKind;
+use crate::passes::{Batch, Subject, show, spread};
+use crate::pipeline::request::Request;
+use crate::progress::Progress;
+use crate::pruning::score::scored;
+use crate::recipe::Precision;
+use crate::reduction::Reduction;
+use crate::refinement::CLOSE_ENOUGH;
+use crate::render::{self, render};
+use crate::scene::Scene;
+use crate::source::FrameSource;
+
+/// What the stage is called.
+const NAME: &str = "field";
+/// Scoring pictures that are compared.
+pub(crate) const PICTURES: usize = 12;
+
+/// The precision of a result's field.
+#[derive(Debug, Clone)]
+pub struct Field {
+    /// How much closer pictures stay to those of the exact field than to the original's, dB.
+    pub margin: f64,
+}
+
+impl Field {
+    /// The stage, of a run that writes a model and whose field may change.
+    pub fn of(request: &Request, kind: OutputKind) -> Option<Field> {
+        let field = &request.recipe.field;
+        (kind == OutputKind::Model && field.field == Precision::Half).then_some(Field { margin: field.field_margin })
+    }
+
+    /// Two states, pictures, and the field once more. A part `left` of the Gaussians stays.
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+        let whole = work.state(Columns::all());
+        let per_gaussian = vec![
+            ("kept", of_left(left, 24)),
+            ("states", whole + of_left(left, whole)),
+            ("result", of_left(left, 2 * work.input.reduced)),
+            ("readers", work.input.reader + of_left(left, work.input.reader)),
+            ("pictures", PICTURE_ON_ALL_THREADS),
+        ];
+        let pictures = (PICTURES as u64).min(work.pictures);
+        Need {
+            stage: NAME,
+            seconds: work.reading(work.count(), 4.0 * pictures as f64)
+                + work.picturing(2.0 * pictures as f64, work.count(), RENDER)
+                + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
+            reads: work.reads(pictures, limits),
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![
+                work.arriving(),
+                ("field", work.input.fixed),
+                ("pictures", render::STRIP_BYTES as u64 + 24 * work.pixels),
+            ],
+        }
+    }
+
+    /// `reduction` with its field in half precision, if that shows in pictures no more than it may.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        let count = reduction.len();
+        let key = scene.work.key(&(self.margin, &reduction));
+        journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, reduction, journal)?, count)))
+    }
+
+    /// [`Field::run`] of an input that can, as a part of another stage.
+    pub fn round(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+        if !scene.input.can_round_field()? {
+            return Ok(reduction);
+        }
+        let what = "half precision of the field";
+        let pictures = spread(&scene.schedule, PICTURES, 1);
+        if reduction.is_empty() || pictures.is_empty() {
+            journal.leave_out(what, "there is nothing to be seen");
+            return Ok(reduction);
+        }
+        let halved = Reduction { field: Precision::Half, ..reduction.clone() };
+        let [exact, half] = [&reduction, &halved].map(|of| scene.input.reduced(of));
+        let (exact, half) = (exact?, half?);
+        let rounding = closeness(scene, [&*exact, &*half], &pictures)?;
+        let result = match rounding >= CLOSE_ENOUGH {
+            true => None,
+            false => Some(closeness(scene, [scene.source(), &*exact], &pictures)?),
+        };
+        drop((exact, half));
+        let least = result.map_or(CLOSE_ENOUGH, |result| least(result, self.margin));
+        let found = FieldSummary { pictures: pictures.len(), rounding, result, least, half: rounding >= least };
+        let fits = found.half;
+        if !fits {
+            journal.leave_out(what, found.why());
+        }
+        journal.field = Some(found);
+        Ok(if fits { halved } else { reduction })
+    }
+}
+
+/// How close to pictures of a result those of a coarser one are to be, dB, so that next to nothing is lost: `margin` closer
+/// than the result's are to the original's (`result`).
+pub(crate) fn least(result: f64, margin: f64) -> f64 {
+    CLOSE_ENOUGH.min(result + margin)
+}
+
+/// Mean PSNR between two sources over `pictures`, dB.
+fn closeness(scene: &Scene, [a, b]: [&dyn FrameSource; 2], pictures: &[Picture]) -> Result<f64> {
+    let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
+    let mut sum = 0.0;
+    let subjects = [Subject::all(a), Subject::all(b)];
+    show(subjects, &scene.schedule.cameras, pictures, Batch::of_frame(&scene.limits), |views| {
+        for view in views {
+            let [a, b] = view.states.map(|state| render(state, view.camera, scene.background));
+            sum += psnr(&a, &b);
+        }
+        progress.advance(views.len() as u64);
+        Ok(())
+    })?;
+    Ok(sum / pictures.len() as f64)
+}

@@ -1,0 +1,405 @@
+//! Stage `merge`: which survivors become one, and what becomes of them.
+//!
+//! Memory, of every Gaussian that may survive [`BYTES_PER_SURVIVOR`], what [`crate::merging`] says of
+//! survivors and candidate pairs, and what [`crate::merging::motion_pass`] says of the pairs it measures together.
+
+use std::borrow::Cow;
+use std::cell::RefCell;
+use std::ops::Range;
+
+use rayon::slice::ParallelSliceMut;
+use serde::{Deserialize, Serialize};
+
+use crate::budget::{Need, Workload};
+use crate::cache::Work;
+use crate::error::{Error, Result};
+use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::merging;
+use crate::merging::known::{KnownPairs, Likeness};
+use crate::merging::motion::MotionGate;
+use crate::merging::motion_pass;
+use crate::merging::motion_pass::PairMeter;
+use crate::merging::proxy::{Importance, weights};
+use crate::merging::voxels::voxel_order;
+use crate::merging::{Asked, Merged, Survivors};
+use crate::model::{Column, Columns, Gaussians};
+use crate::models::trajectories::state_bytes;
+use crate::passes::{BLOCK, gather};
+use crate::pipeline::summary::MergeSummary;
+use crate::progress::Progress;
+use crate::pruning::Ranking;
+use crate::pruning::prune::Prune;
+use crate::pruning::score::{Scored, scored};
+use crate::recipe;
+use crate::reduction::{Cluster, Reduction};
+use crate::scene::Scene;
+use crate::source::FrameSource;
+
+/// What the stage is called.
+const NAME: &str = "merge";
+
+/// What pairs that are measured in parts are called in a work folder.
+pub(crate) const PAIRS: &str = "pairs";
+/// Fewest pairs that are measured in parts.
+const DIVIDED: usize = 20_000;
+
+/// Memory of a Gaussian that may survive: its id, its state with base colours only, whether that is finite, and its class.
+/// Twice the ids while merging is tried on some of them.
+const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
+
+/// Sets of survivors that are taken to be tried until merging leaves the target, to say how much is read: the bracket
+/// closes by the secant, mostly in fewer.
+const TRIALS: f64 = 16.0;
+
+/// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
+const GATHERED: usize = 16 * BLOCK;
+
+/// Seconds that a Gaussian takes: neighbours, tests and what comes of them (`benches/merge.rs`).
+const MERGING: f64 = 1e-5;
+/// Part of the Gaussians whose pairs are followed along the frames, about.
+const FOLLOWED: f64 = 0.3;
+
+/// The merging of a run.
+#[derive(Debug, Clone)]
+pub struct Merge {
+    /// Tests, passes and how members make up a proxy.
+    pub recipe: recipe::Merge,
+    /// What is life, and what is a step.
+    pub scan: recipe::Scan,
+    /// Whether survivors may be pruned to reach the target.
+    pub prunes: bool,
+    /// Exact size of the output.
+    pub target: Option<usize>,
+}
+
+/// A reduction, and what merging did to get there.
+#[derive(Serialize, Deserialize)]
+pub struct Outcome {
+    /// What is left.
+    pub reduction: Reduction,
+    /// Counts of every pass.
+    pub summary: Option<MergeSummary>,
+}
+
+impl Merge {
+    /// The merging that `recipe` has follow on `prune`.
+    pub fn after(prune: &Prune, recipe: &recipe::Recipe) -> Merge {
+        Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: prune.prunes, target: prune.target }
+    }
+
+    /// What is known of pairs that are measured together and of all that may survive, and the proxies.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
+        // Of the colours the first band; of proxies at most one for every two, before a pass and after it, then with
+        // all colours.
+        let proxies = state_bytes(0, Columns::all()).max(work.state(Columns::all()).div_ceil(2));
+        let per_gaussian = vec![
+            // C and Vis are read back.
+            ("importance", if limits.rows_aside { 16 } else { 0 }),
+            ("pool", BYTES_PER_SURVIVOR as u64),
+            ("proxies", proxies),
+            ("survivors", merging::BYTES_PER_SURVIVOR as u64),
+            ("passing", (self.recipe.max_neighbors * merging::BYTES_PER_PASSING) as u64),
+            ("readers", work.input.reader),
+            ("followed", motion_pass::bytes_per_gaussian(limits.frames_held) as u64),
+        ];
+        // States once; every pass follows its pairs along all frames, of every set of survivors that is tried: first those
+        // that coincide, if any do.
+        let trials = if self.target.is_some() && self.prunes { TRIALS } else { 1.0 };
+        let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
+        Need {
+            stage: NAME,
+            reads: work.scattered_reads(1, limits) + followed,
+            seconds: MERGING * work.count() + FOLLOWED * work.reading(work.count(), work.frames as f64),
+            per_gaussian: [scored(limits), per_gaussian].concat(),
+            fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
+        }
+    }
+
+    /// Merges the first `survivors` of a ranking, or, to exactly the target, as many as it takes; solves the proxies.
+    ///
+    /// # Errors
+    /// Frames that cannot be read; a target that merging alone cannot reach.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        ranking: &Ranking,
+        survivors: usize,
+        journal: &mut Journal,
+    ) -> Result<Outcome> {
+        // Importances are read back from the disk only for it.
+        let importance = scene.work.keeps().then(|| scored.importance()).transpose()?;
+        let key = scene.work.key(&(
+            (&self.recipe, self.scan.alpha_min, self.scan.motion, self.prunes, self.target, survivors),
+            (ranking, &scored.protected, scored.reference, scored.position_ulp, importance),
+        ));
+        let run = |journal: &mut Journal| {
+            journal.stage(NAME, survivors, scene.source(), |_| {
+                // Proxies belong to it, too.
+                let progress = Progress::counting(NAME, "sets of survivors");
+                let mut trial = Trial::new(scene, scored, self, ranking.take(survivors), &progress)?;
+                let mut merged = match self.target {
+                    None => trial.merge(&ranking.take(survivors), None)?,
+                    Some(target) if !self.prunes => trial.merge_to(&ranking.take(survivors), target)?,
+                    Some(target) => {
+                        let count = |m| Ok(trial.merge(&ranking.take(m), None)?.reduction.len());
+                        let m = bracket(target, survivors, count)?;
+                        trial.merge_to(&ranking.take(m), target)?
+                    }
+                };
+                drop(trial);
+                scene.work.not_divided(NAME)?;
+                let Outcome { reduction, summary } = &mut merged;
+                let proxies = scene.input.solve(&reduction.clusters, scored.reference, &self.recipe)?;
+                reduction.make(proxies);
+                if let Some(summary) = summary {
+                    summary.deviation = reduction.proxies.deviation;
+                    summary.count(&reduction.clusters);
+                }
+                let left = reduction.len();
+                Ok((merged, left))
+            })
+        };
+        journal.kept(&scene.work, NAME, key, run)
+    }
+}
+
+/// The largest number m of survivors, up to `all`, that the search finds to merge into at most
+/// `target`; m = `target` always does. Counts grow with m but for small dips, so the bracket closes
+/// by the secant, and stops when what is missing is under a thousandth of the target: merging then
+/// ends early by that much.
+fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<usize>) -> Result<usize> {
+    let (mut low, mut high) = (target, all);
+    let mut high_count = merged(high)?;
+    if high_count <= target {
+        return Ok(high);
+    }
+    let mut low_count = merged(low)?;
+    while high - low > 1 && target - low_count > target / 1000 {
+        let slope = (target - low_count) as f64 / (high_count - low_count) as f64;
+        // Away from the ends, so that a curved count cannot stall the search.
+        let m = low + ((high - low) as f64 * slope.clamp(0.1, 0.9)) as usize;
+        let m = m.clamp(low + 1, high - 1);
+        let count = merged(m)?;
+        if count <= target {
+            (low, low_count) = (m, count);
+        } else {
+            (high, high_count) = (m, count);
+        }
+    }
+    Ok(low)
+}
+
+/// Everything merging reads, so that it can be tried on many sets of survivors.
+struct Trial<'a> {
+    scored: &'a Scored,
+    /// The recipe's, with a noise floor no lower than that of the positions.
+    merge: recipe::Merge,
+    /// Ids whose states are known, increasing.
+    pool: Vec<u32>,
+    /// Their states at the reference frame, of the harmonics the first band.
+    states: Gaussians,
+    /// With which others each may merge: those of its class; none: with nobody.
+    classes: Vec<Option<u8>>,
+    /// C and Vis by id.
+    importance: [Cow<'a, [f64]>; 2],
+    meter: PairMeter<'a>,
+    work: &'a Work,
+    /// Pairs measured together.
+    pairs_together: usize,
+    /// How pairs of the pool move: it does not depend on who else survives.
+    known: KnownPairs,
+    /// Sets of survivors that were tried.
+    progress: &'a Progress,
+}
+
+impl<'a> Trial<'a> {
+    fn new(
+        scene: &'a Scene,
+        scored: &'a Scored,
+        stage: &'a Merge,
+        pool: Vec<u32>,
+        progress: &'a Progress,
+    ) -> Result<Self> {
+        let source = scene.source();
+        let (states, finite) = states_of(source, &pool, scored.reference.frame)?;
+        let class = |(&id, is_finite): (&u32, bool)| is_finite.then(|| scene.input.class(id));
+        let mut classes: Vec<Option<u8>> = pool.iter().zip(finite).map(class).collect();
+        for id in &scored.protected {
+            if let Ok(row) = pool.binary_search(id) {
+                classes[row] = None;
+            }
+        }
+        let mut merge = stage.recipe.clone();
+        let unit = merge.length_unit.in_scene_units(scored.reference.extent);
+        merge.motion_noise = merge.motion_noise.max(2.0 * scored.position_ulp / unit);
+        let meter = PairMeter {
+            source,
+            scan: &stage.scan,
+            gate: MotionGate::new(&merge, unit),
+            frames_held: scene.limits.frames_held,
+            scratch: scene.scratch.clone(),
+            gathered: None,
+        };
+        let (pairs_together, known) = (scene.limits.pairs_together, KnownPairs::default());
+        let importance = scored.importance()?;
+        let work = &scene.work;
+        Ok(Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress })
+    }
+
+    /// Merges `survivors` to exactly `target`.
+    fn merge_to(&mut self, survivors: &[u32], target: usize) -> Result<Outcome> {
+        let merged = self.merge(survivors, Some(survivors.len() - target))?;
+        let left = merged.reduction.len();
+        if left > target {
+            return Err(Error::usage(format!(
+                "a target of {target} Gaussians, but merging alone leaves {left} at the least\n  allow pruning, or looser merge passes"
+            )));
+        }
+        Ok(merged)
+    }
+
+    /// Merges `survivors` (increasing, all in the pool), stopping after `limit` joins.
+    fn merge(&mut self, survivors: &[u32], limit: Option<usize>) -> Result<Outcome> {
+        let Trial { scored, merge, pool, states, classes, importance, meter, work, pairs_together, known, progress } =
+            self;
+        let [coverage, visibility] = &*importance;
+        let survivors = Survivors {
+            states,
+            rows: &places_of(survivors, pool),
+            importance: Importance { ids: pool, coverage, visibility },
+            classes,
+            extent: scored.reference.extent,
+        };
+        let most = *pairs_together;
+        let merged = merging::run(&survivors, merge, limit, most, |asked| {
+            let missing = known.missing(asked.pairs());
+            let found = match missing.is_empty() {
+                true => Vec::new(),
+                false => measure(work, meter, (pool, &states.position), missing, &asked, merge)?,
+            };
+            let found = KnownPairs::new(found);
+            let likeness = |pair| known.likeness(pair).or_else(|| found.likeness(pair)).unwrap_or(f64::NAN);
+            let answer = asked.pairs().map(likeness).collect();
+            known.add(found, most);
+            Ok::<_, Error>(answer)
+        })?;
+        progress.advance(1);
+        Ok(outcome(&survivors, &merged, scored.reference.frame, merge))
+    }
+}
+
+/// How alike each of `pairs` moves, in some order. Many of them can be divided, by where they are.
+fn measure(
+    work: &Work,
+    meter: &mut PairMeter<'_>,
+    (pool, reference): (&[u32], &Column),
+    mut pairs: Vec<(u32, u32)>,
+    asked: &Asked<'_>,
+    merge: &recipe::Merge,
+) -> Result<Vec<Likeness>> {
+    if !work.keeps() || pairs.len() < DIVIDED {
+        return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
+    }
+    // Those of one place together, so that few parts read the same Gaussians.
+    let rows: Vec<u32> = (0..pool.len() as u32).collect();
+    let order = voxel_order(&rows, |row| reference.row(row as usize), asked.reach);
+    let mut place = rows;
+    order.iter().zip(0..).for_each(|(&row, k)| place[row as usize] = k);
+    pairs.par_sort_unstable_by_key(|&(a, b)| (place[a as usize], place[b as usize]));
+    let key = work.key(&(merge, meter.scan.alpha_min, meter.scan.motion, pool, &pairs));
+    let (fresh, meter) = (meter.fresh(), RefCell::new(meter));
+    let compute = |some: Range<usize>| match some.len() == pairs.len() {
+        true => meter.borrow_mut().measure(pool, reference, pairs.clone(), asked.reach, asked.is_part),
+        // A part of them is read once and by itself.
+        false => fresh.fresh().measure(pool, reference, pairs[some].to_vec(), asked.reach, false),
+    };
+    work.divided(PAIRS, key, pairs.len(), compute, |parts| {
+        let mut all = Vec::with_capacity(pairs.len());
+        for part in parts {
+            all.extend(part?);
+        }
+        Ok(all)
+    })
+}
+
+/// What `merged` leaves of `survivors`.
+fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::Merge) -> Outcome {
+    let (groups, importance) = (&merged.groups, &survivors.importance);
+    let id = |row: u32| importance.ids[row as usize];
+    let clusters: Vec<Cluster> = groups
+        .clusters()
+        .map(|group| {
+            let rows = groups.members(group as usize);
+            let ids = rows.iter().map(|&row| id(row));
+            let members = ids.zip(weights(rows, importance, survivors.states)).collect();
+            Cluster { output: group, leader: id(groups.leaders()[group as usize]), members }
+        })
+        .collect();
+    let mut summary = MergeSummary {
+        reference_frame,
+        proxies: 0,
+        members: 0,
+        opacity: merge.opacity,
+        passes: merged.passes.clone(),
+        deviation: None,
+    };
+    summary.count(&clusters);
+    let kept = groups.leaders().iter().map(|&row| id(row)).collect();
+    Outcome { reduction: Reduction { clusters, ..Reduction::pruned(kept, merge) }, summary: Some(summary) }
+}
+
+/// States of the Gaussians `ids` (increasing) at `frame`, of the harmonics the first band; and whether the whole state
+/// is finite. Without frames all is zero.
+fn states_of(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Result<(Gaussians, Vec<bool>)> {
+    let mut states = Gaussians::zeros(ids.len(), 0);
+    let mut finite = vec![true; ids.len()];
+    if source.info().times.is_empty() {
+        return Ok((states, finite));
+    }
+    for (ids, start) in ids.chunks(GATHERED).zip((0..).step_by(GATHERED)) {
+        let whole = gather(source, ids, frame, Columns::all())?;
+        states.write_rows(start, &whole);
+        for (row, finite) in finite[start..].iter_mut().take(ids.len()).enumerate() {
+            *finite = merging::is_finite(&whole, row);
+        }
+    }
+    Ok((states, finite))
+}
+
+/// Place of each of `ids` in `pool`, both increasing, the first part of the second.
+fn places_of(ids: &[u32], pool: &[u32]) -> Vec<u32> {
+    let mut place = 0;
+    ids.iter()
+        .map(|&id| {
+            while pool[place] < id {
+                place += 1;
+            }
+            place as u32
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bracket_finds_the_most_survivors_that_merge_into_the_target() {
+        // Merging halves what lies beyond the first hundred.
+        for target in [1, 50, 100, 101, 400, 549, 550, 1000] {
+            let count = |m: usize| m.min(100) + m.saturating_sub(100) / 2;
+            let m = bracket(target, 1000, |m| Ok(count(m))).unwrap();
+            assert!(count(m) <= target && m >= target, "target {target}, got {m}");
+            assert!(m == 1000 || count(m + 2) > target - target / 1000, "target {target}: {m} could be larger");
+        }
+    }
+
+    #[test]
+    fn places_follow_the_ids() {
+        assert_eq!(places_of(&[2, 5, 9], &[1, 2, 3, 5, 9]), [1, 3, 4]);
+        assert!(places_of(&[], &[4]).is_empty());
+    }
+}

@@ -1,0 +1,13 @@
+//! Stages of the pipeline that call on several topics; those of one topic are in its folder (`pruning`, `refinement`).
+
+pub mod archive;
+pub(crate) mod bands;
+pub(crate) mod bounds;
+pub(crate) mod choose;
+pub(crate) mod degree;
+pub mod emit;
+pub(crate) mod field;
+pub mod measure;
+pub(crate) mod merge;
+pub(crate) mod near;
+pub(crate) mod scan;

@@ -1,0 +1,106 @@
+//! Stage `scan`: every Gaussian at every frame once, through one fixed-size accumulator each.
+
+use crate::budget::{Need, Workload};
+use crate::error::Result;
+use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::model::{Columns, Rows};
+use crate::passes::BLOCK;
+use crate::recipe;
+use crate::scene::Scene;
+use crate::statistics;
+use crate::statistics::ScanPlan;
+use crate::statistics::pass::Scanned;
+
+/// What the stage is called.
+pub(crate) const NAME: &str = "scan";
+
+/// Seconds that a state takes to be added to an accumulator, and to be projected to a picture (`benches/scan.rs`,
+/// `benches/projection.rs`).
+const ACCUMULATING: f64 = 2e-8;
+/// See [`ACCUMULATING`].
+const PROJECTING: f64 = 8e-9;
+
+/// The scan of a run.
+#[derive(Debug, Clone)]
+pub struct Scan {
+    /// Its parameters.
+    pub recipe: recipe::Scan,
+}
+
+impl Scan {
+    /// A block of Gaussians at a time, then the rows of all, joined.
+    pub fn need(&self, work: &Workload, _: &Limits) -> Need {
+        // In stages a second reader decodes while the first is read.
+        let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::all());
+        // How many live in each, in the blocks of all threads; the steps between uneven ones.
+        let frames = work.frames * (4 * work.threads + 8);
+        Need {
+            stage: NAME,
+            reads: 1.0,
+            seconds: work.pace.states
+                * work.count()
+                * work.frames as f64
+                * (ACCUMULATING + work.views as f64 * PROJECTING)
+                + work.reading(work.count(), work.frames as f64),
+            per_gaussian: vec![("rows", 2 * Rows::BYTES_PER_GAUSSIAN as u64)],
+            fixed: vec![
+                ("blocks", work.threads * work.at_most(BLOCK as u64) * block),
+                work.arriving(),
+                ("frames", frames),
+            ],
+        }
+    }
+
+    /// Statistics of every Gaussian of `scene`.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, or whose times cannot be scanned.
+    pub fn run(&self, scene: &Scene, journal: &mut Journal) -> Result<Scanned> {
+        let source = scene.source();
+        let info = source.info();
+        let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
+        let compute = |blocks| crate::statistics::pass::scan_blocks(source, &scene.schedule, &plan, blocks);
+        journal.stage(NAME, info.count, source, |_| {
+            let units = crate::statistics::pass::scan_units(info);
+            let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {
+                let mut all = Scanned { alive_per_frame: vec![0; info.times.len()], ..Scanned::default() };
+                for part in parts {
+                    all.join(part?);
+                }
+                Ok(all)
+            })?;
+            Ok((found, info.count))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::tests::{scene, work};
+    use crate::recipe::Recipe;
+
+    #[test]
+    fn every_gaussian_gets_a_row_and_the_stage_is_written_down() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
+        let mut journal = Journal::default();
+        let found = scan.run(&scene, &mut journal).unwrap();
+        assert_eq!((found.rows.len(), found.alive_per_frame.len()), (1500, 6));
+        let stage = &journal.stages[0];
+        assert_eq!((stage.name.as_str(), stage.gaussians_in, stage.gaussians_out), ("scan", 1500, 1500));
+    }
+
+    #[test]
+    fn memory_beside_the_rows_does_not_grow_with_gaussians_beyond_a_block() {
+        let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
+        let need = |count| {
+            let need = scan.need(&work(count), &Limits::NONE);
+            (need.per_gaussian, need.fixed)
+        };
+        assert_eq!(need(1_024), need(1_000_000));
+        assert!(need(100).1[0].1 < need(1_024).1[0].1);
+    }
+}

@@ -1,0 +1,137 @@
+//! What a run will take, with ranges, before it begins.
+
+use std::fmt::Write as _;
+
+use crate::budget::{Need, Tell, Workload, size};
+use crate::journal::records::{Forecast, Range, StageForecast};
+use crate::progress::duration;
+
+/// How far off core-seconds were on three trained models at several sizes after a calibration (`scripts/estimate.py`), as
+/// parts of what was expected, and somewhat more.
+const OFF: [f64; 2] = [0.5, 1.6];
+/// The same where nothing was measured.
+const OFF_UNMEASURED: [f64; 2] = [0.25, 4.0];
+/// The same where the size itself is searched for: how often pictures are refined is found on the way.
+const OFF_SEARCHING: [f64; 2] = [0.15, 2.5];
+/// Part of the processors that stages keep at work, at least: not everything is divided among threads.
+const TOGETHER: f64 = 0.6;
+/// Seconds that starting, opening and writing take, whatever is done.
+const AT_LEAST: f64 = 0.5;
+
+impl Forecast {
+    /// Of stages that need what `needs` says, or at best take `least` core-seconds.
+    pub(super) fn of(work: &Workload, needs: &[Need], least: f64, searches: bool, memory_bytes: u64) -> Forecast {
+        let likely = core_seconds(needs);
+        let measured = work.pace.processors;
+        let off = match (searches, measured) {
+            (true, _) => OFF_SEARCHING,
+            (_, Some(_)) => OFF,
+            (_, None) => OFF_UNMEASURED,
+        };
+        let core = Range { least: off[0] * least, likely, most: off[1] * likely + AT_LEAST };
+        let threads = work.threads as f64;
+        let got = measured.unwrap_or(threads).min(threads);
+        let usual = (0.9 * got).max(1f64.min(got));
+        let fewest = (TOGETHER * got).max(1f64.min(got));
+        Forecast {
+            seconds: Range { least: core.least / threads, likely: core.likely / usual, most: core.most / fewest },
+            core_seconds: core,
+            threads: work.threads,
+            measured: measured.is_some(),
+            memory_bytes,
+            stages: needs
+                .iter()
+                .map(|need| StageForecast { name: need.stage.to_owned(), core_seconds: need.seconds })
+                .collect(),
+        }
+    }
+
+    /// For a person: time and memory, a line each; stage by stage too where everything is to be explained.
+    pub fn text(&self, tell: Tell) -> String {
+        let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
+        let mut out = String::new();
+        // Writing to a String cannot fail.
+        let _ = match seconds.most {
+            ..2.0 => writeln!(out, "time: a second or two on {threads} threads"),
+            _ => writeln!(
+                out,
+                "time: about {}, {} to {} on {threads} threads; {} to {} core-seconds",
+                rounded(seconds.likely),
+                rounded(seconds.least),
+                rounded(seconds.most),
+                digits(core.least),
+                digits(core.most)
+            ),
+        };
+        if tell == Tell::Plan {
+            let named = stages.iter().map(|stage| format!("{} {:.1}", stage.name, stage.core_seconds));
+            let _ = writeln!(out, "core-seconds: {}", named.collect::<Vec<_>>().join(" + "));
+        }
+        let _ = writeln!(out, "memory: at most {}", size(self.memory_bytes));
+        out
+    }
+}
+
+/// Seconds of all processors together that stages take, about.
+pub(super) fn core_seconds(needs: &[Need]) -> f64 {
+    needs.iter().map(|need| need.seconds).sum()
+}
+
+/// Two digits: more would claim what nobody knows.
+fn digits(value: f64) -> String {
+    match value {
+        ..0.95 => format!("{value:.1}"),
+        ..100.0 => format!("{value:.0}"),
+        _ => {
+            let unit = 10f64.powf(value.log10().floor() - 1.0);
+            format!("{:.0}", (value / unit).round() * unit)
+        }
+    }
+}
+
+/// A time that is about known.
+fn rounded(seconds: f64) -> String {
+    match seconds {
+        ..60.0 => format!("{} s", digits(seconds)),
+        ..600.0 => duration((seconds / 10.0).round() * 10.0),
+        _ => duration((seconds / 60.0).round() * 60.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::budget::Pace;
+    use crate::pipeline::tests::work;
+
+    fn need(seconds: f64) -> Need {
+        Need { stage: "scan", reads: 0.0, seconds, per_gaussian: Vec::new(), fixed: Vec::new() }
+    }
+
+    #[test]
+    fn a_range_holds_what_is_likely_and_is_wider_where_less_is_known() {
+        let unmeasured = work(1000);
+        let measured = crate::budget::Workload { pace: Pace { processors: Some(1.5), ..Pace::UNKNOWN }, ..unmeasured };
+        let of = |work: &Workload, searches| Forecast::of(work, &[need(40.0)], 40.0, searches, 1 << 20);
+        let all = [of(&measured, false), of(&unmeasured, false), of(&measured, true)];
+        for Forecast { seconds, core_seconds, .. } in &all {
+            for range in [seconds, core_seconds] {
+                assert!(range.least < range.likely && range.likely < range.most, "{range:?}");
+            }
+        }
+        let width = |forecast: &Forecast| forecast.core_seconds.most / forecast.core_seconds.least;
+        assert!(width(&all[0]) < width(&all[1]) && width(&all[0]) < width(&all[2]));
+        let text = all[0].text(Tell::Plan);
+        assert!(text.starts_with("time: about ") && text.contains(" core-seconds\n"), "{text}");
+        assert!(text.contains("\ncore-seconds: scan 40.0\n") && text.ends_with("memory: at most 1.0 MiB\n"), "{text}");
+        assert!(!all[0].text(Tell::Time).contains("scan"));
+    }
+
+    #[test]
+    fn what_is_about_known_has_two_digits() {
+        for (value, text) in [(0.44, "0.4"), (9.6, "10"), (47.4, "47"), (1234.0, "1200"), (99.7, "100")] {
+            assert_eq!(digits(value), text);
+        }
+        assert_eq!([42.4, 127.0, 4000.0].map(rounded), ["42 s", "2 min 10 s", "1 h 07 min"]);
+    }
+}

@@ -1,0 +1,221 @@
+//! A page that plays one model, or two side by side.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::TOOL;
+use crate::budget::{Need, Plan, Workload};
+use crate::error::{Error, Result};
+use crate::evaluation::open_compressed;
+use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
+use crate::limits::Limits;
+use crate::model::{ALL_HARMONICS, Columns, SequenceInfo};
+use crate::models::Family;
+use crate::player::lattice::{Steps, width};
+use crate::player::page::{Chunks, INDEX, Shown, Stage, looks, upwards};
+use crate::player::track::{GROUP_VALUES, Track, encode};
+use crate::scene::pictures::background;
+use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
+
+/// What making the page is called.
+const NAME: &str = "view";
+
+/// What to show.
+#[derive(Debug, Clone)]
+pub struct ViewOptions {
+    /// The model, or the one before compression; of its split nothing is used.
+    pub original: InputOptions,
+    /// The one after it, of any kind.
+    pub compressed: Option<PathBuf>,
+    /// Show at most so many frames, evenly from first to last.
+    pub max_frames: usize,
+    /// Of the original beside a compressed one; none: as many.
+    pub original_frames: Option<usize>,
+    /// Degree of harmonics to show the original with, beside a compressed one; none: its own.
+    pub original_degree: Option<usize>,
+    /// Red, green, blue in [0, 1]; none: see [`background`].
+    pub background: Option<[f32; 3]>,
+    /// Bytes above which one file becomes a folder.
+    pub page_limit: u64,
+    /// NAME.html, or a folder.
+    pub output: PathBuf,
+    /// Replace an earlier output.
+    pub overwrite: Replace,
+}
+
+/// What was written.
+#[derive(Debug)]
+pub struct Viewed {
+    /// The page to open.
+    pub page: PathBuf,
+    /// Bytes of all files.
+    pub bytes: u64,
+    /// Number of files.
+    pub files: usize,
+    /// Number of frames shown.
+    pub frames: usize,
+    /// Things a person should know.
+    pub notes: Vec<String>,
+}
+
+/// Confirms, before any work, that the page may be written.
+///
+/// # Errors
+/// Those of [`check_target`].
+pub fn check(options: &ViewOptions) -> Result<()> {
+    let mut inputs = vec![options.original.path.as_path()];
+    inputs.extend(options.original.cameras.as_deref());
+    inputs.extend(options.compressed.as_deref());
+    let kind = if is_page(&options.output) { Kind::File } else { Kind::Folder };
+    check_target(&options.output, kind, &inputs, options.overwrite)
+}
+
+fn is_page(output: &Path) -> bool {
+    output.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("html") || ending.eq_ignore_ascii_case("htm"))
+}
+
+/// Writes the page.
+///
+/// Memory: one state of one model, and a group of its frames as lattice points ([`GROUP_VALUES`]).
+///
+/// # Errors
+/// Whatever is wrong with inputs, cameras or output. Nothing is left behind then.
+pub fn view(options: &ViewOptions) -> Result<Viewed> {
+    check(options)?;
+    let mut scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
+    if scene.source().info().times.is_empty() {
+        return Err(Error::input(&options.original.path, "", "at least one frame to show", "none"));
+    }
+    let compressed =
+        options.compressed.as_deref().map(|path| open_compressed(path, &scene, &options.original)).transpose()?;
+    let background = background(options.background, &scene)?;
+    let limits = {
+        let most = compressed.as_ref().map_or(0, |model| model.source().info().count as u64);
+        let work = scene.workload();
+        let work = Workload { gaussians: work.gaussians.max(most), ..work };
+        Plan::fit(work, options.original.memory, |work, limits| vec![need(work, limits)])?.limits
+    };
+    scene.limits = limits;
+    let bounds = first_box(scene.source())?;
+    let (middle, extent) = bounds.map_or(Default::default(), |found| (found.middle, found.extent()));
+    let steps = Steps::of_extent(if extent > 0.0 { extent } else { 1.0 });
+
+    let all = options.max_frames.max(1);
+    let (frames, degree) = match compressed {
+        Some(_) => (options.original_frames.unwrap_or(all), options.original_degree.unwrap_or(ALL_HARMONICS)),
+        None => (all, ALL_HARMONICS),
+    };
+    let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
+    let (mut chunks, mut notes) = (Chunks::new(&scratch)?, std::mem::take(&mut scene.notes));
+    let asked = Asked { role: "original", path: &scene.path, frames, degree };
+    let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks)?];
+    if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
+        let asked = Asked { role: "compressed", path, frames: all, degree: ALL_HARMONICS };
+        models.push(show(model, 1, &asked, steps, &limits, &mut chunks)?);
+    }
+    for model in models.iter().filter(|model| model.track.unseen > 0) {
+        let (name, unseen) = (&model.name, model.track.unseen);
+        notes.push(format!("{name}: {unseen} Gaussians are not finite, or too far away to be shown"));
+    }
+    let frames = models.iter().map(|model| model.track.times.len()).max().unwrap_or(0);
+    let mut stage = Stage {
+        tool: TOOL,
+        models,
+        cameras: looks(&scene.rig),
+        background,
+        middle: middle.to_array(),
+        extent: if extent > 0.0 { extent } else { 1.0 },
+        up: upwards(&scene.rig).to_array(),
+        files: Vec::new(),
+    };
+    if is_page(&options.output) && chunks.bytes() <= options.page_limit {
+        let staged = StagedFile::new(&options.output, options.overwrite)?;
+        let bytes = chunks.write_page(&stage, staged.path())?;
+        staged.commit()?;
+        return Ok(Viewed { page: options.output.clone(), bytes, files: 1, frames, notes });
+    }
+    let folder = if is_page(&options.output) { options.output.with_extension("") } else { options.output.clone() };
+    if is_page(&options.output) {
+        check_target(&folder, Kind::Folder, &[&options.original.path], options.overwrite)?;
+        let (bytes, most) = (chunks.bytes(), options.page_limit);
+        notes.push(format!(
+            "{bytes} bytes of frames are more than one page is to hold ({most}, --page-limit): a folder it is"
+        ));
+    }
+    let staged = StagedFolder::new(&folder, options.overwrite)?;
+    let (names, bytes) = chunks.write_folder(&mut stage, staged.path())?;
+    let marker = staged.path().join(MARKER);
+    let summary = serde_json::json!({ "tool": TOOL, "page": INDEX, "frames": frames });
+    fs::write(&marker, format!("{summary:#}\n")).map_err(Error::io("write", &marker))?;
+    staged.commit()?;
+    Ok(Viewed { page: folder.join(INDEX), bytes, files: names.len(), frames, notes })
+}
+
+/// How a model is to be shown.
+struct Asked<'a> {
+    role: &'static str,
+    path: &'a Path,
+    frames: usize,
+    degree: usize,
+}
+
+/// Makes the chunks of model `place` of the page.
+fn show(
+    model: &dyn Family,
+    place: usize,
+    asked: &Asked<'_>,
+    steps: Steps,
+    limits: &Limits,
+    chunks: &mut Chunks,
+) -> Result<Shown> {
+    let source = model.source();
+    let SequenceInfo { times, sh_degree, .. } = source.info();
+    let frames = evenly(times.len(), asked.frames);
+    let mut track = Track::plan(source, &frames, asked.degree, steps);
+    let groups = track.groups.clone();
+    encode(source, &frames, &mut track, limits.frames_held, |chunk, bytes| {
+        let since = chunk.checked_sub(1).map_or(0.0, |group| groups[group] as f64 / frames.len() as f64);
+        chunks.add(place, chunk, since, &bytes)
+    })?;
+    let name = asked.path.file_name().unwrap_or(asked.path.as_os_str()).to_string_lossy().into_owned();
+    Ok(Shown { role: asked.role, name, bytes: model.size()?.whole(), frames: times.len(), degree: *sh_degree, track })
+}
+
+/// `count` of `frames` frames at most, evenly from first to last.
+fn evenly(frames: usize, count: usize) -> Vec<usize> {
+    let count = count.clamp(1, frames.max(1));
+    let step = (frames.max(1) - 1) as f64 / (count - 1).max(1) as f64;
+    (0..count.min(frames)).map(|i| (i as f64 * step).round_ties_even() as usize).collect()
+}
+
+/// What it takes to turn frames into chunks.
+fn need(work: &Workload, limits: &Limits) -> Need {
+    let points = 4 * width(work.sh_degree) as u64;
+    let of_all = points / 4 * work.gaussians * work.frames.max(1);
+    Need {
+        stage: NAME,
+        reads: 1.0,
+        seconds: work.reading(work.count(), work.frames as f64),
+        per_gaussian: vec![
+            ("states", 2 * work.state(Columns::all())),
+            ("readers", work.input.reader),
+            ("held", work.held(limits, Columns::all())),
+            ("points", 3 * points),
+        ],
+        // The group, and eight of its components as differences and as bytes, and what comes of all.
+        fixed: vec![work.arriving(), ("group", 10 * of_all.min(GROUP_VALUES as u64))],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_evenly_from_first_to_last() {
+        assert_eq!(evenly(60, 4), [0, 20, 39, 59]);
+        assert_eq!(evenly(3, 60), [0, 1, 2]);
+        assert_eq!(evenly(5, 1), [0]);
+        assert_eq!(evenly(0, 60), [0usize; 0]);
+    }
+}

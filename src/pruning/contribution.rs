@@ -1,0 +1,300 @@
+//! Visible contribution: what every Gaussian adds to the scored pictures, occlusion included.
+//!
+//! In: a source, its cameras frame by frame, which pictures to look at. Out: C `visible` and W (method.md,
+//! section 1). Sums of integers and maxima: the same bits whatever the order, the threads and the batches.
+
+use std::num::NonZeroU32;
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::model::{Camera, Columns, Picture};
+use crate::passes::pictures::{Subject, Workers};
+use crate::progress::Progress;
+use crate::render::{Contribution, Renderer};
+use crate::source::{FrameSource, Ids};
+
+/// What contributions depend on: all but colour.
+const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
+
+/// What was seen of N Gaussians.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Seen {
+    /// `[N]`, C: Σ alpha · transmittance per picture, pixels; a sampled pixel stands for stride² of them.
+    pub coverage: Vec<f64>,
+    /// `[N]`, W: largest alpha · transmittance of any pixel looked at, in [0, 0.99].
+    pub peak: Vec<f64>,
+}
+
+impl Seen {
+    /// What `found` in so many pictures comes to.
+    pub fn of(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> Seen {
+        let per_pixel = f64::from(pixel_stride.get()).powi(2);
+        let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
+        Seen { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
+    }
+}
+
+/// Looks at every `pixel_stride`-th pixel each way of `pictures`; [`Seen::of`] says what that comes to.
+///
+/// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
+/// pictures at all give zeros.
+///
+/// Memory per Gaussian: its reader, and that of [`RunningContribution`]. Nothing grows with frames or views.
+pub fn visible_contribution(
+    source: &dyn FrameSource,
+    (cameras, pictures): (&[Camera], &[Picture]),
+    pixel_stride: NonZeroU32,
+    limits: Limits,
+) -> Result<Contribution> {
+    let progress = Progress::new("visible", "pictures", pictures.len() as u64);
+    let mut running = RunningContribution::new(source.info().count, pixel_stride, limits);
+    running.add(source, cameras, pictures, || progress.advance(1))?;
+    Ok(running.sum())
+}
+
+/// Contributions to the pictures so far.
+///
+/// Memory per Gaussian: 44 bytes for each frame of a batch (of 4 × threads pictures, within `limits`) and for a
+/// block's state; for each picture at a time 12 bytes of sums and the picture's buffers
+/// ([`crate::render`]).
+pub struct RunningContribution {
+    count: usize,
+    pixel_stride: NonZeroU32,
+    pictures: usize,
+    workers: Workers<(Renderer, Contribution)>,
+}
+
+impl RunningContribution {
+    /// No pictures yet of `count` Gaussians.
+    pub fn new(count: usize, pixel_stride: NonZeroU32, limits: Limits) -> Self {
+        RunningContribution { count, pixel_stride, pictures: 0, workers: Workers::new(limits) }
+    }
+
+    /// Looks at `pictures` of `source`, by frame. Every source that is added must have the same Gaussians.
+    pub fn add(
+        &mut self,
+        source: &dyn FrameSource,
+        cameras: &[Camera],
+        pictures: &[Picture],
+        advance: impl Fn() + Sync,
+    ) -> Result<()> {
+        let (count, pixel_stride) = (self.count, self.pixel_stride);
+        self.pictures += pictures.len();
+        self.workers.show(
+            Subject { source, ids: Some(Ids::Range(0..count)), columns: GEOMETRY },
+            cameras,
+            pictures,
+            || (Renderer::new(), Contribution::new(count)),
+            |(renderer, seen), state, camera| {
+                renderer.contribution(state, camera, pixel_stride, seen);
+                advance();
+            },
+        )
+    }
+
+    /// What was seen in all pictures.
+    pub fn finish(self) -> Seen {
+        let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
+        Seen::of(&self.sum(), pictures, pixel_stride)
+    }
+
+    fn sum(self) -> Contribution {
+        let mut sum = Contribution::new(self.count);
+        self.workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+        sum
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+    use crate::model::{Flags, Gaussians, Rig, Rows, Schedule, SequenceInfo, Split};
+    use crate::passes::looked_at;
+    use crate::pruning::{Overrides, select};
+    use crate::recipe::{self, Recipe};
+    use crate::render;
+    use crate::source::BlockReader;
+    use crate::statistics::score;
+
+    fn strides(pixel: u32, view: u32, frame: u32) -> recipe::Scan {
+        let [pixel_stride, view_stride, frame_stride] = [pixel, view, frame].map(|n| NonZeroU32::new(n).unwrap());
+        recipe::Scan {
+            pixel_stride,
+            view_stride,
+            frame_stride,
+            look_pictures: 0,
+            ..Recipe::preset("default").unwrap().scan
+        }
+    }
+
+    fn on_threads<R: Send>(threads: usize, work: impl FnOnce() -> R + Send) -> R {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
+    }
+
+    #[test]
+    fn contributions_are_the_bits_of_a_plain_loop_over_pictures_whatever_the_threads() {
+        let scene = Scene::new(2500, 7);
+        let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
+        for (pixel, view, frame) in [(1, 1, 1), (3, 2, 2)] {
+            let scan = strides(pixel, view, frame);
+            let mut plain = Contribution::new(2500);
+            let mut pictures = 0;
+            for (turn, t) in (0..7).step_by(frame as usize).enumerate() {
+                let mut state = Gaussians::zeros(2500, scene.info().sh_degree);
+                scene.open(Ids::Range(0..2500)).unwrap().read(t, Columns::all(), &mut state).unwrap();
+                for &(_, camera) in schedule.views(t).iter().skip(turn % view as usize).step_by(view as usize) {
+                    let camera = &schedule.cameras[camera as usize];
+                    render::contribution(&state, camera, scan.pixel_stride, &mut plain);
+                    pictures += 1;
+                }
+            }
+            let sample = looked_at(&schedule, &scan, 1);
+            let frames = sample.chunk_by(|a, b| a.frame == b.frame).count();
+            assert_eq!((sample.len(), frames), (pictures, 7usize.div_ceil(frame as usize)));
+            let one = Limits { frames_held: 1, frames_together: 1, pictures_together: 1, ..Limits::NONE };
+            for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
+                let look =
+                    || visible_contribution(&scene, (&schedule.cameras, &sample), scan.pixel_stride, limits).unwrap();
+                let seen = Seen::of(&on_threads(threads, look), sample.len(), scan.pixel_stride);
+                for i in 0..2500 {
+                    let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
+                    assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
+                    assert_eq!(seen.peak[i], f64::from(plain.max[i]), "W of {i} on {threads} threads");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_sampled_pixel_stands_for_all_it_skips() {
+        let scene = Scene::new(1200, 3);
+        let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
+        let total = |pixel| {
+            let scan = strides(pixel, 1, 1);
+            let sample = (&schedule.cameras[..], &looked_at(&schedule, &scan, 1)[..]);
+            let found = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
+            Seen::of(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
+        };
+        let (all, third) = (total(1), total(3));
+        assert!((third / all - 1.0).abs() < 0.02, "got {third}, expected about {all}");
+    }
+
+    #[test]
+    fn strides_leave_every_view_its_turn_and_never_no_picture() {
+        let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, 1.0, (8, 8));
+        let views = |from: u32, to: u32| (from..to).map(|view| (view, view)).collect::<Vec<_>>();
+        // The first frame has no picture in this split.
+        let mut schedule = Schedule::new((0..3).map(|_| camera.clone()).collect());
+        for (count, seen) in [(1, views(0, 0)), (2, views(0, 3)), (1, views(0, 0)), (2, views(0, 3))] {
+            schedule.push(count, &seen);
+        }
+        let taken = |view, frame| -> Vec<(usize, u32)> {
+            let sample = looked_at(&schedule, &strides(1, view, frame), 1);
+            sample.iter().map(|picture| (picture.frame, picture.camera)).collect()
+        };
+        assert_eq!(taken(3, 1), [(1, 0), (2, 1), (4, 2), (5, 0)]);
+        assert_eq!(taken(2, 2), [(1, 0), (1, 2), (4, 1)]);
+        assert_eq!(taken(100, 100), [(1, 0)]);
+    }
+
+    /// One state for ever.
+    struct Still(Gaussians, SequenceInfo);
+
+    impl FrameSource for Still {
+        fn info(&self) -> &SequenceInfo {
+            &self.1
+        }
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(Picked(self.0.pick(&ids.iter().map(|id| id as u32).collect::<Vec<_>>()))))
+        }
+    }
+
+    struct Picked(Gaussians);
+
+    impl BlockReader for Picked {
+        fn read(&mut self, _: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            want.iter().for_each(|column| *out.column_mut(column) = self.0.column(column).clone());
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_wholly_occluded_gaussian_has_no_visible_coverage_and_is_pruned_first() {
+        // Bright and large behind four opaque walls; before them one that is hardly there.
+        const HIDDEN: usize = 5;
+        const FAINT: usize = 0;
+        let count = 40;
+        let mut state = Gaussians::zeros(count, 0);
+        for i in 0..count {
+            let (y, size, logit) = match i {
+                FAINT => (-1.0, -4.0, -4.0f32),
+                HIDDEN => (3.0, -1.0, 6.0),
+                1..5 => (0.1 * i as f32, 4.0, 12.0),
+                _ => (-1.0, -2.0, 0.0),
+            };
+            state.position.set_row(i, [0.02 * i as f32 - 0.4, y, 0.0]);
+            state.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+            state.log_scale.set_row(i, [size, if size > 0.0 { -5.0 } else { size }, size]);
+            state.opacity_logit.set_row(i, [logit]);
+        }
+        let info = SequenceInfo { count, times: vec![0.0, 1.0], sh_degree: 0, varying: Columns::empty() };
+        let rig = Rig {
+            cameras: vec![Camera::look_at(glam::DVec3::new(0.0, -4.0, 0.0), glam::DVec3::ZERO, 1.0, (64, 48))],
+            shots: vec![crate::model::Shot { view: 0, camera: 0, time: None, split: Split::Train, image: None }],
+            background: None,
+            origin: "test".into(),
+        };
+        let schedule = rig.schedule(&info.times, None).unwrap();
+        let recipe = Recipe::preset("default").unwrap();
+        let sample = looked_at(&schedule, &recipe.scan, 1);
+        let seen = visible_contribution(
+            &Still(state, info),
+            (&schedule.cameras, &sample),
+            recipe.scan.pixel_stride,
+            Limits::NONE,
+        )
+        .unwrap();
+        let seen = Seen::of(&seen, sample.len(), recipe.scan.pixel_stride);
+        assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
+        assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
+
+        let zeros = || vec![0.0; count];
+        let rows = Rows {
+            d: zeros(),
+            kappa: zeros(),
+            v: zeros(),
+            life: vec![2; count],
+            c: seen.coverage,
+            w: seen.peak,
+            e: zeros(),
+            vis: vec![1.0; count],
+            flags: vec![Flags::empty(); count],
+        };
+        let scores = score::score(&rows, 2, &recipe.score);
+        let selection = select(&scores, &recipe.select, &Overrides::default()).unwrap();
+        let unseen: Vec<bool> = selection.ranking.order().iter().map(|&id| rows.c[id as usize] == 0.0).collect();
+        assert!(unseen.is_sorted() && unseen.iter().filter(|&&unseen| unseen).count() < 5, "{unseen:?}");
+    }
+
+    #[test]
+    fn nothing_to_see_gives_zeros() {
+        let scene = Scene::new(300, 2);
+        let mut schedule = Schedule::default();
+        schedule.push(2, &[]);
+        let look = |source: &dyn FrameSource, schedule: &Schedule| {
+            let sample = looked_at(schedule, &strides(1, 1, 1), 1);
+            let sample = (&schedule.cameras[..], &sample[..]);
+            let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE).unwrap();
+            Seen::of(&found, sample.1.len(), NonZeroU32::MIN)
+        };
+        let seen = look(&scene, &schedule);
+        assert_eq!(seen, Seen { coverage: vec![0.0; 300], peak: vec![0.0; 300] });
+        let none = Still(Gaussians::zeros(0, 0), SequenceInfo { count: 0, ..scene.info().clone() });
+        let schedule = scene.rig().schedule(&scene.info().times, None).unwrap();
+        let seen = look(&none, &schedule);
+        assert!(seen.coverage.is_empty() && seen.peak.is_empty());
+    }
+}

@@ -1,0 +1,73 @@
+//! What the scored pictures would lose with each Gaussian of a part of the input.
+
+use crate::error::Result;
+use crate::limits::Limits;
+use crate::model::{Camera, Columns, Picture};
+use crate::passes::pictures::{Subject, Workers};
+use crate::render::{RemovalError, Renderer};
+use crate::source::{FrameSource, Ids};
+
+/// `[ids]`, [`RemovalError`] of the Gaussians `ids` among each other, over `pictures`: the same bits whatever
+/// the threads.
+///
+/// Memory per Gaussian of `ids`: its reader; 44 + 12·(d + 1)² bytes for each frame of a batch (frames with
+/// 4 × threads pictures between them, within `limits`) and for a block's state; for each picture at a time 8 bytes
+/// of sums and the picture's buffers. Nothing grows with frames or views.
+pub fn removal_error(
+    source: &dyn FrameSource,
+    ids: &[u32],
+    (cameras, pictures): (&[Camera], &[Picture]),
+    background: [f32; 3],
+    contrast_floor: f32,
+    limits: Limits,
+    advance: impl Fn() + Sync,
+) -> Result<RemovalError> {
+    let mut workers = Workers::new(limits);
+    workers.show(
+        Subject { source, ids: Some(Ids::List(ids)), columns: Columns::all() },
+        cameras,
+        pictures,
+        || (Renderer::new(), RemovalError::new(ids.len(), contrast_floor)),
+        |(renderer, errors), state, camera| {
+            renderer.removal_error(state, camera, background, errors);
+            advance();
+        },
+    )?;
+    let mut sum = RemovalError::new(ids.len(), contrast_floor);
+    workers.into_inner().iter().for_each(|(_, of_thread)| sum.merge(of_thread));
+    Ok(sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+    use crate::model::Split;
+    use crate::passes::{VIEWS_AT_ONCE, gather, spread};
+
+    #[test]
+    fn errors_are_the_bits_of_a_plain_loop_over_pictures_of_those_ids_alone_whatever_the_threads() {
+        let scene = Scene::new(2500, 4);
+        let schedule = scene.rig().schedule(&scene.info().times, Some(Split::Train)).unwrap();
+        let ids: Vec<u32> = (0..2500).filter(|id| id % 3 != 1).collect();
+        let background = [0.1, 0.2, 0.3];
+        let mut plain = RemovalError::new(ids.len(), 0.1);
+        for (t, views) in schedule.iter().enumerate() {
+            let state = gather(&scene, &ids, t, Columns::all()).unwrap();
+            for &(_, camera) in views {
+                Renderer::new().removal_error(&state, &schedule.cameras[camera as usize], background, &mut plain);
+            }
+        }
+        assert!(plain.sum.iter().filter(|&&sum| sum > 0).count() > 1000);
+        let sample = spread(&schedule, usize::MAX, VIEWS_AT_ONCE);
+        assert_eq!(sample.len(), schedule.pairs());
+        let two = Limits { frames_held: 2, frames_together: 2, pictures_together: 2, ..Limits::NONE };
+        for (threads, limits) in [(1, Limits::NONE), (3, Limits::NONE), (3, two)] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let found = pool
+                .install(|| removal_error(&scene, &ids, (&schedule.cameras, &sample), background, 0.1, limits, || ()))
+                .unwrap();
+            assert!(found == plain, "{threads} threads");
+        }
+    }
+}

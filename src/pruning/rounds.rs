@@ -1,0 +1,370 @@
+//! Ranking by what the pictures would lose, scored anew as the model shrinks.
+//!
+//! One look at the whole model cannot rank for strong reductions: when a Gaussian goes, those behind it show
+//! and those that it made superfluous are needed. So each round looks at what is left, ranks it by
+//! [`RemovalError`](crate::render::RemovalError) and lets the worst go. Which Gaussians the next round sees
+//! does not depend on how many are wanted in the end: a smaller target keeps a subset of a larger one.
+//! Memory: see [`removal_error`].
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+
+use super::score::{Scored, scored};
+use crate::budget::{Need, REMOVE, Workload};
+use crate::cache::Key;
+use crate::error::Result;
+use crate::journal::Journal;
+use crate::limits::Limits;
+use crate::model::{Columns, Picture};
+use crate::passes::spread_over;
+use crate::progress::Progress;
+use crate::pruning::Ranking;
+use crate::pruning::removal::removal_error;
+use crate::recipe;
+use crate::scene::Scene;
+
+/// What the stage is called.
+const NAME: &str = "rounds";
+
+/// The rounds of a run.
+#[derive(Debug, Clone)]
+pub struct Rounds {
+    /// Part of the Gaussians that a round leaves.
+    pub fraction: f64,
+    /// Pictures that a round looks at, the same for a longer sequence.
+    pub pictures: usize,
+    /// Turns that they take: a round looks at one part of so many, and goes by what the others showed in theirs.
+    pub turns: usize,
+    /// Contrast that every Gaussian is taken to have at least with what it hides.
+    pub contrast_floor: f64,
+    /// Part of the Gaussians that the last round is taken to leave at least, to say how many rounds there are at most.
+    pub fewest: f64,
+    /// Part of them that it usually leaves, to say about how long rounds take.
+    pub usual: f64,
+}
+
+/// Where no size is asked for, rounds are taken to leave this part of the Gaussians at least.
+const FEWEST: f64 = 0.05;
+/// And usually this one.
+const USUAL: f64 = 0.5;
+
+impl Rounds {
+    /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
+    /// contributions.
+    pub fn of(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
+        let recipe::Select {
+            round_fraction: fraction,
+            round_pictures: pictures,
+            round_turns: turns,
+            contrast_floor,
+            ..
+        } = *recipe;
+        let (fewest, usual) = (target.unwrap_or(FEWEST), target.unwrap_or(USUAL));
+        (fraction < 1.0).then_some(Rounds { fraction, pictures, turns, contrast_floor, fewest, usual })
+    }
+
+    /// The ranking, and pictures of all that is left.
+    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+        let (looking, fixed) = work.looking(limits, Columns::all(), 8);
+        let all = (self.pictures as u64).min(work.pictures);
+        let turns = (self.turns as u64).min(all).max(1);
+        let per_gaussian =
+            [scored(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking].concat();
+        let seconds = (0..self.rounds(self.usual)).map(|round| {
+            let left = work.count() * self.fraction.powi(round as i32);
+            let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
+            work.reading(left, pictures.min(work.frames as f64)) + work.picturing(pictures, left, REMOVE)
+        });
+        // The first round takes all turns, each of its own frames.
+        let frames = all.min(work.frames).div_ceil(turns);
+        let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
+        let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
+        Need { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
+    }
+
+    /// Returns the number of rounds after which at most a part `fewest` is left. At most 2207, for a recipe's fraction is
+    /// at most [`MOST_LEFT_BY_ROUND`](recipe::MOST_LEFT_BY_ROUND) and there are at most `u32::MAX` Gaussians.
+    fn rounds(&self, fewest: f64) -> u32 {
+        let fewest = fewest.max(1.0 / f64::from(u32::MAX));
+        (fewest.ln() / self.fraction.ln()).ceil().max(0.0) as u32
+    }
+
+    /// The rounds that leave `fewest` of `count` Gaussians, for people.
+    pub(crate) fn divided(&self, count: usize, fewest: usize) -> Vec<String> {
+        let of = |round: usize| self.pictures.div_ceil(if round == 0 { 1 } else { self.turns.max(1) });
+        let rounds = 0..self.sizes(count, 0, fewest).len();
+        rounds.map(|round| format!("{}: {} pictures at most", name(round), of(round))).collect()
+    }
+
+    /// The pictures in as many parts as there are turns, each of frames of its own where there are as many.
+    fn turns(&self, scene: &Scene, scored: &Scored) -> Vec<Vec<Picture>> {
+        let pictures = spread_over(&scene.schedule, self.pictures, scored.frames_to_see);
+        let by_frame: Vec<&[Picture]> = pictures.chunk_by(|a, b| a.frame == b.frame).collect();
+        let parts = if by_frame.len() < self.turns { pictures.chunks(1).collect() } else { by_frame };
+        let mut turns = vec![Vec::new(); self.turns.min(parts.len())];
+        let count = turns.len().max(1);
+        parts.into_iter().enumerate().for_each(|(k, part)| turns[k % count].extend_from_slice(part));
+        turns
+    }
+
+    /// Ranks all but the dropped Gaussians in rounds, until a round leaves at most `fewest`; those that go in one
+    /// round, and those that stay after the last, by error, ties by the order there was. Protected Gaussians come
+    /// first.
+    ///
+    /// # Errors
+    /// Frames that cannot be read.
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        before: Ranking,
+        fewest: usize,
+        journal: &mut Journal,
+    ) -> Result<Ranking> {
+        let protected = &scored.protected;
+        let is_free = |id: &u32| !scored.is_protected(*id);
+        let mut state = State {
+            free: before.order().iter().copied().filter(is_free).collect(),
+            gone: Vec::new(),
+            errors: Vec::new(),
+        };
+        let first = state.free.len() + protected.len();
+        let sizes = self.sizes(state.free.len(), protected.len(), fewest);
+        if sizes.is_empty() {
+            return Ok(before);
+        }
+        let turns = self.turns(scene, scored);
+        state.errors = vec![vec![0; scored.count()]; turns.len()];
+        // What a round leaves does not depend on how many are wanted in the end.
+        let key = scene.work.key(&(self.fraction, self.contrast_floor, &turns, &before, protected));
+        let mut done = 0;
+        for round in (0..sizes.len()).rev().filter(|_| scene.work.keeps()) {
+            if let Some(found) = scene.work.find(&name(round), key.and(&round))? {
+                (state, done) = (found, round + 1);
+                break;
+            }
+        }
+        let pictures =
+            (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
+        let progress = Progress::new(NAME, "pictures", pictures.sum::<usize>() as u64);
+        let State { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
+            for (round, &left) in sizes.iter().enumerate().skip(done) {
+                state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;
+            }
+            let left = state.free.len() + protected.len();
+            Ok((state, left))
+        })?;
+        Ok(Ranking::new(protected.iter().copied().chain(free).chain(gone).collect()))
+    }
+
+    /// Returns how many of so many free Gaussians each round leaves, until a round leaves at most `fewest` with those
+    /// protected. Every round removes at least one.
+    fn sizes(&self, mut free: usize, protected: usize, fewest: usize) -> Vec<usize> {
+        let mut sizes = Vec::new();
+        while free > 0 && free + protected > fewest {
+            let left = (((free + protected) as f64 * self.fraction) as usize).saturating_sub(protected);
+            free = left.min(free - 1);
+            sizes.push(free);
+        }
+        sizes
+    }
+
+    /// One round, which leaves `left` free Gaussians. It can be divided by pictures.
+    fn round(
+        &self,
+        scene: &Scene,
+        scored: &Scored,
+        (mut state, turns): (State, &[Vec<Picture>]),
+        round: usize,
+        (key, left): (Key, usize),
+        progress: &Progress,
+    ) -> Result<State> {
+        let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
+        ids.sort_unstable();
+        let looking: Vec<usize> = looking(turns, round).collect();
+        let (background, floor) = (scene.background, self.contrast_floor as f32);
+        let units = looking.iter().map(|&turn| turns[turn].len()).sum();
+        // Of every turn that looks, what those of its pictures show that are among `some`; nothing, if none is.
+        let compute = |some: Range<usize>| -> Result<Vec<Vec<u64>>> {
+            let mut start = 0;
+            let of_turn = |&turn: &usize| {
+                let pictures = &turns[turn];
+                let place = |unit: usize| unit.saturating_sub(start).min(pictures.len());
+                let of = place(some.start)..place(some.end);
+                start += pictures.len();
+                if of.is_empty() {
+                    return Ok(Vec::new());
+                }
+                let pictures = (&scene.schedule.cameras[..], &pictures[of]);
+                let advance = || progress.advance(1);
+                Ok(removal_error(scene.source(), &ids, pictures, background, floor, scene.limits, advance)?.sum)
+            };
+            looking.iter().map(of_turn).collect()
+        };
+        scene.work.divided(&name(round), key.and(&round), units, compute, |parts| {
+            for &turn in &looking {
+                ids.iter().for_each(|&id| state.errors[turn][id as usize] = 0);
+            }
+            for part in parts {
+                for (&turn, found) in looking.iter().zip(part?) {
+                    let errors = &mut state.errors[turn];
+                    for (&id, error) in ids.iter().zip(found) {
+                        errors[id as usize] = errors[id as usize].saturating_add(error);
+                    }
+                }
+            }
+            let error = |id: &u32| state.errors.iter().fold(0u64, |sum, of| sum.saturating_add(of[*id as usize]));
+            // Stable: ties keep the order there was.
+            state.free.sort_by_cached_key(|id| std::cmp::Reverse(error(id)));
+            let mut worst = state.free.split_off(left);
+            worst.append(&mut state.gone);
+            state.gone = worst;
+            Ok(state)
+        })
+    }
+}
+
+/// What a round leaves.
+#[derive(Serialize, Deserialize)]
+struct State {
+    /// Neither protected nor gone, best first.
+    free: Vec<u32>,
+    /// Worst last.
+    gone: Vec<u32>,
+    /// By turn, what its pictures showed of every Gaussian when it last looked.
+    errors: Vec<Vec<u64>>,
+}
+
+/// What a round is called in a work folder.
+fn name(round: usize) -> String {
+    format!("{NAME}-{:02}", round + 1)
+}
+
+/// Which turns look in a round: first all, then one after the other.
+fn looking(turns: &[Vec<Picture>], round: usize) -> impl Iterator<Item = usize> {
+    let count = turns.len().max(1);
+    let looking = if round == 0 { turns.len() } else { 1.min(turns.len()) };
+    (0..looking).map(move |k| (round + k) % count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::metrics::psnr;
+    use crate::passes::{gather, spread};
+    use crate::pipeline::tests::{scene, score_scene};
+    use crate::pruning::score::UserOverrides;
+    use crate::recipe::Recipe;
+    use crate::render::render;
+
+    /// The order of scoring, and that of the rounds.
+    fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(scene, &recipe, user);
+        let rounds = Rounds::of(&recipe.select, None).unwrap();
+        let found = rounds.run(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
+        (scored.ranked(), found)
+    }
+
+    #[test]
+    fn a_smaller_target_keeps_a_subset_of_a_larger_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let [(once, few), (_, many)] = [200, 800].map(|fewest| ranked(&scene, &UserOverrides::default(), fewest));
+        assert_eq!(few.take(800), many.take(800));
+        assert_ne!(few.take(800), once.take(800), "rounds changed nothing");
+        let mut every = few.order().to_vec();
+        every.sort_unstable();
+        assert!(every.iter().copied().eq(0..1500), "a Gaussian is missing or stands twice");
+    }
+
+    #[test]
+    fn rounds_keep_more_of_the_pictures_than_one_ranking_by_coverage() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let (once, rounds) = ranked(&scene, &UserOverrides::default(), 150);
+        let all: Vec<u32> = (0..1500).collect();
+        for target in [150, 500] {
+            let quality = |kept: &[u32]| -> f64 {
+                let of_picture = |picture: &Picture| {
+                    let original = gather(scene.source(), &all, picture.frame, Columns::all()).unwrap();
+                    let camera = &scene.schedule.cameras[picture.camera as usize];
+                    psnr(&render(&original.pick(kept), camera, [0.0; 3]), &render(&original, camera, [0.0; 3]))
+                };
+                spread(&scene.schedule, 12, 1).iter().map(of_picture).sum::<f64>() / 12.0
+            };
+            let got = quality(&rounds.take(target));
+            let at_once = quality(&once.take(target));
+            assert!(got > at_once + 1.0, "{target}: got {got} dB in rounds, {at_once} at once");
+        }
+    }
+
+    #[test]
+    fn what_the_user_keeps_comes_first_and_what_he_drops_does_not_come() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let worst = ranked(&scene, &UserOverrides::default(), 100).1.order()[1490..].to_vec();
+        let user = UserOverrides { keep: worst[..5].to_vec(), drop: worst[5..].to_vec(), keep_box: None };
+        let (_, rounds) = ranked(&scene, &user, 100);
+        let (mut first, mut kept) = (rounds.order()[..5].to_vec(), worst[..5].to_vec());
+        first.sort_unstable();
+        kept.sort_unstable();
+        assert_eq!(first, kept);
+        assert!(worst[5..].iter().all(|id| !rounds.order().contains(id)));
+    }
+
+    #[test]
+    fn turns_part_the_pictures_by_frames_or_one_by_one_where_frames_are_few() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let recipe = Recipe::preset("default").unwrap();
+        let scored = score_scene(&scene, &recipe, &UserOverrides::default());
+        for (turns, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
+            let rounds = Rounds { turns, ..Rounds::of(&recipe.select, None).unwrap() };
+            let parts = rounds.turns(&scene, &scored);
+            let all = spread_over(&scene.schedule, rounds.pictures, scored.frames_to_see);
+            assert_eq!(parts.len(), turns.min(all.len()));
+            let mut together: Vec<Picture> = parts.concat();
+            together.sort_by_key(|picture| (picture.frame, picture.view));
+            assert_eq!(together, all, "{turns} turns");
+            let frames = |part: &Vec<Picture>| part.chunk_by(|a, b| a.frame == b.frame).count();
+            let read: usize = parts.iter().map(frames).sum();
+            assert_eq!(read == all.chunk_by(|a, b| a.frame == b.frame).count(), frames_apart, "{turns} turns");
+        }
+    }
+
+    #[test]
+    fn every_round_removes_a_gaussian_whatever_the_fraction() {
+        let recipe = Recipe::preset("default").unwrap();
+        for fraction in [0.1, 0.5, 0.9, recipe::MOST_LEFT_BY_ROUND, 0.999_999_999_9, 1.0 - f64::EPSILON / 2.0] {
+            let rounds = Rounds { fraction, ..Rounds::of(&recipe.select, None).unwrap() };
+            for (count, protected) in (0..=50).flat_map(|count| [(count, 0), (count, 7)]) {
+                for fewest in 0..=count {
+                    let sizes = rounds.sizes(count, protected, fewest);
+                    let before = std::iter::once(count).chain(sizes.iter().copied());
+                    assert!(
+                        before.zip(&sizes).all(|(before, &left)| left < before),
+                        "{fraction} of {count}: {sizes:?}"
+                    );
+                    assert!(sizes.last().copied().unwrap_or(count) + protected <= fewest.max(protected));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_number_of_rounds_is_bounded_for_no_gaussians_at_all() {
+        let recipe = Recipe::preset("default").unwrap();
+        let rounds = Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::of(&recipe.select, Some(0.0)).unwrap() };
+        assert_eq!([0.0, 1e-300, 1.0, 2.0].map(|fewest| rounds.rounds(fewest)), [2207, 2207, 0, 0]);
+    }
+
+    #[test]
+    fn a_model_that_is_small_enough_keeps_its_order() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = scene(folder.path());
+        let (once, rounds) = ranked(&scene, &UserOverrides::default(), 1500);
+        assert_eq!(rounds, once);
+    }
+}

@@ -1,0 +1,204 @@
+//! The scan: every Gaussian at every frame once, blocks of Gaussians on all threads.
+pub(crate) mod blocks;
+pub(crate) mod staged;
+
+use std::ops::Range;
+use std::sync::{Mutex, PoisonError};
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::error::Result;
+use crate::model::{Camera, Gaussians, Rows, Schedule, SequenceInfo};
+use crate::passes::BLOCK;
+use crate::progress::Progress;
+use crate::source::{FrameSource, Ids};
+use crate::statistics::pass::blocks::BlockScans;
+use crate::statistics::{BlockScan, NEEDED, ScanPlan};
+
+/// What a scan gives.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub struct Scanned {
+    /// One row per Gaussian; D and κ before noise is snapped, E not filled.
+    pub rows: Rows,
+    /// Living Gaussians in each frame.
+    pub alive_per_frame: Vec<u32>,
+    /// Largest |coordinate| of any position in any frame.
+    pub largest_coordinate: f32,
+}
+
+/// Scans `source` as seen by the cameras of `schedule`: blocks side by side, or, where the bytes are waited for
+/// ([`FrameSource::ahead`]), in stages.
+///
+/// Memory: a row per Gaussian, twice while blocks are joined, 4 bytes per frame, and per thread one block of Gaussians
+/// with its accumulators ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), its state at one frame, and its reader; in stages
+/// two readers.
+pub fn scan(source: &dyn FrameSource, schedule: &Schedule, plan: &ScanPlan) -> Result<Scanned> {
+    scan_blocks(source, schedule, plan, 0..scan_units(source.info()))
+}
+
+/// How many blocks of Gaussians [`scan`] goes through.
+pub fn scan_units(info: &SequenceInfo) -> usize {
+    info.count.div_ceil(BLOCK)
+}
+
+/// [`scan`] of consecutive blocks of Gaussians alone; [`Scanned::join`] makes one of several.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub fn scan_blocks(
+    source: &dyn FrameSource,
+    schedule: &Schedule,
+    plan: &ScanPlan,
+    blocks: Range<usize>,
+) -> Result<Scanned> {
+    let info = source.info();
+    let frames = info.times.len();
+    let gaussians = info.count.min(blocks.end * BLOCK) - info.count.min(blocks.start * BLOCK);
+    let progress = Progress::new("scan", "states", gaussians as u64 * frames as u64);
+    let scan = BlockScans { source, schedule, plan, blocks, progress, alive: Mutex::new(vec![0; frames]) };
+    let blocks = match source.ahead() {
+        Some(ahead) if frames > 0 => staged::scan_in_stages(&scan, ahead)?,
+        _ => (0..scan.blocks()).into_par_iter().map(|block| scan.block(block)).collect::<Result<_>>()?,
+    };
+    Ok(joined(blocks, scan.alive.into_inner().unwrap_or_else(PoisonError::into_inner)))
+}
+
+impl Scanned {
+    /// Adds what was found of the Gaussians behind these, in the same frames.
+    pub fn join(&mut self, mut other: Scanned) {
+        self.rows.append(&mut other.rows);
+        self.alive_per_frame.iter_mut().zip(other.alive_per_frame).for_each(|(sum, alive)| *sum += alive);
+        self.largest_coordinate = self.largest_coordinate.max(other.largest_coordinate);
+    }
+}
+
+/// The blocks of a sequence, in order, as one.
+fn joined(blocks: impl IntoIterator<Item = (Rows, f32)>, alive_per_frame: Vec<u32>) -> Scanned {
+    let mut rows = Rows::default();
+    let mut largest_coordinate = 0.0f32;
+    for (mut block, largest) in blocks {
+        rows.append(&mut block);
+        largest_coordinate = largest_coordinate.max(largest);
+    }
+    Scanned { rows, alive_per_frame, largest_coordinate }
+}
+
+/// A scan of frames as they arrive: [`scan`] with the frames cut into parts that are seen once each.
+///
+/// Memory: the accumulators of all Gaussians ([`crate::statistics::BYTES_PER_GAUSSIAN`] each), 4 bytes per frame, and
+/// per thread one block's state at one frame.
+pub struct RunningScan<'a> {
+    blocks: Vec<BlockScan<'a>>,
+    alive_per_frame: Vec<u32>,
+}
+
+impl<'a> RunningScan<'a> {
+    /// No frames yet of `count` Gaussians.
+    pub fn new(count: usize, plan: &'a ScanPlan) -> Self {
+        let block = |start: usize| BlockScan::new(BLOCK.min(count - start), start, plan);
+        RunningScan { blocks: (0..count).step_by(BLOCK).map(block).collect(), alive_per_frame: Vec::new() }
+    }
+
+    /// Adds the next frames: all those of `source`, each with the cameras that see it.
+    pub fn add(&mut self, source: &dyn FrameSource, cameras: &[Vec<&Camera>]) -> Result<()> {
+        let info = source.info();
+        let first = self.alive_per_frame.len();
+        let alive: Vec<Vec<u32>> = self
+            .blocks
+            .par_iter_mut()
+            .enumerate()
+            .map(|(block, scan)| {
+                let range = block * BLOCK..info.count.min((block + 1) * BLOCK);
+                let mut state = Gaussians::zeros(range.len(), info.sh_degree);
+                let mut reader = source.open(Ids::Range(range))?;
+                for (t, cameras) in cameras.iter().enumerate() {
+                    let changed = scan.wanted(first + t, info.varying);
+                    // The state is new, though the accumulators know what does not vary.
+                    let want = if t == 0 { changed | NEEDED } else { changed };
+                    reader.read(t, want, &mut state)?;
+                    scan.frame(first + t, &state, cameras, changed);
+                }
+                Ok(scan.take_alive())
+            })
+            .collect::<Result<_>>()?;
+        self.alive_per_frame.resize(first + cameras.len(), 0);
+        for alive in alive {
+            for (sum, count) in self.alive_per_frame[first..].iter_mut().zip(alive) {
+                *sum += count;
+            }
+        }
+        Ok(())
+    }
+
+    /// The rows, by the plan that knows all frames.
+    ///
+    /// # Panics
+    /// If `plan` is not of the frames that were added ([`ScanPlan::finishes`]).
+    pub fn finish(self, plan: &ScanPlan) -> Scanned {
+        let blocks = self.blocks.into_iter().map(|block| {
+            let found = block.finish_by(plan);
+            (found.rows, found.largest_coordinate)
+        });
+        joined(blocks, self.alive_per_frame)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+    use crate::diagnostics::demo_scene::Scene;
+    use crate::model::{Columns, SequenceInfo, Split};
+    use crate::recipe::{self, Recipe};
+    use crate::source::BlockReader;
+
+    /// A scene of which only positions vary, and what was asked of it.
+    struct Asked {
+        scene: Scene,
+        info: SequenceInfo,
+        /// Frames and columns.
+        reads: Mutex<Vec<(usize, Columns)>>,
+    }
+
+    struct AskedReader<'a>(&'a Asked, Box<dyn BlockReader + 'a>);
+
+    impl FrameSource for Asked {
+        fn info(&self) -> &SequenceInfo {
+            &self.info
+        }
+        fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
+            Ok(Box::new(AskedReader(self, self.scene.open(ids)?)))
+        }
+    }
+
+    impl BlockReader for AskedReader<'_> {
+        fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
+            self.0.reads.lock().unwrap().push((frame, want));
+            self.1.read(frame, want & Columns::POSITION, out)?;
+            self.1.read(0, want.difference(Columns::POSITION), out)
+        }
+    }
+
+    #[test]
+    fn what_does_not_vary_is_read_once_and_reading_it_again_changes_no_bit() {
+        let scene = Scene::new(1500, 5);
+        let info = SequenceInfo { varying: Columns::POSITION, ..scene.info().clone() };
+        let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
+        let asked = Asked { scene, info, reads: Mutex::default() };
+        let by = |reread: bool| {
+            let scan_recipe = recipe::Scan { reread, ..Recipe::preset("default").unwrap().scan };
+            let plan = ScanPlan::new(&scan_recipe, &asked.info.times, &schedule).unwrap();
+            let found = scan(&asked, &schedule, &plan).unwrap();
+            (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *asked.reads.lock().unwrap()))
+        };
+        let (skipping, everything) = (by(false), by(true));
+        assert_eq!((&skipping.0, &skipping.1), (&everything.0, &everything.1));
+        for (frame, want) in &skipping.2 {
+            assert_eq!(*want, if *frame == 0 { Columns::all() } else { Columns::POSITION }, "frame {frame}");
+        }
+        assert!(everything.2.iter().all(|(_, want)| *want == Columns::all()));
+        assert_eq!((skipping.2.len(), everything.2.len()), (10, 10), "blocks times frames");
+    }
+}
