@@ -20,7 +20,7 @@ use std::time::Duration;
 use cpu_time::ProcessTime;
 use criterion::measurement::{Measurement, ValueFormatter, WallTime};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use splatsieve::deform::{Motion, Network, Tensor, Tensors};
+use splatsieve::deform::{Network, PredictedMotion, Tensor, Tensors};
 use splatsieve::model::{Column, Columns, Gaussians};
 
 use splatsieve::models::OpenOptions;
@@ -130,7 +130,7 @@ fn networks(criterion: &mut Criterion<Processor>) {
     let (network, mut seed) = (network(), 2);
     let mut position = Column::zeros(3, BLOCK);
     position.planes_mut().iter_mut().for_each(|x| *x = noise(&mut seed));
-    let (encoded, mut motion, mut frame) = (network.encode(&position), Motion::default(), 0);
+    let (encoded, mut motion, mut frame) = (network.encode(&position), PredictedMotion::default(), 0);
     group.bench_function("d3g", |bencher| {
         bencher.iter(|| {
             frame = (frame + 1) % 60;

@@ -28,14 +28,14 @@ use splatsieve::merging::motion::{MotionGate, PairMotion};
 use splatsieve::merging::motion_pass::PairMeter;
 use splatsieve::merging::neighbors::PointIndex;
 use splatsieve::merging::proxy::Importance;
-use splatsieve::merging::tree::{Nearest, Point, Tree};
+use splatsieve::merging::tree::{Nearest, Tree, TreePoint};
 use splatsieve::merging::voxels::voxel_order;
-use splatsieve::merging::{Asked, Survivors};
+use splatsieve::merging::{RequestedPairs, Survivors};
 use splatsieve::model::hash_id;
 use splatsieve::model::{Column, Columns, Gaussians};
 use splatsieve::outputs::container::write_container;
 use splatsieve::passes::gather;
-use splatsieve::recipe::{Motion, Recipe};
+use splatsieve::recipe::{MotionParams, Recipe};
 use splatsieve::source::FrameSource;
 
 /// As many as the presets look at.
@@ -62,8 +62,8 @@ fn strewn(n: usize) -> (Gaussians, f64) {
 /// Number of neighbours found in all, from positions and ε.
 type Find = fn(&Column, f64) -> usize;
 
-fn points(position: &Column) -> Vec<Point> {
-    (0..position.len()).map(|i| Point { at: position.row(i), index: i as u32 }).collect()
+fn points(position: &Column) -> Vec<TreePoint> {
+    (0..position.len()).map(|i| TreePoint { at: position.row(i), index: i as u32 }).collect()
 }
 
 fn by_voxels(position: &Column, epsilon: f64) -> usize {
@@ -220,7 +220,7 @@ fn motion(criterion: &mut Criterion) {
         bencher.iter(|| {
             one_thread.install(|| {
                 let reference = (0..position.len()).map(|i| position.row(i));
-                let mut motion = PairMotion::new(pairs.iter().copied(), reference, Motion::Runs);
+                let mut motion = PairMotion::new(pairs.iter().copied(), reference, MotionParams::Runs);
                 for frame in 0..frames {
                     motion.frame(|i| (position.row::<3>(i).map(|x| x + 0.01 * frame as f32), true));
                 }
@@ -277,7 +277,7 @@ fn whole(criterion: &mut Criterion) {
         classes: &vec![Some(0); n],
         extent: 1.0,
     };
-    let alike = |asked: Asked<'_>| Ok::<_, Infallible>(vec![1.0; asked.pairs().len()]);
+    let alike = |asked: RequestedPairs<'_>| Ok::<_, Infallible>(vec![1.0; asked.pairs().len()]);
     let mut group = criterion.benchmark_group("merge");
     group.sample_size(10).throughput(Throughput::Elements(n as u64));
     group.bench_function("pass", |bencher| {

@@ -36,7 +36,7 @@ use splatsieve::model::hash_id;
 use splatsieve::model::{Columns, Gaussians, Schedule, SequenceInfo};
 use splatsieve::outputs::container::write_container;
 use splatsieve::recipe::Recipe;
-use splatsieve::source::{Ahead, BlockReader, FrameSource, Ids};
+use splatsieve::source::{BlockReader, FrameSource, Ids, Prefetch};
 use splatsieve::statistics::ScanPlan;
 use splatsieve::statistics::pass::scan;
 
@@ -221,12 +221,12 @@ impl FrameSource for Fed<'_> {
         }
     }
 
-    fn ahead(&self) -> Option<&dyn Ahead> {
+    fn ahead(&self) -> Option<&dyn Prefetch> {
         self.in_stages.then_some(self)
     }
 }
 
-impl Ahead for Fed<'_> {
+impl Prefetch for Fed<'_> {
     fn frame_block(&self) -> usize {
         self.container.frame_block()
     }

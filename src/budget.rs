@@ -1,5 +1,5 @@
 //! What a run needs of memory and about how long it takes, and how it keeps to a budget. Names no stage: each states its
-//! own [`Need`].
+//! own [`ResourceEstimate`].
 //!
 //! A need is a number of bytes per Gaussian and a fixed one, both as sums of named parts; the largest stage counts.
 //! [`Plan::fit`] begins with limits that cost no time and halves the one that frees most, until all stages fit.
@@ -15,7 +15,7 @@ use crate::files::frame_stream::StreamHeader;
 use crate::limits::{Limits, ReadLimit};
 use crate::machine::{memory_limit, peak_memory_bytes};
 use crate::model::{Camera, Columns, Rig, Schedule, SequenceInfo};
-use crate::models::Residence;
+use crate::models::MemoryProfile;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
 use crate::passes::{BLOCK, PICTURES_PER_THREAD};
@@ -24,7 +24,7 @@ use crate::render;
 
 /// What a run says of itself before it begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Tell {
+pub enum Verbosity {
     /// Nothing.
     #[default]
     Nothing,
@@ -40,7 +40,7 @@ pub struct Budget {
     /// Bytes; none: a quarter of what this process may take, see [`memory_limit`].
     pub bytes: Option<u64>,
     /// What to print on standard error before any work.
-    pub tell: Tell,
+    pub tell: Verbosity,
 }
 
 /// Resident before any Gaussian is: the program (12.5 MiB of it where it is not optimised), its libraries (3.6), its threads'
@@ -75,7 +75,7 @@ pub struct Workload {
     /// Columns that differ between frames.
     pub varying: Columns,
     /// What the input keeps in memory.
-    pub input: Residence,
+    pub input: MemoryProfile,
     /// Different views of the cameras.
     pub viewpoints: u64,
     /// Pixels of the largest picture.
@@ -89,12 +89,12 @@ pub struct Workload {
     /// Threads to work on.
     pub threads: u64,
     /// How fast they are.
-    pub pace: Pace,
+    pub pace: Throughput,
 }
 
 impl Workload {
     /// Of an open input that nobody looks at.
-    pub fn new(info: &SequenceInfo, input: Residence) -> Workload {
+    pub fn new(info: &SequenceInfo, input: MemoryProfile) -> Workload {
         Workload {
             gaussians: info.count as u64,
             frames: info.times.len() as u64,
@@ -107,14 +107,14 @@ impl Workload {
             pictures: 0,
             rig: 0,
             threads: rayon::current_num_threads() as u64,
-            pace: Pace::UNKNOWN,
+            pace: Throughput::UNKNOWN,
         }
     }
 
     /// Of no Gaussians.
     pub fn nothing() -> Workload {
         let info = SequenceInfo { count: 0, times: Vec::new(), sh_degree: 0, varying: Columns::empty() };
-        Workload::new(&info, Residence::of_tiles(0))
+        Workload::new(&info, MemoryProfile::of_tiles(0))
     }
 
     /// The same as the cameras of `schedule`, of `rig`, see it.
@@ -148,7 +148,7 @@ impl Workload {
         let pairs = if frames > 0 { timeless as u64 * frames + times.len() as u64 } else { 0 };
         let StreamHeader { count, sh_degree, varying, .. } = *header;
         let info = SequenceInfo { count, times: Vec::new(), sh_degree, varying };
-        let work = Workload { frames, ..Workload::new(&info, Residence::of_tiles(frame_block as u64)) };
+        let work = Workload { frames, ..Workload::new(&info, MemoryProfile::of_tiles(frame_block as u64)) };
         work.seen_by(rig, views, pairs)
     }
 
@@ -178,14 +178,14 @@ impl Workload {
     }
 
     /// One block of each thread on its way from a reader, and what decoding it takes.
-    pub fn arriving(&self) -> Part {
+    pub fn arriving(&self) -> MemoryPart {
         let block = self.at_most(BLOCK as u64) * (self.state(Columns::all()) + self.input.reader);
         ("arriving", self.decoding() + self.threads * block)
     }
 
     /// Buffers of all threads that decode or encode tiles: stored, shuffled and decoded bytes of the largest one.
     fn decoding(&self) -> u64 {
-        let Residence { frame_block, gaussian_block, .. } = self.input;
+        let MemoryProfile { frame_block, gaussian_block, .. } = self.input;
         let gaussian_block = self.at_most(gaussian_block);
         let frame_block = self.frames_at_most(frame_block);
         let frames = |column| if self.varying.contains(column) { frame_block } else { 1 };
@@ -195,7 +195,7 @@ impl Workload {
 
     /// Looking at pictures: states of the columns `of` that lie ready, what is on its way to them, and pictures in
     /// the making with `sums` bytes per Gaussian. Per Gaussian, and however many there are.
-    pub fn looking(&self, limits: &Limits, of: Columns, sums: u64) -> (Vec<Part>, Vec<Part>) {
+    pub fn looking(&self, limits: &Limits, of: Columns, sums: u64) -> (Vec<MemoryPart>, Vec<MemoryPart>) {
         let pictures = self.threads.min(limits.pictures_together as u64);
         let ready = PICTURES_PER_THREAD as u64 * self.threads;
         let per_gaussian = vec![
@@ -209,17 +209,17 @@ impl Workload {
     }
 
     /// A list of so many pictures.
-    pub fn listed(pictures: f64) -> Part {
+    pub fn listed(pictures: f64) -> MemoryPart {
         ("list", (PER_PICTURE as f64 * pictures).ceil() as u64)
     }
 
     /// Buffers of a container, or of a frame's file, in the making.
-    pub fn writing(&self) -> Vec<Part> {
+    pub fn writing(&self) -> Vec<MemoryPart> {
         self.writing_together(FRAME_BLOCK)
     }
 
     /// Buffers of a container of `frames` frames per tile in the making.
-    pub fn writing_together(&self, frames: usize) -> Vec<Part> {
+    pub fn writing_together(&self, frames: usize) -> Vec<MemoryPart> {
         let varying = self.frames_at_most(frames as u64) * self.state(self.varying);
         let block =
             self.at_most(GAUSSIAN_BLOCK as u64) * (2 * self.state(Columns::all()) + 3 * varying + self.input.reader);
@@ -227,7 +227,7 @@ impl Workload {
     }
 
     /// What zstd takes at a level where tiles of `frames` frames are compressed.
-    pub fn compressing(&self, level: i32, frames: usize) -> Part {
+    pub fn compressing(&self, level: i32, frames: usize) -> MemoryPart {
         let widest = Columns::all().iter().map(|column| self.state(column)).max().unwrap_or(0);
         ("zstd", self.threads * zstd_tables(level, (GAUSSIAN_BLOCK * frames) as u64 * widest))
     }
@@ -253,7 +253,7 @@ impl Workload {
     }
 
     /// Seconds that `pictures` pictures of `gaussians` Gaussians take to be made in some way.
-    pub fn picturing(&self, pictures: f64, gaussians: f64, Picturing { gaussian, pixel, pace }: Picturing) -> f64 {
+    pub fn picturing(&self, pictures: f64, gaussians: f64, RenderCost { gaussian, pixel, pace }: RenderCost) -> f64 {
         pace(&self.pace) * pictures * (gaussians * gaussian + self.pixels as f64 * pixel)
     }
 
@@ -288,7 +288,7 @@ impl Workload {
 
 /// What a scene takes on this machine, as times what the constants here name: by a calibration, else 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pace {
+pub struct Throughput {
     /// Reading states, and what is done with each of them.
     pub states: f64,
     /// See [`LOOK`].
@@ -301,34 +301,34 @@ pub struct Pace {
     pub processors: Option<f64>,
 }
 
-impl Pace {
+impl Throughput {
     /// Of a machine and a scene that nobody measured.
-    pub const UNKNOWN: Pace = Pace { states: 1.0, look: 1.0, remove: 1.0, render: 1.0, processors: None };
+    pub const UNKNOWN: Throughput = Throughput { states: 1.0, look: 1.0, remove: 1.0, render: 1.0, processors: None };
 }
 
 /// A way of making pictures.
 #[derive(Debug, Clone, Copy)]
-pub struct Picturing {
+pub struct RenderCost {
     /// Seconds of one processor for each Gaussian.
     gaussian: f64,
     /// And for each pixel.
     pixel: f64,
-    pace: fn(&Pace) -> f64,
+    pace: fn(&Throughput) -> f64,
 }
 
 /// Looking at a picture, fitted to runs on three trained models (`scripts/estimate.py` shows how well such times tell
 /// that of a run).
-pub const LOOK: Picturing = Picturing { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
+pub const LOOK: RenderCost = RenderCost { gaussian: 1.6e-7, pixel: 5e-9, pace: |pace| pace.look };
 /// Finding what a picture loses without each of its Gaussians.
-pub const REMOVE: Picturing = Picturing { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };
+pub const REMOVE: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 1.6e-8, pace: |pace| pace.remove };
 /// Rendering a picture and comparing it.
-pub const RENDER: Picturing = Picturing { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render };
+pub const RENDER: RenderCost = RenderCost { gaussian: 3.5e-7, pixel: 3.2e-8, pace: |pace| pace.render };
 
 /// Per Gaussian of a picture that is made on all threads: their shares, and these in a row.
 pub const PICTURE_ON_ALL_THREADS: u64 = 2 * render::BYTES_PER_VISIBLE as u64;
 
 /// A named part of a stage's memory.
-pub type Part = (&'static str, u64);
+pub type MemoryPart = (&'static str, u64);
 
 /// `bytes` per Gaussian of what is left, of which there are a part `left` of all, per Gaussian of the input.
 pub fn of_left(left: f64, bytes: u64) -> u64 {
@@ -337,7 +337,7 @@ pub fn of_left(left: f64, bytes: u64) -> u64 {
 
 /// What a stage needs.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Need {
+pub struct ResourceEstimate {
     /// The stage's name.
     pub stage: &'static str,
     /// Full reads of the frames, at most.
@@ -345,12 +345,12 @@ pub struct Need {
     /// Seconds of one processor, about: what is done so many times, by what doing it once took where it was timed.
     pub seconds: f64,
     /// Bytes per Gaussian.
-    pub per_gaussian: Vec<Part>,
+    pub per_gaussian: Vec<MemoryPart>,
     /// Bytes, however many Gaussians there are.
-    pub fixed: Vec<Part>,
+    pub fixed: Vec<MemoryPart>,
 }
 
-impl Need {
+impl ResourceEstimate {
     fn of_gaussian(&self) -> u64 {
         self.per_gaussian.iter().map(|&(_, bytes)| bytes).sum()
     }
@@ -377,7 +377,7 @@ pub struct Plan {
     budget: u64,
     /// What stages keep at a time.
     pub limits: Limits,
-    needs: Vec<Need>,
+    needs: Vec<ResourceEstimate>,
 }
 
 impl Plan {
@@ -385,23 +385,31 @@ impl Plan {
     ///
     /// # Errors
     /// A budget that no limits fit; the error names the least that works.
-    pub fn fit(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<Plan> {
+    pub fn fit(
+        work: Workload,
+        budget: Budget,
+        needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
+    ) -> Result<Plan> {
         let plan = Self::closest(work, budget.limit(), needs);
         let fits = plan.excess() == 0;
         match budget.tell {
-            Tell::Plan => crate::progress::tell(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()),
-            Tell::Time | Tell::Nothing => (),
+            Verbosity::Plan => crate::progress::tell(format!("budget: {}\n{}", budget.named(), plan.text()).trim_end()),
+            Verbosity::Time | Verbosity::Nothing => (),
         }
         if fits { Ok(plan) } else { Err(plan.refusal(budget)) }
     }
 
     /// Whether there are limits by which every stage that `needs` names fits into `budget`.
-    pub fn fits(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> bool {
+    pub fn fits(work: Workload, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>) -> bool {
         Self::closest(work, budget.limit(), needs).excess() == 0
     }
 
     /// The fastest plan that fits into `budget`, else the one that takes least.
-    pub(crate) fn closest(work: Workload, budget: u64, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Plan {
+    pub(crate) fn closest(
+        work: Workload,
+        budget: u64,
+        needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
+    ) -> Plan {
         let mut limits = Limits {
             frames_held: FRAME_BLOCK,
             frames_together: PICTURES_PER_THREAD * work.threads as usize,
@@ -413,10 +421,11 @@ impl Plan {
         };
         // A model is read whole before anything else.
         let opening = vec![("file", work.input.opening)];
-        let read = Need { stage: "read", reads: 0.0, seconds: 0.0, per_gaussian: opening, fixed: Vec::new() };
+        let read =
+            ResourceEstimate { stage: "read", reads: 0.0, seconds: 0.0, per_gaussian: opening, fixed: Vec::new() };
         let all = |limits: &Limits| {
             let first = Some(read.clone()).filter(|_| work.input.opening > 0);
-            first.into_iter().chain(needs(&work, limits)).collect::<Vec<Need>>()
+            first.into_iter().chain(needs(&work, limits)).collect::<Vec<ResourceEstimate>>()
         };
         // Costs next to no time.
         let [excess, less] = [false, true].map(|rows_aside| {
@@ -509,7 +518,7 @@ impl Plan {
             size(self.base() - PROGRAM - PER_THREAD * work.threads - work.known())
         );
         for need in &self.needs {
-            let parts = |parts: &[Part], unit: fn(u64) -> String| -> String {
+            let parts = |parts: &[MemoryPart], unit: fn(u64) -> String| -> String {
                 let some = parts.iter().filter(|&&(_, bytes)| bytes > 0);
                 some.map(|&(name, bytes)| format!("{} {name}", unit(bytes))).collect::<Vec<_>>().join(" + ")
             };
@@ -542,8 +551,8 @@ impl Plan {
     }
 
     /// How long it will take, by what was measured elsewhere; said where the plan is.
-    pub fn tell_time(&self, tell: Tell) {
-        if tell == Tell::Plan {
+    pub fn tell_time(&self, tell: Verbosity) {
+        if tell == Verbosity::Plan {
             let stages = seconds(&self.work, &self.needs);
             let whole: f64 = stages.iter().map(|(_, seconds)| seconds).sum();
             let named = stages.iter().map(|(stage, seconds)| format!("{} {stage}", duration(*seconds)));
@@ -588,7 +597,7 @@ impl Budget {
 }
 
 /// Names of stages and the seconds that each takes on all threads, about.
-pub fn seconds(work: &Workload, needs: &[Need]) -> Vec<(&'static str, f64)> {
+pub fn seconds(work: &Workload, needs: &[ResourceEstimate]) -> Vec<(&'static str, f64)> {
     needs.iter().map(|need| (need.stage, need.seconds / work.threads as f64)).collect()
 }
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::model::{ALL_HARMONICS, Column, Columns, Gaussians, Raw};
-use crate::recipe::{Merge, Precision};
+use crate::recipe::{MergeParams, Precision};
 
 /// The frame at which Gaussians are compared, and the scale of the scene there.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -45,9 +45,9 @@ pub struct Proxies {
 /// A row for every Gaussian of the output, in columns that change; columns that do not are empty. Harmonics may be of
 /// a lower degree than the output's: those above stay.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Change(pub Gaussians);
+pub struct ParamDelta(pub Gaussians);
 
-impl Change {
+impl ParamDelta {
     /// The columns that change.
     pub fn columns(&self) -> Columns {
         let changes = |&column: &Columns| !self.0.column(column).is_empty();
@@ -60,8 +60,8 @@ impl Change {
     }
 
     /// The change of the Gaussians at `places`, in that order.
-    pub fn pick(&self, places: &[u32]) -> Change {
-        let mut picked = Change::default();
+    pub fn pick(&self, places: &[u32]) -> ParamDelta {
+        let mut picked = ParamDelta::default();
         for column in self.columns().iter() {
             *picked.0.column_mut(column) = self.0.column(column).pick(places);
         }
@@ -74,7 +74,7 @@ impl Change {
     }
 
     /// This change and then `more`, whose harmonics are of no lower degree where both have some.
-    pub fn and(self, mut more: Change) -> Change {
+    pub fn and(self, mut more: ParamDelta) -> ParamDelta {
         for column in self.columns().iter() {
             let (of, to) = (self.0.column(column), more.0.column_mut(column));
             if to.is_empty() {
@@ -87,7 +87,7 @@ impl Change {
     }
 
     /// What leads from `before` here.
-    pub fn since(&self, before: &Change) -> Change {
+    pub fn since(&self, before: &ParamDelta) -> ParamDelta {
         let mut back = before.clone();
         back.scale(-1.0);
         back.and(self.clone())
@@ -106,12 +106,12 @@ impl Change {
     }
 }
 
-/// What is added beside a [`Change`], another amount at every time: these at times that lie evenly from the first frame to
+/// What is added beside a [`ParamDelta`], another amount at every time: these at times that lie evenly from the first frame to
 /// the last, and in between what lies on the straight line; none: nothing. All have the same columns.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Course(pub Vec<Change>);
+pub struct TrajectoryDelta(pub Vec<ParamDelta>);
 
-impl Course {
+impl TrajectoryDelta {
     /// Which of `knots`, 2 or more, make up what is added at `frame` of `frames`, and with which weights.
     pub fn weights(knots: usize, frame: usize, frames: usize) -> [(usize, f32); 2] {
         let along = frame as f64 * (knots - 1) as f64 / (frames.max(2) - 1) as f64;
@@ -127,15 +127,15 @@ impl Course {
 
     /// The columns that change.
     pub fn columns(&self) -> Columns {
-        self.0.first().map_or(Columns::empty(), Change::columns)
+        self.0.first().map_or(Columns::empty(), ParamDelta::columns)
     }
 
     /// What is added at `frame` of `frames`.
-    pub fn at(&self, frame: usize, frames: usize) -> Change {
+    pub fn at(&self, frame: usize, frames: usize) -> ParamDelta {
         if self.is_empty() {
-            return Change::default();
+            return ParamDelta::default();
         }
-        let [(first, before), (second, after)] = Course::weights(self.0.len(), frame, frames);
+        let [(first, before), (second, after)] = TrajectoryDelta::weights(self.0.len(), frame, frames);
         let [mut change, mut more] = [first, second].map(|knot| self.0[knot].clone());
         change.scale(before);
         more.scale(after);
@@ -143,52 +143,52 @@ impl Course {
     }
 
     /// The course of the Gaussians at `places`, in that order.
-    pub fn pick(&self, places: &[u32]) -> Course {
-        Course(self.0.iter().map(|knot| knot.pick(places)).collect())
+    pub fn pick(&self, places: &[u32]) -> TrajectoryDelta {
+        TrajectoryDelta(self.0.iter().map(|knot| knot.pick(places)).collect())
     }
 
     /// This course and then `more`, of as many knots if both have any.
-    pub fn and(self, more: Course) -> Course {
+    pub fn and(self, more: TrajectoryDelta) -> TrajectoryDelta {
         match (self.is_empty(), more.is_empty()) {
             (_, true) => self,
             (true, _) => more,
-            _ => Course(self.0.into_iter().zip(more.0).map(|(knot, more)| knot.and(more)).collect()),
+            _ => TrajectoryDelta(self.0.into_iter().zip(more.0).map(|(knot, more)| knot.and(more)).collect()),
         }
     }
 }
 
 /// The Gaussians of the output in terms of those of the input.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Reduction {
+pub struct CompressedModel {
     /// For every Gaussian of the output the id of its original, or of its cluster's leader; increasing.
     pub kept: Vec<u32>,
     /// The proxies among them, by place in the output.
     pub clusters: Vec<Cluster>,
     /// How members make up a proxy.
-    pub rule: Merge,
+    pub rule: MergeParams,
     /// The proxies, solved.
     pub proxies: Proxies,
     /// What is added to their parameters.
-    pub change: Change,
+    pub change: ParamDelta,
     /// And beside that along time, where their state stands in every frame and there are no proxies.
-    pub course: Course,
+    pub course: TrajectoryDelta,
     /// How the field that deforms them is written, where there is one.
     pub field: Precision,
     /// Degree of the harmonics that stay of them; those above go, if there are any.
     pub sh_degree: usize,
 }
 
-impl Reduction {
+impl CompressedModel {
     /// The Gaussians `kept` (increasing) as they are, with their field and all of their harmonics. Nothing is merged, so
     /// that nothing goes by `rule`.
-    pub fn pruned(kept: Vec<u32>, rule: &Merge) -> Self {
-        Reduction {
+    pub fn pruned(kept: Vec<u32>, rule: &MergeParams) -> Self {
+        CompressedModel {
             kept,
             clusters: Vec::new(),
             rule: rule.clone(),
             proxies: Proxies::default(),
-            change: Change::default(),
-            course: Course::default(),
+            change: ParamDelta::default(),
+            course: TrajectoryDelta::default(),
             field: Precision::Exact,
             sh_degree: ALL_HARMONICS,
         }
@@ -196,7 +196,7 @@ impl Reduction {
 
     /// The Gaussians `kept` (increasing) in the same manner.
     pub fn with(&self, kept: Vec<u32>) -> Self {
-        Reduction { kept, ..self.clone() }
+        CompressedModel { kept, ..self.clone() }
     }
 
     /// Makes the clusters what `proxies` say that they are; those refused are their leaders, as these are.
@@ -226,16 +226,16 @@ impl Reduction {
     ///
     /// # Panics
     /// If there is a proxy.
-    pub fn pick(&self, places: &[u32]) -> Reduction {
+    pub fn pick(&self, places: &[u32]) -> CompressedModel {
         assert!(self.clusters.is_empty(), "proxies have no place to pick them by");
         let kept = places.iter().map(|&place| self.kept[place as usize]).collect();
         let (change, course) = (self.change.pick(places), self.course.pick(places));
         let (field, sh_degree) = (self.field, self.sh_degree);
-        Reduction { change, course, field, sh_degree, ..Reduction::pruned(kept, &self.rule) }
+        CompressedModel { change, course, field, sh_degree, ..CompressedModel::pruned(kept, &self.rule) }
     }
 
     /// All that is added at `frame` of `frames`.
-    pub fn change_at(&self, frame: usize, frames: usize) -> Change {
+    pub fn change_at(&self, frame: usize, frames: usize) -> ParamDelta {
         // The course has no higher bands.
         self.course.at(frame, frames).and(self.change.clone())
     }
@@ -268,7 +268,7 @@ mod tests {
         by.rotation = Default::default();
         by.position.set_row(1, [1.0, 0.0, -2.0]);
         by.sh.set_row(0, [0.5, 0.0, 0.25]);
-        let change = Change(by);
+        let change = ParamDelta(by);
         assert_eq!(change.columns(), Columns::all().difference(Columns::ROTATION));
         let mut changed = state.clone();
         change.add_to(&mut changed, change.columns().difference(Columns::LOG_SCALE));
@@ -278,7 +278,7 @@ mod tests {
         assert_eq!((&changed.rotation, &changed.log_scale), (&state.rotation, &state.log_scale));
         change.pick(&[1, 0]).add_to(&mut state, Columns::all());
         assert_eq!((state.position.row(0), state.sh.row(1)), ([1.0, 0.0, -2.0], [0.5, 0.0, 0.25]));
-        assert!(Change::default().is_empty() && !change.is_empty());
+        assert!(ParamDelta::default().is_empty() && !change.is_empty());
     }
 
     #[test]
@@ -287,9 +287,9 @@ mod tests {
             let mut by = Gaussians::zeros(0, 0);
             by.position = Column::from_planes(3, vec![x, 0.0, 2.0 * x, 0.0, 0.0, -x]);
             by.opacity_logit = Column::from_planes(1, vec![logit, 1.0]);
-            Change(by)
+            ParamDelta(by)
         };
-        let course = Course(vec![knot(1.0, 0.0), knot(3.0, 4.0), knot(-1.0, 4.0)]);
+        let course = TrajectoryDelta(vec![knot(1.0, 0.0), knot(3.0, 4.0), knot(-1.0, 4.0)]);
         assert_eq!(course.columns(), Columns::POSITION | Columns::OPACITY);
         for (frame, x, logit) in [(0, 1.0, 0.0), (1, 1.5, 1.0), (4, 3.0, 4.0), (7, 0.0, 4.0), (8, -1.0, 4.0)] {
             assert_eq!(course.at(frame, 9), knot(x, logit), "frame {frame}");
@@ -297,11 +297,13 @@ mod tests {
             assert_eq!(course.clone().and(course.clone()).at(frame, 9), knot(x, logit).and(knot(x, logit)));
         }
         assert_eq!(course.at(0, 1), knot(1.0, 0.0));
-        assert!(Course::default().at(3, 9).is_empty() && Course::default().and(course.clone()) == course);
+        assert!(
+            TrajectoryDelta::default().at(3, 9).is_empty() && TrajectoryDelta::default().and(course.clone()) == course
+        );
         let mut of_all = Gaussians::zeros(2, 1);
         of_all.sh.planes_mut().fill(0.5);
-        let mut reduction = Reduction::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
-        (reduction.change, reduction.course) = (Change(of_all), course);
+        let mut reduction = CompressedModel::pruned(vec![2, 7], &Recipe::preset("default").unwrap().merge);
+        (reduction.change, reduction.course) = (ParamDelta(of_all), course);
         let both = reduction.change_at(4, 9);
         assert_eq!((both.0.position.row(0), both.0.sh.row::<12>(1)), ([3.0, 6.0, 0.0], [0.5; 12]));
         assert_eq!(reduction.pick(&[1]).change_at(4, 9), both.pick(&[1]));
@@ -310,7 +312,7 @@ mod tests {
     #[test]
     fn clusters_that_are_refused_are_their_leaders_and_the_others_keep_their_proxies() {
         let rule = Recipe::preset("default").unwrap().merge;
-        let mut reduction = Reduction::pruned(vec![1, 4, 6], &rule);
+        let mut reduction = CompressedModel::pruned(vec![1, 4, 6], &rule);
         let cluster = |output: u32, leader: u32, other: u32| Cluster {
             output,
             leader,
@@ -328,7 +330,7 @@ mod tests {
     #[test]
     fn members_of_a_cluster_share_its_place() {
         let rule = Recipe::preset("default").unwrap().merge;
-        let mut reduction = Reduction::pruned(vec![1, 4], &rule);
+        let mut reduction = CompressedModel::pruned(vec![1, 4], &rule);
         assert_eq!(reduction.index_map(6), [None, Some(0), None, None, Some(1), None]);
         reduction.clusters.push(Cluster { output: 1, leader: 4, members: vec![(2, 0.25), (4, 0.75)] });
         assert_eq!(reduction.index_map(6), [None, Some(0), Some(1), None, Some(1), None]);

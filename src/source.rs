@@ -47,30 +47,30 @@ impl Ids<'_> {
 ///
 /// Advice: other frames, or these in another order, read the same and cost more.
 #[derive(Debug, Clone)]
-pub struct Wanted {
+pub struct ReadPlan {
     /// Increasing; none: every frame.
     frames: Option<Arc<[usize]>>,
     held: usize,
 }
 
-impl Wanted {
+impl ReadPlan {
     /// Every frame, in order: what a reader expects unless it is told.
-    pub fn every() -> Wanted {
-        Wanted { frames: None, held: usize::MAX }
+    pub fn every() -> ReadPlan {
+        ReadPlan { frames: None, held: usize::MAX }
     }
 
     /// These frames, in increasing order.
-    pub fn of(frames: impl IntoIterator<Item = usize>) -> Wanted {
+    pub fn of(frames: impl IntoIterator<Item = usize>) -> ReadPlan {
         let mut frames: Vec<usize> = frames.into_iter().collect();
         frames.sort_unstable();
         frames.dedup();
-        Wanted { frames: Some(frames.into()), held: usize::MAX }
+        ReadPlan { frames: Some(frames.into()), held: usize::MAX }
     }
 
     /// Keeping at most `frames` (at least 1) of those that have to be decoded together anyway: less memory, at the
     /// price of decoding again.
-    pub fn holding(self, frames: usize) -> Wanted {
-        Wanted { held: frames.max(1), ..self }
+    pub fn holding(self, frames: usize) -> ReadPlan {
+        ReadPlan { held: frames.max(1), ..self }
     }
 
     /// Most frames to keep.
@@ -165,7 +165,7 @@ pub trait FrameSource: Send + Sync {
 
     /// A reader over all Gaussians, for the frames `wanted`, if it costs less than readers of blocks. Memory: its own,
     /// per Gaussian, may be more than theirs.
-    fn open_all(&self, _wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, _wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         None
     }
 
@@ -177,7 +177,7 @@ pub trait FrameSource: Send + Sync {
 
     /// How its pictures get their colours, where Gaussians have features in the place of colours; the colours of its states
     /// are then near to what they look like.
-    fn decoder(&self) -> Option<&dyn Decoder> {
+    fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         None
     }
 
@@ -187,7 +187,7 @@ pub trait FrameSource: Send + Sync {
     }
 
     /// How to have its bytes in memory before they are read, where waiting for them would cost more than asking.
-    fn ahead(&self) -> Option<&dyn Ahead> {
+    fn ahead(&self) -> Option<&dyn Prefetch> {
         None
     }
 }
@@ -215,7 +215,7 @@ pub trait Deformation: Sync {
 }
 
 /// Features in the place of colours: they are blended without a background, and what comes of that decides, pixel by pixel.
-pub trait Decoder: Sync {
+pub trait FeatureDecoder: Sync {
     /// Writes the features of all Gaussians at `frame` into `out`: as many planes as there are features.
     ///
     /// # Errors
@@ -227,7 +227,7 @@ pub trait Decoder: Sync {
 }
 
 /// A source on a disk, whose bytes can be brought ahead of their use, from a thread that does nothing else.
-pub trait Ahead: Sync {
+pub trait Prefetch: Sync {
     /// Frames that are brought and decoded together: those from a multiple of it to the next.
     fn frame_block(&self) -> usize;
 
@@ -244,7 +244,7 @@ pub trait BlockReader: Send {
 
     /// Tells it which frames it will be asked for from now on, and how many it may keep. Readers that keep no frames
     /// have nothing to do.
-    fn expect(&mut self, _wanted: &Wanted) {}
+    fn expect(&mut self, _wanted: &ReadPlan) {}
 
     /// Does now what reading `want` at `frame` and at those decoded with it takes beside copying, as far as it may
     /// keep the outcome.
@@ -259,13 +259,13 @@ mod tests {
 
     #[test]
     fn wanted_frames_are_found_from_any_of_them_and_a_stranger_stands_alone() {
-        let wanted = Wanted::of([40, 3, 9, 3, 31]).holding(0);
+        let wanted = ReadPlan::of([40, 3, 9, 3, 31]).holding(0);
         assert_eq!(wanted.held(), 1);
         assert_eq!(wanted.between(3, 32), [3, 9, 31]);
         assert_eq!(wanted.between(9, 32), [9, 31]);
         assert_eq!(wanted.between(4, 32), [4]);
         assert_eq!([wanted.next(0), wanted.next(32), wanted.next(41)], [Some(3), Some(40), None]);
-        assert_eq!(Wanted::every().between(30, 32), [30, 31]);
-        assert_eq!(Wanted::every().next(64), Some(64));
+        assert_eq!(ReadPlan::every().between(30, 32), [30, 31]);
+        assert_eq!(ReadPlan::every().next(64), Some(64));
     }
 }

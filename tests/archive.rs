@@ -7,7 +7,7 @@ use std::path::Path;
 
 use scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, state, tiny};
 use splatsieve::model::{Columns, Gaussians};
-use splatsieve::models::{Family, ModelFolder};
+use splatsieve::models::{InputModel, ModelFolder};
 use splatsieve::outputs::container::write_container;
 
 /// How to have the tiny model archived without refining anything.
@@ -77,7 +77,7 @@ fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
     assert_eq!(archive.kind(), "gsz archive");
     let archive = archive.with_times(vec![0.0, 0.4, 1.0]).unwrap();
     for frame in 0..3 {
-        let (a, b) = (state(archive.source(), frame), state(Family::source(&folder), frame));
+        let (a, b) = (state(archive.source(), frame), state(InputModel::source(&folder), frame));
         assert!((0..a.len()).all(|i| bits(&a, i) == bits(&b, i)), "frame {frame}");
     }
     drop(archive);

@@ -9,22 +9,22 @@ use scene::{Workplace, state, tiny, without_sh_head};
 use splatsieve::limits::Limits;
 use splatsieve::model::{ALL_HARMONICS, Columns, Gaussians};
 use splatsieve::models;
-use splatsieve::models::{Family, OpenOptions};
+use splatsieve::models::{InputModel, OpenOptions};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::recipe::{Precision, Recipe};
-use splatsieve::reduction::{Change, Cluster, Reduction, Reference};
+use splatsieve::reduction::{Cluster, CompressedModel, ParamDelta, Reference};
 
 /// Opens `path`, at three times where it leaves them open.
-fn open(path: &Path) -> Box<dyn Family> {
+fn open(path: &Path) -> Box<dyn InputModel> {
     let input = models::open(path, &OpenOptions::default()).unwrap();
     if input.source().info().times.is_empty() { input.with_times(vec![0.0, 0.25, 1.0]).unwrap() } else { input }
 }
 
 /// Every third Gaussian of `input`, two of them merged with a neighbour.
-fn reduction(input: &dyn Family) -> Reduction {
+fn reduction(input: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
     let kept: Vec<u32> = (0..input.source().info().count as u32).step_by(3).collect();
-    let mut reduction = Reduction::pruned(kept, &rule);
+    let mut reduction = CompressedModel::pruned(kept, &rule);
     for output in [1, 4] {
         let leader = reduction.kept[output as usize];
         reduction.clusters.push(Cluster { output, leader, members: vec![(leader, 0.625), (leader + 1, 0.375)] });
@@ -35,7 +35,7 @@ fn reduction(input: &dyn Family) -> Reduction {
 }
 
 /// Something else for every third Gaussian, in the columns `of`.
-fn change(count: usize, of: Columns) -> Change {
+fn change(count: usize, of: Columns) -> ParamDelta {
     let mut by = Gaussians::default();
     for column in of.iter() {
         *by.column_mut(column) = Gaussians::zeros(count, 0).column(column).clone();
@@ -44,11 +44,16 @@ fn change(count: usize, of: Columns) -> Change {
             (0..count).step_by(3).for_each(|i| plane[i] = 0.01 * (c + 1) as f32 * (i as f32 - 7.0));
         }
     }
-    Change(by)
+    ParamDelta(by)
 }
 
 /// States of what `reduction` leaves of `input`, and of what is written of it as `kind` and read again.
-fn both(workplace: &Workplace, input: &dyn Family, reduction: &Reduction, kind: OutputKind) -> [Vec<Gaussians>; 2] {
+fn both(
+    workplace: &Workplace,
+    input: &dyn InputModel,
+    reduction: &CompressedModel,
+    kind: OutputKind,
+) -> [Vec<Gaussians>; 2] {
     let path = workplace.path(if kind.is_folder() { "written" } else { "written.gseq" });
     if kind.is_folder() {
         std::fs::create_dir(&path).unwrap();
@@ -81,7 +86,7 @@ fn frames_of_a_reduction_are_those_of_what_is_written_whatever_column_was_change
         let input = open(&path);
         let mut reduction = reduction(&*input);
         for kind in kinds {
-            reduction.change = Change::default();
+            reduction.change = ParamDelta::default();
             let [plain, _] = both(&workplace, &*input, &reduction, kind);
             for column in Columns::all().iter().chain([Columns::all()]) {
                 reduction.change = change(reduction.len(), column);

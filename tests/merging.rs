@@ -12,11 +12,11 @@ use splatsieve::merging::proxy::{ProxyState, merge_state};
 use splatsieve::model::{Columns, Gaussians, SH_C0};
 use splatsieve::pipeline::{Only, Request, Target, compress_scene, score_scene};
 use splatsieve::pruning::score::{Scored, UserOverrides};
-use splatsieve::recipe::{Merge, MergePass, Motion, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
+use splatsieve::recipe::{MergeParams, MergePass, MotionParams, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
 use splatsieve::scene::{InputOptions, Scene, open_scene};
 
 /// Tightens a gate.
-type Edit = fn(&mut Merge);
+type Edit = fn(&mut MergeParams);
 
 /// A model in memory, every frame of it.
 struct Whole {
@@ -65,7 +65,7 @@ fn covariance(state: &Gaussians, i: usize) -> DMat3 {
 }
 
 /// Tests 1 and 2 for two nodes with these states.
-fn alike(state: &Gaussians, i: usize, j: usize, merge: &Merge, pass: &MergePass) -> bool {
+fn alike(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &MergePass) -> bool {
     let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
     let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
     let regular = sigma + DMat3::from_diagonal(DVec3::splat(1e-6 * trace));
@@ -103,13 +103,13 @@ fn move_alike(whole: &Whole, i: usize, j: usize, recipe: &Recipe, pass: &MergePa
     }
     let steps: Vec<(DVec3, DVec3)> = common
         .iter()
-        .filter(|&&t| t > 0 && (recipe.scan.motion == Motion::Literal || both(t - 1)))
+        .filter(|&&t| t > 0 && (recipe.scan.motion == MotionParams::Literal || both(t - 1)))
         .map(|&t| (whole.at(t, i) - whole.at(t - 1, i), whole.at(t, j) - whole.at(t - 1, j)))
         .collect();
     let similarity = match merge.trajectory {
         Trajectory::Cosine => {
             let sum: f64 = steps.iter().map(|(a, b)| a.dot(*b) / (a.length() * b.length() + 1e-8)).sum();
-            let terms = if recipe.scan.motion == Motion::Literal { common.len() } else { steps.len() };
+            let terms = if recipe.scan.motion == MotionParams::Literal { common.len() } else { steps.len() };
             if terms == 0 { 0.0 } else { sum / terms as f64 }
         }
         Trajectory::Alignment => {
@@ -218,7 +218,7 @@ fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
 
 /// Holds a merged state against the definitions over its members, weights w: μ = Σ w x, or the leader's place; covariance
 /// Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colours Σ w c; opacity by its rule, an area being a quarter of an ellipsoid's surface.
-fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &Merge) {
+fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &MergeParams) {
     let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
     let mean = match merge.placement {
         Placement::Leader => position(leader),
@@ -280,7 +280,7 @@ fn proxies_are_solved_at_their_leaders(
     whole: &Whole,
     scored: &Scored,
     clusters: &[Vec<usize>],
-    merge: &Merge,
+    merge: &MergeParams,
 ) {
     let cloud = "point_cloud/iteration_7/point_cloud.ply";
     let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));

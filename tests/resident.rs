@@ -11,8 +11,8 @@ use splatsieve::diagnostics::demo_scene::Scene;
 use splatsieve::files::container::Container;
 use splatsieve::model::{Columns, Gaussians};
 use splatsieve::outputs::container::{FRAME_BLOCK, write_container};
-use splatsieve::passes::Frames;
-use splatsieve::source::{BlockReader, FrameSource, Ids, Wanted};
+use splatsieve::passes::FrameReaders;
+use splatsieve::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 const COUNT: usize = 20_000;
 const FRAMES: usize = 1200;
@@ -45,7 +45,8 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
         most = most.max(status("RssFile:"));
     }
     // Frame by frame.
-    let mut frames = Frames::open(&container, Ids::Range(0..COUNT), varying, &Wanted::every().holding(1)).unwrap();
+    let mut frames =
+        FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::every().holding(1)).unwrap();
     let mut state = frames.state();
     for frame in 0..FRAMES {
         frames.read(frame, varying, &mut state).unwrap();
@@ -54,8 +55,8 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     drop(frames);
     // Some of all tiles, some frames of each.
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(7).collect();
-    let wanted = Wanted::of((0..FRAMES).step_by(5));
-    let mut frames = Frames::open(&container, Ids::List(&scattered), varying, &wanted).unwrap();
+    let wanted = ReadPlan::of((0..FRAMES).step_by(5));
+    let mut frames = FrameReaders::open(&container, Ids::List(&scattered), varying, &wanted).unwrap();
     let mut state = frames.state();
     for frame in (0..FRAMES).step_by(5) {
         frames.read(frame, varying, &mut state).unwrap();
@@ -66,7 +67,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     assert!(grown < 6 << 20, "{grown} bytes more of files resident while reading {file}");
 
     // Frame by frame, where a frame block of all Gaussians may be held.
-    let mut frames = Frames::open(&container, Ids::Range(0..COUNT), varying, &Wanted::every()).unwrap();
+    let mut frames = FrameReaders::open(&container, Ids::Range(0..COUNT), varying, &ReadPlan::every()).unwrap();
     let mut state = frames.state();
     for frame in 0..FRAMES {
         frames.read(frame, varying, &mut state).unwrap();

@@ -9,7 +9,7 @@ use scene::{arrays, shared, state, tiny};
 use splatsieve::model::{Gaussians, Rows, Schedule};
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::UserOverrides;
-use splatsieve::recipe::{Motion, Recipe};
+use splatsieve::recipe::{MotionParams, Recipe};
 
 fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
     assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance:e}");
@@ -74,7 +74,7 @@ fn frames_agree(model: &Path) {
     }
 }
 
-fn rows(model: &Path, motion: Motion) -> (Rows, f64) {
+fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
     let mut recipe = Recipe::preset("default").unwrap();
     recipe.scan.motion = motion;
     recipe.scan.snap_noise = false;
@@ -97,7 +97,7 @@ fn rows(model: &Path, motion: Motion) -> (Rows, f64) {
 /// by 2·mean|d|·2a + 4a² ≤ 4a·√V + 4a².
 fn statistics_agree(model: &Path) {
     let expected = arrays(&model.join("statistics_f64.npz"));
-    for (motion, name) in [(Motion::Literal, "literal"), (Motion::Runs, "runs")] {
+    for (motion, name) in [(MotionParams::Literal, "literal"), (MotionParams::Runs, "runs")] {
         let (rows, ulp) = rows(model, motion);
         let (e, a) = (ulp, 1e-6);
         let (of_d, of_kappa) = (&expected[&format!("D_{name}")], &expected[&format!("kappa_{name}")]);

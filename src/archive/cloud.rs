@@ -7,10 +7,10 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::entropy::{Decoder, Encoder, Model, SYMBOLS};
-use super::predict::{Fit, Parts, expected, factors};
+use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
+use super::predict::{PredictorFit, PredictorWeights, expected, factors};
 use super::residual::Residuals;
-use super::step::Grid;
+use super::step::QuantizationGrid;
 use crate::model::{Column, Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
 
 /// Attributes with a step each, by place in [`CloudSteps`]: harmonics by degree.
@@ -29,7 +29,7 @@ const CURVE_BITS: u32 = 21;
 /// What a cloud is, beside its symbols.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Shape {
+pub(super) struct PointCloudShape {
     pub(super) gaussians: usize,
     pub(super) sh_degree: usize,
     pub(super) steps: CloudSteps,
@@ -40,7 +40,7 @@ pub(super) struct Shape {
     /// Mean of every plane after the positions, in steps.
     pub(super) means: Vec<i64>,
     /// How values of every plane are expected.
-    pub(super) parts: Vec<Parts<NEIGHBOURS>>,
+    pub(super) parts: Vec<PredictorWeights<NEIGHBOURS>>,
 }
 
 /// The planes after the positions: column, plane of it, and attribute.
@@ -52,7 +52,7 @@ fn planes(sh_degree: usize) -> Vec<(Columns, usize, usize)> {
     planes
 }
 
-impl Shape {
+impl PointCloudShape {
     /// Whether it goes together, whatever an archive says.
     pub(super) fn is_sound(&self) -> bool {
         self.sh_degree <= HIGHEST_DEGREE
@@ -100,7 +100,7 @@ fn gather(x: u64) -> u64 {
 }
 
 /// Positions on their grid above the lowest, the lowest, and the loose bits.
-fn on_grid(position: &Column, grid: Grid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
+fn on_grid(position: &Column, grid: QuantizationGrid) -> (Vec<[u64; 3]>, [i64; 3], u32) {
     let all: Vec<[i64; 3]> = (0..position.len()).map(|i| position.row(i).map(|x| grid.multiple(x))).collect();
     let lowest = [0, 1, 2].map(|axis| all.iter().map(|p| p[axis]).min().unwrap_or(0));
     let above: Vec<[u64; 3]> = all.iter().map(|p| [0, 1, 2].map(|axis| p[axis].abs_diff(lowest[axis]))).collect();
@@ -119,13 +119,13 @@ pub(super) fn encode(
     cloud: &Gaussians,
     steps: &CloudSteps,
     bits: &mut BTreeMap<String, f64>,
-) -> (Shape, Vec<u8>, Vec<u32>) {
-    let mut encoder = Encoder::default();
-    let (places, lowest, loose) = on_grid(&cloud.position, Grid::new(steps[0]));
+) -> (PointCloudShape, Vec<u8>, Vec<u32>) {
+    let mut encoder = SymbolEncoder::default();
+    let (places, lowest, loose) = on_grid(&cloud.position, QuantizationGrid::new(steps[0]));
     let mut order: Vec<u32> = (0..cloud.len() as u32).collect();
     // Stable: ties by id.
     order.sort_by_key(|&id| on_curve(&places[id as usize], loose));
-    let (mut lengths, mut before) = (Lengths::new(), 0);
+    let (mut lengths, mut before) = (RunLengths::new(), 0);
     for &id in &order {
         let place = &places[id as usize];
         let at = on_curve(place, loose);
@@ -135,7 +135,7 @@ pub(super) fn encode(
     }
     bits.insert(ATTRIBUTES[0].to_owned(), encoder.cost());
     let planes = planes(cloud.sh_degree());
-    let mut shape = Shape {
+    let mut shape = PointCloudShape {
         gaussians: cloud.len(),
         sh_degree: cloud.sh_degree(),
         steps: *steps,
@@ -144,14 +144,14 @@ pub(super) fn encode(
         means: Vec::new(),
         parts: Vec::new(),
     };
-    let mut walk = Walk::new(cloud.len());
+    let mut walk = PlaneWalker::new(cloud.len());
     for (column, c, attribute) in planes {
-        let grid = Grid::new(steps[attribute]);
+        let grid = QuantizationGrid::new(steps[attribute]);
         let plane = cloud.column(column).plane(c);
         let multiples: Vec<i64> = order.iter().map(|&id| grid.multiple(plane[id as usize])).collect();
         let sum: i128 = multiples.iter().map(|&multiple| i128::from(multiple)).sum();
         let mean = (sum / multiples.len().max(1) as i128) as i64;
-        let mut fit = Fit::new();
+        let mut fit = PredictorFit::new();
         walk.clone().plane(attribute, grid, mean, |i, around, _, _| {
             fit.add(around, grid.value(multiples[i]) - grid.value(mean));
             (multiples[i], 0)
@@ -173,11 +173,11 @@ pub(super) fn encode(
 }
 
 /// Reads a cloud; none where the bytes are of another.
-pub(super) fn decode(shape: &Shape, bytes: &[u8]) -> Option<Gaussians> {
-    let mut decoder = Decoder::new(bytes)?;
+pub(super) fn decode(shape: &PointCloudShape, bytes: &[u8]) -> Option<Gaussians> {
+    let mut decoder = SymbolDecoder::new(bytes)?;
     let mut cloud = Gaussians::zeros(shape.gaussians, shape.sh_degree);
-    let grid = Grid::new(shape.steps[0]);
-    let (mut lengths, mut at) = (Lengths::new(), 0u64);
+    let grid = QuantizationGrid::new(shape.steps[0]);
+    let (mut lengths, mut at) = (RunLengths::new(), 0u64);
     for i in 0..shape.gaussians {
         at = at.wrapping_add(lengths.decode(&mut decoder));
         let place = [0, 1, 2].map(|axis| {
@@ -186,9 +186,9 @@ pub(super) fn decode(shape: &Shape, bytes: &[u8]) -> Option<Gaussians> {
         });
         cloud.position.set_row(i, place);
     }
-    let mut walk = Walk::new(shape.gaussians);
+    let mut walk = PlaneWalker::new(shape.gaussians);
     for (k, (column, c, attribute)) in planes(shape.sh_degree).into_iter().enumerate() {
-        let grid = Grid::new(shape.steps[attribute]);
+        let grid = QuantizationGrid::new(shape.steps[attribute]);
         let mean = shape.means[k];
         let factors = factors(&shape.parts[k]);
         let plane = cloud.column_mut(column).plane_mut(c);
@@ -204,24 +204,24 @@ pub(super) fn decode(shape: &Shape, bytes: &[u8]) -> Option<Gaussians> {
 }
 
 /// Distances along the curve: how many bits they have as two symbols, and the bits below the first.
-struct Lengths {
-    high: Model,
-    low: [Model; 4],
+struct RunLengths {
+    high: SymbolModel,
+    low: [SymbolModel; 4],
 }
 
-impl Lengths {
-    fn new() -> Lengths {
-        Lengths { high: Model::NEW, low: [const { Model::NEW }; 4] }
+impl RunLengths {
+    fn new() -> RunLengths {
+        RunLengths { high: SymbolModel::NEW, low: [const { SymbolModel::NEW }; 4] }
     }
 
-    fn encode(&mut self, distance: u64, to: &mut Encoder) {
+    fn encode(&mut self, distance: u64, to: &mut SymbolEncoder) {
         let length = 64 - distance.leading_zeros();
         to.symbol(&mut self.high, length as usize / SYMBOLS);
         to.symbol(&mut self.low[length as usize / SYMBOLS], length as usize % SYMBOLS);
         to.long_bits(distance, length.saturating_sub(1));
     }
 
-    fn decode(&mut self, from: &mut Decoder<'_>) -> u64 {
+    fn decode(&mut self, from: &mut SymbolDecoder<'_>) -> u64 {
         let high = from.symbol(&mut self.high) & 3;
         let length = (high * SYMBOLS + from.symbol(&mut self.low[high])) as u32;
         let below = from.long_bits(length.saturating_sub(1));
@@ -231,7 +231,7 @@ impl Lengths {
 
 /// Goes through one plane after another.
 #[derive(Clone)]
-struct Walk {
+struct PlaneWalker {
     /// Differences from their mean in the plane before and the one before that.
     known: [Vec<f32>; 2],
     /// How far values of an attribute were from what was expected, in steps: of late, by Gaussian.
@@ -241,10 +241,10 @@ struct Walk {
     models: Residuals,
 }
 
-impl Walk {
-    fn new(count: usize) -> Walk {
+impl PlaneWalker {
+    fn new(count: usize) -> PlaneWalker {
         let none = || vec![0.0; count];
-        Walk { known: [none(), none()], sizes: none(), attribute: usize::MAX, models: Residuals::new() }
+        PlaneWalker { known: [none(), none()], sizes: none(), attribute: usize::MAX, models: Residuals::new() }
     }
 
     /// Visits every Gaussian of a plane. `code` is given what lies around, how large differences were there, in steps,
@@ -253,7 +253,7 @@ impl Walk {
     fn plane(
         &mut self,
         attribute: usize,
-        grid: Grid,
+        grid: QuantizationGrid,
         mean: i64,
         mut code: impl FnMut(usize, &[f32; NEIGHBOURS], f32, &mut Residuals) -> (i64, i64),
     ) {
@@ -282,7 +282,7 @@ pub(super) fn round(cloud: &mut Gaussians, steps: &CloudSteps, attributes: &[usi
     let positions = (0..3).map(|c| (Columns::POSITION, c, 0));
     for (column, c, attribute) in positions.chain(planes(cloud.sh_degree())) {
         if attributes.contains(&attribute) {
-            let grid = Grid::new(steps[attribute]);
+            let grid = QuantizationGrid::new(steps[attribute]);
             cloud.column_mut(column).plane_mut(c).iter_mut().for_each(|value| *value = grid.round(*value));
         }
     }

@@ -37,21 +37,21 @@ const KNOWN: [[i16; SYMBOLS]; SYMBOLS] = {
 
 /// What is expected of a symbol.
 #[derive(Debug, Clone)]
-pub(super) struct Model {
+pub(super) struct SymbolModel {
     /// Sums of the parts of all symbols before each.
     starts: [i16; SYMBOLS],
     seen: u32,
 }
 
-impl Model {
-    pub(super) const NEW: Model = {
+impl SymbolModel {
+    pub(super) const NEW: SymbolModel = {
         let mut starts = [0; SYMBOLS];
         let mut i = 0;
         while i < SYMBOLS {
             starts[i] = i as i16 * (1 << (PRECISION - 4));
             i += 1;
         }
-        Model { starts, seen: 0 }
+        SymbolModel { starts, seen: 0 }
     };
 
     /// Start and part of a symbol.
@@ -73,7 +73,7 @@ impl Model {
 
 /// Writes symbols and bits.
 #[derive(Debug, Default)]
-pub(super) struct Encoder {
+pub(super) struct SymbolEncoder {
     symbols: Vec<(u16, u16)>,
     bits: Vec<u8>,
     waiting: u64,
@@ -82,13 +82,13 @@ pub(super) struct Encoder {
     cost: f64,
 }
 
-impl Encoder {
+impl SymbolEncoder {
     /// Bits of what was written so far, about.
     pub(super) fn cost(&self) -> f64 {
         self.cost
     }
 
-    pub(super) fn symbol(&mut self, model: &mut Model, symbol: usize) {
+    pub(super) fn symbol(&mut self, model: &mut SymbolModel, symbol: usize) {
         let (start, part) = model.part(symbol);
         self.cost += f64::from(PRECISION) - f64::from(part).log2();
         self.symbols.push((start as u16, part as u16));
@@ -146,9 +146,9 @@ impl Encoder {
     }
 }
 
-/// Reads what [`Encoder`] wrote. Bytes that are no such thing give other symbols, and a [`Decoder::is_finished`] that is false.
+/// Reads what [`SymbolEncoder`] wrote. Bytes that are no such thing give other symbols, and a [`SymbolDecoder::is_finished`] that is false.
 #[derive(Debug)]
-pub(super) struct Decoder<'a> {
+pub(super) struct SymbolDecoder<'a> {
     state: u64,
     words: std::slice::Iter<'a, [u8; 4]>,
     bits: &'a [u8],
@@ -157,19 +157,19 @@ pub(super) struct Decoder<'a> {
     is_short: bool,
 }
 
-impl<'a> Decoder<'a> {
+impl<'a> SymbolDecoder<'a> {
     /// None where the lengths do not fit.
-    pub(super) fn new(bytes: &'a [u8]) -> Option<Decoder<'a>> {
+    pub(super) fn new(bytes: &'a [u8]) -> Option<SymbolDecoder<'a>> {
         let (length, rest) = bytes.split_first_chunk::<8>()?;
         let (words, bits) = rest.split_at_checked(usize::try_from(u64::from_le_bytes(*length)).ok()?)?;
         let ([head, words @ ..], []) = words.as_chunks::<4>() else { return None };
         let (second, words) = words.split_first()?;
         let state = u64::from(u32::from_le_bytes(*head)) << 32 | u64::from(u32::from_le_bytes(*second));
-        Some(Decoder { state, words: words.iter(), bits, waiting: 0, waiting_bits: 0, is_short: false })
+        Some(SymbolDecoder { state, words: words.iter(), bits, waiting: 0, waiting_bits: 0, is_short: false })
     }
 
     #[inline(always)]
-    pub(super) fn symbol(&mut self, model: &mut Model) -> usize {
+    pub(super) fn symbol(&mut self, model: &mut SymbolModel) -> usize {
         let place = (self.state & ((1 << PRECISION) - 1)) as i16;
         let at_or_below: i16 = model.starts.iter().map(|&start| i16::from(start <= place)).sum();
         let symbol = (at_or_below as usize - 1) & (SYMBOLS - 1);
@@ -239,16 +239,16 @@ mod tests {
         fn symbols_and_bits_come_back_in_their_order(
             items in prop::collection::vec((0usize..SYMBOLS, 0usize..3, any::<u64>(), 0u32..64), 0..2000)
         ) {
-            let mut models = vec![Model::NEW; 3];
-            let mut encoder = Encoder::default();
+            let mut models = vec![SymbolModel::NEW; 3];
+            let mut encoder = SymbolEncoder::default();
             for &(symbol, model, value, count) in &items {
                 encoder.symbol(&mut models[model], symbol);
                 encoder.long_bits(value, count);
                 encoder.number(value >> (count + 1).min(63));
             }
             let bytes = encoder.finish();
-            let mut models = vec![Model::NEW; 3];
-            let mut decoder = Decoder::new(&bytes).unwrap();
+            let mut models = vec![SymbolModel::NEW; 3];
+            let mut decoder = SymbolDecoder::new(&bytes).unwrap();
             for &(symbol, model, value, count) in &items {
                 prop_assert_eq!(decoder.symbol(&mut models[model]), symbol);
                 prop_assert_eq!(decoder.long_bits(count), value & ((1 << count) - 1));
@@ -259,8 +259,8 @@ mod tests {
 
         #[test]
         fn any_bytes_decode_to_something_without_a_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
-            if let Some(mut decoder) = Decoder::new(&bytes) {
-                let mut model = Model::NEW;
+            if let Some(mut decoder) = SymbolDecoder::new(&bytes) {
+                let mut model = SymbolModel::NEW;
                 for _ in 0..300 {
                     prop_assert!(decoder.symbol(&mut model) < SYMBOLS);
                     decoder.number();
@@ -270,7 +270,7 @@ mod tests {
 
         #[test]
         fn no_symbol_ever_becomes_impossible(symbols in prop::collection::vec(0usize..SYMBOLS, 0..5000)) {
-            let mut model = Model::NEW;
+            let mut model = SymbolModel::NEW;
             for symbol in symbols {
                 model.learn(symbol);
                 for of in 0..SYMBOLS {
@@ -283,8 +283,8 @@ mod tests {
     #[test]
     fn a_skewed_source_takes_its_entropy() {
         // Three quarters of one symbol, the rest even over three others: H = 0.75·log2(4/3) + 0.25·log2(12) = 1.2075.
-        let mut encoder = Encoder::default();
-        let mut model = Model::NEW;
+        let mut encoder = SymbolEncoder::default();
+        let mut model = SymbolModel::NEW;
         let mut random = 1u64;
         let count = 40_000;
         for _ in 0..count {

@@ -8,11 +8,11 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::entropy::{Decoder, Encoder};
-use super::lattice::{Lattice, NEIGHBOURS};
-use super::predict::Parts;
+use super::entropy::{SymbolDecoder, SymbolEncoder};
+use super::lattice::{NEIGHBOURS, QuantizedTensor};
+use super::predict::PredictorWeights;
 use super::residual::Residuals;
-use super::step::Grid;
+use super::step::QuantizationGrid;
 use super::texels;
 use crate::deform::{Box3, Tensor, Tensors};
 use crate::model::Column;
@@ -43,7 +43,7 @@ pub enum Role {
 /// A tensor in the archive's table.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Entry {
+pub(super) struct TensorEntry {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     pub(super) role: Role,
@@ -58,7 +58,7 @@ pub(super) struct Entry {
     pub(super) mean: i64,
     /// How its values are expected from their neighbours.
     #[serde(default)]
-    pub(super) parts: Parts<NEIGHBOURS>,
+    pub(super) parts: PredictorWeights<NEIGHBOURS>,
 }
 
 /// How finely tensors are to be stored, by name.
@@ -84,11 +84,11 @@ pub(super) struct Readers<'a> {
     pub(super) times: [f32; 2],
 }
 
-impl Entry {
-    pub(super) fn new(name: &str, tensor: &Tensor, role: Role, steps: Option<&TensorSteps>) -> Entry {
+impl TensorEntry {
+    pub(super) fn new(name: &str, tensor: &Tensor, role: Role, steps: Option<&TensorSteps>) -> TensorEntry {
         let TensorSteps { step, channels } = steps.cloned().unwrap_or_default();
         let (name, shape) = (name.to_owned(), tensor.shape.clone());
-        Entry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBOURS] }
+        TensorEntry { name, shape, role, step, channels, mean: 0, parts: [0; NEIGHBOURS] }
     }
 
     /// Values, unless so many have no number.
@@ -140,8 +140,8 @@ impl Entry {
     }
 
     /// The grid of a class of a channel.
-    fn grid(&self, channel: usize, class: u8) -> Grid {
-        Grid::new(match self.role {
+    fn grid(&self, channel: usize, class: u8) -> QuantizationGrid {
+        QuantizationGrid::new(match self.role {
             Role::Weights => self.step + i32::from(class) - i32::from(MIDDLE),
             _ => {
                 let of_channel = i32::from(self.channels.get(channel).copied().unwrap_or(0));
@@ -162,7 +162,7 @@ impl Entry {
     }
 
     /// Calls `with` with how the tensor lies on its grids; nothing where nothing of it is stored so.
-    fn lay<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&Lattice<'_>) -> R) -> Option<R> {
+    fn lay<R>(&self, readers: &Readers<'_>, with: impl FnOnce(&QuantizedTensor<'_>) -> R) -> Option<R> {
         if self.values() == Some(0) {
             return None;
         }
@@ -178,7 +178,7 @@ impl Entry {
             (Role::Weights, _) => (self.weight_classes(), 0..rows),
             _ => return None,
         };
-        Some(with(&Lattice {
+        Some(with(&QuantizedTensor {
             channels,
             rows,
             columns,
@@ -186,7 +186,7 @@ impl Entry {
             classes: &classes,
             grids: &|channel, class| self.grid(channel, class),
             class_count: if self.role == Role::Weights { 2 * usize::from(MIDDLE) + 1 } else { texels::CLASSES },
-            mean: Grid::new(self.step).value(self.mean),
+            mean: QuantizationGrid::new(self.step).value(self.mean),
         }))
     }
 }
@@ -195,7 +195,7 @@ impl Entry {
 struct Shared(Vec<((u8, usize), Residuals)>);
 
 impl Shared {
-    fn of(&mut self, entry: &Entry) -> &mut Residuals {
+    fn of(&mut self, entry: &TensorEntry) -> &mut Residuals {
         let family = entry.family();
         let place = self.0.iter().position(|(known, _)| *known == family).unwrap_or_else(|| {
             self.0.push((family, Residuals::new()));
@@ -208,12 +208,12 @@ impl Shared {
 /// Writes the tensors of `entries`, whose means and parts are found; gives the symbols and the values that are exact.
 /// The bits of every tensor are added to `bits`.
 pub(super) fn encode(
-    entries: &mut [Entry],
+    entries: &mut [TensorEntry],
     tensors: &Tensors,
     readers: &Readers<'_>,
     bits: &mut BTreeMap<String, f64>,
 ) -> (Vec<u8>, Vec<f32>) {
-    let (mut encoder, mut exact) = (Encoder::default(), Vec::new());
+    let (mut encoder, mut exact) = (SymbolEncoder::default(), Vec::new());
     let mut shared = Shared(Vec::new());
     for entry in entries {
         let Some(tensor) = tensors.get(&entry.name) else { continue };
@@ -222,7 +222,7 @@ pub(super) fn encode(
         }
         if matches!(entry.role, Role::Plane(_) | Role::TimePlane(_)) {
             let mean = entry.lay(readers, |lattice| lattice.mean(&tensor.data)).unwrap_or(0.0);
-            entry.mean = Grid::new(entry.step).nearest(mean);
+            entry.mean = QuantizationGrid::new(entry.step).nearest(mean);
         }
         if let Some(parts) = entry.lay(readers, |lattice| lattice.fit(&mut tensor.data.clone())) {
             entry.parts = parts;
@@ -237,8 +237,13 @@ pub(super) fn encode(
 }
 
 /// Reads the tensors of `entries`; none where the bytes are of other tensors. Shapes have been checked.
-pub(super) fn decode(entries: &[Entry], bytes: &[u8], mut exact: &[f32], readers: &Readers<'_>) -> Option<Tensors> {
-    let mut decoder = Decoder::new(bytes)?;
+pub(super) fn decode(
+    entries: &[TensorEntry],
+    bytes: &[u8],
+    mut exact: &[f32],
+    readers: &Readers<'_>,
+) -> Option<Tensors> {
+    let mut decoder = SymbolDecoder::new(bytes)?;
     let mut shared = Shared(Vec::new());
     let mut tensors = Tensors::new();
     for entry in entries {
@@ -259,7 +264,7 @@ pub(super) fn decode(entries: &[Entry], bytes: &[u8], mut exact: &[f32], readers
 
 /// What a tensor comes back as where its grid is that of `steps`, its neighbours aside.
 pub fn rounded(tensor: &Tensor, role: Role, steps: &TensorSteps, position: &Column, space: Option<Box3>) -> Tensor {
-    let entry = Entry::new("", tensor, role, Some(steps));
+    let entry = TensorEntry::new("", tensor, role, Some(steps));
     let readers = Readers { position, space, times: [-1.0, 1.0] };
     let mut data = tensor.data.clone();
     entry.lay(&readers, |lattice| lattice.fit(&mut data));

@@ -47,7 +47,7 @@ pub(super) struct Sections {
 
 /// Bytes of an archive, and of its parts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Parts {
+pub struct ArchiveSize {
     /// The cloud.
     pub cloud: u64,
     /// The deformation field.
@@ -56,9 +56,9 @@ pub struct Parts {
     pub rest: u64,
 }
 
-impl Parts {
-    fn of(total: u64, cloud: u64, field: u64) -> Parts {
-        Parts { cloud, field, rest: total - cloud - field }
+impl ArchiveSize {
+    fn of(total: u64, cloud: u64, field: u64) -> ArchiveSize {
+        ArchiveSize { cloud, field, rest: total - cloud - field }
     }
 
     /// All of them.
@@ -87,7 +87,7 @@ impl Damage {
 }
 
 /// The bytes of an archive and of its parts.
-pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, Parts)> {
+pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     let pack = |bytes: &[u8]| {
         zstd::bulk::compress(bytes, LEVEL).map_err(|error| Error::usage(format!("cannot compress an archive: {error}")))
     };
@@ -105,21 +105,21 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, Parts)> {
     }
     out.extend(xxh3_64(&out).to_le_bytes());
     stored.iter().for_each(|bytes| out.extend_from_slice(bytes));
-    let parts = Parts::of(out.len() as u64, sections.cloud.len() as u64, sections.field.len() as u64);
+    let parts = ArchiveSize::of(out.len() as u64, sections.cloud.len() as u64, sections.field.len() as u64);
     Ok((out, parts))
 }
 
 /// The head of an archive.
-pub(super) struct Head {
+pub(super) struct ArchiveHeader {
     /// Bytes of the whole file.
     whole: u64,
     /// Of each section: bytes in the file, bytes of content, checksum of the bytes in the file.
     sections: [[u64; 3]; SECTIONS],
 }
 
-impl Head {
+impl ArchiveHeader {
     /// Parses the first bytes of a file of `whole` bytes, at least [`HEAD`] of them if the file has so many.
-    pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<Head, Damage> {
+    pub(super) fn parse(head: &[u8], whole: u64) -> std::result::Result<ArchiveHeader, Damage> {
         if !head.starts_with(&MAGIC) {
             let first = head.get(..8.min(head.len())).unwrap_or_default();
             return Err(Damage::new("byte 0", "the first bytes of an archive (.gsz)", format!("{first:02x?}")));
@@ -157,7 +157,7 @@ impl Head {
             let expected = format!("at most {MOST_TABLE} bytes of content");
             return Err(Damage::new("section table", expected, format!("{table} bytes")));
         }
-        Ok(Head { whole, sections })
+        Ok(ArchiveHeader { whole, sections })
     }
 
     /// Bytes that the file and the contents of its sections take in memory, each twice: as a whole and in parts.
@@ -173,7 +173,7 @@ impl Head {
 }
 
 /// The sections of an archive with head `head`, each with its checksum right, and the sizes of its parts.
-pub(super) fn read(head: &Head, bytes: &[u8]) -> std::result::Result<(Sections, Parts), Damage> {
+pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(Sections, ArchiveSize), Damage> {
     let mut rest = &bytes[HEAD..];
     let mut sections: [&[u8]; SECTIONS] = [&[]; SECTIONS];
     for (k, name) in NAMES.iter().enumerate() {
@@ -195,7 +195,7 @@ pub(super) fn read(head: &Head, bytes: &[u8]) -> std::result::Result<(Sections, 
         if content.len() == length { Ok(content) } else { Err(wrong(content.len().to_string())) }
     };
     let [_, cloud, field, _] = sections;
-    let parts = Parts::of(bytes.len() as u64, cloud.len() as u64, field.len() as u64);
+    let parts = ArchiveSize::of(bytes.len() as u64, cloud.len() as u64, field.len() as u64);
     let content = Sections { table: unpack(0)?, cloud: cloud.to_vec(), field: field.to_vec(), blobs: unpack(3)? };
     Ok((content, parts))
 }

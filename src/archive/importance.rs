@@ -28,7 +28,7 @@ pub fn offsets(
     space: Option<Box3>,
     times: [f32; 2],
 ) -> BTreeMap<String, Vec<i8>> {
-    let network = Network { tensors };
+    let network = FieldWeights { tensors };
     let mut found = BTreeMap::new();
     let Some(space) = space else { return found };
     let Some(trunk) = network.layers("deformation_net.feature_out", 0, 2) else { return found };
@@ -38,7 +38,7 @@ pub fn offsets(
         return found;
     }
     // Forward: the mean square of what every layer reads.
-    let mut reads: Vec<(Layer<'_>, Vec<f64>)> = Vec::new();
+    let mut reads: Vec<(WeightLayer<'_>, Vec<f64>)> = Vec::new();
     let mut now = samples.features.clone();
     for layer in &trunk {
         reads.push((layer.clone(), mean_squares(&now, layer.inputs())));
@@ -78,7 +78,7 @@ pub fn offsets(
 }
 
 /// Adds what a layer's rows count for and what its columns read.
-fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &Layer<'_>, rows: &[f64], columns: &[f64]) {
+fn add(found: &mut BTreeMap<String, Vec<i8>>, layer: &WeightLayer<'_>, rows: &[f64], columns: &[f64]) {
     found.insert(format!("{}.weight", layer.name), [steps(rows), steps(columns)].concat());
     found.insert(format!("{}.bias", layer.name), steps(rows));
 }
@@ -105,36 +105,36 @@ fn heads(field: &BTreeMap<String, Role>) -> Vec<String> {
     field.iter().filter_map(of).collect()
 }
 
-struct Network<'a> {
+struct FieldWeights<'a> {
     tensors: &'a Tensors,
 }
 
 #[derive(Clone)]
-struct Layer<'a> {
+struct WeightLayer<'a> {
     name: String,
     weight: &'a Tensor,
     bias: &'a Tensor,
 }
 
-impl<'a> Network<'a> {
-    fn layer(&self, name: String) -> Option<Layer<'a>> {
+impl<'a> FieldWeights<'a> {
+    fn layer(&self, name: String) -> Option<WeightLayer<'a>> {
         let weight = self.tensors.get(&format!("{name}.weight")).filter(|weight| weight.shape.len() == 2)?;
         let bias = self.tensors.get(&format!("{name}.bias")).filter(|bias| bias.data.len() == weight.shape[0])?;
-        Some(Layer { name, weight, bias })
+        Some(WeightLayer { name, weight, bias })
     }
 
     /// Layers of numbers from `first` on; none if there is not even one.
-    fn layers(&self, name: &str, first: usize, by: usize) -> Option<Vec<Layer<'a>>> {
+    fn layers(&self, name: &str, first: usize, by: usize) -> Option<Vec<WeightLayer<'a>>> {
         let layers = (0..).map_while(|k| self.layer(format!("{name}.{}", first + k * by)));
         Some(layers.collect::<Vec<_>>()).filter(|layers| !layers.is_empty())
     }
 
-    fn head(&self, name: &str) -> Option<[Layer<'a>; 2]> {
+    fn head(&self, name: &str) -> Option<[WeightLayer<'a>; 2]> {
         Some([self.layer(format!("{name}.1"))?, self.layer(format!("{name}.3"))?])
     }
 }
 
-impl Layer<'_> {
+impl WeightLayer<'_> {
     fn inputs(&self) -> usize {
         self.weight.shape[1]
     }

@@ -3,10 +3,10 @@
 //! In: values `[channels, rows, columns]`, a class for every place of a channel that says how fine it is or that nobody
 //! reads it. Out: symbols, and the values as they come back. Memory: three rows.
 
-use super::entropy::{Decoder, Encoder};
-use super::predict::{Fit, Parts, expected, factors};
+use super::entropy::{SymbolDecoder, SymbolEncoder};
+use super::predict::{PredictorFit, PredictorWeights, expected, factors};
 use super::residual::Residuals;
-use super::step::Grid;
+use super::step::QuantizationGrid;
 
 /// Values that others are expected from: left, above, above left, above right, two to the left, two above.
 pub(super) const NEIGHBOURS: usize = 6;
@@ -15,7 +15,7 @@ pub(super) const NEIGHBOURS: usize = 6;
 pub(super) const UNREAD: u8 = u8::MAX;
 
 /// How a tensor lies on its grids.
-pub(super) struct Lattice<'a> {
+pub(super) struct QuantizedTensor<'a> {
     pub(super) channels: usize,
     pub(super) rows: usize,
     pub(super) columns: usize,
@@ -24,7 +24,7 @@ pub(super) struct Lattice<'a> {
     /// Of every place of a stored row, `[rows, columns]`, or of one row for all of them, `[columns]`.
     pub(super) classes: &'a [u8],
     /// Of every class of every channel.
-    pub(super) grids: &'a dyn Fn(usize, u8) -> Grid,
+    pub(super) grids: &'a dyn Fn(usize, u8) -> QuantizationGrid,
     /// Number of classes.
     pub(super) class_count: usize,
     /// What values differ from.
@@ -39,7 +39,7 @@ struct Around {
     size: f32,
 }
 
-impl Lattice<'_> {
+impl QuantizedTensor<'_> {
     /// Mean of the values that are read.
     pub(super) fn mean(&self, data: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0usize);
@@ -65,8 +65,8 @@ impl Lattice<'_> {
     }
 
     /// The parts that expect the values best.
-    pub(super) fn fit(&self, data: &mut [f32]) -> Parts<NEIGHBOURS> {
-        let mut fit = Fit::new();
+    pub(super) fn fit(&self, data: &mut [f32]) -> PredictorWeights<NEIGHBOURS> {
+        let mut fit = PredictorFit::new();
         self.walk(data, |_, value, around, grid| {
             let value = grid.round(value);
             fit.add(&around.values, value - self.mean);
@@ -76,7 +76,13 @@ impl Lattice<'_> {
     }
 
     /// Writes the values; `data` becomes what they come back as.
-    pub(super) fn encode(&self, parts: &Parts<NEIGHBOURS>, models: &mut Residuals, data: &mut [f32], to: &mut Encoder) {
+    pub(super) fn encode(
+        &self,
+        parts: &PredictorWeights<NEIGHBOURS>,
+        models: &mut Residuals,
+        data: &mut [f32],
+        to: &mut SymbolEncoder,
+    ) {
         let factors = factors(parts);
         self.walk(data, |_, value, around, grid| {
             let expected = grid.nearest(f64::from(expected(self.mean, &factors, &around.values)));
@@ -89,10 +95,10 @@ impl Lattice<'_> {
     /// Reads the values into `data`.
     pub(super) fn decode(
         &self,
-        parts: &Parts<NEIGHBOURS>,
+        parts: &PredictorWeights<NEIGHBOURS>,
         models: &mut Residuals,
         data: &mut [f32],
-        from: &mut Decoder<'_>,
+        from: &mut SymbolDecoder<'_>,
     ) {
         let factors = factors(parts);
         self.walk(data, |_, _, around, grid| {
@@ -106,14 +112,15 @@ impl Lattice<'_> {
     /// Visits every place that is read, row by row; what `code` makes of the value there and how far that is from what
     /// was expected is what later ones have around them. Places that nobody reads get the mean of those around them.
     #[inline(always)]
-    fn walk(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Around, Grid) -> (f32, f32)) {
+    fn walk(&self, data: &mut [f32], mut code: impl FnMut(usize, f32, &Around, QuantizationGrid) -> (f32, f32)) {
         let columns = self.columns;
         // Two more to the left and one to the right.
         let line = || vec![0.0f32; columns + 3];
         let (mut above2, mut above, mut here) = (line(), line(), line());
         let (mut sizes_above, mut sizes) = (line(), line());
         for (channel, data) in data.chunks_exact_mut((self.rows * columns).max(1)).take(self.channels).enumerate() {
-            let grids: Vec<Grid> = (0..self.class_count).map(|class| (self.grids)(channel, class as u8)).collect();
+            let grids: Vec<QuantizationGrid> =
+                (0..self.class_count).map(|class| (self.grids)(channel, class as u8)).collect();
             [&mut above2, &mut above, &mut sizes_above].into_iter().for_each(|line| line.fill(0.0));
             for row in self.stored.clone() {
                 let classes = self.classes_of(row);

@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 
 pub use cloud::{ATTRIBUTES, CloudSteps};
 pub use field::{FieldSteps, Role, TensorSteps, rounded};
-pub use file::{HEAD, MAGIC, Parts, VERSION};
+pub use file::{ArchiveSize, HEAD, MAGIC, VERSION};
 pub use importance::offsets;
 pub use step::{STEPS, nearest, step};
 
@@ -32,8 +32,8 @@ use crate::deform::{Box3, Tensor, Tensors};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Columns, Gaussians};
-use field::{Entry, Readers};
-use file::{Damage, Head, Sections};
+use field::{Readers, TensorEntry};
+use file::{ArchiveHeader, Damage, Sections};
 
 /// Name of the tensor that holds the box that planes cover.
 pub const BOX: &str = "deformation_net.grid.aabb";
@@ -70,7 +70,7 @@ pub struct Encoded {
     /// The file.
     pub bytes: Vec<u8>,
     /// How many of them are for what.
-    pub parts: Parts,
+    pub parts: ArchiveSize,
     /// For every Gaussian of the archive its place in the content.
     pub order: Vec<u32>,
     /// Bits of each attribute and of each tensor that has a grid, by name, about.
@@ -81,10 +81,10 @@ pub struct Encoded {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Table {
-    cloud: cloud::Shape,
+    cloud: cloud::PointCloudShape,
     /// Bits of the first and the last time, which a text would round.
     times: [u32; 2],
-    tensors: Vec<Entry>,
+    tensors: Vec<TensorEntry>,
     /// Bytes beside the attributes of each Gaussian.
     beside: usize,
     /// Names and lengths of files.
@@ -104,11 +104,11 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     let readers = Readers { position: &stored.position, space: space(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
         let role = content.field.get(name).copied().unwrap_or(Role::Unread);
-        Entry::new(name, tensor, role, steps.field.0.get(name))
+        TensorEntry::new(name, tensor, role, steps.field.0.get(name))
     };
-    let mut entries: Vec<Entry> = content.tensors.iter().map(entry).collect();
+    let mut entries: Vec<TensorEntry> = content.tensors.iter().map(entry).collect();
     if let Some(entry) = entries.iter().find(|entry| !entry.is_sound()) {
-        let Entry { name, shape, .. } = entry;
+        let TensorEntry { name, shape, .. } = entry;
         return Err(Error::usage(format!("an archive holds no tensor such as {name} of shape {shape:?}")));
     }
     let (field, exact) = field::encode(&mut entries, &content.tensors, &readers, &mut bits);
@@ -136,12 +136,12 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
 /// # Errors
 /// Bytes that are no archive, are cut short or damaged, of a later version, or that declare more than they can hold, or
 /// more than `memory`. Nothing is allocated by what they declare before it is checked.
-pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, Parts)> {
-    let head = Head::parse(bytes, bytes.len() as u64).map_err(|damage| damage.of(path))?;
+pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
+    let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.of(path))?;
     head.admit(path, memory)?;
     let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.of(path))?;
     let table = table(&sections, bytes.len()).map_err(|damage| damage.of(path))?;
-    let values = table.tensors.iter().filter_map(Entry::values).chain(table.cloud.values()).sum::<usize>() as u64;
+    let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
     // Decoding knows two values of each Gaussian and its error.
     let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
@@ -153,7 +153,7 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, 
 /// # Errors
 /// A head that is not that of an archive of so many bytes; an archive that exceeds `memory` with its content.
 pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
-    Head::parse(head, whole).map_err(|damage| damage.of(path))?.admit(path, memory)
+    ArchiveHeader::parse(head, whole).map_err(|damage| damage.of(path))?.admit(path, memory)
 }
 
 /// The table of an archive of `length` bytes, whose parts go together.
@@ -175,13 +175,17 @@ fn table(sections: &Sections, length: usize) -> std::result::Result<Table, Damag
     Ok(table)
 }
 
-fn decoded(sections: Sections, table: Table, parts: Parts) -> std::result::Result<(Content, Parts), Damage> {
+fn decoded(
+    sections: Sections,
+    table: Table,
+    parts: ArchiveSize,
+) -> std::result::Result<(Content, ArchiveSize), Damage> {
     let Sections { cloud, field, blobs, .. } = sections;
     let unsound = |place: &str| Damage::new(place, "numbers that go together", "others");
     let cloud = cloud::decode(&table.cloud, &cloud).ok_or_else(|| unsound("cloud"))?;
 
-    let count = |entry: &&Entry| entry.role == Role::Exact;
-    let exact = table.tensors.iter().filter(count).filter_map(Entry::values).sum::<usize>() * 4;
+    let count = |entry: &&TensorEntry| entry.role == Role::Exact;
+    let exact = table.tensors.iter().filter(count).filter_map(TensorEntry::values).sum::<usize>() * 4;
     let beside = table.beside.checked_mul(cloud.len());
     let files = table.files.iter().try_fold(0usize, |sum, &(_, length)| sum.checked_add(length));
     let all = beside.zip(files).and_then(|(beside, files)| beside.checked_add(files)?.checked_add(exact));
@@ -208,7 +212,7 @@ fn decoded(sections: Sections, table: Table, parts: Parts) -> std::result::Resul
     }
     // The box is among what is exact; planes need it before they are read.
     let before = table.tensors.iter().take_while(|entry| entry.name != BOX).filter(count);
-    let start: usize = before.filter_map(Entry::values).sum();
+    let start: usize = before.filter_map(TensorEntry::values).sum();
     let has_box = table.tensors.iter().any(|entry| entry.name == BOX && entry.role == Role::Exact);
     let space = exact.get(start..).filter(|_| has_box).and_then(|values| Box3::new(values.get(..6)?));
     if space.is_none() && table.tensors.iter().any(|entry| matches!(entry.role, Role::Plane(_) | Role::TimePlane(_))) {

@@ -4,10 +4,10 @@
 const PARTS: f32 = 64.0;
 
 /// Parts of `N` differences, each in 64ths from −2 to 127/64.
-pub(super) type Parts<const N: usize> = [i8; N];
+pub(super) type PredictorWeights<const N: usize> = [i8; N];
 
 /// Parts in the form that is calculated with.
-pub(super) fn factors<const N: usize>(parts: &Parts<N>) -> [f32; N] {
+pub(super) fn factors<const N: usize>(parts: &PredictorWeights<N>) -> [f32; N] {
     parts.map(|part| f32::from(part) / PARTS)
 }
 
@@ -23,14 +23,14 @@ pub(super) fn expected<const N: usize>(mean: f32, factors: &[f32; N], difference
 
 /// Finds the parts whose squared error is least.
 #[derive(Debug)]
-pub(super) struct Fit<const N: usize> {
+pub(super) struct PredictorFit<const N: usize> {
     products: [[f64; N]; N],
     with_value: [f64; N],
 }
 
-impl<const N: usize> Fit<N> {
+impl<const N: usize> PredictorFit<N> {
     pub(super) fn new() -> Self {
-        Fit { products: [[0.0; N]; N], with_value: [0.0; N] }
+        PredictorFit { products: [[0.0; N]; N], with_value: [0.0; N] }
     }
 
     /// Learns that `value`, less its mean, stood beside `differences`.
@@ -45,7 +45,7 @@ impl<const N: usize> Fit<N> {
     }
 
     /// The parts: normal equations, with as much of a ridge as makes them solvable (R. Cholesky).
-    pub(super) fn parts(mut self) -> Parts<N> {
+    pub(super) fn parts(mut self) -> PredictorWeights<N> {
         let trace: f64 = (0..N).map(|i| self.products[i][i]).sum();
         if !(trace.is_finite() && trace > 0.0) {
             return [0; N];
@@ -81,7 +81,7 @@ mod tests {
 
     #[test]
     fn what_is_a_sum_of_parts_is_found_as_such() {
-        let mut fit = Fit::new();
+        let mut fit = PredictorFit::new();
         for i in 0..400 {
             let x = [(i as f32 * 0.7).sin(), (i as f32 * 1.3).cos(), (i as f32 * 0.11).sin()];
             fit.add(&x, 0.75 * x[0] - 1.25 * x[1] + 0.5 * x[2]);
@@ -93,10 +93,10 @@ mod tests {
 
     #[test]
     fn where_nothing_differs_nothing_is_expected() {
-        let mut fit = Fit::<4>::new();
+        let mut fit = PredictorFit::<4>::new();
         fit.add(&[0.0; 4], 1.0);
         assert_eq!(fit.parts(), [0; 4]);
-        let mut fit = Fit::<2>::new();
+        let mut fit = PredictorFit::<2>::new();
         fit.add(&[f32::NAN; 2], 1.0);
         assert_eq!(fit.parts(), [0; 2]);
     }

@@ -3,7 +3,7 @@
 //! The magnitude of a difference falls into one of sixteen classes, which is a symbol; where in the class it lies, and
 //! its sign, are bits as they are: within a class the likelihoods hardly differ.
 
-use super::entropy::{Decoder, Encoder, Model, SYMBOLS};
+use super::entropy::{SYMBOLS, SymbolDecoder, SymbolEncoder, SymbolModel};
 
 /// First magnitude and bits of each class but the last, which has no end.
 const CLASSES: [(u64, u32); SYMBOLS] = [
@@ -30,21 +30,21 @@ const CONTEXTS: usize = 16;
 
 /// The models of a group of planes that behave alike.
 #[derive(Debug, Clone)]
-pub(super) struct Residuals([Model; CONTEXTS]);
+pub(super) struct Residuals([SymbolModel; CONTEXTS]);
 
 impl Residuals {
     pub(super) fn new() -> Residuals {
-        Residuals([Model::NEW; CONTEXTS])
+        Residuals([SymbolModel::NEW; CONTEXTS])
     }
 
     /// By the mean magnitude of what lies around, in steps; told by exponent and first bit of the mantissa.
     #[inline(always)]
-    fn around(&mut self, size: f32) -> &mut Model {
+    fn around(&mut self, size: f32) -> &mut SymbolModel {
         let half_octaves = (size.abs().to_bits() >> 22) as i32 - ((127 - 2) << 1);
         &mut self.0[half_octaves.clamp(0, CONTEXTS as i32 - 1) as usize]
     }
 
-    pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut Encoder) {
+    pub(super) fn encode(&mut self, residual: i64, size: f32, to: &mut SymbolEncoder) {
         let magnitude = residual.unsigned_abs();
         let class = CLASSES.iter().rposition(|&(first, _)| first <= magnitude).unwrap_or(0);
         to.symbol(self.around(size), class);
@@ -60,7 +60,7 @@ impl Residuals {
     }
 
     #[inline(always)]
-    pub(super) fn decode(&mut self, size: f32, from: &mut Decoder<'_>) -> i64 {
+    pub(super) fn decode(&mut self, size: f32, from: &mut SymbolDecoder<'_>) -> i64 {
         let class = from.symbol(self.around(size));
         if class == 0 {
             return 0;
@@ -87,10 +87,10 @@ mod tests {
     fn differences_come_back_whatever_was_around() {
         let values: Vec<i64> = (-300..300).chain([1 << 40, -(1 << 50), i64::from(i32::MAX)]).collect();
         for size in [0.0, 0.3, 1.0, 50.0, f32::INFINITY, f32::NAN] {
-            let (mut models, mut encoder) = (Residuals::new(), Encoder::default());
+            let (mut models, mut encoder) = (Residuals::new(), SymbolEncoder::default());
             values.iter().for_each(|&value| models.encode(value, size, &mut encoder));
             let bytes = encoder.finish();
-            let (mut models, mut decoder) = (Residuals::new(), Decoder::new(&bytes).unwrap());
+            let (mut models, mut decoder) = (Residuals::new(), SymbolDecoder::new(&bytes).unwrap());
             for &value in &values {
                 assert_eq!(models.decode(size, &mut decoder), value);
             }

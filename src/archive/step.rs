@@ -37,15 +37,15 @@ pub fn nearest(size: f64) -> i32 {
 
 /// A grid to put values on.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Grid {
+pub(super) struct QuantizationGrid {
     step: f64,
     inverse: f64,
 }
 
-impl Grid {
-    pub(super) fn new(k: i32) -> Grid {
+impl QuantizationGrid {
+    pub(super) fn new(k: i32) -> QuantizationGrid {
         let step = step(k);
-        Grid { step, inverse: 1.0 / step }
+        QuantizationGrid { step, inverse: 1.0 / step }
     }
 
     /// The multiple nearest to `value`.
@@ -99,14 +99,14 @@ mod tests {
     proptest! {
         #[test]
         fn a_value_comes_back_within_half_a_step(value in -1e6f32..1e6, k in -100i32..60) {
-            let back = Grid::new(k).round(value);
+            let back = QuantizationGrid::new(k).round(value);
             let bound = step(k) / 2.0 + f64::from(value.abs()) * f64::from(f32::EPSILON);
             prop_assert!((f64::from(back) - f64::from(value)).abs() <= bound, "{value} {back} {bound}");
         }
 
         #[test]
         fn what_is_on_the_grid_stays(multiple in -(1i64 << 20)..1 << 20, k in -100i32..60) {
-            let grid = Grid::new(k);
+            let grid = QuantizationGrid::new(k);
             prop_assert_eq!(grid.multiple(grid.value(multiple)), multiple);
         }
     }

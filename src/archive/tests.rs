@@ -204,7 +204,7 @@ fn lengths_that_no_file_of_its_size_has_are_refused_before_anything_is_allocated
     }
     // So many Gaussians, of a table that is sound.
     let (Sections { table, cloud, field, blobs }, _) =
-        file::read(&Head::parse(&sound, sound.len() as u64).unwrap(), &sound).unwrap();
+        file::read(&ArchiveHeader::parse(&sound, sound.len() as u64).unwrap(), &sound).unwrap();
     let table = String::from_utf8(table).unwrap().replace("\"gaussians\":12", "\"gaussians\":4000000000");
     let bytes = file::write(&Sections { table: table.into_bytes(), cloud, field, blobs }).unwrap().0;
     let message = decode(&bytes, Path::new("a.gsz"), ReadLimit::NONE).unwrap_err().to_string();

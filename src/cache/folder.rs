@@ -8,7 +8,7 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::Serialize;
 
-use super::piece::{ENDING, Name, Piece, names};
+use super::piece::{CacheEntry, ENDING, EntryName, names};
 use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
 use crate::model::ranges;
@@ -40,7 +40,7 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
     let mut found: BTreeMap<(String, String, usize), Listed> = BTreeMap::new();
     for name in names(folder)? {
         let path = folder.join(name.file());
-        let Name { stage, key, part: (index, of) } = name;
+        let EntryName { stage, key, part: (index, of) } = name;
         let listed = found.entry((stage.clone(), key.clone(), of)).or_insert_with(|| Listed {
             stage,
             key: key.clone(),
@@ -52,7 +52,7 @@ pub fn list(folder: &Path) -> Result<Vec<Listed>> {
         });
         listed.missing.retain(|&missing| missing != index);
         listed.bytes += fs::metadata(&path).map_err(Error::io("read the size of", &path))?.len();
-        match Piece::open(&path, &key)? {
+        match CacheEntry::open(&path, &key)? {
             Ok(piece) => piece.about().clone_into(&mut listed.belongs_to),
             Err(_) => listed.damaged.push(index),
         }

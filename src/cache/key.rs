@@ -7,23 +7,23 @@ use xxhash_rust::xxh3::Xxh3;
 
 /// The digest of everything that a result follows from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Key(Option<u128>);
+pub struct CacheKey(Option<u128>);
 
-impl Key {
+impl CacheKey {
     /// Of whatever: nothing is looked up under it.
-    pub const NONE: Key = Key(None);
+    pub const NONE: CacheKey = CacheKey(None);
 
     /// Of `value`, by its bits.
-    pub fn of(value: &impl Serialize) -> Key {
+    pub fn of(value: &impl Serialize) -> CacheKey {
         let mut hash = Hash(Xxh3::new());
         // Nothing that is hashed here has a part that cannot be written down.
         postcard::to_io(value, &mut hash).expect("plain data");
-        Key(Some(hash.0.digest128()))
+        CacheKey(Some(hash.0.digest128()))
     }
 
     /// Of what this stands for, and `value`.
-    pub fn and(self, value: &impl Serialize) -> Key {
-        self.0.map_or(Key::NONE, |before| Key::of(&(before, Key::of(value))))
+    pub fn and(self, value: &impl Serialize) -> CacheKey {
+        self.0.map_or(CacheKey::NONE, |before| CacheKey::of(&(before, CacheKey::of(value))))
     }
 
     /// In 32 digits.
@@ -32,7 +32,7 @@ impl Key {
     }
 }
 
-impl Serialize for Key {
+impl Serialize for CacheKey {
     fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         self.0.serialize(to)
     }

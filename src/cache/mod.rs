@@ -26,48 +26,48 @@ use serde::de::DeserializeOwned;
 use crate::error::{Error, Result};
 use crate::model::ranges;
 pub use folder::{Listed, clean, list, text};
-pub use key::Key;
+pub use key::CacheKey;
 use part::MOST_PARTS;
-pub use part::Part;
-use piece::Name;
-use place::Place;
-pub use spill::{Spill, Spilling};
+pub use part::Shard;
+use piece::EntryName;
+use place::CacheDir;
+pub use spill::{Spill, SpillWriter};
 
 /// What a user asks for.
 #[derive(Debug, Clone)]
-pub struct Asked {
+pub struct CacheRequest {
     /// The work folder.
     pub folder: PathBuf,
     /// Of the next stage that can be divided this part is computed and nothing else; none: everything.
-    pub part: Option<Part>,
+    pub part: Option<Shard>,
 }
 
 /// Where the results of stages are kept, if anywhere, and which part of the work is this run's.
 #[derive(Debug, Default)]
-pub struct Work {
-    place: Option<Place>,
-    part: Option<Part>,
+pub struct Cache {
+    place: Option<CacheDir>,
+    part: Option<Shard>,
     /// Key of the Gaussians that the input is read without; none: it is read with all.
-    absent: Mutex<Option<Key>>,
+    absent: Mutex<Option<CacheKey>>,
     said: Mutex<Vec<String>>,
 }
 
-impl Work {
+impl Cache {
     /// Nothing is kept.
-    pub fn none() -> Work {
-        Work::default()
+    pub fn none() -> Cache {
+        Cache::default()
     }
 
     /// As `asked`, in a folder that is created if it is not there. `about` says in words what the pieces belong to.
     ///
     /// # Errors
     /// A folder that cannot be created, or is none.
-    pub fn open(asked: &Asked, about: String) -> Result<Work> {
-        Ok(Work { place: Some(Place::at(&asked.folder, about)?), part: asked.part, ..Work::default() })
+    pub fn open(asked: &CacheRequest, about: String) -> Result<Cache> {
+        Ok(Cache { place: Some(CacheDir::at(&asked.folder, about)?), part: asked.part, ..Cache::default() })
     }
 
     /// From now on everything follows from what `context` stands for, too.
-    pub fn follow_from(&mut self, context: Key) {
+    pub fn follow_from(&mut self, context: CacheKey) {
         if let Some(place) = &mut self.place {
             place.follow_from(context);
         }
@@ -81,16 +81,16 @@ impl Work {
     /// Has all keys made from now on follow from the ids of the Gaussians that the input is read without, if there are any.
     pub fn set_absent(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
-            (self.keeps() && !ids.is_empty()).then(|| Key::of(&ids));
+            (self.keeps() && !ids.is_empty()).then(|| CacheKey::of(&ids));
     }
 
     /// The key of `value`; where nothing is kept it stands for nothing, and takes no time.
-    pub fn key(&self, value: &impl Serialize) -> Key {
+    pub fn key(&self, value: &impl Serialize) -> CacheKey {
         let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
         match (self.keeps(), absent) {
-            (false, _) => Key::NONE,
-            (true, None) => Key::of(value),
-            (true, Some(absent)) => Key::of(value).and(&absent),
+            (false, _) => CacheKey::NONE,
+            (true, None) => CacheKey::of(value),
+            (true, Some(absent)) => CacheKey::of(value).and(&absent),
         }
     }
 
@@ -107,16 +107,16 @@ impl Work {
     ///
     /// # Errors
     /// A folder that cannot be read. A damaged piece counts as none, with a note.
-    pub fn find<T: DeserializeOwned>(&self, stage: &str, key: Key) -> Result<Option<T>> {
-        self.find_part(stage, key, Part::WHOLE)
+    pub fn find<T: DeserializeOwned>(&self, stage: &str, key: CacheKey) -> Result<Option<T>> {
+        self.find_part(stage, key, Shard::WHOLE)
     }
 
     /// Keeps what `stage` found for `key`.
     ///
     /// # Errors
     /// A folder that cannot be written.
-    pub fn keep<T: Serialize>(&self, stage: &str, key: Key, found: &T) -> Result<()> {
-        self.keep_part(stage, key, Part::WHOLE, found)
+    pub fn keep<T: Serialize>(&self, stage: &str, key: CacheKey, found: &T) -> Result<()> {
+        self.keep_part(stage, key, Shard::WHOLE, found)
     }
 
     /// What `compute` finds as `stage` for `key`, or found earlier. A run of a part computes it too, unless `compute` says
@@ -127,7 +127,7 @@ impl Work {
     pub fn known<T: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
-        key: Key,
+        key: CacheKey,
         compute: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
         if let Some(found) = self.find(stage, key)? {
@@ -160,7 +160,7 @@ impl Work {
     pub fn divided<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,
         stage: &str,
-        key: Key,
+        key: CacheKey,
         units: usize,
         compute: impl Fn(Range<usize>) -> Result<T>,
         join: impl FnOnce(&mut dyn Iterator<Item = Result<T>>) -> Result<U>,
@@ -169,7 +169,7 @@ impl Work {
             return Ok(whole);
         }
         let find = |part| self.find_part(stage, key, part);
-        let make = |part: Part| -> Result<T> {
+        let make = |part: Shard| -> Result<T> {
             let found = compute(part.of_units(units))?;
             self.keep_part(stage, key, part, &found)?;
             Ok(found)
@@ -177,7 +177,7 @@ impl Work {
         let of = self.divide(stage, key, &find, &make)?;
         let whole = match of {
             1 => join(&mut std::iter::once_with(|| compute(0..units)))?,
-            _ => join(&mut Part::all(of).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
+            _ => join(&mut Shard::all(of).map(|part| find(part)?.map_or_else(|| make(part), Ok)))?,
         };
         self.keep(stage, key, &whole)?;
         self.complete(stage, whole)
@@ -187,40 +187,40 @@ impl Work {
     /// units of every part, and their content.
     ///
     /// # Errors
-    /// Those of [`Work::divided`].
+    /// Those of [`Cache::divided`].
     pub fn divided_spill(
         &self,
         stage: &str,
-        key: Key,
+        key: CacheKey,
         units: usize,
         scratch: &Path,
-        write: impl Fn(Range<usize>, &mut Spilling) -> Result<()>,
+        write: impl Fn(Range<usize>, &mut SpillWriter) -> Result<()>,
     ) -> Result<Vec<(Range<usize>, Spill)>> {
         let find = |part| match &self.place {
             None => Ok(None),
-            Some(place) => place.open(&Name::new(stage, place.key(key), part), |note| self.say(note)),
+            Some(place) => place.open(&EntryName::new(stage, place.key(key), part), |note| self.say(note)),
         };
-        let make = |part: Part| -> Result<Spill> {
+        let make = |part: Shard| -> Result<Spill> {
             let mut spilling = match &self.place {
-                None => Spilling::new(scratch)?,
-                Some(place) => place.begin(&Name::new(stage, place.key(key), part))?,
+                None => SpillWriter::new(scratch)?,
+                Some(place) => place.begin(&EntryName::new(stage, place.key(key), part))?,
             };
             write(part.of_units(units), &mut spilling)?;
             spilling.finish()
         };
-        if let Some(whole) = find(Part::WHOLE)? {
+        if let Some(whole) = find(Shard::WHOLE)? {
             return Ok(vec![(0..units, whole)]);
         }
         let of = self.divide(stage, key, &find, &make)?;
-        let spill = |part: Part| Ok((part.of_units(units), find(part)?.map_or_else(|| make(part), Ok)?));
-        let spills = Part::all(of).map(spill).collect::<Result<_>>()?;
+        let spill = |part: Shard| Ok((part.of_units(units), find(part)?.map_or_else(|| make(part), Ok)?));
+        let spills = Shard::all(of).map(spill).collect::<Result<_>>()?;
         self.complete(stage, spills)
     }
 
     /// All of `stage`, with which a run of its only part ends.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
-            Some(Part::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Part::WHOLE))),
+            Some(Shard::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Shard::WHOLE))),
             _ => Ok(whole),
         }
     }
@@ -230,9 +230,9 @@ impl Work {
     fn divide<T>(
         &self,
         stage: &str,
-        key: Key,
-        find: &dyn Fn(Part) -> Result<Option<T>>,
-        make: &dyn Fn(Part) -> Result<T>,
+        key: CacheKey,
+        find: &dyn Fn(Shard) -> Result<Option<T>>,
+        make: &dyn Fn(Shard) -> Result<T>,
     ) -> Result<usize> {
         let Some(place) = &self.place else { return Ok(1) };
         // By the number of parts, those that are there.
@@ -273,7 +273,7 @@ impl Work {
     }
 
     /// Says that there are parts of `stage` that are none of this run's.
-    fn say_of_others(&self, place: &Place, stage: &str, key: Key) -> Result<()> {
+    fn say_of_others(&self, place: &CacheDir, stage: &str, key: CacheKey) -> Result<()> {
         for other in place.others(stage, key)? {
             self.say(format!(
                 "{stage}: parts that are there are of another input, recipe, version or kind of processor, and are not \
@@ -283,14 +283,14 @@ impl Work {
         Ok(())
     }
 
-    fn find_part<T: DeserializeOwned>(&self, stage: &str, key: Key, part: Part) -> Result<Option<T>> {
+    fn find_part<T: DeserializeOwned>(&self, stage: &str, key: CacheKey, part: Shard) -> Result<Option<T>> {
         let Some(place) = &self.place else { return Ok(None) };
-        place.read(&Name::new(stage, place.key(key), part), |note| self.say(note))
+        place.read(&EntryName::new(stage, place.key(key), part), |note| self.say(note))
     }
 
-    fn keep_part<T: Serialize>(&self, stage: &str, key: Key, part: Part, found: &T) -> Result<()> {
+    fn keep_part<T: Serialize>(&self, stage: &str, key: CacheKey, part: Shard, found: &T) -> Result<()> {
         let Some(place) = &self.place else { return Ok(()) };
-        place.write(&Name::new(stage, place.key(key), part), found)
+        place.write(&EntryName::new(stage, place.key(key), part), found)
     }
 }
 

@@ -9,18 +9,18 @@ pub(super) const MOST_PARTS: usize = 900;
 
 /// Part `index`, counted from 1, of `of`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Part {
+pub struct Shard {
     index: usize,
     of: usize,
 }
 
-impl Part {
+impl Shard {
     /// All there is.
-    pub(super) const WHOLE: Part = Part { index: 1, of: 1 };
+    pub(super) const WHOLE: Shard = Shard { index: 1, of: 1 };
 
     /// Every part of `of`.
-    pub(super) fn all(of: usize) -> impl Iterator<Item = Part> {
-        (1..=of).map(move |index| Part { index, of })
+    pub(super) fn all(of: usize) -> impl Iterator<Item = Shard> {
+        (1..=of).map(move |index| Shard { index, of })
     }
 
     /// Its number, and how many there are.
@@ -35,19 +35,19 @@ impl Part {
     }
 }
 
-impl fmt::Display for Part {
+impl fmt::Display for Shard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}/{}", self.index, self.of)
     }
 }
 
-impl FromStr for Part {
+impl FromStr for Shard {
     type Err = String;
 
-    fn from_str(text: &str) -> Result<Part, String> {
+    fn from_str(text: &str) -> Result<Shard, String> {
         let numbers = text.split_once('/').and_then(|(index, of)| Some((index.parse().ok()?, of.parse().ok()?)));
         match numbers {
-            Some((index, of)) if (1..=of).contains(&index) && of <= MOST_PARTS => Ok(Part { index, of }),
+            Some((index, of)) if (1..=of).contains(&index) && of <= MOST_PARTS => Ok(Shard { index, of }),
             _ => Err(format!("expected i/n with 1 <= i <= n <= {MOST_PARTS}, such as 3/8")),
         }
     }

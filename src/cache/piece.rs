@@ -22,8 +22,8 @@ use std::path::Path;
 use serde::de::DeserializeOwned;
 use xxhash_rust::xxh3::Xxh3;
 
-use super::key::Key;
-use super::part::Part;
+use super::key::CacheKey;
+use super::part::Shard;
 use crate::error::{Error, Result};
 use crate::files::digest::hash_rest;
 
@@ -38,7 +38,7 @@ const MOST_TEXT: u64 = 8 << 20;
 
 /// What a piece is called.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Name {
+pub(super) struct EntryName {
     pub(super) stage: String,
     /// In 32 digits.
     pub(super) key: String,
@@ -46,13 +46,13 @@ pub(super) struct Name {
     pub(super) part: (usize, usize),
 }
 
-impl Name {
-    pub(super) fn new(stage: &str, key: Key, part: Part) -> Name {
-        Name { stage: stage.to_owned(), key: key.text(), part: part.numbers() }
+impl EntryName {
+    pub(super) fn new(stage: &str, key: CacheKey, part: Shard) -> EntryName {
+        EntryName { stage: stage.to_owned(), key: key.text(), part: part.numbers() }
     }
 
     pub(super) fn file(&self) -> String {
-        let Name { stage, key, part } = self;
+        let EntryName { stage, key, part } = self;
         match part {
             (_, 1) => format!("{stage}.{key}{ENDING}"),
             (index, of) => format!("{stage}.{key}.{index}-of-{of}{ENDING}"),
@@ -60,7 +60,7 @@ impl Name {
     }
 
     /// That of a file, if it is one of a piece.
-    pub(super) fn of(file: &str) -> Option<Name> {
+    pub(super) fn of(file: &str) -> Option<EntryName> {
         let mut fields = file.strip_suffix(ENDING)?.split('.');
         let (stage, key, part) = (fields.next()?, fields.next()?, fields.next());
         let part = match part {
@@ -70,25 +70,25 @@ impl Name {
                 (index.parse().ok()?, of.parse().ok()?)
             }
         };
-        let name = Name { stage: stage.to_owned(), key: key.to_owned(), part };
+        let name = EntryName { stage: stage.to_owned(), key: key.to_owned(), part };
         // Nothing else is written that way.
         (fields.next().is_none() && key.len() == 32 && name.file() == file).then_some(name)
     }
 }
 
 /// Names of all pieces of `folder`.
-pub(super) fn names(folder: &Path) -> Result<Vec<Name>> {
+pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("read the work folder", folder))? {
         let entry = entry.map_err(Error::io("read the work folder", folder))?;
-        found.extend(entry.file_name().to_str().and_then(Name::of));
+        found.extend(entry.file_name().to_str().and_then(EntryName::of));
     }
     found.sort();
     Ok(found)
 }
 
 /// Writes a piece to a file.
-pub(super) struct Writer {
+pub(super) struct EntryWriter {
     file: BufWriter<File>,
     key: u128,
     text: u32,
@@ -98,10 +98,10 @@ pub(super) struct Writer {
     pub(super) failed: Option<io::Error>,
 }
 
-impl Writer {
+impl EntryWriter {
     /// Behind room for the header.
-    pub(super) fn new(file: File, key: u128, about: &str) -> io::Result<Writer> {
-        let mut writer = Writer {
+    pub(super) fn new(file: File, key: u128, about: &str) -> io::Result<EntryWriter> {
+        let mut writer = EntryWriter {
             file: BufWriter::new(file),
             key,
             text: about.len() as u32,
@@ -136,7 +136,7 @@ impl Writer {
     }
 }
 
-impl Write for Writer {
+impl Write for EntryWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.file.write(bytes).inspect_err(|error| self.failed = Some(again(error)))?;
         self.hash.update(&bytes[..written]);
@@ -155,7 +155,7 @@ fn again(error: &io::Error) -> io::Error {
 }
 
 /// A piece that was written, open for reading at its content.
-pub(super) struct Piece {
+pub(super) struct CacheEntry {
     file: File,
     about: String,
     start: u64,
@@ -163,15 +163,15 @@ pub(super) struct Piece {
 }
 
 /// Numbers of a header.
-struct Header {
+struct EntryHeader {
     text: u64,
     content: u64,
     hash: u64,
     key: u128,
 }
 
-impl Header {
-    fn of(bytes: &[u8; HEADER]) -> std::result::Result<Header, String> {
+impl EntryHeader {
+    fn of(bytes: &[u8; HEADER]) -> std::result::Result<EntryHeader, String> {
         let number = |start: usize, length: usize| {
             bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
         };
@@ -182,15 +182,15 @@ impl Header {
             return Err(format!("version {}, expected {VERSION}", number(8, 4)));
         }
         let [text, content, hash] = [(12, 4), (16, 8), (24, 8)].map(|(start, length)| number(start, length) as u64);
-        Ok(Header { text, content, hash, key: number(32, 16) })
+        Ok(EntryHeader { text, content, hash, key: number(32, 16) })
     }
 }
 
-impl Piece {
+impl CacheEntry {
     /// Opens a piece and looks at every byte of it; of a damaged one what is wrong. `key`: the one it should have.
     ///
     /// Plain reads: a map of a large piece would count as memory of this process.
-    pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<Piece, String>> {
+    pub(super) fn open(path: &Path, key: &str) -> Result<std::result::Result<CacheEntry, String>> {
         let failed = |error| Error::io("read", path)(error);
         let mut file = File::open(path).map_err(Error::io("open", path))?;
         let length = file.metadata().map_err(failed)?.len();
@@ -199,7 +199,7 @@ impl Piece {
         }
         let mut bytes = [0; HEADER];
         file.read_exact(&mut bytes).map_err(failed)?;
-        let Header { text, content, hash, key: own } = match Header::of(&bytes) {
+        let EntryHeader { text, content, hash, key: own } = match EntryHeader::of(&bytes) {
             Ok(header) => header,
             Err(why) => return Ok(Err(why)),
         };
@@ -218,7 +218,7 @@ impl Piece {
         let mut about = vec![0; text as usize];
         file.seek(SeekFrom::Start(HEADER as u64)).and_then(|_| file.read_exact(&mut about)).map_err(failed)?;
         let about = String::from_utf8_lossy(&about).into_owned();
-        Ok(Ok(Piece { file, about, start, length: content }))
+        Ok(Ok(CacheEntry { file, about, start, length: content }))
     }
 
     /// Its file, and where its content begins.

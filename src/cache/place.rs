@@ -9,25 +9,25 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::key::Key;
+use super::key::CacheKey;
 use super::part::MOST_PARTS;
-use super::piece::{ENDING, Name, Piece, names};
-use super::spill::{Spill, Spilling};
+use super::piece::{CacheEntry, ENDING, EntryName, names};
+use super::spill::{Spill, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::remove_leftovers;
 
 /// A work folder that is written to.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct CacheDir {
     folder: PathBuf,
     /// What all keys begin with.
-    context: Key,
+    context: CacheKey,
     about: String,
 }
 
-impl Place {
+impl CacheDir {
     /// `folder`, created if it is not there.
-    pub(super) fn at(folder: &Path, about: String) -> Result<Place> {
+    pub(super) fn at(folder: &Path, about: String) -> Result<CacheDir> {
         match fs::create_dir(folder) {
             Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
                 Err(Error::io("create the work folder", folder)(error))
@@ -35,23 +35,23 @@ impl Place {
             _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.shown()))),
             _ => {
                 remove_leftovers(folder, ENDING);
-                Ok(Place { folder: folder.to_owned(), context: Key::of(&()), about })
+                Ok(CacheDir { folder: folder.to_owned(), context: CacheKey::of(&()), about })
             }
         }
     }
 
     /// What is read and written from now on follows from this, too.
-    pub(super) fn follow_from(&mut self, context: Key) {
+    pub(super) fn follow_from(&mut self, context: CacheKey) {
         self.context = self.context.and(&context);
     }
 
     /// `key` in this context.
-    pub(super) fn key(&self, key: Key) -> Key {
+    pub(super) fn key(&self, key: CacheKey) -> CacheKey {
         self.context.and(&key)
     }
 
     /// Which of several parts of `stage` are there, by how many there are in all.
-    pub(super) fn parts(&self, stage: &str, key: Key) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
+    pub(super) fn parts(&self, stage: &str, key: CacheKey) -> Result<BTreeMap<usize, BTreeSet<usize>>> {
         let key = self.key(key).text();
         let mut found: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
         for name in names(&self.folder)? {
@@ -64,14 +64,14 @@ impl Place {
     }
 
     /// To what parts of `stage` belong that follow from something else.
-    pub(super) fn others(&self, stage: &str, key: Key) -> Result<BTreeSet<String>> {
+    pub(super) fn others(&self, stage: &str, key: CacheKey) -> Result<BTreeSet<String>> {
         let key = self.key(key).text();
-        let is_other = |name: &Name| name.stage == stage && name.key != key && name.part.1 > 1;
+        let is_other = |name: &EntryName| name.stage == stage && name.key != key && name.part.1 > 1;
         let mut found = BTreeMap::new();
         for name in names(&self.folder)?.into_iter().filter(is_other) {
             // One of each is enough; one that is damaged belongs to nobody.
             if let Entry::Vacant(new) = found.entry(name.key.clone()) {
-                let piece = Piece::open(&self.folder.join(name.file()), &name.key)?;
+                let piece = CacheEntry::open(&self.folder.join(name.file()), &name.key)?;
                 new.insert(piece.map_or_else(|_| "nobody knows".to_owned(), |piece| piece.about().to_owned()));
             }
         }
@@ -79,7 +79,7 @@ impl Place {
     }
 
     /// What is in a piece, if it is there. `damaged` is told of one that is not as it was written; it counts as none.
-    pub(super) fn read<T: DeserializeOwned>(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<T>> {
+    pub(super) fn read<T: DeserializeOwned>(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<T>> {
         let Some(piece) = self.open_piece(name, &damaged)? else { return Ok(None) };
         let found = piece.value();
         let wrong = |error| damaged(format!("{} holds something else ({error}): computed again", name.file()));
@@ -87,21 +87,21 @@ impl Place {
     }
 
     /// The content of a piece, if it is there and as it was written.
-    pub(super) fn open(&self, name: &Name, damaged: impl Fn(String)) -> Result<Option<Spill>> {
+    pub(super) fn open(&self, name: &EntryName, damaged: impl Fn(String)) -> Result<Option<Spill>> {
         let at = self.folder.join(name.file());
-        let spill = |piece: Piece| {
+        let spill = |piece: CacheEntry| {
             let (file, start) = piece.into_file();
             Spill::of(file, start, at)
         };
         Ok(self.open_piece(name, &damaged)?.map(spill))
     }
 
-    fn open_piece(&self, name: &Name, damaged: &impl Fn(String)) -> Result<Option<Piece>> {
+    fn open_piece(&self, name: &EntryName, damaged: &impl Fn(String)) -> Result<Option<CacheEntry>> {
         let path = self.folder.join(name.file());
         if !path.exists() {
             return self.is_there().map(|()| None);
         }
-        match Piece::open(&path, &name.key) {
+        match CacheEntry::open(&path, &name.key) {
             Ok(Ok(piece)) => Ok(Some(piece)),
             Ok(Err(why)) => {
                 damaged(format!("{} is damaged ({why}): computed again", name.file()));
@@ -119,7 +119,7 @@ impl Place {
     }
 
     /// Writes a piece.
-    pub(super) fn write<T: Serialize>(&self, name: &Name, found: &T) -> Result<()> {
+    pub(super) fn write<T: Serialize>(&self, name: &EntryName, found: &T) -> Result<()> {
         let mut spilling = self.begin(name)?;
         spilling.write_value(found)?;
         spilling.finish()?;
@@ -127,9 +127,9 @@ impl Place {
     }
 
     /// A piece in the making.
-    pub(super) fn begin(&self, name: &Name) -> Result<Spilling> {
+    pub(super) fn begin(&self, name: &EntryName) -> Result<SpillWriter> {
         self.is_there()?;
         let key = u128::from_str_radix(&name.key, 16).unwrap_or_default();
-        Spilling::named(&self.folder.join(name.file()), key, &self.about)
+        SpillWriter::named(&self.folder.join(name.file()), key, &self.about)
     }
 }

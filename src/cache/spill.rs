@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 
-use super::piece::Writer;
+use super::piece::EntryWriter;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, StagedFile};
 
@@ -24,8 +24,8 @@ pub struct Spill {
 }
 
 /// A [`Spill`] that is being written.
-pub struct Spilling {
-    writer: Writer,
+pub struct SpillWriter {
+    writer: EntryWriter,
     /// What it is called in messages: its own name, or the folder of one without.
     at: PathBuf,
     /// Where it gets its name.
@@ -47,7 +47,7 @@ impl Spill {
         self.file.read_exact_at(bytes, self.start + start).map_err(Error::io("read back values from", &self.at))
     }
 
-    /// Reads into `bytes` what [`Spilling::write_record`] wrote at `start`; gives where the next one is.
+    /// Reads into `bytes` what [`SpillWriter::write_record`] wrote at `start`; gives where the next one is.
     ///
     /// # Errors
     /// Those of [`Spill::read`].
@@ -66,24 +66,24 @@ impl Spill {
     }
 }
 
-impl Spilling {
+impl SpillWriter {
     /// An empty one without a name in `folder`: the system removes it with the process.
     ///
     /// # Errors
     /// A folder that does not exist; the system refuses.
-    pub fn new(folder: &Path) -> Result<Spilling> {
+    pub fn new(folder: &Path) -> Result<SpillWriter> {
         let file = tempfile::tempfile_in(folder).map_err(Error::io("create a scratch file in", folder))?;
-        let writer = Writer::new(file, 0, "").map_err(Error::io("write a scratch file in", folder))?;
-        Ok(Spilling { writer, at: folder.to_owned(), staged: None })
+        let writer = EntryWriter::new(file, 0, "").map_err(Error::io("write a scratch file in", folder))?;
+        Ok(SpillWriter { writer, at: folder.to_owned(), staged: None })
     }
 
     /// An empty one that gets the name `target` at its end.
-    pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<Spilling> {
+    pub(super) fn named(target: &Path, key: u128, about: &str) -> Result<SpillWriter> {
         let staged = StagedFile::new(target, Replace::Any)?;
         let file = File::options().read(true).write(true).create_new(true).open(staged.path());
         let file = file.map_err(Error::io("create", target))?;
-        let writer = Writer::new(file, key, about).map_err(Error::io("write", target))?;
-        Ok(Spilling { writer, at: target.to_owned(), staged: Some(staged) })
+        let writer = EntryWriter::new(file, key, about).map_err(Error::io("write", target))?;
+        Ok(SpillWriter { writer, at: target.to_owned(), staged: Some(staged) })
     }
 
     /// What fails with a write: a scratch file has no name to call it by.
@@ -122,7 +122,7 @@ impl Spilling {
     /// A failed write.
     pub fn finish(self) -> Result<Spill> {
         let action = self.action();
-        let Spilling { writer, at, staged } = self;
+        let SpillWriter { writer, at, staged } = self;
         let start = writer.start();
         let file = writer.finish().map_err(Error::io(action, &at))?;
         staged.map_or(Ok(()), StagedFile::commit)?;

@@ -3,16 +3,16 @@ use std::fs;
 
 use super::*;
 
-fn asked(folder: &Path, part: Option<&str>) -> Asked {
-    Asked { folder: folder.join("work"), part: part.map(|part| part.parse().unwrap()) }
+fn asked(folder: &Path, part: Option<&str>) -> CacheRequest {
+    CacheRequest { folder: folder.join("work"), part: part.map(|part| part.parse().unwrap()) }
 }
 
-fn open(folder: &Path, part: Option<&str>) -> Work {
-    Work::open(&asked(folder, part), "a test".to_owned()).unwrap()
+fn open(folder: &Path, part: Option<&str>) -> Cache {
+    Cache::open(&asked(folder, part), "a test".to_owned()).unwrap()
 }
 
 /// Squares of the first `units` numbers, divided; and which units were computed.
-fn squares(work: &Work, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
+fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
     let computed = RefCell::new(Vec::new());
     let compute = |some: Range<usize>| {
         computed.borrow_mut().extend(some.clone());
@@ -25,7 +25,7 @@ fn squares(work: &Work, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
         }
         Ok(all)
     };
-    let found = work.divided("squares", Key::of(&units), units, compute, join);
+    let found = work.divided("squares", CacheKey::of(&units), units, compute, join);
     (found, computed.into_inner())
 }
 
@@ -87,8 +87,8 @@ fn a_part_that_is_there_is_not_computed_again_and_missing_ones_are_named_and_the
 fn parts_of_another_input_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let of = |about: &str, part: Option<&str>| {
-        let mut work = Work::open(&asked(folder.path(), part), about.to_owned()).unwrap();
-        work.follow_from(Key::of(&about));
+        let mut work = Cache::open(&asked(folder.path(), part), about.to_owned()).unwrap();
+        work.follow_from(CacheKey::of(&about));
         work
     };
     _ = squares(&of("the first", Some("1/2")), 8);
@@ -103,16 +103,16 @@ fn parts_of_another_input_are_refused_by_name() {
 #[test]
 fn other_inputs_and_parameters_find_nothing() {
     let folder = tempfile::tempdir().unwrap();
-    let key = |number: f64| Key::of(&("stage", number));
+    let key = |number: f64| CacheKey::of(&("stage", number));
     let mut work = open(folder.path(), None);
-    work.follow_from(Key::of(&"an input"));
+    work.follow_from(CacheKey::of(&"an input"));
     work.keep("stage", key(0.0), &7u32).unwrap();
     assert_eq!(work.find("stage", key(0.0)).unwrap(), Some(7u32));
     assert_eq!(work.find::<u32>("stage", key(-0.0)).unwrap(), None);
     assert_eq!(work.find::<u32>("another", key(0.0)).unwrap(), None);
     let mut other = open(folder.path(), None);
     assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
-    other.follow_from(Key::of(&"another input"));
+    other.follow_from(CacheKey::of(&"another input"));
     assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
 }
 
@@ -148,7 +148,7 @@ fn a_piece_cut_short_flipped_or_renamed_is_computed_again_with_a_note() {
 #[test]
 fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
     let write =
-        |some: Range<usize>, to: &mut Spilling| some.map(|unit| unit as u8).try_for_each(|byte| to.write(&[byte]));
+        |some: Range<usize>, to: &mut SpillWriter| some.map(|unit| unit as u8).try_for_each(|byte| to.write(&[byte]));
     let read = |spills: Vec<(Range<usize>, Spill)>| -> Vec<u8> {
         let of_spill = |(some, spill): &(Range<usize>, Spill)| {
             let mut bytes = vec![0; some.len()];
@@ -159,8 +159,8 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
     };
     let expected: Vec<u8> = (0..50).collect();
     let folder = tempfile::tempdir().unwrap();
-    let spilled = |work: &Work| work.divided_spill("bytes", Key::of(&1), 50, folder.path(), write);
-    assert_eq!(read(spilled(&Work::none()).unwrap()), expected);
+    let spilled = |work: &Cache| work.divided_spill("bytes", CacheKey::of(&1), 50, folder.path(), write);
+    assert_eq!(read(spilled(&Cache::none()).unwrap()), expected);
     assert!(names_in(folder.path()).is_empty());
     for index in 1..=3 {
         assert!(spilled(&open(folder.path(), Some(&format!("{index}/3")))).is_err());
@@ -177,7 +177,7 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
 #[test]
 fn what_is_not_divided_ends_a_run_of_a_part() {
     let folder = tempfile::tempdir().unwrap();
-    let of_part = |work: &Work| work.known("alone", Key::of(&1), || work.not_divided("alone").map(|()| 5u8));
+    let of_part = |work: &Cache| work.known("alone", CacheKey::of(&1), || work.not_divided("alone").map(|()| 5u8));
     let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
     assert!(message.contains("what comes next, alone, is not divided"), "{message}");
     assert_eq!(of_part(&open(folder.path(), None)).unwrap(), 5);
@@ -189,7 +189,7 @@ fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
     let folder = tempfile::tempdir().unwrap();
     let work = folder.path().join("work");
     _ = squares(&open(folder.path(), Some("2/3")), 9);
-    open(folder.path(), None).keep("stage", Key::of(&1), &[1u64, 2]).unwrap();
+    open(folder.path(), None).keep("stage", CacheKey::of(&1), &[1u64, 2]).unwrap();
     let listed = list(&work).unwrap();
     assert_eq!(listed.len(), 2);
     let [squares, stage] = [0, 1].map(|k| &listed[k]);
@@ -209,27 +209,28 @@ fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
 fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("work"), "a file").unwrap();
-    let message = Work::open(&asked(folder.path(), None), String::new()).unwrap_err().to_string();
+    let message = Cache::open(&asked(folder.path(), None), String::new()).unwrap_err().to_string();
     assert!(message.contains("is no folder"), "{message}");
     fs::remove_file(folder.path().join("work")).unwrap();
     let work = open(folder.path(), None);
     fs::remove_dir(folder.path().join("work")).unwrap();
-    for message in
-        [work.keep("stage", Key::of(&1), &1).unwrap_err(), work.find::<i32>("stage", Key::of(&1)).unwrap_err()]
-    {
+    for message in [
+        work.keep("stage", CacheKey::of(&1), &1).unwrap_err(),
+        work.find::<i32>("stage", CacheKey::of(&1)).unwrap_err(),
+    ] {
         assert!(message.to_string().contains("work"), "{message}");
     }
-    let message = Work::open(&asked(&folder.path().join("nowhere"), None), String::new()).unwrap_err().to_string();
+    let message = Cache::open(&asked(&folder.path().join("nowhere"), None), String::new()).unwrap_err().to_string();
     assert!(message.contains("nowhere"), "{message}");
 }
 
 #[test]
 fn parts_are_named_by_two_numbers() {
     for good in ["1/1", "3/8", "64/64"] {
-        assert_eq!(good.parse::<Part>().unwrap().to_string(), good);
+        assert_eq!(good.parse::<Shard>().unwrap().to_string(), good);
     }
     for bad in ["", "1", "0/3", "4/3", "1/0", "a/b", "1/2/3", "-1/2", "1/901"] {
-        assert!(bad.parse::<Part>().is_err(), "{bad}");
+        assert!(bad.parse::<Shard>().is_err(), "{bad}");
     }
 }
 
@@ -241,6 +242,6 @@ fn where_nothing_is_kept_no_key_is_made() {
             unreachable!("it would be hashed for nothing")
         }
     }
-    assert_eq!(Work::none().key(&Untouched), Key::NONE);
-    assert_eq!(Key::NONE.and(&Untouched), Key::NONE);
+    assert_eq!(Cache::none().key(&Untouched), CacheKey::NONE);
+    assert_eq!(CacheKey::NONE.and(&Untouched), CacheKey::NONE);
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use super::recipe_flags::{RecipeFlags, numbers};
-use splatsieve::cache::Part;
+use splatsieve::cache::Shard;
 use splatsieve::diagnostics::precision::Turned;
 use splatsieve::error::quoted;
 use splatsieve::evaluation::method::Method;
@@ -177,7 +177,7 @@ pub(super) struct Kept {
     /// Compute part I of N of the next stage that can be divided, in the work folder, and nothing else; a run without
     /// this joins them and does the rest
     #[arg(long, help_heading = IN_PARTS, value_name = "I/N", requires = "work", hide_short_help = true)]
-    pub(super) part: Option<Part>,
+    pub(super) part: Option<Shard>,
 }
 
 /// What to do with what has the output's name.

@@ -62,7 +62,7 @@ fn path_of(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
     if file < 0 {
         return 0;
     }
-    let mut line = Line::new();
+    let mut line = MapsLine::new();
     let mut piece = [0u8; 512];
     loop {
         // SAFETY: the pointer and length are those of `piece`.
@@ -78,14 +78,14 @@ fn path_of(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
             if (line.range[0]..line.range[1]).contains(&address) {
                 return line.length;
             }
-            line = Line::new();
+            line = MapsLine::new();
         }
     }
 }
 
 /// A line of `/proc/self/maps`, `START-END MODE OFFSET DEVICE INODE PATH`, read byte by byte.
 #[cfg(target_os = "linux")]
-struct Line {
+struct MapsLine {
     range: [usize; 2],
     /// Number of separators before the path that have passed: one dash and five runs of blanks.
     field: usize,
@@ -95,9 +95,9 @@ struct Line {
 }
 
 #[cfg(target_os = "linux")]
-impl Line {
-    fn new() -> Line {
-        Line { range: [0; 2], field: 0, after_blank: false, length: 0 }
+impl MapsLine {
+    fn new() -> MapsLine {
+        MapsLine { range: [0; 2], field: 0, after_blank: false, length: 0 }
     }
 
     fn push(&mut self, byte: u8, path: &mut [u8; PATH_BYTES]) {

@@ -21,11 +21,11 @@ use args::{
     SplitArg, Sweep, Trained, Verb, View,
 };
 use output::{print, print_as};
-use splatsieve::budget::{self, Budget, Tell};
+use splatsieve::budget::{self, Budget, Verbosity};
 use splatsieve::cache;
 use splatsieve::commands::container::Storing;
-use splatsieve::commands::render::{RenderOptions, Wanted};
-use splatsieve::commands::video::{VideoOptions, Way, places, video};
+use splatsieve::commands::render::{RenderOptions, RenderSelection};
+use splatsieve::commands::video::{FilmPath, VideoOptions, places, video};
 use splatsieve::commands::{archive, container, convert, render, score};
 use splatsieve::diagnostics::demo::DemoOptions;
 use splatsieve::diagnostics::precision::{PrecisionOptions, Turned};
@@ -43,7 +43,7 @@ use splatsieve::model::Split;
 use splatsieve::models::{Conventions, Link};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::pipeline::summary::Detail;
-use splatsieve::pipeline::{Only, Request, Run, Target, compress, divided_stages, foresee};
+use splatsieve::pipeline::{Only, Request, RunOptions, Target, compress, divided_stages, foresee};
 use splatsieve::player::view;
 use splatsieve::player::view::ViewOptions;
 use splatsieve::progress::{Mode, Progress, tell};
@@ -351,8 +351,8 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
     let is_flipped = args.input.trained.rot4d == Some(Rot4d::Flipped);
     let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
     input.work = work_of(args.kept);
-    if input.memory.tell == Tell::Nothing && !quiet {
-        input.memory.tell = Tell::Time;
+    if input.memory.tell == Verbosity::Nothing && !quiet {
+        input.memory.tell = Verbosity::Time;
     }
     // What the command line leaves open is as it was in the run that the recipe was written beside.
     let run = match record.run {
@@ -384,13 +384,21 @@ fn compress_options(args: Compress, quiet: bool) -> Result<Request> {
             }
             run
         }
-        None => Run::default(),
+        None => RunOptions::default(),
     };
     let OutputSize { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth } = args.size;
-    let asked = Run { target_count, target_ratio, min_psnr, max_loss, target_size, ground_truth, ..Run::default() };
+    let asked = RunOptions {
+        target_count,
+        target_ratio,
+        min_psnr,
+        max_loss,
+        target_size,
+        ground_truth,
+        ..RunOptions::default()
+    };
     // One of them, of the command line if it names one.
-    let of = if asked == Run::default() { &run } else { &asked };
-    if let (true, Some(photographs)) = (asked == Run::default(), &run.ground_truth) {
+    let of = if asked == RunOptions::default() { &run } else { &asked };
+    if let (true, Some(photographs)) = (asked == RunOptions::default(), &run.ground_truth) {
         args.recipe.check_named("ground-truth", photographs)?;
     }
     let (target, goal) = (of.target(), of.goal().map_err(Error::usage)?);
@@ -427,8 +435,8 @@ fn render_options(args: Render) -> Result<RenderOptions> {
         Some(ImageKind::Png) | None => ImageFormat::Png,
     };
     let (wanted, part) = match args.frame.zip(args.view) {
-        Some((frame, view)) => (Wanted::One { frame: frame as usize, view }, PictureSet::All),
-        None => (Wanted::All(format), PictureSet::HeldOut),
+        Some((frame, view)) => (RenderSelection::One { frame: frame as usize, view }, PictureSet::All),
+        None => (RenderSelection::All(format), PictureSet::HeldOut),
     };
     let output = args.output.unwrap_or_default();
     let mut input = input_options(args.input, None, Some(&output));
@@ -447,8 +455,8 @@ fn render_options(args: Render) -> Result<RenderOptions> {
 /// `render --video`.
 fn film(args: Render, output: PathBuf) -> Result<()> {
     let (way, part) = match args.path {
-        Some(views) => (Way::Path(views), PictureSet::HeldOut),
-        None => (Way::View(args.view), PictureSet::All),
+        Some(views) => (FilmPath::Path(views), PictureSet::HeldOut),
+        None => (FilmPath::View(args.view), PictureSet::All),
     };
     let mut input = input_options(args.input, None, Some(&output));
     args.cameras.apply_to(&mut input);
@@ -520,7 +528,7 @@ fn view_of_result(request: &Request, output: Option<PathBuf>) -> Result<ViewOpti
         PathBuf::from(name)
     };
     let mut original = request.input.clone();
-    (original.work, original.memory.tell) = (None, Tell::Nothing);
+    (original.work, original.memory.tell) = (None, Verbosity::Nothing);
     let options = ViewOptions {
         original,
         compressed: Some(request.output.clone()),
@@ -588,12 +596,12 @@ fn part_of(split: SplitArg) -> PictureSet {
     }
 }
 
-fn work_of(kept: Kept) -> Option<cache::Asked> {
-    kept.work.map(|folder| cache::Asked { folder, part: kept.part })
+fn work_of(kept: Kept) -> Option<cache::CacheRequest> {
+    kept.work.map(|folder| cache::CacheRequest { folder, part: kept.part })
 }
 
 fn budget_of(memory: Memory) -> Budget {
-    Budget { bytes: memory.memory, tell: if memory.explain { Tell::Plan } else { Tell::Nothing } }
+    Budget { bytes: memory.memory, tell: if memory.explain { Verbosity::Plan } else { Verbosity::Nothing } }
 }
 
 fn conventions(trained: &Trained) -> Conventions {

@@ -6,7 +6,7 @@ use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use splatsieve::error::{Error, Result, ShowPath, quoted};
 use splatsieve::files::text::read_text;
-use splatsieve::pipeline::Record;
+use splatsieve::pipeline::RecipeRecord;
 use splatsieve::recipe::{Effort, MergePass, PRESETS, Recipe, parameters};
 
 const RECIPE: &str = "Recipe";
@@ -28,11 +28,11 @@ pub(super) struct RecipeFlags {
 
 impl RecipeFlags {
     /// What the recipe file, if there is one, says of the run it was written beside.
-    pub(super) fn record(&self) -> Result<Record> {
-        let Some(path) = &self.file else { return Ok(Record::default()) };
+    pub(super) fn record(&self) -> Result<RecipeRecord> {
+        let Some(path) = &self.file else { return Ok(RecipeRecord::default()) };
         let text = read_text(path, MAX_RECIPE)?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        Record::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
+        RecipeRecord::read(&text, folder).map_err(|message| Error::usage(format!("{}: {message}", path.shown())))
     }
 
     /// Confirms that what the recipe file names for `option` is there.

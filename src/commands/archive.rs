@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::Path;
 
 use crate::TOOL;
-use crate::archive::{MAGIC, Parts};
+use crate::archive::{ArchiveSize, MAGIC};
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::names::name_of;
@@ -21,7 +21,7 @@ pub struct Unpacked {
     /// N.
     pub gaussians: usize,
     /// Bytes of the archive.
-    pub parts: Parts,
+    pub parts: ArchiveSize,
     /// Bytes of the field's tensors and the cloud's attributes, as f32.
     pub bytes: u64,
 }

@@ -10,8 +10,8 @@ use gseq::{Compression, Reader, RecoverReport, VerifyReport};
 use serde::Serialize;
 
 use crate::TOOL;
-use crate::budget::{Budget, Need, Plan, Workload};
-use crate::cache::Spilling;
+use crate::budget::{Budget, Plan, ResourceEstimate, Workload};
+use crate::cache::SpillWriter;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::container::Container;
@@ -21,21 +21,21 @@ use crate::model::Columns;
 use crate::models;
 use crate::models::stream::pack_stream;
 use crate::models::trajectories::write_sequence;
-use crate::models::{ColumnInfo, Family, Size, Timing};
+use crate::models::{ColumnInfo, InputModel, Size, Timing};
 use crate::outputs::bounds::{Bounds, MaxError};
 use crate::outputs::container::{
     BOUNDED_FRAME_BLOCK, FRAME_BLOCK, Packing, join_container, spill_blocks, write_container,
 };
 use crate::outputs::frame_stream::StreamWriter;
 use crate::outputs::kind::{OutputKind, check_container_name, check_folder_name};
-use crate::passes::Frames;
+use crate::passes::FrameReaders;
 use crate::pipeline::stages::emit::ENCODING;
 use crate::pipeline::summary::InputSummary;
 use crate::progress::Progress;
 use crate::scene::{
     InputOptions, Opened, first_box, is_linked, kept_work, link_stream, open_input, open_stream, room_to_pack,
 };
-use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// What packing is called.
 const PACK: &str = "pack";
@@ -95,7 +95,7 @@ pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: R
     let attributes = BTreeMap::from([("source_digest".to_owned(), digest.map_or_else(|| opened.input.digest(), Ok)?)]);
     let progress = |frames: usize| Progress::new(PACK, "states", (source.info().count * frames) as u64);
     let staged = if work.keeps() {
-        let encode = |blocks: Range<usize>, to: &mut Spilling| {
+        let encode = |blocks: Range<usize>, to: &mut SpillWriter| {
             let progress = progress(blocks.clone().map(|block| packing.frames(source, block).len()).sum());
             spill_blocks(source, packing, blocks, to, |done| progress.advance(done))
         };
@@ -154,8 +154,8 @@ pub fn unpack_stream(input: &InputOptions, to: impl Write) -> Result<Opened> {
     let plan = Plan::fit(workload(&*opened.input), input.memory, unpacking)?;
     plan.tell_time(input.memory.tell);
     let held = plan.limits.frames_held;
-    let wanted = Wanted::every().holding(held);
-    let mut frames = Frames::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
+    let wanted = ReadPlan::every().holding(held);
+    let mut frames = FrameReaders::open(source, Ids::Range(0..source.info().count), Columns::all(), &wanted)?;
     let mut state = frames.state();
     if !info.times.is_empty() {
         frames.read(0, Columns::all(), &mut state)?;
@@ -216,7 +216,7 @@ pub fn recover(input: &Path, output: &Path, overwrite: Replace) -> Result<Recove
 
 /// What an input holds.
 #[derive(Debug, Serialize)]
-pub struct Info {
+pub struct InputInfo {
     /// The input.
     #[serde(flatten)]
     pub input: InputSummary,
@@ -228,8 +228,8 @@ pub struct Info {
 }
 
 /// Looks at an input. Its bytes are read once for the digest, but no frame is evaluated.
-pub fn info(options: &InputOptions) -> Result<Info> {
-    let input: Box<dyn Family> = match options.is_stream() {
+pub fn info(options: &InputOptions) -> Result<InputInfo> {
+    let input: Box<dyn InputModel> = match options.is_stream() {
         true => open_input(options)?.input,
         false => models::open(&options.path, &options.opening())?,
     };
@@ -239,16 +239,16 @@ pub fn info(options: &InputOptions) -> Result<Info> {
     if input.timing() == Timing::Continuous {
         summary.frames = None;
     }
-    Ok(Info { input: summary, times, columns: input.columns()? })
+    Ok(InputInfo { input: summary, times, columns: input.columns()? })
 }
 
 /// Of an input that nobody looks at.
-fn workload(input: &dyn Family) -> Workload {
+fn workload(input: &dyn InputModel) -> Workload {
     Workload::new(input.source().info(), input.residence())
 }
 
 /// What it takes to write every frame as a container.
-fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
+fn packing(work: &Workload, storing: &Storing) -> Vec<ResourceEstimate> {
     let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
     let level = match storing {
         Storing::Exact(Compression::Zstd(level)) | Storing::Within(_, level) => *level,
@@ -261,18 +261,18 @@ fn packing(work: &Workload, storing: &Storing) -> Vec<Need> {
     };
     let per_gaussian = vec![("positions", positions)];
     let fixed = [work.writing_together(together), vec![work.compressing(level, together)]].concat();
-    vec![Need { stage: PACK, reads: 1.0, seconds, per_gaussian, fixed }]
+    vec![ResourceEstimate { stage: PACK, reads: 1.0, seconds, per_gaussian, fixed }]
 }
 
 /// What it takes to write every frame by itself.
-fn unpacking(work: &Workload, limits: &Limits) -> Vec<Need> {
+fn unpacking(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     let states = ("states", work.state(Columns::all()));
     let per_gaussian = vec![states, ("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
     let seconds = 2.0 * work.reading(work.count(), work.frames as f64);
-    vec![Need { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.arriving()] }]
+    vec![ResourceEstimate { stage: "unpack", reads: 1.0, seconds, per_gaussian, fixed: vec![work.arriving()] }]
 }
 
-impl Info {
+impl InputInfo {
     /// A few lines for a person.
     pub fn text(&self) -> String {
         let input = &self.input;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::TOOL;
-use crate::budget::{Need, Plan, Workload};
+use crate::budget::{Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
@@ -16,7 +16,7 @@ use crate::passes::TRACKED;
 use crate::pipeline::stages::emit::ENCODING;
 use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::scene::{InputOptions, open_input};
 
 /// Bytes that a Gaussian takes while formats are fitted to it and encoded, about: a few pieces of it.
@@ -69,7 +69,7 @@ pub fn convert(
     let work = Workload::new(source.info(), family.residence());
     let plan = Plan::fit(work, input.memory, |work, limits| vec![need(kind, work, limits)])?;
     plan.tell_time(input.memory.tell);
-    let all = Reduction::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
+    let all = CompressedModel::pruned((0..gaussians as u32).collect(), &Recipe::preset("default")?.merge);
     let mut notes = opened.notes;
     let mut write = |path: &Path| -> Result<u64> {
         notes.extend(family.write(&all, kind, path, &plan.limits)?);
@@ -96,7 +96,7 @@ pub fn convert(
 }
 
 /// All states once, and what is fitted to them.
-fn need(kind: OutputKind, work: &Workload, limits: &Limits) -> Need {
+fn need(kind: OutputKind, work: &Workload, limits: &Limits) -> ResourceEstimate {
     let whole = work.state(Columns::all());
     let fits = matches!(kind, OutputKind::Splatv | OutputKind::FourDgs);
     let tracked = work.threads * TRACKED as u64 * work.frames * whole;
@@ -110,5 +110,5 @@ fn need(kind: OutputKind, work: &Workload, limits: &Limits) -> Need {
         ("fitted", if fits { FITTED } else { 0 }),
     ];
     let seconds = work.reading(work.count(), work.frames as f64) + work.count() * work.frames as f64 * ENCODING;
-    Need { stage: "convert", reads: 1.0, seconds, per_gaussian, fixed }
+    ResourceEstimate { stage: "convert", reads: 1.0, seconds, per_gaussian, fixed }
 }

@@ -7,15 +7,15 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use crate::TOOL;
-use crate::budget::{Need, Workload};
-use crate::cache::{Spill, Spilling};
+use crate::budget::{ResourceEstimate, Workload};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::image::write::{ImageFormat, image_bytes, write_image};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture};
 use crate::outputs::kind::check_folder_name;
-use crate::passes::{Batch, Subject, View, show};
+use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::pipeline::summary::{CameraSummary, InputSummary};
 use crate::progress::Progress;
 use crate::render::Image;
@@ -28,7 +28,7 @@ const NAME: &str = "render";
 
 /// Which pictures to render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Wanted {
+pub enum RenderSelection {
     /// One, into a file whose name says its format.
     One {
         /// Frame of the sequence.
@@ -46,7 +46,7 @@ pub struct RenderOptions {
     /// What to read; of its split nothing is used.
     pub input: InputOptions,
     /// Which pictures.
-    pub wanted: Wanted,
+    pub wanted: RenderSelection,
     /// Part of the cameras' pictures they are among.
     pub part: PictureSet,
     /// Red, green, blue in [0, 1]; none: see [`background`].
@@ -75,11 +75,11 @@ pub struct Rendered {
 pub fn render(options: &RenderOptions) -> Result<Rendered> {
     let output = options.output.as_path();
     let (kind, format) = match options.wanted {
-        Wanted::All(format) => {
+        RenderSelection::All(format) => {
             check_folder_name(output, "--all")?;
             (Kind::Folder, format)
         }
-        Wanted::One { .. } => (Kind::File, format_of(output)?),
+        RenderSelection::One { .. } => (Kind::File, format_of(output)?),
     };
     let mut inputs = vec![options.input.path.as_path()];
     inputs.extend(options.input.cameras.as_deref());
@@ -93,10 +93,10 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
     let times = &source.info().times;
     let background = background(options.background, &scene)?;
     let chosen = match options.wanted {
-        Wanted::One { frame, view } => vec![picture(&scene.rig, times, options.part, frame, view)?],
-        Wanted::All(_) => pictures(&scene.rig, times, options.part)?,
+        RenderSelection::One { frame, view } => vec![picture(&scene.rig, times, options.part, frame, view)?],
+        RenderSelection::All(_) => pictures(&scene.rig, times, options.part)?,
     };
-    let job = Job { source, cameras: &scene.rig.cameras, limits: scene.limits, background, format };
+    let job = RenderJob { source, cameras: &scene.rig.cameras, limits: scene.limits, background, format };
     if kind == Kind::File {
         let staged = StagedFile::new(output, options.overwrite)?;
         job.write(&chosen, |_| staged.path().to_owned())?;
@@ -105,7 +105,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         let name = |picture: &Picture| format!("{}.{}", picture.name(), format.extension());
         let staged = if scene.work.keeps() {
             let key = scene.work.key(&(&chosen, background, format.extension()));
-            let make = |some: Range<usize>, to: &mut Spilling| job.spill(&chosen[some], to);
+            let make = |some: Range<usize>, to: &mut SpillWriter| job.spill(&chosen[some], to);
             let spills = scene.work.divided_spill(NAME, key, chosen.len(), &scene.scratch, make)?;
             scene.work.not_divided("writing")?;
             let staged = StagedFolder::new(output, options.overwrite)?;
@@ -137,7 +137,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
 }
 
 /// What it takes to make pictures of a model; `waiting`: the files of those that are made together wait to be written.
-fn needs(work: &Workload, limits: &Limits, waiting: bool) -> Vec<Need> {
+fn needs(work: &Workload, limits: &Limits, waiting: bool) -> Vec<ResourceEstimate> {
     vec![pictures::need(work, limits, NAME, 1, if waiting { 24 } else { 12 })]
 }
 
@@ -151,7 +151,7 @@ fn format_of(output: &Path) -> Result<ImageFormat> {
 }
 
 /// Rendering into files.
-struct Job<'a> {
+struct RenderJob<'a> {
     source: &'a dyn FrameSource,
     cameras: &'a [Camera],
     limits: Limits,
@@ -159,13 +159,13 @@ struct Job<'a> {
     format: ImageFormat,
 }
 
-impl Job<'_> {
+impl RenderJob<'_> {
     fn write(&self, pictures: &[Picture], path: impl Fn(&Picture) -> PathBuf + Sync) -> Result<()> {
         self.make(pictures, |picture, image| write_image(image, self.format, &path(&picture)), |()| Ok(()))
     }
 
     /// Writes a record of the file of each of `pictures`, in order.
-    fn spill(&self, pictures: &[Picture], to: &mut Spilling) -> Result<()> {
+    fn spill(&self, pictures: &[Picture], to: &mut SpillWriter) -> Result<()> {
         let encode = |picture: Picture, image: &Image| {
             let named = PathBuf::from(format!("{}.{}", picture.name(), self.format.extension()));
             image_bytes(image, self.format).map_err(Error::io("make", &named))
@@ -183,7 +183,7 @@ impl Job<'_> {
         let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
         show([Subject::all(self.source)], self.cameras, pictures, Batch::of_frame(&self.limits), |views| {
             // Tasks within a picture too: a frame may have fewer pictures than there are threads.
-            let made = views.par_iter().map(|view: &View<'_, 1>| {
+            let made = views.par_iter().map(|view: &ViewStates<'_, 1>| {
                 let made = of_each(view.picture, &view.render(0, self.background))?;
                 progress.advance(1);
                 Ok(made)
@@ -193,7 +193,7 @@ impl Job<'_> {
     }
 }
 
-/// Writes the files that [`Job::spill`] has made of `pictures`, one at a time.
+/// Writes the files that [`RenderJob::spill`] has made of `pictures`, one at a time.
 fn write_spilled(pictures: &[Picture], spill: &Spill, path: impl Fn(&Picture) -> PathBuf) -> Result<()> {
     let (mut at, mut bytes) = (0, Vec::new());
     for picture in pictures {

@@ -8,7 +8,7 @@ use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::journal::Journal;
 use crate::outputs::rows::RowTable;
 use crate::pipeline::open_to_measure;
-use crate::pipeline::stages::measure::{Measure, Outlook};
+use crate::pipeline::stages::measure::{InputMeta, Measure};
 use crate::pruning::score::UserOverrides;
 use crate::recipe::Recipe;
 use crate::scene::InputOptions;
@@ -22,7 +22,8 @@ pub fn score(input: &InputOptions, output: &Path, recipe: &Recipe, overwrite: Re
     }
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let journal = &mut Journal::default();
-    let plan = |outlook: Outlook, _: &Workload| Ok(Measure::new(recipe, outlook.has_cameras, UserOverrides::default()));
+    let plan =
+        |outlook: InputMeta, _: &Workload| Ok(Measure::new(recipe, outlook.has_cameras, UserOverrides::default()));
     let (scene, measure, arrived) = open_to_measure(input, plan, journal)?;
     let scored = measure.run(&scene, arrived, journal)?;
     let scores = scored.scores(&recipe.score)?;

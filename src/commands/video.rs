@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use crate::budget::Need;
+use crate::budget::ResourceEstimate;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::open_compressed;
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
 use crate::model::{Camera, Picture, Rig, Shot};
-use crate::outputs::film::{Film, FilmFormat};
-use crate::passes::{Batch, Subject, View, show};
+use crate::outputs::film::{FilmFormat, FilmOutput};
+use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::progress::Progress;
 use crate::render::Image;
 use crate::scene::path::along;
@@ -27,7 +27,7 @@ const STEPS: usize = 24;
 
 /// From where a film is taken.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Way {
+pub enum FilmPath {
     /// One view, wherever its camera is at a time; none: that of the lowest number.
     View(Option<u32>),
     /// Through the cameras of these views, in order; empty: of all, by number.
@@ -42,7 +42,7 @@ pub struct VideoOptions {
     /// Another model of the same frames, to the right.
     pub beside: Option<PathBuf>,
     /// From where.
-    pub way: Way,
+    pub way: FilmPath,
     /// Part of the cameras' pictures whose views count.
     pub part: PictureSet,
     /// Frames per second, at least 1.
@@ -87,7 +87,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let mut scene = scene_of(opened, &InputOptions { split: None, ..options.input.clone() })?;
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
-    scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<Need> {
+    scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
         // Two pictures, and the frame that they make up, with its bytes and, of a GIF, those that colours are chosen from.
         let mut need = pictures::need(work, limits, NAME, models, models * 12);
         need.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
@@ -100,8 +100,8 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let size = (size.0 * models as u32, size.1);
 
     let staged = StagedFile::new(output, options.overwrite)?;
-    let mut film = Film::create((staged.path(), output), &format, size, pictures.len() as u32, options.fps)?;
-    let shown = Shown { cameras: &cameras, pictures: &pictures, limits: &scene.limits, background };
+    let mut film = FilmOutput::create((staged.path(), output), &format, size, pictures.len() as u32, options.fps)?;
+    let shown = FilmSource { cameras: &cameras, pictures: &pictures, limits: &scene.limits, background };
     match &beside {
         None => shown.film([Subject::all(scene.source())], &mut film)?,
         Some(other) => shown.film([scene.source(), other.source()].map(Subject::all), &mut film)?,
@@ -133,9 +133,9 @@ fn shots(all: &[Shot], rig: &Rig, part: PictureSet) -> Result<Vec<Shot>> {
 }
 
 /// The cameras of the film and its pictures, one after the other.
-fn plan(way: &Way, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<Picture>)> {
+fn plan(way: &FilmPath, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Camera>, Vec<Picture>)> {
     match way {
-        Way::View(view) => {
+        FilmPath::View(view) => {
             let view = view.unwrap_or_else(|| shots.first().map_or(0, |shot| shot.view));
             let own = of_view(shots, view, "--view", rig)?;
             let away = |shot: &Shot, time: f64| shot.time.map_or(0.0, |at| (at - time).abs());
@@ -144,7 +144,7 @@ fn plan(way: &Way, shots: &[Shot], rig: &Rig, times: &[f64]) -> Result<(Vec<Came
             let picture = |(frame, time)| Picture { frame, view, camera: camera(time) };
             Ok((rig.cameras.clone(), times.iter().enumerate().map(picture).collect()))
         }
-        Way::Path(views) => {
+        FilmPath::Path(views) => {
             let all = || shots.chunk_by(|a, b| a.view == b.view).map(|of| of[0].view).collect();
             let views: Vec<u32> = if views.is_empty() { all() } else { views.clone() };
             if views.len() < 2 {
@@ -189,20 +189,20 @@ fn one_size(cameras: &[Camera]) -> Result<(u32, u32)> {
 }
 
 /// What a film shows.
-struct Shown<'a> {
+struct FilmSource<'a> {
     cameras: &'a [Camera],
     pictures: &'a [Picture],
     limits: &'a Limits,
     background: [f32; 3],
 }
 
-impl Shown<'_> {
-    fn film<const S: usize>(&self, subjects: [Subject<'_>; S], film: &mut Film) -> Result<()> {
+impl FilmSource<'_> {
+    fn film<const S: usize>(&self, subjects: [Subject<'_>; S], film: &mut FilmOutput) -> Result<()> {
         let progress = Progress::new(NAME, "frames", self.pictures.len() as u64);
         show(subjects, self.cameras, self.pictures, Batch::of_frame(self.limits), |views| {
             let made: Vec<Image> = views
                 .par_iter()
-                .map(|view: &View<'_, S>| {
+                .map(|view: &ViewStates<'_, S>| {
                     let of_models = (0..S).into_par_iter().map(|subject| view.render(subject, self.background));
                     side_by_side(of_models.collect())
                 })

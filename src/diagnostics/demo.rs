@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use crate::budget::Budget;
 use crate::diagnostics::demo_scene;
-use crate::diagnostics::demo_scene::Body;
+use crate::diagnostics::demo_scene::DemoBody;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::files::container::Container;
@@ -45,7 +45,7 @@ pub struct DemoReport {
     /// The compression.
     pub summary: Summary,
     /// For every body its Gaussians: all, kept as they were or as leaders, merged away.
-    pub bodies: Vec<(Body, usize, usize, usize)>,
+    pub bodies: Vec<(DemoBody, usize, usize, usize)>,
 }
 
 /// Generates the scene, packs it, compresses it.
@@ -88,7 +88,7 @@ fn run_in(folder: &Path, options: &DemoOptions) -> Result<DemoReport> {
     fs::write(&marker, summary.json()).map_err(Error::io("write", &marker))?;
 
     let mut leaders = vec![false; summary.gaussians];
-    let bodies = Body::ALL
+    let bodies = DemoBody::ALL
         .iter()
         .map(|&body| {
             let members = made.members(body);

@@ -12,8 +12,8 @@ use super::whole_run::{WholeRun, result_name, trained};
 use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::evaluation::cost::Repeats;
-use crate::evaluation::method::{Means, Method, STEPS, refining_by};
-use crate::evaluation::trade_off::{Knob, Point, Setting, TradeOff};
+use crate::evaluation::method::{Method, MethodKind, STEPS, refining_by};
+use crate::evaluation::trade_off::{EffortCurve, Setting, TradeOff, TradeOffPoint};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::names::name_of;
 use crate::outputs::kind::check_folder_name;
@@ -106,7 +106,7 @@ pub fn sweep(options: &SweepOptions) -> Result<TradeOff> {
         progress.advance(1);
     }
     if !settings.is_empty() {
-        found.knobs.push(Knob { parameter: STEPS.to_owned(), settings });
+        found.knobs.push(EffortCurve { parameter: STEPS.to_owned(), settings });
     }
     if let Some(least) = merged_alone(&found) {
         let name = Method::PaperMerge.name();
@@ -151,7 +151,7 @@ fn start(options: &SweepOptions) -> Result<(TradeOff, &'static str)> {
 
 /// Gaussians that merging leaves where nothing is pruned, once that point is measured.
 fn merged_alone(found: &TradeOff) -> Option<usize> {
-    let own = |point: &&Point| point.method == Method::PaperMerge.name() && point.asked.is_none();
+    let own = |point: &&TradeOffPoint| point.method == Method::PaperMerge.name() && point.asked.is_none();
     found.points.iter().find(own).map(|point| point.count)
 }
 
@@ -166,13 +166,13 @@ fn measure(
     run: &WholeRun<'_>,
     method: Method,
     asked: Option<f64>,
-    means: &Means,
+    means: &MethodKind,
     found: &mut TradeOff,
-) -> Result<Point> {
+) -> Result<TradeOffPoint> {
     let (evaluation, cost) = run.run(means, asked.map(Target::Ratio), |result| run.compared(result))?;
     found.pictures = evaluation.cameras.pairs;
     let means = evaluation.loss.overall;
-    Ok(Point {
+    Ok(TradeOffPoint {
         method: method.name().to_owned(),
         asked,
         count: evaluation.count.compressed,

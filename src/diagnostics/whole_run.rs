@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::evaluation::baseline::prune_by;
 use crate::evaluation::cost::{Cost, Repeats};
 use crate::evaluation::found::Evaluation;
-use crate::evaluation::method::Means;
+use crate::evaluation::method::MethodKind;
 use crate::evaluation::{EvaluateOptions, evaluate};
 use crate::files::atomic::Replace;
 use crate::model::Split;
@@ -40,7 +40,7 @@ impl WholeRun<'_> {
     /// Those of `compress` and of `look`.
     pub(crate) fn run<T>(
         &self,
-        means: &Means,
+        means: &MethodKind,
         target: Option<Target>,
         look: impl FnOnce(&Path) -> Result<T>,
     ) -> Result<(T, Cost)> {
@@ -49,11 +49,11 @@ impl WholeRun<'_> {
         let clear = || fs::remove_dir_all(self.scratch).map_err(Error::io("remove", self.scratch));
         let create = || fs::create_dir(self.scratch).map_err(Error::io("create", self.scratch));
         let once = || match means {
-            Means::Recipe(recipe, only) => {
+            MethodKind::Recipe(recipe, only) => {
                 let run = Request::new(input.clone(), output.clone(), (**recipe).clone());
                 compress(&Request { only: *only, target, ..run }).map(|_| ())
             }
-            Means::Baseline(baseline) => prune_by(*baseline, &input, target, &output).map(|_| ()),
+            MethodKind::Baseline(baseline) => prune_by(*baseline, &input, target, &output).map(|_| ()),
         };
         create()?;
         let ((), cost) = self.repeats.measure(once, || clear().and_then(|()| create()))?;

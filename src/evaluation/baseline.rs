@@ -12,7 +12,7 @@ use crate::passes::gather;
 use crate::pipeline::Target;
 use crate::pipeline::stages::emit::write_alone;
 use crate::recipe::Recipe;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::scene::{InputOptions, open_scene};
 
 /// What a baseline ranks by, largest first, ties by hashed id.
@@ -45,7 +45,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
     let kept = best(baseline, &state, ids, wanted);
     let kind = OutputKind::of(output, None, scene.input.own_output());
     scene.input.check_output(kind, output)?;
-    let reduction = Reduction::pruned(kept, &Recipe::preset("default")?.merge);
+    let reduction = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
     write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE)
 }
 

@@ -27,7 +27,7 @@ pub struct Both<T> {
 
 /// How close two pictures are.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Score {
+pub struct ImageScore {
     /// [`crate::metrics::psnr`], dB.
     pub psnr: f64,
     /// [`crate::metrics::ssim`].
@@ -48,15 +48,15 @@ pub struct PictureScores {
     /// View number.
     pub view: u32,
     /// Compressed against original.
-    pub loss: Score,
+    pub loss: ImageScore,
     /// Each against the ground truth, where that is given.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub truth: Option<Both<Score>>,
+    pub truth: Option<Both<ImageScore>>,
 }
 
 /// Means over pictures.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Means {
+pub struct QualityMeans {
     /// Number of pictures.
     pub pairs: usize,
     /// Mean PSNR, dB.
@@ -77,7 +77,7 @@ pub struct ViewMeans {
     pub view: u32,
     /// Its means.
     #[serde(flatten)]
-    pub means: Means,
+    pub means: QualityMeans,
 }
 
 /// Means over the pictures of one frame.
@@ -89,7 +89,7 @@ pub struct FrameMeans {
     pub time: f64,
     /// Its means; the temporal error is that since the frame evaluated before.
     #[serde(flatten)]
-    pub means: Means,
+    pub means: QualityMeans,
 }
 
 /// Pictures of one origin against pictures of another.
@@ -97,7 +97,7 @@ pub struct FrameMeans {
 pub struct Comparison {
     /// Over all pictures.
     #[serde(flatten)]
-    pub overall: Means,
+    pub overall: QualityMeans,
     /// View by view, by number.
     pub per_view: Vec<ViewMeans>,
     /// Frame by frame.
@@ -151,16 +151,16 @@ pub struct Evaluation {
     pub pictures: Vec<PictureScores>,
 }
 
-impl Means {
+impl QualityMeans {
     /// Of nothing: no pairs, and NaN, which JSON shows as null.
-    fn of(scores: &[Score]) -> Means {
+    fn of(scores: &[ImageScore]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        let all = |value: fn(&Score) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
-        let given = |value: fn(&Score) -> Option<f64>| {
+        let all = |value: fn(&ImageScore) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
+        let given = |value: fn(&ImageScore) -> Option<f64>| {
             let values: Vec<f64> = scores.iter().filter_map(value).collect();
             (!values.is_empty()).then(|| mean(&values))
         };
-        Means {
+        QualityMeans {
             pairs: scores.len(),
             psnr: all(|score| score.psnr),
             ssim: all(|score| score.ssim),
@@ -172,13 +172,13 @@ impl Means {
 
 impl Comparison {
     /// Averages what `score` picks of each picture; of those that have it; none if all lack it.
-    pub fn of(pictures: &[PictureScores], score: impl Fn(&PictureScores) -> Option<Score>) -> Option<Comparison> {
-        let (pictures, scores): (Vec<&PictureScores>, Vec<Score>) =
+    pub fn of(pictures: &[PictureScores], score: impl Fn(&PictureScores) -> Option<ImageScore>) -> Option<Comparison> {
+        let (pictures, scores): (Vec<&PictureScores>, Vec<ImageScore>) =
             pictures.iter().filter_map(|picture| Some((picture, score(picture)?))).unzip();
         if scores.is_empty() {
             return None;
         }
-        let mut views: BTreeMap<u32, Vec<Score>> = BTreeMap::new();
+        let mut views: BTreeMap<u32, Vec<ImageScore>> = BTreeMap::new();
         for (picture, &score) in pictures.iter().zip(&scores) {
             views.entry(picture.view).or_default().push(score);
         }
@@ -186,12 +186,12 @@ impl Comparison {
         let mut rest = &scores[..];
         for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
             let (these, after) = rest.split_at(frame.len());
-            per_frame.push(FrameMeans { frame: frame[0].frame, time: frame[0].time, means: Means::of(these) });
+            per_frame.push(FrameMeans { frame: frame[0].frame, time: frame[0].time, means: QualityMeans::of(these) });
             rest = after;
         }
         Some(Comparison {
-            overall: Means::of(&scores),
-            per_view: views.iter().map(|(&view, scores)| ViewMeans { view, means: Means::of(scores) }).collect(),
+            overall: QualityMeans::of(&scores),
+            per_view: views.iter().map(|(&view, scores)| ViewMeans { view, means: QualityMeans::of(scores) }).collect(),
             per_frame,
         })
     }
@@ -233,7 +233,7 @@ impl Evaluation {
         let with_flip = self.loss.overall.flip.is_some();
         let flip = if with_flip { "     FLIP" } else { "" };
         let _ = writeln!(out, "  {:<38} {:>8} {:>8} {:>10}{flip}", "", "PSNR dB", "SSIM", "temporal");
-        let mut line = |what: &str, means: &Means| {
+        let mut line = |what: &str, means: &QualityMeans| {
             let temporal = means.temporal.map_or("-".to_owned(), |error| format!("{error:.6}"));
             let flip = means.flip.map_or(String::new(), |error| format!(" {error:>8.5}"));
             let _ = writeln!(out, "  {what:<38} {:>8.3} {:>8.5} {temporal:>10}{flip}", means.psnr, means.ssim);
@@ -293,7 +293,7 @@ mod tests {
     use super::*;
 
     fn picture(frame: usize, view: u32, psnr: f64, temporal: Option<f64>) -> PictureScores {
-        let loss = Score { psnr, ssim: psnr / 100.0, temporal, flip: None };
+        let loss = ImageScore { psnr, ssim: psnr / 100.0, temporal, flip: None };
         PictureScores { frame, time: frame as f64 / 4.0, view, loss, truth: None }
     }
 
@@ -307,7 +307,7 @@ mod tests {
             picture(3, 1, 10.0, Some(0.75)),
         ];
         let found = Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap();
-        assert_eq!(found.overall, Means { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
+        assert_eq!(found.overall, QualityMeans { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
         let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
         assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
         let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
@@ -347,7 +347,8 @@ mod tests {
         );
         for picture in &mut pictures {
             picture.loss.flip = Some(0.5);
-            picture.truth = Some(Both { original: Score { flip: None, ..picture.loss }, compressed: picture.loss });
+            picture.truth =
+                Some(Both { original: ImageScore { flip: None, ..picture.loss }, compressed: picture.loss });
         }
         assert_eq!(
             evaluation(pictures).csv(),

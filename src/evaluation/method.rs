@@ -71,7 +71,7 @@ impl Method {
     ///
     /// # Errors
     /// None but of presets that do not parse.
-    pub(crate) fn means(self) -> Result<Means> {
+    pub(crate) fn means(self) -> Result<MethodKind> {
         let unrefined = || Ok::<_, Error>(Recipe::preset("default")?.unrefined());
         let pruning = |coverage| {
             let mut recipe = unrefined()?;
@@ -85,20 +85,20 @@ impl Method {
             recipe.score.clip_norm = false;
             recipe.select.round_fraction = 1.0;
             recipe.select.choose_by_views = false;
-            Ok::<_, Error>(Means::Recipe(Box::new(recipe), Only::Prune))
+            Ok::<_, Error>(MethodKind::Recipe(Box::new(recipe), Only::Prune))
         };
-        let paper = |only| Ok(Means::Recipe(Box::new(Recipe::preset("paper")?), only));
+        let paper = |only| Ok(MethodKind::Recipe(Box::new(Recipe::preset("paper")?), only));
         match self {
-            Method::Default => Ok(Means::Recipe(Box::new(Recipe::preset("default")?), Only::Both)),
-            Method::NoRefine => Ok(Means::Recipe(Box::new(unrefined()?), Only::Both)),
+            Method::Default => Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?), Only::Both)),
+            Method::NoRefine => Ok(MethodKind::Recipe(Box::new(unrefined()?), Only::Both)),
             Method::Paper => paper(Only::Both),
             Method::PaperPrune => paper(Only::Prune),
             Method::PaperMerge => paper(Only::Merge),
             Method::Visible => pruning(Coverage::Visible),
             Method::Projected => pruning(Coverage::Projected),
-            Method::Opacity => Ok(Means::Baseline(Baseline::Opacity)),
-            Method::Scale => Ok(Means::Baseline(Baseline::Scale)),
-            Method::Random => Ok(Means::Baseline(Baseline::Random)),
+            Method::Opacity => Ok(MethodKind::Baseline(Baseline::Opacity)),
+            Method::Scale => Ok(MethodKind::Baseline(Baseline::Scale)),
+            Method::Random => Ok(MethodKind::Baseline(Baseline::Random)),
         }
     }
 
@@ -109,7 +109,7 @@ impl Method {
 }
 
 /// How a method compresses.
-pub(crate) enum Means {
+pub(crate) enum MethodKind {
     Recipe(Box<Recipe>, Only),
     Baseline(Baseline),
 }
@@ -118,8 +118,8 @@ pub(crate) enum Means {
 pub(crate) const STEPS: &str = "refine_steps";
 
 /// [`Method::Default`] with so many steps, and before each cut as many in proportion.
-pub(crate) fn refining_by(steps: u32) -> Result<Means> {
-    Ok(Means::Recipe(Box::new(Recipe::preset("default")?.refining_by(steps)), Only::Both))
+pub(crate) fn refining_by(steps: u32) -> Result<MethodKind> {
+    Ok(MethodKind::Recipe(Box::new(Recipe::preset("default")?.refining_by(steps)), Only::Both))
 }
 
 #[cfg(test)]
@@ -130,7 +130,7 @@ mod tests {
     fn turning_steps_to_the_presets_own_leaves_the_preset() {
         let preset = Recipe::preset("default").unwrap();
         let recipe = |steps| match refining_by(steps).unwrap() {
-            Means::Recipe(recipe, Only::Both) => *recipe,
+            MethodKind::Recipe(recipe, Only::Both) => *recipe,
             _ => panic!("not method default"),
         };
         assert_eq!(recipe(preset.refine.refine_steps), preset);

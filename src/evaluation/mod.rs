@@ -20,17 +20,17 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::TOOL;
-use crate::budget::{Budget, Need, Plan, Workload};
-use crate::cache::Key;
+use crate::budget::{Budget, Plan, ResourceEstimate, Workload};
+use crate::cache::CacheKey;
 use crate::error::{Error, Result, ShowPath};
-use crate::evaluation::found::{Both, Comparison, Evaluation, PictureScores, Score, TruthComparison};
+use crate::evaluation::found::{Both, Comparison, Evaluation, ImageScore, PictureScores, TruthComparison};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Picture};
 use crate::models;
-use crate::models::{Family, OpenOptions, Timing};
-use crate::passes::{Batch, Subject, View, show};
+use crate::models::{InputModel, OpenOptions, Timing};
+use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::pipeline::summary::CameraSummary;
 use crate::progress::Progress;
 use crate::render::Image;
@@ -72,7 +72,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
     }
-    let mut side = SideBySide::open(options)?;
+    let mut side = ModelPair::open(options)?;
     side.keep_to(options.original.memory, needs)?;
     let evaluation = side.evaluate()?;
     if let Some(csv) = &options.csv {
@@ -84,7 +84,7 @@ pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
 }
 
 /// What it takes to make pictures of two models, each of as many Gaussians at most, and to compare them.
-pub fn needs(work: &Workload, limits: &Limits) -> Vec<Need> {
+pub fn needs(work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
     // Both models' and the photograph, and what they are compared with.
     let mut need = pictures::need(work, limits, NAME, 2, 3 * 12 + metrics::BYTES_PER_PIXEL as u64);
     need.per_gaussian.push(("other model", work.input.per_gaussian));
@@ -104,10 +104,10 @@ impl EvaluateOptions {
 }
 
 /// Two open models, and the pictures to compare them on.
-pub struct SideBySide {
+pub struct ModelPair {
     /// The original and its cameras, those of every split.
     pub scene: Scene,
-    compressed: Box<dyn Family>,
+    compressed: Box<dyn InputModel>,
     /// How the compressed one was opened.
     compressed_as: InputOptions,
     background: [f32; 3],
@@ -117,13 +117,13 @@ pub struct SideBySide {
     truth: Option<Photographs>,
 }
 
-impl SideBySide {
+impl ModelPair {
     /// Opens both models and finds every picture; of `options` the files to write are not looked at.
     ///
     /// # Errors
     /// Whatever is wrong with inputs, cameras or the folder of photographs; models whose frames are not
     /// the same.
-    pub fn open(options: &EvaluateOptions) -> Result<SideBySide> {
+    pub fn open(options: &EvaluateOptions) -> Result<ModelPair> {
         let scene = open_scene(&InputOptions { split: None, ..options.original.clone() })?;
         let compressed = open_compressed(&options.compressed, &scene, &options.original)?;
         let background = background(options.background, &scene)?;
@@ -136,7 +136,7 @@ impl SideBySide {
             Some(folder) => Some(Photographs::of_some(folder, &scene.rig, times, chosen.clone())?.1),
             None => None,
         };
-        Ok(SideBySide {
+        Ok(ModelPair {
             truth,
             truth_folder: options.ground_truth.clone(),
             compressed_as: InputOptions {
@@ -156,7 +156,11 @@ impl SideBySide {
     ///
     /// # Errors
     /// A budget that cannot work.
-    pub fn keep_to(&mut self, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
+    pub fn keep_to(
+        &mut self,
+        budget: Budget,
+        needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
+    ) -> Result<()> {
         let of_scene = self.scene.workload();
         let gaussians = of_scene.gaussians.max(self.compressed_count() as u64);
         let pictures = of_scene.pictures.max(self.pictures.len() as u64);
@@ -176,29 +180,29 @@ impl SideBySide {
         Ok(evaluation)
     }
 
-    /// [`SideBySide::evaluate`] as the beginning of a longer run, which uses the same parts.
+    /// [`ModelPair::evaluate`] as the beginning of a longer run, which uses the same parts.
     ///
     /// # Errors
-    /// Those of [`SideBySide::evaluate`].
+    /// Those of [`ModelPair::evaluate`].
     pub fn compare(&self) -> Result<Evaluation> {
         let compute = |some| Ok(self.scores(some, |_, _, _| ())?.0);
         self.evaluation(self.divided(NAME, compute)?)
     }
 
-    /// [`SideBySide::compare`], undivided, of which `observe` sees every picture too, with the original's state, from any
+    /// [`ModelPair::compare`], undivided, of which `observe` sees every picture too, with the original's state, from any
     /// thread. Gives what it made of them in the order of [`Evaluation::pictures`].
     ///
     /// # Errors
     /// A source or a photograph that cannot be read.
     pub fn observe<O: Send>(
         &self,
-        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+        observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<(Evaluation, Vec<O>)> {
         let (scores, observed) = self.scores(0..self.pictures.len(), observe)?;
         Ok((self.evaluation(scores)?, observed))
     }
 
-    /// What `observe` makes of every picture, as [`SideBySide::observe`] has it, without scores: the stage `name`, in
+    /// What `observe` makes of every picture, as [`ModelPair::observe`] has it, without scores: the stage `name`, in
     /// parts if the scene's work folder has some.
     ///
     /// # Errors
@@ -206,13 +210,13 @@ impl SideBySide {
     pub fn observe_in_parts<O: Send + Serialize + DeserializeOwned>(
         &self,
         name: &'static str,
-        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
+        observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
     ) -> Result<Vec<O>> {
         self.divided(name, |some| {
             let progress = Progress::new(name, "pictures", some.len() as u64);
             let mut all = Vec::with_capacity(some.len());
             self.show(&self.pictures[some], |views| {
-                let see = |view: &View<'_, 2>| {
+                let see = |view: &ViewStates<'_, 2>| {
                     let seen = observe(view.states[0], view.camera, &self.take(view)?);
                     progress.advance(1);
                     Ok(seen)
@@ -242,7 +246,7 @@ impl SideBySide {
     }
 
     /// What the scores of all pictures say.
-    fn evaluation(&self, scores: Vec<Scores>) -> Result<Evaluation> {
+    fn evaluation(&self, scores: Vec<PairScores>) -> Result<Evaluation> {
         let times = &self.scene.source().info().times;
         let of_picture = |(&Picture { frame, view, .. }, (loss, truth))| PictureScores {
             frame,
@@ -261,7 +265,7 @@ impl SideBySide {
             })
         });
         let scene = &self.scene;
-        let count = |input: &dyn Family| input.source().info().count;
+        let count = |input: &dyn InputModel| input.source().info().count;
         let path = Both {
             original: scene.path.to_string_lossy().into_owned(),
             compressed: self.compressed_as.path.to_string_lossy().into_owned(),
@@ -288,13 +292,13 @@ impl SideBySide {
     }
 
     /// What scores follow from, beside the original and its cameras.
-    fn key(&self) -> Result<Key> {
+    fn key(&self) -> Result<CacheKey> {
         if !self.scene.work.keeps() {
-            return Ok(Key::NONE);
+            return Ok(CacheKey::NONE);
         }
         let compressed = self.scene.digest_of(&self.compressed_as, &*self.compressed)?;
         let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.pictures)).transpose()?;
-        Ok(Key::of(&(compressed, photographs, &self.pictures, self.background, self.flip)))
+        Ok(CacheKey::of(&(compressed, photographs, &self.pictures, self.background, self.flip)))
     }
 
     /// Makes the pictures numbered `places` among [`Evaluation::pictures`] again (to keep all of them would
@@ -305,7 +309,7 @@ impl SideBySide {
     pub fn again<O>(
         &self,
         places: &[usize],
-        mut see: impl FnMut(usize, &Gaussians, &Camera, Taken) -> O,
+        mut see: impl FnMut(usize, &Gaussians, &Camera, RenderedViews) -> O,
     ) -> Result<Vec<O>> {
         let mut places = places.to_vec();
         places.sort_unstable();
@@ -333,7 +337,7 @@ impl SideBySide {
     pub fn both<O: Send>(&self, pictures: &[Picture], see: impl Fn([&Image; 2]) -> Result<O> + Sync) -> Result<Vec<O>> {
         let mut found = Vec::with_capacity(pictures.len());
         self.show(pictures, |views| {
-            let of = |view: &View<'_, 2>| {
+            let of = |view: &ViewStates<'_, 2>| {
                 let images = [0, 1].map(|subject| view.render(subject, self.background));
                 see([&images[0], &images[1]])
             };
@@ -349,7 +353,7 @@ impl SideBySide {
     }
 
     /// Shows the original and the compressed model.
-    fn show(&self, pictures: &[Picture], visit: impl FnMut(&[View<'_, 2>]) -> Result<()>) -> Result<()> {
+    fn show(&self, pictures: &[Picture], visit: impl FnMut(&[ViewStates<'_, 2>]) -> Result<()>) -> Result<()> {
         let subjects = [self.scene.source(), self.compressed.source()].map(Subject::all);
         show(subjects, &self.scene.rig.cameras, pictures, Batch::of_frame(&self.scene.limits), visit)
     }
@@ -358,8 +362,8 @@ impl SideBySide {
     fn scores<O: Send>(
         &self,
         some: Range<usize>,
-        observe: impl Fn(&Gaussians, &Camera, &Taken) -> O + Sync,
-    ) -> Result<(Vec<Scores>, Vec<O>)> {
+        observe: impl Fn(&Gaussians, &Camera, &RenderedViews) -> O + Sync,
+    ) -> Result<(Vec<PairScores>, Vec<O>)> {
         let mut chosen = last_before(&self.pictures, some.start, &self.pictures[some.clone()]);
         let again = chosen.len();
         chosen.extend_from_slice(&self.pictures[some]);
@@ -367,7 +371,7 @@ impl SideBySide {
         for picture in &chosen {
             last_frame.insert(picture.view, picture.frame);
         }
-        let mut before: HashMap<u32, Taken> = HashMap::new();
+        let mut before: HashMap<u32, RenderedViews> = HashMap::new();
         let mut all = Vec::with_capacity(chosen.len() - again);
         let mut observed = Vec::with_capacity(chosen.len() - again);
         let mut shown = 0;
@@ -406,9 +410,9 @@ impl SideBySide {
         Ok((all, observed))
     }
 
-    fn take(&self, view: &View<'_, 2>) -> Result<Taken> {
-        let &View { picture, camera, .. } = view;
-        Ok(Taken {
+    fn take(&self, view: &ViewStates<'_, 2>) -> Result<RenderedViews> {
+        let &ViewStates { picture, camera, .. } = view;
+        Ok(RenderedViews {
             original: view.render(0, self.background),
             compressed: view.render(1, self.background),
             truth: match &self.truth {
@@ -433,7 +437,7 @@ const TIME_TOLERANCE: f64 = 1e-6;
 
 /// Opens the compressed model, of which holds what `options` say of the original but its iteration, at the original's
 /// frames.
-pub(crate) fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn Family>> {
+pub(crate) fn open_compressed(path: &Path, original: &Scene, options: &InputOptions) -> Result<Box<dyn InputModel>> {
     let times = &original.source().info().times;
     let input = models::open(path, &OpenOptions { iteration: None, ..options.opening() })?;
     let input = match input.timing() {
@@ -461,10 +465,10 @@ pub(crate) fn open_compressed(path: &Path, original: &Scene, options: &InputOpti
 }
 
 /// Of a picture: compressed against original, and each against the ground truth, where that is given.
-type Scores = (Score, Option<Both<Score>>);
+type PairScores = (ImageScore, Option<Both<ImageScore>>);
 
 /// The pictures of one (frame, view), all of one size.
-pub struct Taken {
+pub struct RenderedViews {
     /// Render of the original.
     pub original: Image,
     /// Render of the compressed model.
@@ -473,15 +477,15 @@ pub struct Taken {
     pub truth: Option<Image>,
 }
 
-impl Taken {
+impl RenderedViews {
     /// Scores, with those of motion from the pictures `before` of the same view.
-    fn scores(&self, before: Option<&Taken>, with_flip: bool) -> Scores {
-        let size = |taken: &Taken| (taken.original.width, taken.original.height);
+    fn scores(&self, before: Option<&RenderedViews>, with_flip: bool) -> PairScores {
+        let size = |taken: &RenderedViews| (taken.original.width, taken.original.height);
         // A view whose camera changed may have another size, and nothing to be compared with.
         let before = before.filter(|before| size(before) == size(self));
         let loss = score(&self.compressed, &self.original, before.map(|b| [&b.compressed, &b.original]), with_flip);
         let truth = self.truth.as_ref().map(|truth| {
-            let against = |image: fn(&Taken) -> &Image| {
+            let against = |image: fn(&RenderedViews) -> &Image| {
                 score(image(self), truth, before.and_then(|b| Some([image(b), b.truth.as_ref()?])), with_flip)
             };
             Both { original: against(|taken| &taken.original), compressed: against(|taken| &taken.compressed) }
@@ -491,7 +495,7 @@ impl Taken {
 }
 
 /// How close `a` is to `b`, given the same two at the view's frame before.
-fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> Score {
+fn score(a: &Image, b: &Image, before: Option<[&Image; 2]>, with_flip: bool) -> ImageScore {
     let temporal = before.map(|[a_before, b_before]| temporal_error([a_before, a], [b_before, b]));
-    Score { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
+    ImageScore { psnr: psnr(a, b), ssim: ssim(a, b), temporal, flip: with_flip.then(|| flip(a, b)) }
 }

@@ -11,7 +11,7 @@ use crate::files::csv::{known, table};
 
 /// Every knob that was turned on a model, and what all of it shares.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Precision {
+pub struct PrecisionDiagram {
     /// Program and version.
     pub tool: String,
     /// Input, as given.
@@ -34,12 +34,12 @@ pub struct Precision {
     pub kept: usize,
     /// Threads at work, but where threads are turned.
     pub threads: usize,
-    /// Every setting is run so often at most, and not again once its runs took [`Precision::enough`] seconds.
+    /// Every setting is run so often at most, and not again once its runs took [`PrecisionDiagram::enough`] seconds.
     pub runs: usize,
-    /// See [`Precision::runs`].
+    /// See [`PrecisionDiagram::runs`].
     pub enough: f64,
     /// What was turned.
-    pub knobs: Vec<Knob>,
+    pub knobs: Vec<PrecisionKnob>,
     /// Things a person should know.
     pub notes: Vec<String>,
 }
@@ -69,7 +69,7 @@ impl Source {
 
 /// Something that can be had cheaper or finer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Knob {
+pub struct PrecisionKnob {
     /// As `--knobs` names it.
     pub name: String,
     /// What is turned, and what its errors are.
@@ -77,20 +77,20 @@ pub struct Knob {
     /// What error turning it changes.
     pub source: Source,
     /// Ways to turn it.
-    pub curves: Vec<Curve>,
+    pub curves: Vec<PrecisionCurve>,
 }
 
 /// One way to turn a knob.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Curve {
+pub struct PrecisionCurve {
     /// What is turned; a recipe's parameter by its name.
     pub name: String,
     /// What errors are measured against.
     pub against: String,
     /// In the order in which they were tried: mostly from coarse to fine.
-    pub marks: Vec<Mark>,
+    pub marks: Vec<PrecisionSetting>,
     /// How errors go with the step.
-    pub orders: Vec<Order>,
+    pub orders: Vec<ObservedOrder>,
     /// The recipe's own value, if it is among the marks.
     pub own: Option<f64>,
     /// The coarsest value from which on errors added to pictures stay below a tenth of the model's own.
@@ -99,7 +99,7 @@ pub struct Curve {
 
 /// One setting.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Mark {
+pub struct PrecisionSetting {
     /// Value of what is turned.
     pub value: f64,
     /// What errors go with as a power, of which the exponent is the order: a step h, or of sums the number of frames.
@@ -114,7 +114,7 @@ pub struct Mark {
 
 /// An observed order: of convergence, or of sums of growth.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Order {
+pub struct ObservedOrder {
     /// Of which error.
     pub of: String,
     /// Slope of log error by log step, by least squares.
@@ -136,7 +136,7 @@ pub const PERCENTILES: &str = "percentiles";
 /// See [`meaning`].
 pub const BYTES: &str = "bytes";
 
-/// A tenth: what [`Curve::enough`] allows.
+/// A tenth: what [`PrecisionCurve::enough`] allows.
 const SMALL: f64 = 0.1;
 
 /// What an error is of, for an axis.
@@ -152,9 +152,15 @@ pub fn meaning(error: &str) -> String {
     }
 }
 
-impl Curve {
+impl PrecisionCurve {
     /// A curve of `marks`, with the orders of all errors, those in `expected` beside what theory says.
-    pub fn new(name: &str, against: &str, marks: Vec<Mark>, own: Option<f64>, expected: &[(&str, f64)]) -> Curve {
+    pub fn new(
+        name: &str,
+        against: &str,
+        marks: Vec<PrecisionSetting>,
+        own: Option<f64>,
+        expected: &[(&str, f64)],
+    ) -> PrecisionCurve {
         // JSON has no infinity.
         let mut marks = marks;
         marks.iter_mut().for_each(|mark| mark.errors.retain(|_, error| error.is_finite()));
@@ -166,14 +172,14 @@ impl Curve {
         let order = |of: String| {
             let points = marks.iter().filter_map(|mark| Some((mark.step, *mark.errors.get(&of)?)));
             let expected = expected.iter().find(|(name, _)| *name == of).map(|&(_, order)| order);
-            Some(Order { observed: slope(points)?, expected, of })
+            Some(ObservedOrder { observed: slope(points)?, expected, of })
         };
         let orders = names.into_iter().filter_map(order).collect();
-        let is_small = |mark: &Mark| mark.errors.get(ADDED).is_some_and(|&added| added < SMALL);
+        let is_small = |mark: &PrecisionSetting| mark.errors.get(ADDED).is_some_and(|&added| added < SMALL);
         // The finest is measured against itself.
         let small = marks.iter().rev().take_while(|mark| is_small(mark)).skip(1).last();
         let own = own.filter(|own| marks.iter().any(|mark| mark.value == *own));
-        Curve {
+        PrecisionCurve {
             name: name.to_owned(),
             against: against.to_owned(),
             enough: small.map(|mark| mark.value),
@@ -216,7 +222,7 @@ pub(crate) fn added(error: f64, finest: f64) -> f64 {
     ((error * error - finest * finest).max(0.0)).sqrt() / finest.max(f64::MIN_POSITIVE)
 }
 
-impl Precision {
+impl PrecisionDiagram {
     /// As JSON, for programs.
     pub fn json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("plain data");
@@ -264,7 +270,7 @@ impl Precision {
         table(&names, rows)
     }
 
-    fn curves(&self) -> impl Iterator<Item = (&Knob, &Curve)> {
+    fn curves(&self) -> impl Iterator<Item = (&PrecisionKnob, &PrecisionCurve)> {
         self.knobs.iter().flat_map(|knob| knob.curves.iter().map(move |curve| (knob, curve)))
     }
 
@@ -316,9 +322,9 @@ impl Precision {
 mod tests {
     use super::*;
 
-    fn mark(value: f64, step: f64, errors: &[(&str, f64)]) -> Mark {
+    fn mark(value: f64, step: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
         let seconds = Spread::of(vec![value]);
-        Mark {
+        PrecisionSetting {
             value,
             step,
             cost: Cost { runs: 1, seconds, processor_seconds: None, peak_memory_bytes: Some(7) },
@@ -330,7 +336,7 @@ mod tests {
     #[test]
     fn the_order_of_a_power_is_its_exponent_and_zeros_tell_nothing() {
         let marks = [8.0, 4.0, 2.0, 1.0].map(|h: f64| mark(1.0 / h, h, &[("C", 3.0 * h.powf(1.5)), ("W", 0.0)]));
-        let curve = Curve::new("strides", "all", marks.to_vec(), None, &[("C", 1.5)]);
+        let curve = PrecisionCurve::new("strides", "all", marks.to_vec(), None, &[("C", 1.5)]);
         assert_eq!(curve.orders.len(), 1);
         assert!((curve.orders[0].observed - 1.5).abs() < 1e-12, "{:?}", curve.orders);
         assert_eq!(curve.orders[0].expected, Some(1.5));
@@ -340,7 +346,7 @@ mod tests {
     fn enough_is_the_coarsest_value_from_which_on_all_are_small() {
         let of = |added: &[f64]| {
             let marks = added.iter().zip(1..).map(|(&added, k)| mark(f64::from(k), 1.0, &[(ADDED, added)])).collect();
-            Curve::new("pictures", "all", marks, Some(2.0), &[])
+            PrecisionCurve::new("pictures", "all", marks, Some(2.0), &[])
         };
         assert_eq!(of(&[0.5, 0.05, 0.2, 0.09, 0.0]).enough, Some(4.0));
         assert_eq!(of(&[0.5, 0.5]).enough, None);
@@ -359,14 +365,14 @@ mod tests {
 
     #[test]
     fn csv_has_a_line_for_every_error_and_reads_back_from_json() {
-        let curve = Curve::new("bits", "exact", vec![mark(2.0, 0.25, &[("C", 0.5), (KEPT, 0.0)])], None, &[]);
-        let knob = Knob {
+        let curve = PrecisionCurve::new("bits", "exact", vec![mark(2.0, 0.25, &[("C", 0.5), (KEPT, 0.0)])], None, &[]);
+        let knob = PrecisionKnob {
             name: "percentiles".to_owned(),
             about: String::new(),
             source: Source::Discretisation,
             curves: vec![curve],
         };
-        let found = Precision {
+        let found = PrecisionDiagram {
             tool: String::new(),
             path: "p".to_owned(),
             digest: String::new(),
@@ -387,6 +393,6 @@ mod tests {
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(lines[1], "percentiles,discretisation,bits,2,0.25,0.5,C,,1,2,2,2,,,,7");
         assert_eq!(lines.len(), 3);
-        assert_eq!(serde_json::from_str::<Precision>(&found.json()).unwrap(), found);
+        assert_eq!(serde_json::from_str::<PrecisionDiagram>(&found.json()).unwrap(), found);
     }
 }

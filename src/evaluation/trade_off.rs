@@ -30,17 +30,17 @@ pub struct TradeOff {
     #[serde(default = "once")]
     pub runs: usize,
     /// By method, as listed in `--methods`, then by the fraction asked for, falling.
-    pub points: Vec<Point>,
+    pub points: Vec<TradeOffPoint>,
     /// Parameters that were turned.
     #[serde(default)]
-    pub knobs: Vec<Knob>,
+    pub knobs: Vec<EffortCurve>,
     /// Things a person should know.
     pub notes: Vec<String>,
 }
 
 /// One method at one size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Point {
+pub struct TradeOffPoint {
     /// Name of the method, as `--methods` takes it.
     pub method: String,
     /// Kept fraction that was asked for; none: the method's own choice.
@@ -63,21 +63,21 @@ pub struct Point {
 
 /// One method at one size as one parameter is turned, all others as they are: what more time buys.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Knob {
+pub struct EffortCurve {
     /// Name of the parameter, as a recipe has it.
     pub parameter: String,
     /// By value, rising.
     pub settings: Vec<Setting>,
 }
 
-/// What a value of a [`Knob`]'s parameter comes to.
+/// What a value of a [`EffortCurve`]'s parameter comes to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Setting {
     /// The parameter's value.
     pub value: u32,
     /// Method, size and what was measured.
     #[serde(flatten)]
-    pub point: Point,
+    pub point: TradeOffPoint,
 }
 
 /// Runs of every point where a file does not say.
@@ -105,14 +105,14 @@ impl TradeOff {
     /// The same of every setting of every knob.
     pub fn knobs_csv(&self) -> String {
         let settings = self.knobs.iter().flat_map(|knob| knob.settings.iter().map(move |setting| (knob, setting)));
-        let row = |(knob, setting): (&Knob, &Setting)| {
+        let row = |(knob, setting): (&EffortCurve, &Setting)| {
             [vec![knob.parameter.clone(), setting.value.to_string()], self.row(&setting.point)].concat()
         };
         table(&[&["parameter", "value"], &COLUMNS[..]].concat(), settings.map(row))
     }
 
     /// Fields of [`COLUMNS`].
-    fn row(&self, point: &Point) -> Vec<String> {
+    fn row(&self, point: &TradeOffPoint) -> Vec<String> {
         vec![
             point.method.clone(),
             known(point.asked),
@@ -159,7 +159,7 @@ impl TradeOff {
     }
 
     /// A point in the table.
-    fn line(&self, point: &Point) -> String {
+    fn line(&self, point: &TradeOffPoint) -> String {
         let temporal = point.temporal.map_or("-".to_owned(), |error| format!("{error:.5}"));
         let memory = point.peak_memory_bytes.map_or("-".to_owned(), |bytes| format!("{} MiB", bytes >> 20));
         format!(
@@ -175,7 +175,7 @@ impl TradeOff {
     }
 
     /// Part of the Gaussians that a point keeps; 1 of none.
-    pub fn fraction(&self, point: &Point) -> f64 {
+    pub fn fraction(&self, point: &TradeOffPoint) -> f64 {
         if self.gaussians == 0 { 1.0 } else { point.count as f64 / self.gaussians as f64 }
     }
 }
@@ -186,7 +186,7 @@ mod tests {
 
     #[test]
     fn csv_is_these_bytes() {
-        let point = Point {
+        let point = TradeOffPoint {
             method: "paper".to_owned(),
             asked: Some(0.5),
             count: 6,
@@ -197,7 +197,7 @@ mod tests {
             seconds: 2.5,
             peak_memory_bytes: Some(4096),
         };
-        let own = Point {
+        let own = TradeOffPoint {
             method: "of \"others\", unknown".to_owned(),
             asked: None,
             temporal: None,
@@ -216,7 +216,7 @@ mod tests {
             cameras: String::new(),
             runs: 1,
             points: vec![point, own],
-            knobs: vec![Knob { parameter: "refine_steps".to_owned(), settings }],
+            knobs: vec![EffortCurve { parameter: "refine_steps".to_owned(), settings }],
             notes: Vec::new(),
         };
         assert_eq!(

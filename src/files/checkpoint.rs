@@ -50,7 +50,7 @@ pub(crate) struct Checkpoint {
 
 /// A type of the values of a tensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum ValueType {
     F16,
     BF16,
     F32,
@@ -59,21 +59,21 @@ pub(crate) enum Kind {
     Other(&'static str, usize),
 }
 
-impl Kind {
-    fn of(global: &str) -> Option<Kind> {
+impl ValueType {
+    fn of(global: &str) -> Option<ValueType> {
         Some(match global {
-            "torch.HalfStorage" => Kind::F16,
-            "torch.BFloat16Storage" => Kind::BF16,
-            "torch.FloatStorage" => Kind::F32,
-            "torch.DoubleStorage" => Kind::F64,
-            "torch.LongStorage" => Kind::Other("int64", 8),
-            "torch.IntStorage" => Kind::Other("int32", 4),
-            "torch.ShortStorage" => Kind::Other("int16", 2),
-            "torch.CharStorage" => Kind::Other("int8", 1),
-            "torch.ByteStorage" => Kind::Other("uint8", 1),
-            "torch.BoolStorage" => Kind::Other("bool", 1),
-            "torch.ComplexFloatStorage" => Kind::Other("complex64", 8),
-            "torch.ComplexDoubleStorage" => Kind::Other("complex128", 16),
+            "torch.HalfStorage" => ValueType::F16,
+            "torch.BFloat16Storage" => ValueType::BF16,
+            "torch.FloatStorage" => ValueType::F32,
+            "torch.DoubleStorage" => ValueType::F64,
+            "torch.LongStorage" => ValueType::Other("int64", 8),
+            "torch.IntStorage" => ValueType::Other("int32", 4),
+            "torch.ShortStorage" => ValueType::Other("int16", 2),
+            "torch.CharStorage" => ValueType::Other("int8", 1),
+            "torch.ByteStorage" => ValueType::Other("uint8", 1),
+            "torch.BoolStorage" => ValueType::Other("bool", 1),
+            "torch.ComplexFloatStorage" => ValueType::Other("complex64", 8),
+            "torch.ComplexDoubleStorage" => ValueType::Other("complex128", 16),
             _ => return None,
         })
     }
@@ -81,36 +81,36 @@ impl Kind {
     /// As PyTorch calls it.
     pub(crate) fn name(self) -> &'static str {
         match self {
-            Kind::F16 => "float16",
-            Kind::BF16 => "bfloat16",
-            Kind::F32 => "float32",
-            Kind::F64 => "float64",
-            Kind::Other(name, _) => name,
+            ValueType::F16 => "float16",
+            ValueType::BF16 => "bfloat16",
+            ValueType::F32 => "float32",
+            ValueType::F64 => "float64",
+            ValueType::Other(name, _) => name,
         }
     }
 
     /// Bytes of a value.
     pub(crate) fn bytes(self) -> usize {
         match self {
-            Kind::F16 | Kind::BF16 => 2,
-            Kind::F32 => 4,
-            Kind::F64 => 8,
-            Kind::Other(_, bytes) => bytes,
+            ValueType::F16 | ValueType::BF16 => 2,
+            ValueType::F32 => 4,
+            ValueType::F64 => 8,
+            ValueType::Other(_, bytes) => bytes,
         }
     }
 
     /// Whether it is a floating-point type.
     pub(crate) fn is_float(self) -> bool {
-        !matches!(self, Kind::Other(..))
+        !matches!(self, ValueType::Other(..))
     }
 
     /// The value in `stored`, of a floating-point type.
     fn decode(self, stored: &[u8]) -> f32 {
         match (self, stored) {
-            (Kind::F16, &[a, b]) => f16::from_le_bytes([a, b]).to_f32(),
-            (Kind::BF16, &[a, b]) => bf16::from_le_bytes([a, b]).to_f32(),
-            (Kind::F32, &[a, b, c, d]) => f32::from_le_bytes([a, b, c, d]),
-            (Kind::F64, _) => stored.try_into().map_or(f32::NAN, |stored| f64::from_le_bytes(stored) as f32),
+            (ValueType::F16, &[a, b]) => f16::from_le_bytes([a, b]).to_f32(),
+            (ValueType::BF16, &[a, b]) => bf16::from_le_bytes([a, b]).to_f32(),
+            (ValueType::F32, &[a, b, c, d]) => f32::from_le_bytes([a, b, c, d]),
+            (ValueType::F64, _) => stored.try_into().map_or(f32::NAN, |stored| f64::from_le_bytes(stored) as f32),
             _ => f32::NAN,
         }
     }
@@ -118,23 +118,23 @@ impl Kind {
     /// Stores `value`; a type that is no floating-point one takes zeros.
     pub(crate) fn encode(self, value: f32, stored: &mut [u8]) {
         match self {
-            Kind::F16 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
-            Kind::BF16 => stored.copy_from_slice(&bf16::from_f32(value).to_le_bytes()),
-            Kind::F32 => stored.copy_from_slice(&value.to_le_bytes()),
-            Kind::F64 => stored.copy_from_slice(&f64::from(value).to_le_bytes()),
-            Kind::Other(..) => stored.fill(0),
+            ValueType::F16 => stored.copy_from_slice(&f16::from_f32(value).to_le_bytes()),
+            ValueType::BF16 => stored.copy_from_slice(&bf16::from_f32(value).to_le_bytes()),
+            ValueType::F32 => stored.copy_from_slice(&value.to_le_bytes()),
+            ValueType::F64 => stored.copy_from_slice(&f64::from(value).to_le_bytes()),
+            ValueType::Other(..) => stored.fill(0),
         }
     }
 }
 
 /// A view of a storage: element `i` of its `shape` is value `offset + Σ i·stride`.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Tensor {
+pub(crate) struct TensorView {
     /// The node that makes it: of a parameter the tensor inside.
     pub(crate) id: NodeId,
     /// What names its storage.
     pub(crate) storage: String,
-    pub(crate) kind: Kind,
+    pub(crate) kind: ValueType,
     pub(crate) shape: Vec<usize>,
     pub(crate) stride: Vec<usize>,
     pub(crate) offset: usize,
@@ -151,7 +151,7 @@ pub(crate) struct Places {
     pub(crate) stride: Vec<Range<usize>>,
 }
 
-impl Tensor {
+impl TensorView {
     /// Its type and shape, for a person.
     pub(crate) fn describe(&self) -> String {
         let shape = &self.shape;
@@ -288,7 +288,7 @@ impl Checkpoint {
     }
 
     /// The tensor at a node: itself, or what a parameter is made of.
-    pub(crate) fn tensor(&self, id: NodeId) -> Option<Tensor> {
+    pub(crate) fn tensor(&self, id: NodeId) -> Option<TensorView> {
         match self.pickle.call(id)? {
             ("torch._utils._rebuild_parameter" | "torch._utils._rebuild_parameter_with_state", [tensor, ..]) => {
                 self.plain_tensor(*tensor)
@@ -297,7 +297,7 @@ impl Checkpoint {
         }
     }
 
-    fn plain_tensor(&self, id: NodeId) -> Option<Tensor> {
+    fn plain_tensor(&self, id: NodeId) -> Option<TensorView> {
         let (name, arguments) = self.pickle.call(id)?;
         let [storage, offset, size, stride, ..] = *arguments else { return None };
         let Node::Outside(named) = self.pickle.node(storage) else { return None };
@@ -309,10 +309,10 @@ impl Checkpoint {
         let (shape, shape_at) = self.numbers(size)?;
         let (stride, stride_at) = self.numbers(stride)?;
         (is_tensor && shape.len() == stride.len()).then_some(())?;
-        Some(Tensor {
+        Some(TensorView {
             id,
             storage: self.pickle.text(key)?.to_owned(),
-            kind: Kind::of(kind)?,
+            kind: ValueType::of(kind)?,
             shape,
             stride,
             offset,
@@ -321,7 +321,7 @@ impl Checkpoint {
     }
 
     /// Every tensor, each once.
-    pub(crate) fn tensors(&self) -> impl Iterator<Item = Tensor> {
+    pub(crate) fn tensors(&self) -> impl Iterator<Item = TensorView> {
         self.pickle.ids().filter_map(|id| self.plain_tensor(id))
     }
 
@@ -340,7 +340,7 @@ impl Checkpoint {
     ///
     /// # Errors
     /// Something else there; a storage that is not there or has fewer values.
-    pub(crate) fn float_tensor(&self, id: NodeId, place: &str) -> Result<Tensor> {
+    pub(crate) fn float_tensor(&self, id: NodeId, place: &str) -> Result<TensorView> {
         let wrong = |expected: &str, found: String| self.wrong(place, expected, found);
         let tensor = self.tensor(id).filter(|tensor| tensor.kind.is_float());
         let tensor = tensor.ok_or_else(|| wrong("a tensor of floating-point numbers", self.describe(id)))?;
@@ -349,7 +349,7 @@ impl Checkpoint {
     }
 
     /// Confirms that the storage has every element of `tensor`, and that these are not many more than it has values.
-    pub(crate) fn check(&self, tensor: &Tensor) -> std::result::Result<(), String> {
+    pub(crate) fn check(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let values = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes / tensor.kind.bytes());
         self.check_extent(tensor)?;
         match tensor.len().is_some_and(|len| len <= values.saturating_mul(MAX_EXPANSION)) {
@@ -359,7 +359,7 @@ impl Checkpoint {
     }
 
     /// Confirms that the storage has every element of `tensor`.
-    pub(crate) fn check_extent(&self, tensor: &Tensor) -> std::result::Result<(), String> {
+    pub(crate) fn check_extent(&self, tensor: &TensorView) -> std::result::Result<(), String> {
         let Some(&(_, bytes)) = self.storages.get(&tensor.storage) else {
             return Err(format!("no file data/{}", tensor.storage));
         };
@@ -376,7 +376,7 @@ impl Checkpoint {
     }
 
     /// Most values that the tensors of a storage may mean together.
-    pub(crate) fn most_values(&self, key: &str, kind: Kind) -> usize {
+    pub(crate) fn most_values(&self, key: &str, kind: ValueType) -> usize {
         self.storages.get(key).map_or(0, |&(_, bytes)| (bytes / kind.bytes()).saturating_mul(MAX_EXPANSION))
     }
 
@@ -399,7 +399,7 @@ impl Checkpoint {
     ///
     /// # Errors
     /// Values that are not as they were written, or no numbers.
-    pub(crate) fn floats(&self, tensor: &Tensor, place: &str) -> Result<Vec<f32>> {
+    pub(crate) fn floats(&self, tensor: &TensorView, place: &str) -> Result<Vec<f32>> {
         let values = self.values(tensor, place)?;
         match values.iter().position(|value| !value.is_finite()) {
             Some(at) => {
@@ -414,7 +414,7 @@ impl Checkpoint {
     ///
     /// # Errors
     /// Values that are not as they were written; more memory than allowed.
-    pub(crate) fn values(&self, tensor: &Tensor, place: &str) -> Result<Vec<f32>> {
+    pub(crate) fn values(&self, tensor: &TensorView, place: &str) -> Result<Vec<f32>> {
         let stored = self.storages.get(&tensor.storage).map_or(0, |&(_, bytes)| bytes as u64);
         let (bytes, len) = (tensor.kind.bytes(), tensor.len().unwrap_or(0));
         self.allow(place, "its values", stored.saturating_add(4 * len as u64))?;
@@ -428,7 +428,7 @@ impl Checkpoint {
     ///
     /// # Errors
     /// Those of `take`; a file that is not as it was written.
-    pub(crate) fn files(&self, mut take: impl FnMut(&str, File<'_>, Vec<u8>) -> Result<()>) -> Result<()> {
+    pub(crate) fn files(&self, mut take: impl FnMut(&str, CheckpointFile<'_>, Vec<u8>) -> Result<()>) -> Result<()> {
         let mut archive = self.archive.clone();
         for index in 0..archive.len() {
             let broken = |error: &dyn std::fmt::Display| {
@@ -437,9 +437,9 @@ impl Checkpoint {
             let name = archive.by_index(index).map_err(|error| broken(&error))?.name().to_owned();
             let bytes = bytes_of(&mut archive, &self.file, index).map_err(|error| broken(&error))?;
             let what = match inside(&name).strip_prefix("data/") {
-                _ if index == self.pickle_at => File::Pickle,
-                Some(key) => File::Storage(key),
-                None => File::Other,
+                _ if index == self.pickle_at => CheckpointFile::Pickle,
+                Some(key) => CheckpointFile::Storage(key),
+                None => CheckpointFile::Other,
             };
             take(&name, what, bytes)?;
         }
@@ -449,7 +449,7 @@ impl Checkpoint {
 
 /// A file of a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum File<'a> {
+pub(crate) enum CheckpointFile<'a> {
     /// The tree.
     Pickle,
     /// The storage of that key.

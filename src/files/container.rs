@@ -26,7 +26,7 @@ pub use self::store::Container;
 use self::tiles::TileReader;
 use crate::error::Result;
 use crate::model::{Columns, SequenceInfo};
-use crate::source::{Ahead, BlockReader, FrameSource, Ids, Reads};
+use crate::source::{BlockReader, FrameSource, Ids, Prefetch, Reads};
 
 /// Places of the file that are asked about to know whether the system holds it in memory.
 const SAMPLES: u64 = 64;
@@ -46,7 +46,7 @@ impl FrameSource for Container {
     }
 
     /// Not for a file that lies in memory: see the figures at the top of this module.
-    fn ahead(&self) -> Option<&dyn Ahead> {
+    fn ahead(&self) -> Option<&dyn Prefetch> {
         match self.reader.is_cached(SAMPLES) {
             Some(true) => None,
             _ => Some(self),
@@ -54,7 +54,7 @@ impl FrameSource for Container {
     }
 }
 
-impl Ahead for Container {
+impl Prefetch for Container {
     fn frame_block(&self) -> usize {
         self.reader.layout().frame_block as usize
     }

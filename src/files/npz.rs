@@ -37,12 +37,12 @@ const MOST_PER_BYTE: u64 = 1032;
 pub(crate) struct Npz {
     path: PathBuf,
     map: Arc<FileMap>,
-    entries: Vec<Entry>,
+    entries: Vec<NpzArray>,
 }
 
 /// An array of an archive.
 #[derive(Debug, Clone)]
-pub(crate) struct Entry {
+pub(crate) struct NpzArray {
     /// Without `.npy`.
     pub(crate) name: String,
     /// Length of every axis, the slowest first.
@@ -111,7 +111,7 @@ impl Float {
     }
 }
 
-impl Entry {
+impl NpzArray {
     /// Number of values.
     pub(crate) fn len(&self) -> usize {
         self.shape.iter().product()
@@ -134,7 +134,7 @@ impl Npz {
         if archive.len() > MAX_ARRAYS {
             return Err(wrong("list of arrays".into(), format!("{} arrays", archive.len())));
         }
-        let mut entries: Vec<Entry> = Vec::new();
+        let mut entries: Vec<NpzArray> = Vec::new();
         for index in 0..archive.len() {
             let mut file =
                 archive.by_index(index).map_err(|error| wrong(format!("array {index}"), error.to_string()))?;
@@ -142,7 +142,7 @@ impl Npz {
             if entries.iter().any(|entry| entry.name == name) {
                 return Err(wrong(name, "two arrays of this name".into()));
             }
-            let entry = Entry::read(&mut file, index, name.clone()).map_err(|found| wrong(name.clone(), found))?;
+            let entry = NpzArray::read(&mut file, index, name.clone()).map_err(|found| wrong(name.clone(), found))?;
             let bytes = entry.float.map(|float| entry.len() * float.bytes);
             if bytes.is_some_and(|bytes| (entry.header + bytes) as u64 != file.size())
                 || entry.stored > map.len() as u64
@@ -166,12 +166,12 @@ impl Npz {
     }
 
     /// Its arrays, in the file's order.
-    pub(crate) fn entries(&self) -> &[Entry] {
+    pub(crate) fn entries(&self) -> &[NpzArray] {
         &self.entries
     }
 
     /// The array called `name`.
-    pub(crate) fn entry(&self, name: &str) -> Option<&Entry> {
+    pub(crate) fn entry(&self, name: &str) -> Option<&NpzArray> {
         self.entries.iter().find(|entry| entry.name == name)
     }
 
@@ -198,7 +198,7 @@ impl Npz {
     }
 
     /// The array called `name` and the type of its values.
-    fn float(&self, name: &str) -> Result<(&Entry, Float)> {
+    fn float(&self, name: &str) -> Result<(&NpzArray, Float)> {
         let Some(entry) = self.entry(name) else {
             let names: Vec<&str> = self.entries.iter().map(|entry| entry.name.as_str()).collect();
             return Err(Error::input(&self.path, name, "an array of this name", names.join(", ")));
@@ -246,7 +246,7 @@ impl Npz {
     ///
     /// # Errors
     /// Those of `take`; a file cut short since it was opened.
-    pub(crate) fn read(&self, entry: &Entry, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
+    pub(crate) fn read(&self, entry: &NpzArray, take: impl FnOnce(&mut dyn Read) -> Result<()>) -> Result<()> {
         self.map.check()?;
         let mut archive = open_zip(&self.path)?.map_err(|found| self.damaged(entry, &found))?;
         let mut file = archive.by_index(entry.index).map_err(|error| self.damaged(entry, &error))?;
@@ -256,7 +256,7 @@ impl Npz {
     }
 
     /// That the values of `entry` are not as they were written.
-    pub(crate) fn damaged(&self, entry: &Entry, error: &dyn std::fmt::Display) -> Error {
+    pub(crate) fn damaged(&self, entry: &NpzArray, error: &dyn std::fmt::Display) -> Error {
         Error::input(&self.path, &entry.name, "the values as they were written", error.to_string())
     }
 }
@@ -277,13 +277,13 @@ fn open_zip(path: &Path) -> Result<std::result::Result<ZipArchive<BufReader<File
     Ok(ZipArchive::new(BufReader::new(file)).map_err(|error| error.to_string()))
 }
 
-impl Entry {
+impl NpzArray {
     /// Whether values of type `float` can be read where they lie.
     fn is_in_place(&self, float: Float) -> bool {
         !self.is_compressed && float == Float::F32
     }
 
-    fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<Entry, String> {
+    fn read(file: &mut ZipFile<'_>, index: usize, name: String) -> std::result::Result<NpzArray, String> {
         let is_compressed = file.compression() != zip::CompressionMethod::Stored;
         let start = file.data_start();
         let mut text = Vec::new();
@@ -294,7 +294,7 @@ impl Entry {
         let mut rest = &text[..];
         let header = NpyHeader::from_reader(&mut rest).map_err(|error| error.to_string())?;
         let before = text.len() - rest.len();
-        Ok(Entry {
+        Ok(NpzArray {
             name,
             shape: header.shape().iter().map(|&length| length as usize).collect(),
             float: Float::of(&header),

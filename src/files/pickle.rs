@@ -16,7 +16,7 @@ mod read;
 #[cfg(test)]
 mod tests;
 
-use read::Reader;
+use read::PickleMachine;
 
 /// Maximum nesting depth of containers. Checkpoints of trained models reach about 10.
 pub(crate) const MAX_DEPTH: u8 = 100;
@@ -92,7 +92,7 @@ impl Pickle {
         if u32::try_from(bytes.len()).is_err() {
             return Err(Wrong::TooMuch(0, "a pickle below 4 GiB".into(), format!("{} bytes", bytes.len())));
         }
-        Reader::new(bytes, memory.min(MAX_MEMORY)).read()
+        PickleMachine::new(bytes, memory.min(MAX_MEMORY)).read()
     }
 
     /// The whole.

@@ -2,7 +2,7 @@
 //!
 //! u32 [`MAGIC`], u32 length of a JSON text, that text, the texture it describes; all little-endian. The text is a list whose
 //! entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The texture holds
-//! [`ROW_BYTES`] per Gaussian ([`Row`]), then zeros. Source: antmatter15/splaTV.
+//! [`ROW_BYTES`] per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
 pub mod write;
 
 use std::ops::Range;
@@ -30,7 +30,7 @@ pub const WORDS: usize = 16;
 /// A Gaussian whose position is a cubic of the time since its centre, whose quaternion is linear in it, and whose opacity is
 /// multiplied by exp(−((t − centre)/width)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Row {
+pub struct SplatvGaussian {
     /// Where it is at its centre, scene units.
     pub position: [f32; 3],
     /// Coefficients of dt, dt², dt³, each of x, y, z.
@@ -51,13 +51,13 @@ pub struct Row {
     pub width: f32,
 }
 
-impl Row {
+impl SplatvGaussian {
     /// The Gaussian that `words` hold.
-    pub fn of_words(words: &[u32; WORDS]) -> Row {
+    pub fn of_words(words: &[u32; WORDS]) -> SplatvGaussian {
         let half = |at: usize, high: usize| f16::from_bits((words[at] >> (16 * high)) as u16).to_f32();
         let halves = |first: usize, k: usize| half(first + k / 2, k % 2);
         let byte = |k: usize| f64::from((words[7] >> (8 * k)) & 0xff) / 255.0;
-        Row {
+        SplatvGaussian {
             position: std::array::from_fn(|c| f32::from_bits(words[c])),
             rotation: std::array::from_fn(|k| halves(3, k)),
             scale: std::array::from_fn(|k| halves(5, k)),

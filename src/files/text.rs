@@ -48,7 +48,7 @@ const MAX_LINE: u64 = 1 << 16;
 
 /// The lines of a text file of any length, one at a time.
 #[derive(Debug)]
-pub(crate) struct Lines {
+pub(crate) struct TextLines {
     path: PathBuf,
     file: BufReader<File>,
     line: Vec<u8>,
@@ -57,14 +57,14 @@ pub(crate) struct Lines {
     at: u64,
 }
 
-impl Lines {
+impl TextLines {
     /// Opens the file at `path`.
     ///
     /// # Errors
     /// A file that cannot be opened.
-    pub(crate) fn open(path: &Path) -> Result<Lines> {
+    pub(crate) fn open(path: &Path) -> Result<TextLines> {
         let file = BufReader::new(open_file(path)?);
-        Ok(Lines { path: path.to_owned(), file, line: Vec::new(), number: 0, at: 0 })
+        Ok(TextLines { path: path.to_owned(), file, line: Vec::new(), number: 0, at: 0 })
     }
 
     /// Returns the next line without its end, and its number, from 1 on; `None` at the end of the file.
@@ -118,7 +118,7 @@ mod tests {
     fn lines_are_those_of_the_whole_text() {
         for text in ["", "\n", "a", "a\n", "\na\r\n\r\nb\rc\n\n d ", "\u{feff}ä\nö"] {
             let file = file(text.as_bytes());
-            let mut lines = Lines::open(file.path()).unwrap();
+            let mut lines = TextLines::open(file.path()).unwrap();
             let mut found = Vec::new();
             while let Some((number, line)) = lines.next_line().unwrap() {
                 found.push(line.to_owned());
@@ -132,12 +132,12 @@ mod tests {
     fn only_lines_that_are_read_have_a_longest_length() {
         let long = [b"a\n".to_vec(), vec![b'x'; 1 << 20], b"\nb\n\xff\n".to_vec()].concat();
         let file = file(&long);
-        let mut lines = Lines::open(file.path()).unwrap();
+        let mut lines = TextLines::open(file.path()).unwrap();
         assert_eq!(lines.next_line().unwrap(), Some((1, "a")));
         lines.skip_line().unwrap();
         assert_eq!(lines.next_line().unwrap(), Some((3, "b")));
         assert!(lines.next_line().unwrap_err().to_string().contains("byte 1048581"));
-        let mut lines = Lines::open(file.path()).unwrap();
+        let mut lines = TextLines::open(file.path()).unwrap();
         lines.next_line().unwrap();
         assert!(lines.next_line().unwrap_err().to_string().contains("line 2: expected a line of at most 65536 bytes"));
     }

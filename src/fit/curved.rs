@@ -7,11 +7,11 @@
 //! shared out: by multiplicative updates that keep them positive (Richardson 1972, Lucy 1974).
 
 use super::least_squares::polynomial;
-use super::{Misfit, SEEN, Tolerance, Track};
+use super::{FittedTrack, Misfit, SEEN, Tolerance};
 
 /// A Gaussian on its way.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Curve {
+pub struct CubicTrack {
     /// Centre of its window, and the instant that the polynomials count from.
     pub centre: f64,
     /// Width of its window; infinite where it has no end.
@@ -28,7 +28,7 @@ pub struct Curve {
     pub sh: Vec<f32>,
 }
 
-impl Curve {
+impl CubicTrack {
     /// Where it is at `time`.
     pub fn place(&self, time: f64) -> [f64; 3] {
         let dt = time - self.centre;
@@ -55,11 +55,11 @@ const LIGHT: f64 = 1e-3;
 
 /// The curves of `track`, as few as hold what `tolerance` says at every frame that is seen; the closest if none do. How
 /// far they are off goes into `misfit`.
-pub fn curved(track: &Track, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<Curve> {
+pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<CubicTrack> {
     let Some(first) = (0..track.len()).find(|&frame| track.is_seen(frame)) else { return Vec::new() };
     let last = (first..track.len()).rev().find(|&frame| track.is_seen(frame)).unwrap_or(first);
-    let mut best: Option<(f64, Vec<Curve>, Misfit)> = None;
-    let mut attempt = |curves: Vec<Curve>| {
+    let mut best: Option<(f64, Vec<CubicTrack>, Misfit)> = None;
+    let mut attempt = |curves: Vec<CubicTrack>| {
         let (excess, found) = misfit_of(track, &curves, tolerance);
         if best.as_ref().is_none_or(|(least, _, _)| excess < *least) {
             best = Some((excess, curves, found));
@@ -86,16 +86,16 @@ fn depth(opacity: f64) -> f64 {
 }
 
 /// One curve without an end.
-fn endless(track: &Track) -> Curve {
+fn endless(track: &FittedTrack) -> CubicTrack {
     let centre = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
     let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
     let curve = moving(track, centre, f64::INFINITY, |_| 1.0);
-    Curve { opacity: sum / f64::max(count, 1.0), ..curve }
+    CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
 /// One curve whose window has the middle and the spread of the opacities.
-fn once(track: &Track) -> Curve {
+fn once(track: &FittedTrack) -> CubicTrack {
     let moment = |of: &dyn Fn(f64) -> f64| -> f64 {
         (0..track.len()).map(|frame| track.opacity[frame] * of(track.times[frame])).sum()
     };
@@ -112,11 +112,11 @@ fn once(track: &Track) -> Curve {
         normal += windows(frame).powi(2);
     }
     let curve = moving(track, centre, width, |frame| window(track.times[frame], centre, width));
-    Curve { opacity: (right / normal.max(1e-300)).min(OPAQUE), ..curve }
+    CubicTrack { opacity: (right / normal.max(1e-300)).min(OPAQUE), ..curve }
 }
 
 /// `count` + 1 curves over the life between two instants.
-fn handing_over(track: &Track, [start, end]: [f64; 2], count: usize) -> Vec<Curve> {
+fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = 0.75 * apart;
     let centres: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
@@ -153,13 +153,13 @@ fn handing_over(track: &Track, [start, end]: [f64; 2], count: usize) -> Vec<Curv
     }
     let curve = |(k, depth): (usize, f64)| {
         let curve = moving(track, centres[k], width, |frame| window(track.times[frame], centres[k], width));
-        Curve { opacity: 1.0 - (-depth).exp(), ..curve }
+        CubicTrack { opacity: 1.0 - (-depth).exp(), ..curve }
     };
     depths.into_iter().enumerate().map(curve).collect()
 }
 
 /// A curve that moves and turns as `track` does where `weight` is, by least squares; its opacity is still to be said.
-fn moving(track: &Track, centre: f64, width: f64, weight: impl Fn(usize) -> f64) -> Curve {
+fn moving(track: &FittedTrack, centre: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
     let heavy: Vec<(usize, f64)> =
         (0..track.len()).map(|frame| (frame, weight(frame))).filter(|(_, weight)| *weight > LIGHT * SEEN).collect();
@@ -175,7 +175,7 @@ fn moving(track: &Track, centre: f64, width: f64, weight: impl Fn(usize) -> f64)
     };
     let width_of_sh = track.sh(0).len();
     let unscaled = |k: usize| reach.powi(k as i32);
-    Curve {
+    CubicTrack {
         centre,
         width,
         position: std::array::from_fn(|k| position[k].map(|value| value / unscaled(k))),
@@ -188,7 +188,7 @@ fn moving(track: &Track, centre: f64, width: f64, weight: impl Fn(usize) -> f64)
 
 /// How far `curves` are off, in tolerances at worst and altogether. Where several are seen, each has to be where the
 /// Gaussian is, as much as it is seen.
-fn misfit_of(track: &Track, curves: &[Curve], tolerance: &Tolerance) -> (f64, Misfit) {
+fn misfit_of(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) -> (f64, Misfit) {
     let (mut worst, mut misfit) = (0.0f64, Misfit::default());
     for frame in 0..track.len() {
         let time = track.times[frame];
@@ -229,9 +229,9 @@ fn misfit_of(track: &Track, curves: &[Curve], tolerance: &Tolerance) -> (f64, Mi
 mod tests {
     use super::*;
 
-    fn track(frames: usize, position: impl Fn(f64) -> [f64; 3], opacity: impl Fn(f64) -> f64) -> Track {
+    fn track(frames: usize, position: impl Fn(f64) -> [f64; 3], opacity: impl Fn(f64) -> f64) -> FittedTrack {
         let times: Vec<f64> = (0..frames).map(|i| i as f64 / frames as f64).collect();
-        Track {
+        FittedTrack {
             position: times.iter().map(|&t| position(t)).collect(),
             rotation: times.iter().map(|t| [(0.3 * t).cos(), (0.3 * t).sin(), 0.0, 0.0]).collect(),
             log_scale: vec![[-3.0, -2.0, -3.0]; frames],

@@ -8,10 +8,10 @@ mod least_squares;
 mod straight;
 mod track;
 
-pub use curved::{Curve, curved};
+pub use curved::{CubicTrack, curved};
 pub(crate) use least_squares::polynomial;
-pub use straight::{Piece, straight};
-pub use track::{SEEN, Track};
+pub use straight::{LinearPiece, straight};
+pub use track::{FittedTrack, SEEN};
 
 /// How far a fit may be from the states, at every frame that is seen.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -3,11 +3,11 @@
 use std::ops::Range;
 
 use super::least_squares::polynomial;
-use super::{Misfit, Tolerance, Track};
+use super::{FittedTrack, Misfit, Tolerance};
 
 /// What a Gaussian is for some frames.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Piece {
+pub struct LinearPiece {
     /// Its frames.
     pub frames: Range<usize>,
     /// The instant at which it is at `position`.
@@ -29,7 +29,7 @@ pub struct Piece {
 /// The pieces of `track`, in order: halves of the sequence, of its halves and so on (of 2ᵏ frames from a multiple of 2ᵏ on),
 /// each the largest that holds what `tolerance` says at every frame; nothing where it is not seen. Of all Gaussians together
 /// there are so no more different spans than twice the frames. How far the pieces are off goes into `misfit`.
-pub fn straight(track: &Track, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<Piece> {
+pub fn straight(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -> Vec<LinearPiece> {
     let mut pieces = Vec::new();
     cut(track, 0..track.len().next_power_of_two(), tolerance, &mut pieces);
     for piece in &pieces {
@@ -41,7 +41,7 @@ pub fn straight(track: &Track, tolerance: &Tolerance, misfit: &mut Misfit) -> Ve
 }
 
 /// Adds the pieces of a span of 2ᵏ frames, of which the last ones may not exist.
-fn cut(track: &Track, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<Piece>) {
+fn cut(track: &FittedTrack, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Vec<LinearPiece>) {
     let frames = span.start..span.end.min(track.len());
     let seen = frames.clone().filter(|&frame| track.is_seen(frame)).count();
     if seen == 0 {
@@ -59,12 +59,12 @@ fn cut(track: &Track, span: Range<usize>, tolerance: &Tolerance, pieces: &mut Ve
 }
 
 /// Where `piece` is at `time`.
-fn place(piece: &Piece, time: f64) -> [f64; 3] {
+fn place(piece: &LinearPiece, time: f64) -> [f64; 3] {
     std::array::from_fn(|c| piece.position[c] + piece.velocity[c] * (time - piece.at))
 }
 
 /// The best piece of these frames: positions by least squares, all else their mean.
-fn piece(track: &Track, frames: Range<usize>) -> Piece {
+fn piece(track: &FittedTrack, frames: Range<usize>) -> LinearPiece {
     let count = frames.len() as f64;
     let (first, last) = (track.times[frames.start], track.times[frames.end - 1]);
     let (at, half) = (first.midpoint(last), ((last - first) / 2.0).max(f64::MIN_POSITIVE));
@@ -75,7 +75,7 @@ fn piece(track: &Track, frames: Range<usize>) -> Piece {
     let rotation: [f64; 4] = std::array::from_fn(|c| mean(&|frame| track.rotation[frame][c]));
     let length = rotation.iter().map(|x| x * x).sum::<f64>().sqrt();
     let width = track.sh(frames.start).len();
-    Piece {
+    LinearPiece {
         at,
         position,
         velocity: if frames.len() > 1 { velocity.map(|v| v / half) } else { velocity },
@@ -88,7 +88,7 @@ fn piece(track: &Track, frames: Range<usize>) -> Piece {
 }
 
 /// Whether `piece` is as close as `tolerance` asks at every one of its frames.
-fn holds(track: &Track, piece: &Piece, tolerance: &Tolerance) -> bool {
+fn holds(track: &FittedTrack, piece: &LinearPiece, tolerance: &Tolerance) -> bool {
     let near = |a: f64, b: f64, within: f64| (a - b).abs() <= within;
     piece.frames.clone().all(|frame| {
         track.distance(frame, place(piece, track.times[frame])) <= tolerance.position
@@ -104,9 +104,13 @@ mod tests {
     use super::*;
 
     /// A Gaussian of size e⁻³ at `position`, seen with `opacity`.
-    pub(super) fn track(frames: usize, position: impl Fn(f64) -> [f64; 3], opacity: impl Fn(f64) -> f64) -> Track {
+    pub(super) fn track(
+        frames: usize,
+        position: impl Fn(f64) -> [f64; 3],
+        opacity: impl Fn(f64) -> f64,
+    ) -> FittedTrack {
         let times: Vec<f64> = (0..frames).map(|i| i as f64 / frames as f64).collect();
-        Track {
+        FittedTrack {
             position: times.iter().map(|&t| position(t)).collect(),
             rotation: vec![[1.0, 0.0, 0.0, 0.0]; frames],
             log_scale: vec![[-3.0; 3]; frames],

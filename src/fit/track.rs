@@ -7,7 +7,7 @@ pub const SEEN: f64 = 1.0 / 255.0;
 
 /// What one Gaussian does.
 #[derive(Debug, Clone, Default)]
-pub struct Track {
+pub struct FittedTrack {
     /// Of every frame, increasing.
     pub times: Vec<f64>,
     /// Scene units.
@@ -22,10 +22,10 @@ pub struct Track {
     pub sh: Vec<Vec<f32>>,
 }
 
-impl Track {
+impl FittedTrack {
     /// Of Gaussian `row` of the states at `times`, in order.
-    pub fn of(times: &[f64], states: &[Gaussians], row: usize) -> Track {
-        let mut track = Track { times: times.to_vec(), ..Track::default() };
+    pub fn of(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
+        let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];
         for state in states {
             track.position.push(state.position.row::<3>(row).map(f64::from));

@@ -9,11 +9,11 @@ use cpu_time::ProcessTime;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::{Key, Spill, Work};
+use crate::cache::{Cache, CacheKey, Spill};
 use crate::error::Result;
 use crate::journal::as_toml::AsToml;
 use crate::journal::records::Forecast;
-use crate::journal::records::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, Stage};
+use crate::journal::records::{BandsSummary, FieldSummary, LeftOut, RefinedSummary, Saved, StageRecord};
 use crate::machine::peak_memory_bytes;
 use crate::scene::Scene;
 use crate::source::{FrameSource, Reads};
@@ -55,7 +55,7 @@ pub struct Journal {
     #[serde(skip)]
     pub whole: Reads,
     /// Everything done, in order.
-    pub stages: Vec<Stage>,
+    pub stages: Vec<StageRecord>,
     /// What the scene did not need.
     pub left_out: Vec<LeftOut>,
     /// Things a person should know.
@@ -98,7 +98,7 @@ impl Journal {
         name: &'static str,
         gaussians_in: usize,
         scene: &Scene,
-        key: Key,
+        key: CacheKey,
         compute: impl FnOnce(&mut Journal) -> Result<(T, usize)>,
     ) -> Result<T> {
         self.kept(&scene.work, name, key, |journal| {
@@ -113,9 +113,9 @@ impl Journal {
     /// Those of `compute` and of the folder.
     pub fn kept<T: Serialize + DeserializeOwned>(
         &mut self,
-        work: &Work,
+        work: &Cache,
         stage: &str,
-        key: Key,
+        key: CacheKey,
         compute: impl FnOnce(&mut Journal) -> Result<T>,
     ) -> Result<T> {
         if !work.keeps() {
@@ -163,7 +163,7 @@ impl Journal {
     ) {
         let Reads { bytes, states, .. } = self.whole;
         let (read, whole) = if bytes > 0 { (reads.bytes, bytes) } else { (reads.states, states) };
-        self.stages.push(Stage {
+        self.stages.push(StageRecord {
             name: name.to_owned(),
             gaussians_in,
             gaussians_out,

@@ -9,7 +9,7 @@ use crate::source::Reads;
 
 /// One stage of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Stage {
+pub struct StageRecord {
     /// Its name.
     pub name: String,
     /// Gaussians that entered it.

@@ -27,7 +27,7 @@ pub struct Gates {
 
 impl Gates {
     /// The thresholds of `pass` and of `merge`.
-    pub fn new(merge: &recipe::Merge, pass: &recipe::MergePass) -> Self {
+    pub fn new(merge: &recipe::MergeParams, pass: &recipe::MergePass) -> Self {
         Gates {
             d0: pass.d0,
             rho: pass.rho,

@@ -2,16 +2,16 @@
 
 /// Groups of some rows, in the order of their leaders' rows. Memory: 12 bytes per row at most.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Groups {
+pub struct MergeGroups {
     leaders: Vec<u32>,
     start: Vec<u32>,
     members: Vec<u32>,
 }
 
-impl Groups {
+impl MergeGroups {
     /// Each of `rows` (increasing) for itself.
     pub fn alone(rows: &[u32]) -> Self {
-        Groups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
+        MergeGroups { leaders: rows.to_vec(), start: (0..=rows.len() as u32).collect(), members: rows.to_vec() }
     }
 
     /// These groups after group g joined group `leader_of[g]`, which stayed its own; the joined
@@ -43,7 +43,7 @@ impl Groups {
         for group in start.windows(2) {
             members[group[0] as usize..group[1] as usize].sort_unstable();
         }
-        Groups { leaders, start, members }
+        MergeGroups { leaders, start, members }
     }
 
     /// Number of groups.
@@ -79,12 +79,12 @@ mod tests {
     #[test]
     fn joining_twice_flattens_to_original_rows() {
         // Rows 2 and 4 join 5; then group of 5 joins that of 1.
-        let once = Groups::alone(&[1, 2, 3, 4, 5]).joined(&[0, 4, 2, 4, 4]);
+        let once = MergeGroups::alone(&[1, 2, 3, 4, 5]).joined(&[0, 4, 2, 4, 4]);
         assert_eq!(once.leaders(), [1, 3, 5]);
         assert_eq!((once.members(0), once.members(1), once.members(2)), (&[1][..], &[3][..], &[2, 4, 5][..]));
         let twice = once.joined(&[0, 1, 0]);
         assert_eq!((twice.leaders(), twice.len()), (&[1, 3][..], 2));
         assert_eq!((twice.members(0), twice.members(1)), (&[1, 2, 4, 5][..], &[3][..]));
-        assert!(Groups::alone(&[]).joined(&[]).is_empty());
+        assert!(MergeGroups::alone(&[]).joined(&[]).is_empty());
     }
 }

@@ -12,9 +12,9 @@ use rayon::prelude::*;
 use crate::error::Result;
 use crate::merging::proxy::{ProxyState, merge_state};
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::passes::Frames;
-use crate::recipe::{Merge, Placement};
-use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
+use crate::passes::FrameReaders;
+use crate::recipe::{MergeParams, Placement};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Columns that follow from one another: moments mix position, rotation and scale, and opacity follows from areas.
 const MIXED: Columns = Columns::all().difference(Columns::SH);
@@ -30,7 +30,7 @@ pub struct MergedSequence<'a> {
     kept: &'a [u32],
     /// Members (id, weight) of each Gaussian that is a proxy; empty for the others.
     members: Vec<&'a [(u32, f64)]>,
-    merge: Merge,
+    merge: MergeParams,
 }
 
 impl<'a> MergedSequence<'a> {
@@ -40,7 +40,7 @@ impl<'a> MergedSequence<'a> {
         source: &'a dyn FrameSource,
         kept: &'a [u32],
         clusters: impl Iterator<Item = (u32, &'a [(u32, f64)])>,
-        merge: &Merge,
+        merge: &MergeParams,
     ) -> Self {
         let mut members: Vec<&[(u32, f64)]> = vec![&[]; kept.len()];
         for (place, of_cluster) in clusters {
@@ -51,7 +51,13 @@ impl<'a> MergedSequence<'a> {
             varying |= MIXED;
         }
         let info = SequenceInfo { count: kept.len(), varying, ..source.info().clone() };
-        MergedSequence { source, info, kept, members, merge: Merge { placement: Placement::Mean, ..merge.clone() } }
+        MergedSequence {
+            source,
+            info,
+            kept,
+            members,
+            merge: MergeParams { placement: Placement::Mean, ..merge.clone() },
+        }
     }
 }
 
@@ -60,9 +66,9 @@ impl MergedSequence<'_> {
     /// threads.
     ///
     /// Memory per Gaussian needed, members included: its reader, its state at one frame, and 24 bytes.
-    pub fn together(&self, places: Range<usize>, wanted: &Wanted) -> Result<Box<dyn BlockReader + '_>> {
-        let merging = Merging::new(self, places);
-        let frames = Frames::open(self.source, Ids::List(&merging.ids), Columns::all(), wanted)?;
+    pub fn together(&self, places: Range<usize>, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + '_>> {
+        let merging = MergedMembers::new(self, places);
+        let frames = FrameReaders::open(self.source, Ids::List(&merging.ids), Columns::all(), wanted)?;
         Ok(Box::new(MergedReader::new(self, Box::new(frames), merging)))
     }
 
@@ -78,12 +84,12 @@ impl FrameSource for MergedSequence<'_> {
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        let merging = Merging::new(self, ids.iter());
+        let merging = MergedMembers::new(self, ids.iter());
         let reader = self.source.open(Ids::List(&merging.ids))?;
         Ok(Box::new(MergedReader::new(self, reader, merging)))
     }
 
-    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(self.together(0..self.kept.len(), wanted))
     }
 
@@ -93,7 +99,7 @@ impl FrameSource for MergedSequence<'_> {
 }
 
 /// What some Gaussians are made of.
-struct Merging {
+struct MergedMembers {
     /// Everybody needed, by id in the source.
     ids: Vec<u32>,
     /// For every Gaussian the row of its own id in `ids`.
@@ -109,8 +115,8 @@ struct Proxy {
     members: Range<usize>,
 }
 
-impl Merging {
-    fn new(sequence: &MergedSequence<'_>, places: impl IntoIterator<Item = usize>) -> Merging {
+impl MergedMembers {
+    fn new(sequence: &MergedSequence<'_>, places: impl IntoIterator<Item = usize>) -> MergedMembers {
         let places: Vec<usize> = places.into_iter().collect();
         let mut ids: Vec<u32> = places.iter().map(|&place| sequence.kept[place]).collect();
         ids.extend(places.iter().flat_map(|&place| sequence.members[place].iter().map(|&(id, _)| id)));
@@ -124,7 +130,7 @@ impl Merging {
             members.extend(sequence.members[place].iter().map(|&(id, weight)| (row_of(id), weight)));
             proxies.push(Proxy { row, members: first..members.len() });
         }
-        Merging { ids, rows, proxies, members }
+        MergedMembers { ids, rows, proxies, members }
     }
 
     /// Columns of the members that `want` takes.
@@ -133,7 +139,7 @@ impl Merging {
     }
 
     /// Writes the columns `want` of the Gaussians, made of `state`, to `out`.
-    fn write(&self, state: &Gaussians, want: Columns, merge: &Merge, out: &mut Gaussians) {
+    fn write(&self, state: &Gaussians, want: Columns, merge: &MergeParams, out: &mut Gaussians) {
         for column in want.iter() {
             let (from, to) = (state.column(column), out.column_mut(column));
             to.resize(self.rows.len());
@@ -163,11 +169,11 @@ struct MergedReader<'a> {
     state: Gaussians,
     /// What `state` holds of columns that are the same at every frame.
     known: Columns,
-    merging: Merging,
+    merging: MergedMembers,
 }
 
 impl<'a> MergedReader<'a> {
-    fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, merging: Merging) -> Self {
+    fn new(sequence: &'a MergedSequence<'a>, reader: Box<dyn BlockReader + 'a>, merging: MergedMembers) -> Self {
         let state = Gaussians::zeros(merging.ids.len(), sequence.info.sh_degree);
         MergedReader { sequence, reader, state, known: Columns::empty(), merging }
     }
@@ -182,7 +188,7 @@ impl BlockReader for MergedReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.reader.expect(wanted);
     }
 }

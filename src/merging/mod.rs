@@ -35,11 +35,11 @@ use crate::model::hash_id;
 use crate::model::{Columns, Gaussians};
 use crate::recipe;
 use gates::{Appearance, Gates};
-pub use groups::Groups;
+pub use groups::MergeGroups;
 use known::KNOWN_BYTES;
-use neighbors::{PointIndex, Search};
+use neighbors::{NeighborSearch, PointIndex};
 use proxy::Importance;
-use tree::Point;
+use tree::TreePoint;
 
 /// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
 /// rank 4, and the largest of the neighbour index, 46, who coincides with whom, 24, and the clustering, 24.
@@ -73,7 +73,7 @@ pub struct Survivors<'a> {
 
 /// Pairs of a pass whose motion is asked for.
 #[derive(Debug, Clone, Copy)]
-pub struct Asked<'a> {
+pub struct RequestedPairs<'a> {
     pairs: &'a [(u32, u32)],
     row: &'a [u32],
     /// ε of the pass, scene units: the nodes of a pair lie within it.
@@ -82,7 +82,7 @@ pub struct Asked<'a> {
     pub is_part: bool,
 }
 
-impl<'a> Asked<'a> {
+impl<'a> RequestedPairs<'a> {
     /// The pairs, as rows of the states.
     pub fn pairs(self) -> impl ExactSizeIterator<Item = (u32, u32)> + 'a {
         self.pairs.iter().map(move |&(i, j)| (self.row[i as usize], self.row[j as usize]))
@@ -93,7 +93,7 @@ impl<'a> Asked<'a> {
 #[derive(Debug, Clone)]
 pub struct Merged {
     /// Who stands for whom.
-    pub groups: Groups,
+    pub groups: MergeGroups,
     /// State at the reference frame of every group of more than one member, in their order.
     pub proxies: Gaussians,
     /// What each pass did; passes after the limit was met are not made.
@@ -129,14 +129,14 @@ pub struct PassCounts {
 /// not so many; the joins kept are the first ones in sequential order. Fails only if `measure` does.
 pub fn run<E>(
     survivors: &Survivors<'_>,
-    recipe: &recipe::Merge,
+    recipe: &recipe::MergeParams,
     limit: Option<usize>,
     most_pairs: usize,
-    mut measure: impl FnMut(Asked<'_>) -> Result<Vec<f64>, E>,
+    mut measure: impl FnMut(RequestedPairs<'_>) -> Result<Vec<f64>, E>,
 ) -> Result<Merged, E> {
     let importance = &survivors.importance;
     let unit = recipe.length_unit.in_scene_units(survivors.extent);
-    let mut groups = Groups::alone(survivors.rows);
+    let mut groups = MergeGroups::alone(survivors.rows);
     let mut proxies = survivors.states.pick(&[]);
     let (mut passes, mut left) = (Vec::new(), limit);
     for pass in &recipe.passes {
@@ -146,10 +146,10 @@ pub fn run<E>(
         let mut counts = PassCounts::default();
         for coincident in [true, false] {
             let rank = ranks(&groups, importance);
-            let nodes = Nodes::new(survivors, &groups, &proxies);
+            let nodes = MergeNodes::new(survivors, &groups, &proxies);
             let mut pairs = Vec::new();
             let take = |some: &[(u32, u32)], is_part| {
-                let asked = Asked { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
+                let asked = RequestedPairs { pairs: some, row: groups.leaders(), reach: pass.epsilon * unit, is_part };
                 let likeness = measure(asked)?;
                 debug_assert_eq!(likeness.len(), some.len(), "one likeness per pair");
                 let alike = some.iter().zip(likeness).filter(|&(_, likeness)| likeness > pass.tau_m);
@@ -183,7 +183,7 @@ pub fn run<E>(
 }
 
 /// The rank of every group: by ΣC, ties by the hash of the leader's id.
-fn ranks(groups: &Groups, importance: &Importance<'_>) -> Vec<u32> {
+fn ranks(groups: &MergeGroups, importance: &Importance<'_>) -> Vec<u32> {
     let size = |group: usize| groups.members(group).iter().map(|&row| importance.coverage(row)).sum();
     let sizes: Vec<f64> = (0..groups.len()).map(size).collect();
     let hash = |&row: &u32| hash_id(importance.ids[row as usize].into());
@@ -192,21 +192,21 @@ fn ranks(groups: &Groups, importance: &Importance<'_>) -> Vec<u32> {
 }
 
 /// The groups of a pass: Gaussians that are alone, and proxies.
-struct Nodes<'a> {
+struct MergeNodes<'a> {
     survivors: &'a Survivors<'a>,
-    groups: &'a Groups,
+    groups: &'a MergeGroups,
     proxies: &'a Gaussians,
     /// Row of the survivors' states, or of the proxies.
     place: Vec<u32>,
 }
 
-impl<'a> Nodes<'a> {
-    fn new(survivors: &'a Survivors<'a>, groups: &'a Groups, proxies: &'a Gaussians) -> Self {
+impl<'a> MergeNodes<'a> {
+    fn new(survivors: &'a Survivors<'a>, groups: &'a MergeGroups, proxies: &'a Gaussians) -> Self {
         let mut place = groups.leaders().to_vec();
         for (proxy, group) in groups.clusters().enumerate() {
             place[group as usize] = proxy as u32;
         }
-        Nodes { survivors, groups, proxies, place }
+        MergeNodes { survivors, groups, proxies, place }
     }
 
     fn len(&self) -> usize {
@@ -255,7 +255,7 @@ impl<'a> Nodes<'a> {
 /// The nearest neighbours of a crowd are some of itself, the same ones for all: without this it would stay many, and
 /// hide who is near.
 fn each_coincident<E>(
-    nodes: &Nodes<'_>,
+    nodes: &MergeNodes<'_>,
     rank: &[u32],
     gates: &Gates,
     most: usize,
@@ -288,20 +288,20 @@ fn each_coincident<E>(
 /// A node that is not mergeable or not finite leads nobody, joins nobody and takes no place among the nearest
 /// neighbours of others.
 fn each_candidate<E>(
-    nodes: &Nodes<'_>,
+    nodes: &MergeNodes<'_>,
     rank: &[u32],
-    recipe: &recipe::Merge,
+    recipe: &recipe::MergeParams,
     (pass, unit): (&recipe::MergePass, f64),
     most: usize,
     mut take: impl FnMut(&[(u32, u32)], bool) -> Result<(), E>,
 ) -> Result<usize, E> {
     let usable = (0..nodes.len()).into_par_iter().filter(|&node| nodes.is_usable(node));
-    let points = usable.map(|node| Point { at: nodes.position(node), index: node as u32 }).collect();
+    let points = usable.map(|node| TreePoint { at: nodes.position(node), index: node as u32 }).collect();
     let index = PointIndex::new(points, pass.epsilon * unit);
     let gates = Gates::new(recipe, pass);
-    let of_chunk = |search: &mut Search<'_>, leaders: &[Point]| {
+    let of_chunk = |search: &mut NeighborSearch<'_>, leaders: &[TreePoint]| {
         let (mut pairs, mut truncated) = (Vec::new(), 0);
-        for &Point { at, index: i } in leaders {
+        for &TreePoint { at, index: i } in leaders {
             let (look, class) = (nodes.look(i as usize), nodes.class(i as usize));
             let passes = |j: u32| nodes.class(j as usize) == class && gates.pass(&look, &nodes.look(j as usize));
             let (near, cut) = search.nearest(i, at, recipe.max_neighbors);

@@ -16,7 +16,7 @@ const MAX_SWEEPS: usize = 40;
 
 /// A weighted Gaussian of a mixture.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Part {
+pub struct WeightedGaussian {
     /// Share in the mixture, ≥ 0; the shares sum to 1.
     pub weight: f64,
     /// μ, any unit of length.
@@ -46,7 +46,7 @@ pub struct Ellipsoid {
 /// Guarantee: every scale has a relative error of about 1e-14 if the parts' columns do, at any
 /// anisotropy. Edges: no parts give zero scales at `about` or the origin; scales need only be finite,
 /// their squares may overflow.
-pub fn moments(parts: &[Part], about: Option<DVec3>) -> Ellipsoid {
+pub fn moments(parts: &[WeightedGaussian], about: Option<DVec3>) -> Ellipsoid {
     let mean = about.unwrap_or_else(|| parts.iter().map(|part| part.weight * part.position).sum());
     let mut rows: [Vec<f64>; 3] = std::array::from_fn(|_| Vec::with_capacity(4 * parts.len()));
     for part in parts {
@@ -157,12 +157,12 @@ mod tests {
             .prop_map(|[x, y, z, w]| DQuat::from_xyzw(x, y, z, w).normalize())
     }
 
-    fn mixture() -> impl Strategy<Value = Vec<Part>> {
+    fn mixture() -> impl Strategy<Value = Vec<WeightedGaussian>> {
         let part =
             (0.01..1.0f64, prop::array::uniform3(-1.0..1.0f64), unit_quaternion(), prop::array::uniform3(-4.0..0.0f64));
         prop::collection::vec(part, 1..12).prop_map(|parts| {
             let total: f64 = parts.iter().map(|part| part.0).sum();
-            let part = |(weight, position, rotation, logs): (f64, [f64; 3], DQuat, [f64; 3])| Part {
+            let part = |(weight, position, rotation, logs): (f64, [f64; 3], DQuat, [f64; 3])| WeightedGaussian {
                 weight: weight / total,
                 position: position.into(),
                 rotation,
@@ -182,7 +182,7 @@ mod tests {
     }
 
     /// Mean and covariance by the textbook, forming Σ.
-    fn oracle(parts: &[Part], about: Option<DVec3>) -> (DVec3, DMat3) {
+    fn oracle(parts: &[WeightedGaussian], about: Option<DVec3>) -> (DVec3, DMat3) {
         let mean = about.unwrap_or_else(|| parts.iter().fold(DVec3::ZERO, |sum, p| sum + p.position * p.weight));
         let sigma = parts
             .iter()
@@ -202,8 +202,8 @@ mod tests {
         );
     }
 
-    fn part(weight: f64, position: DVec3, rotation: DQuat, scales: DVec3) -> Part {
-        Part { weight, position, rotation, scales }
+    fn part(weight: f64, position: DVec3, rotation: DQuat, scales: DVec3) -> WeightedGaussian {
+        WeightedGaussian { weight, position, rotation, scales }
     }
 
     fn tilt() -> DQuat {
@@ -227,9 +227,9 @@ mod tests {
         fn a_moved_mixture_merges_to_the_moved_gaussian(parts in mixture(), turn in unit_quaternion(), shift in prop::array::uniform3(-9.0..9.0f64)) {
             let still = moments(&parts, None);
             let shift = DVec3::from(shift);
-            let moved: Vec<Part> = parts
+            let moved: Vec<WeightedGaussian> = parts
                 .iter()
-                .map(|p| Part { position: turn * p.position + shift, rotation: (turn * p.rotation).normalize(), ..*p })
+                .map(|p| WeightedGaussian { position: turn * p.position + shift, rotation: (turn * p.rotation).normalize(), ..*p })
                 .collect();
             let got = moments(&moved, None);
             prop_assert!((got.mean - (turn * still.mean + shift)).length() < 1e-13);
@@ -266,7 +266,7 @@ mod tests {
             .map(|(a, b)| part(1.0 / 3.0, a * u + b * v, tilt(), DVec3::new(0.1, 0.2, 1e-9)));
         let got = moments(&parts, None);
         assert!((got.scales.z / 1e-9 - 1.0).abs() < 1e-6, "thickness {:e}, expected 1e-9", got.scales.z);
-        let flat = parts.map(|p| Part { scales: p.scales.with_z(0.0), ..p });
+        let flat = parts.map(|p| WeightedGaussian { scales: p.scales.with_z(0.0), ..p });
         assert!(moments(&flat, None).scales.z < 1e-16);
     }
 

@@ -9,19 +9,19 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::gates::COSINE_EPSILON;
-use crate::recipe::{self, Motion, Trajectory};
+use crate::recipe::{self, MotionParams, Trajectory};
 
 /// Memory of one pair while frames stream by.
-pub const PAIR_BYTES: usize = size_of::<Pair>();
+pub const PAIR_BYTES: usize = size_of::<NodePair>();
 /// Memory of one node while frames stream by.
-pub const NODE_BYTES: usize = size_of::<Track>();
+pub const NODE_BYTES: usize = size_of::<NodeTrack>();
 
 /// How two Gaussians move beside each other. Velocities are steps x(t) − x(t−1) between consecutive
 /// frames, whatever their distance in time: the noise floor they are held against is one of steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairMeasure {
     /// Mean cosine of velocities, a·b/(‖a‖‖b‖ + 1e-8); a step with a velocity of zero counts as 0. The mean is over all
-    /// frames of the common life (`Motion::Literal`) or over the steps inside it (`Motion::Runs`).
+    /// frames of the common life (`MotionParams::Literal`) or over the steps inside it (`MotionParams::Runs`).
     pub cosine: f64,
     /// Σ a·b over the steps, squared scene units.
     pub dot: f64,
@@ -66,7 +66,7 @@ pub struct MotionGate {
 
 impl MotionGate {
     /// The thresholds of `merge`; `unit` is the length of one unit of the recipe.
-    pub fn new(merge: &recipe::Merge, unit: f64) -> Self {
+    pub fn new(merge: &recipe::MergeParams, unit: f64) -> Self {
         // An unlimited drift stays unlimited in a scene of no extent.
         let max_drift = if merge.max_drift.is_infinite() { f64::INFINITY } else { merge.max_drift * unit };
         MotionGate {
@@ -91,7 +91,7 @@ impl MotionGate {
 
 /// A node between two frames.
 #[derive(Debug, Clone, Copy)]
-struct Track {
+struct NodeTrack {
     reference: [f32; 3],
     now: [f32; 3],
     before: [f32; 3],
@@ -100,7 +100,7 @@ struct Track {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Pair {
+struct NodePair {
     nodes: (u32, u32),
     cosines: f64,
     dot: f64,
@@ -114,10 +114,10 @@ struct Pair {
 /// Measures pairs of nodes over frames that arrive in order.
 #[derive(Debug)]
 pub struct PairMotion {
-    motion: Motion,
+    motion: MotionParams,
     frames: usize,
-    tracks: Vec<Track>,
-    pairs: Vec<Pair>,
+    tracks: Vec<NodeTrack>,
+    pairs: Vec<NodePair>,
 }
 
 impl PairMotion {
@@ -127,11 +127,11 @@ impl PairMotion {
     pub fn new(
         pairs: impl ExactSizeIterator<Item = (u32, u32)>,
         reference: impl ExactSizeIterator<Item = [f32; 3]>,
-        motion: Motion,
+        motion: MotionParams,
     ) -> Self {
         let track =
-            |reference| Track { reference, now: reference, before: reference, alive: false, alive_before: false };
-        let fresh = Pair {
+            |reference| NodeTrack { reference, now: reference, before: reference, alive: false, alive_before: false };
+        let fresh = NodePair {
             nodes: (0, 0),
             cosines: 0.0,
             dot: 0.0,
@@ -145,7 +145,7 @@ impl PairMotion {
             motion,
             frames: 0,
             tracks: reference.map(track).collect(),
-            pairs: pairs.map(|nodes| Pair { nodes, ..fresh }).collect(),
+            pairs: pairs.map(|nodes| NodePair { nodes, ..fresh }).collect(),
         }
     }
 
@@ -165,7 +165,7 @@ impl PairMotion {
             }
             pair.common += 1;
             pair.drift(a, b);
-            if steps_end_here && (motion == Motion::Literal || (a.alive_before && b.alive_before)) {
+            if steps_end_here && (motion == MotionParams::Literal || (a.alive_before && b.alive_before)) {
                 pair.step(a.velocity(), b.velocity());
             }
         });
@@ -175,10 +175,10 @@ impl PairMotion {
     /// What the frames so far say of each pair, in the order given.
     pub fn finish(self) -> impl ExactSizeIterator<Item = PairMeasure> {
         let motion = self.motion;
-        let measure = move |pair: Pair| {
+        let measure = move |pair: NodePair| {
             let terms = match motion {
-                Motion::Literal => pair.common,
-                Motion::Runs => pair.steps,
+                MotionParams::Literal => pair.common,
+                MotionParams::Runs => pair.steps,
             };
             PairMeasure {
                 cosine: if terms == 0 { 0.0 } else { pair.cosines / f64::from(terms) },
@@ -194,13 +194,13 @@ impl PairMotion {
     }
 }
 
-impl Track {
+impl NodeTrack {
     fn velocity(&self) -> DVec3 {
         wide(self.now) - wide(self.before)
     }
 }
 
-impl Pair {
+impl NodePair {
     fn step(&mut self, a: DVec3, b: DVec3) {
         let dot = a.dot(b);
         self.cosines += dot / (a.length() * b.length() + COSINE_EPSILON);
@@ -209,7 +209,7 @@ impl Pair {
         self.steps += 1;
     }
 
-    fn drift(&mut self, a: &Track, b: &Track) {
+    fn drift(&mut self, a: &NodeTrack, b: &NodeTrack) {
         let change = (wide(a.now) - wide(b.now)) - (wide(a.reference) - wide(b.reference));
         let squared = change.length_squared();
         // A NaN must not be forgotten: it counts as an endless drift.
@@ -231,7 +231,7 @@ mod tests {
     type Path = Vec<(f32, bool)>;
 
     /// Measures the pair (0, 1) of nodes that move along x; reference frame 0.
-    fn measure(a: &Path, b: &Path, motion: Motion) -> PairMeasure {
+    fn measure(a: &Path, b: &Path, motion: MotionParams) -> PairMeasure {
         let state = |t: usize, node: usize| {
             let (x, alive) = [a, b][node][t];
             ([x, 0.0, 0.0], alive)
@@ -251,12 +251,12 @@ mod tests {
     /// Verdict of the default recipe in a scene of extent `extent`.
     fn merges(a: &Path, b: &Path, extent: f64) -> bool {
         let merge = Recipe::preset("default").unwrap().merge;
-        MotionGate::new(&merge, extent).likeness(&measure(a, b, Motion::Runs)) > merge.passes[0].tau_m
+        MotionGate::new(&merge, extent).likeness(&measure(a, b, MotionParams::Runs)) > merge.passes[0].tau_m
     }
 
     fn merges_in_paper(a: &Path, b: &Path) -> bool {
         let merge = Recipe::preset("paper").unwrap().merge;
-        MotionGate::new(&merge, 1.0).likeness(&measure(a, b, Motion::Literal)) > merge.passes[0].tau_m
+        MotionGate::new(&merge, 1.0).likeness(&measure(a, b, MotionParams::Literal)) > merge.passes[0].tau_m
     }
 
     #[test]
@@ -274,9 +274,9 @@ mod tests {
         let slow = path(|t| 0.01 * t as f32);
         assert!(!merges(&slow, &path(|t| -0.01 * t as f32), 1.0));
         assert!(!merges(&slow, &path(|t| 0.1 * t as f32), 1.0));
-        let opposite = measure(&slow, &path(|t| -0.01 * t as f32), Motion::Runs);
+        let opposite = measure(&slow, &path(|t| -0.01 * t as f32), MotionParams::Runs);
         assert!((opposite.alignment(0.0) + 1.0).abs() < 1e-12);
-        let tenfold = measure(&slow, &path(|t| 0.1 * t as f32), Motion::Runs);
+        let tenfold = measure(&slow, &path(|t| 0.1 * t as f32), MotionParams::Runs);
         assert!((tenfold.alignment(0.0) - 20.0 / 101.0).abs() < 1e-6);
         assert!(merges_in_paper(&slow, &path(|t| 0.1 * t as f32)), "the cosine is blind to speed");
         assert!(!merges_in_paper(&slow, &path(|t| -0.01 * t as f32)));
@@ -287,7 +287,7 @@ mod tests {
     fn steps_that_are_next_to_nothing_hardly_count_in_the_cosine_of_the_paper() {
         let slow = path(|t| 1e-5 * t as f32);
         assert!(merges_in_paper(&path(|t| 1e-3 * t as f32), &path(|t| 1e-3 * t as f32)));
-        let cosine = measure(&slow, &slow, Motion::Runs).cosine;
+        let cosine = measure(&slow, &slow, MotionParams::Runs).cosine;
         // 1e-10 / (1e-10 + 1e-8), of coordinates in f32.
         assert!((cosine - 1.0 / 101.0).abs() < 1e-6, "{cosine}");
         assert!(!merges_in_paper(&slow, &slow));
@@ -302,8 +302,8 @@ mod tests {
         let mut hidden = path(|t| if t == 10 { 50.0 } else { 0.0 });
         hidden[10].1 = false;
         assert!(merges(&still, &hidden, 1.0));
-        assert_eq!(measure(&still, &hidden, Motion::Runs).squares, 0.0);
-        assert!(measure(&still, &hidden, Motion::Literal).squares > 0.0, "the literal rule counts the step back");
+        assert_eq!(measure(&still, &hidden, MotionParams::Runs).squares, 0.0);
+        assert!(measure(&still, &hidden, MotionParams::Literal).squares > 0.0, "the literal rule counts the step back");
     }
 
     #[test]
@@ -315,8 +315,9 @@ mod tests {
         merge.max_dead_time = f64::INFINITY;
         merge.max_drift = f64::INFINITY;
         // No threshold lets them through, not even one that all alignments exceed.
-        let exceeds =
-            |a: &Path, b: &Path, tau: f64| MotionGate::new(&merge, 1.0).likeness(&measure(a, b, Motion::Runs)) > tau;
+        let exceeds = |a: &Path, b: &Path, tau: f64| {
+            MotionGate::new(&merge, 1.0).likeness(&measure(a, b, MotionParams::Runs)) > tau
+        };
         assert!(!exceeds(&first, &last, f64::NEG_INFINITY));
         let never: Path = vec![(0.0, false); 20];
         assert!(!exceeds(&never, &never, f64::NEG_INFINITY));
@@ -327,7 +328,7 @@ mod tests {
     fn dead_time_is_the_share_of_the_union_in_which_one_lives_alone() {
         let long: Path = (0..20).map(|t| (0.0, t < 16)).collect();
         let short: Path = (0..20).map(|t| (0.0, (4..16).contains(&t))).collect();
-        let pair = measure(&long, &short, Motion::Runs);
+        let pair = measure(&long, &short, MotionParams::Runs);
         assert_eq!((pair.common, pair.union, pair.steps, pair.dead_time()), (12, 16, 11, 0.25));
         assert!(!merges(&long, &short, 1.0), "a quarter dead is more than a tenth");
     }
@@ -350,14 +351,14 @@ mod tests {
             let b: Path = frames.iter().map(|f| (f.2, f.3)).collect();
             let both = |t: usize| a[t].1 && b[t].1;
             let common: Vec<usize> = (0..a.len()).filter(|&t| both(t)).collect();
-            for motion in [Motion::Literal, Motion::Runs] {
+            for motion in [MotionParams::Literal, MotionParams::Runs] {
                 let got = measure(&a, &b, motion);
                 let ends: Vec<usize> =
-                    common.iter().copied().filter(|&t| t > 0 && (motion == Motion::Literal || both(t - 1))).collect();
+                    common.iter().copied().filter(|&t| t > 0 && (motion == MotionParams::Literal || both(t - 1))).collect();
                 let v = |p: &Path, t: usize| f64::from(p[t].0) - f64::from(p[t - 1].0);
                 let products = ends.iter().map(|&t| v(&a, t) * v(&b, t));
                 let signs: f64 = products.map(|product| product / (product.abs() + 1e-8)).sum();
-                let terms = if motion == Motion::Literal { common.len() } else { ends.len() };
+                let terms = if motion == MotionParams::Literal { common.len() } else { ends.len() };
                 let cosine = if terms == 0 { 0.0 } else { signs / terms as f64 };
                 let dot: f64 = ends.iter().map(|&t| v(&a, t) * v(&b, t)).sum();
                 let squares: f64 = ends.iter().map(|&t| v(&a, t).powi(2) + v(&b, t).powi(2)).sum();

@@ -17,10 +17,10 @@ use crate::merging::motion::{MotionGate, NODE_BYTES, PAIR_BYTES, PairMotion};
 use crate::merging::voxels::voxel_order;
 use crate::model::{Column, opacity};
 use crate::outputs::container::FRAME_BLOCK;
-use crate::passes::Frames;
+use crate::passes::FrameReaders;
 use crate::progress::Progress;
 use crate::recipe;
-use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// Memory of one pair while it is measured: its sums, its two Gaussians while they are counted, its result.
 pub const BYTES_PER_PAIR: usize = PAIR_BYTES + 8 + size_of::<f64>();
@@ -36,7 +36,7 @@ pub struct PairMeter<'a> {
     /// Where they move.
     pub source: &'a dyn FrameSource,
     /// What is life, and what is a step.
-    pub scan: &'a recipe::Scan,
+    pub scan: &'a recipe::ScanParams,
     /// What makes a pair alike.
     pub gate: MotionGate,
     /// Frames that readers hold, and that are gathered together.
@@ -133,8 +133,8 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = Progress::new("merge", "states", (ids.len() * frames) as u64);
-        let wanted = Wanted::of(0..frames).holding(self.frames_held);
-        let mut readers = Frames::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
+        let wanted = ReadPlan::of(0..frames).holding(self.frames_held);
+        let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state();
         for frame in 0..frames {
             readers.read(frame, if frame == 0 { NEEDED } else { varying }, &mut state)?;

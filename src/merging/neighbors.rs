@@ -19,7 +19,7 @@ use std::ops::Range;
 use hashbrown::HashTable;
 use rayon::prelude::*;
 
-use super::tree::{Nearest, Point, Tree};
+use super::tree::{Nearest, Tree, TreePoint};
 use super::voxels::{Voxels, along, voxel_of};
 use crate::model::hash_id;
 
@@ -35,7 +35,7 @@ pub struct PointIndex {
     epsilon: f64,
     voxels: Voxels,
     /// By voxel.
-    points: Vec<Point>,
+    points: Vec<TreePoint>,
     /// Of the voxels that have one.
     trees: Vec<Tree>,
     table: HashTable<Occupied>,
@@ -60,7 +60,7 @@ impl PointIndex {
     /// Indexes those of `points` that are finite, at most 2³² − 2, each of an index of its own.
     ///
     /// Edges: ε = 0 finds exact duplicates, an infinite ε reaches all points.
-    pub fn new(mut points: Vec<Point>, epsilon: f64) -> Self {
+    pub fn new(mut points: Vec<TreePoint>, epsilon: f64) -> Self {
         points.retain(|point| point.at.iter().all(|x| x.is_finite()));
         // Wider than ε, lest rounding put what is exactly ε away two voxels away.
         let voxels = Voxels::around(points.iter().map(|point| point.at), epsilon * (1.0 + 2.0 * MARGIN));
@@ -68,8 +68,8 @@ impl PointIndex {
         let order = voxels.order(&rows, |row| points[row as usize].at);
         drop(rows);
         points = order.into_iter().map(|row| points[row as usize]).collect();
-        let number = |point: &Point| voxels.number(point.at);
-        let same = |a: &Point, b: &Point| number(a) == number(b);
+        let number = |point: &TreePoint| voxels.number(point.at);
+        let same = |a: &TreePoint, b: &TreePoint| number(a) == number(b);
         let trees: Vec<Tree> = points.par_chunk_by_mut(same).filter(|all| all.len() > SPARSE).map(Tree::new).collect();
         let mut table = HashTable::with_capacity(points.chunk_by(same).count());
         let (mut start, mut tree) = (0, 0);
@@ -84,13 +84,13 @@ impl PointIndex {
     }
 
     /// All points, those of a voxel together: the fastest order to ask for their neighbours in.
-    pub fn points(&self) -> &[Point] {
+    pub fn points(&self) -> &[TreePoint] {
         &self.points
     }
 
     /// What asks for neighbours: one for each thread, to be used again.
-    pub fn search(&self) -> Search<'_> {
-        Search { index: self, entered: None, around: Vec::new(), nearest: Nearest::default() }
+    pub fn search(&self) -> NeighborSearch<'_> {
+        NeighborSearch { index: self, entered: None, around: Vec::new(), nearest: Nearest::default() }
     }
 
     fn find(&self, number: u64) -> Option<Occupied> {
@@ -108,7 +108,7 @@ fn hash(number: u64) -> u64 {
 
 /// Asks an index for neighbours, and remembers what surrounds the voxel asked about last.
 #[derive(Debug)]
-pub struct Search<'a> {
+pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
     entered: Option<[u32; 3]>,
     /// The occupied voxels around that one and itself, the step to each along the axes, as in [`STEPS`].
@@ -116,7 +116,7 @@ pub struct Search<'a> {
     nearest: Nearest,
 }
 
-impl Search<'_> {
+impl NeighborSearch<'_> {
     /// The at most `k` nearest indexed points other than `query` whose distance to `at` is at most
     /// ε, nearest first, equal distances by index; and whether there were more than `k`.
     ///
@@ -195,8 +195,8 @@ mod tests {
 
     use super::*;
 
-    fn named(points: &[[f32; 3]]) -> Vec<Point> {
-        points.iter().zip(0..).map(|(&at, index)| Point { at, index }).collect()
+    fn named(points: &[[f32; 3]]) -> Vec<TreePoint> {
+        points.iter().zip(0..).map(|(&at, index)| TreePoint { at, index }).collect()
     }
 
     fn indexed(points: &[[f32; 3]], k: usize, epsilon: f64) -> Vec<(Vec<u32>, bool)> {
@@ -328,7 +328,9 @@ mod tests {
     fn timed(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
         let start = Instant::now();
         let index = PointIndex::new(named(points), epsilon);
-        let ask = |search: &mut Search<'_>, point: &Point| usize::from(search.nearest(point.index, point.at, k).1);
+        let ask = |search: &mut NeighborSearch<'_>, point: &TreePoint| {
+            usize::from(search.nearest(point.index, point.at, k).1)
+        };
         let cut = index.points().par_iter().map_init(|| index.search(), ask).sum();
         (start.elapsed().as_secs_f64(), cut)
     }

@@ -7,9 +7,9 @@
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::Groups;
+use super::MergeGroups;
 use super::gates::unit_rotation;
-use super::moments::{Ellipsoid, Part, align_axes, moments};
+use super::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::model::{self, Columns, Gaussians};
 use crate::recipe::{self, Placement, ProxyOpacity, ShHigh};
 
@@ -106,7 +106,7 @@ pub fn merge_state(
     members: &[(u32, f64)],
     states: &Gaussians,
     leader: u32,
-    merge: &recipe::Merge,
+    merge: &recipe::MergeParams,
     want: Columns,
 ) -> ProxyState {
     // All in the leader's frame: coordinates far from the origin cancel once, and Jacobi starts from
@@ -116,14 +116,14 @@ pub fn merge_state(
     let part = |&(i, weight): &(u32, f64)| {
         let rotation = unit_rotation(states.rotation.row(i as usize));
         let relative = if rotation == frame { DQuat::IDENTITY } else { (frame.inverse() * rotation).normalize() };
-        Part {
+        WeightedGaussian {
             weight,
             position: frame.inverse() * (position(states, i) - origin),
             rotation: relative,
             scales: scales(states, i),
         }
     };
-    let parts: Vec<Part> = members.iter().map(part).collect();
+    let parts: Vec<WeightedGaussian> = members.iter().map(part).collect();
     let about = match merge.placement {
         Placement::Mean => None,
         Placement::Leader => Some(DVec3::ZERO),
@@ -144,10 +144,10 @@ pub fn merge_state(
 
 /// One row per group of more than one member, in their order: its proxy.
 pub fn merge_groups(
-    groups: &Groups,
+    groups: &MergeGroups,
     importance: &Importance<'_>,
     states: &Gaussians,
-    merge: &recipe::Merge,
+    merge: &recipe::MergeParams,
 ) -> Gaussians {
     let clusters: Vec<u32> = groups.clusters().collect();
     let mut out = states.pick(&[]);
@@ -244,10 +244,10 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::recipe::{Merge, Recipe};
+    use crate::recipe::{MergeParams, Recipe};
 
-    fn recipe(placement: Placement, opacity: ProxyOpacity) -> Merge {
-        Merge { placement, opacity, ..Recipe::preset("default").unwrap().merge }
+    fn recipe(placement: Placement, opacity: ProxyOpacity) -> MergeParams {
+        MergeParams { placement, opacity, ..Recipe::preset("default").unwrap().merge }
     }
 
     /// `n` copies of a Gaussian of degree 1.

@@ -8,7 +8,7 @@ use xxhash_rust::xxh3::xxh3_64_with_seed;
 use super::motion::{MotionGate, PairMotion};
 use super::*;
 use crate::model::Column;
-use crate::recipe::{Merge, Motion, Recipe};
+use crate::recipe::{MergeParams, MotionParams, Recipe};
 
 /// A number in [0, 1) for Gaussian `i`, another for every `salt`.
 fn uniform(i: usize, salt: u64) -> f64 {
@@ -49,25 +49,25 @@ impl Scene {
     }
 
     /// The default recipe with a reach of about two Gaussians here.
-    fn recipe(&self) -> Merge {
+    fn recipe(&self) -> MergeParams {
         let mut merge = Recipe::preset("default").unwrap().merge;
         merge.passes[0].epsilon = 1.2 * (self.states.len() as f64).powf(-1.0 / 3.0);
         merge.passes[0].d0 = 2.0;
         merge
     }
 
-    fn merge(&self, recipe: &Merge, limit: Option<usize>) -> Merged {
+    fn merge(&self, recipe: &MergeParams, limit: Option<usize>) -> Merged {
         self.merge_moving(recipe, limit, std::slice::from_ref(&self.states.position))
     }
 
     /// Merges with everything alive and at `frames`, the first of which is the reference.
-    fn merge_moving(&self, recipe: &Merge, limit: Option<usize>, frames: &[Column]) -> Merged {
+    fn merge_moving(&self, recipe: &MergeParams, limit: Option<usize>, frames: &[Column]) -> Merged {
         let rows: Vec<u32> = (0..self.states.len() as u32).collect();
         self.merge_rows(&rows, recipe, limit, frames)
     }
 
     /// [`Scene::merge_moving`] of some rows.
-    fn merge_rows(&self, rows: &[u32], recipe: &Merge, limit: Option<usize>, frames: &[Column]) -> Merged {
+    fn merge_rows(&self, rows: &[u32], recipe: &MergeParams, limit: Option<usize>, frames: &[Column]) -> Merged {
         self.merge_in_parts(rows, recipe, limit, frames, usize::MAX).0
     }
 
@@ -75,7 +75,7 @@ impl Scene {
     fn merge_in_parts(
         &self,
         rows: &[u32],
-        recipe: &Merge,
+        recipe: &MergeParams,
         limit: Option<usize>,
         frames: &[Column],
         most_pairs: usize,
@@ -84,10 +84,10 @@ impl Scene {
         let survivors = Survivors { states, rows, importance: self.importance(), classes, extent: *extent };
         let gate = MotionGate::new(recipe, recipe.length_unit.in_scene_units(*extent));
         let mut parts = Vec::new();
-        let measure = |asked: Asked<'_>| {
+        let measure = |asked: RequestedPairs<'_>| {
             parts.push(asked.pairs().len());
             let reference = (0..states.len()).map(|i| frames[0].row(i));
-            let mut motion = PairMotion::new(asked.pairs(), reference, Motion::Runs);
+            let mut motion = PairMotion::new(asked.pairs(), reference, MotionParams::Runs);
             frames.iter().for_each(|frame| motion.frame(|i| (frame.row(i), true)));
             Ok::<_, Infallible>(motion.finish().map(|pair| gate.likeness(&pair)).collect())
         };
@@ -121,7 +121,7 @@ fn joins(merged: &Merged) -> usize {
 }
 
 /// The group of `row`.
-fn group_of(groups: &Groups, row: u32) -> usize {
+fn group_of(groups: &MergeGroups, row: u32) -> usize {
     (0..groups.len()).find(|&group| groups.members(group).contains(&row)).unwrap()
 }
 
@@ -280,7 +280,7 @@ fn order_of_rows_changes_no_cluster() {
         }
         turned.ids[new_row(row)] = scene.ids[row];
     }
-    let leaders = |groups: &Groups, place: &dyn Fn(usize) -> usize| -> Vec<u32> {
+    let leaders = |groups: &MergeGroups, place: &dyn Fn(usize) -> usize| -> Vec<u32> {
         (0..n).map(|row| groups.leaders()[group_of(groups, place(row) as u32)]).collect()
     };
     let straight = leaders(&scene.merge(&scene.recipe(), None).groups, &|row| row);
@@ -337,7 +337,7 @@ fn rows_left_out_change_nothing_as_if_they_were_not_there() {
     let got = scene.merge_rows(&rows, &recipe, None, std::slice::from_ref(&scene.states.position));
     let expected = part.merge(&recipe, None);
     assert!(joins(&got) > 100 && got.proxies == expected.proxies);
-    let named = |groups: &Groups, id: &dyn Fn(u32) -> u32| -> Vec<Vec<u32>> {
+    let named = |groups: &MergeGroups, id: &dyn Fn(u32) -> u32| -> Vec<Vec<u32>> {
         (0..groups.len()).map(|g| groups.members(g).iter().map(|&row| id(row)).collect()).collect()
     };
     assert_eq!(named(&got.groups, &|row| row), named(&expected.groups, &|row| rows[row as usize]));

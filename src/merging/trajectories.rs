@@ -18,18 +18,18 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use crate::cache::{Spill, Spilling};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::outputs::container::FRAME_BLOCK;
 use crate::passes::BLOCK;
 use crate::progress::Progress;
-use crate::source::{FrameSource, Ids, Wanted};
+use crate::source::{FrameSource, Ids, ReadPlan};
 
 /// What test 3 reads of a Gaussian at one frame: x, y, z, opacity logit.
-pub(crate) type Moment = [f32; 4];
+pub(crate) type TrajectorySample = [f32; 4];
 
-/// The columns of a [`Moment`].
+/// The columns of a [`TrajectorySample`].
 pub(crate) const NEEDED: Columns = Columns::POSITION.union(Columns::OPACITY);
 
 /// Gaussians between two that are wanted which are rather read than skipped.
@@ -63,7 +63,7 @@ impl Trajectories {
         let (frames, columns) = (source.info().times.len(), source.info().varying & NEEDED);
         let mut places: Vec<(u32, u32)> = ids.iter().copied().zip(0..).collect();
         places.par_sort_unstable();
-        let mut file = Spilling::new(folder)?;
+        let mut file = SpillWriter::new(folder)?;
         let block = frames_together.clamp(1, FRAME_BLOCK);
         let progress = Progress::new("merge", "frames", frames as u64);
         let mut values = Vec::new();
@@ -88,11 +88,11 @@ impl Trajectories {
     ///
     /// # Errors
     /// Those of reading the file.
-    pub(crate) fn play(&self, places: &[u32], mut show: impl FnMut(&[Moment])) -> Result<()> {
+    pub(crate) fn play(&self, places: &[u32], mut show: impl FnMut(&[TrajectorySample])) -> Result<()> {
         if self.frames == 0 {
             return Ok(());
         }
-        let mut now: Vec<Moment> = vec![Moment::default(); places.len()];
+        let mut now: Vec<TrajectorySample> = vec![TrajectorySample::default(); places.len()];
         self.read(0, 4, places, bytemuck::cast_slice_mut(&mut now))?;
         if self.varying.is_empty() {
             show(&now);
@@ -132,7 +132,7 @@ impl Trajectories {
     }
 }
 
-/// The numbers of a [`Moment`] that `columns` are.
+/// The numbers of a [`TrajectorySample`] that `columns` are.
 fn numbers(columns: Columns) -> Range<usize> {
     let start = if columns.contains(Columns::POSITION) { 0 } else { 3 };
     start..if columns.contains(Columns::OPACITY) { 4 } else { 3 }
@@ -148,7 +148,7 @@ fn take(
 ) -> Result<()> {
     let width = columns.width(0);
     values.resize(places.len() * frames.len() * width, 0.0);
-    let wanted = Wanted::of(frames.clone());
+    let wanted = ReadPlan::of(frames.clone());
     let read = |block: &[(u32, u32)]| -> Result<Vec<Gaussians>> {
         let ids: Vec<u32> = block.iter().map(|&(id, _)| id).collect();
         let mut reader = source.open(Ids::List(&ids))?;
@@ -217,7 +217,7 @@ mod tests {
         }
     }
 
-    fn moments(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Vec<Moment> {
+    fn moments(source: &dyn FrameSource, ids: &[u32], frame: usize) -> Vec<TrajectorySample> {
         let mut state = Gaussians::zeros(0, source.info().sh_degree);
         source.open(Ids::List(ids)).unwrap().read(frame, NEEDED, &mut state).unwrap();
         let moment = |i| {
@@ -241,7 +241,8 @@ mod tests {
                 let mut shown = Vec::new();
                 gathered.play(&places, |moments| shown.push(moments.to_vec())).unwrap();
                 let frames = if varying.is_empty() { 1 } else { 7 };
-                let expected: Vec<Vec<Moment>> = (0..frames).map(|t| moments(&source, &of_places, t)).collect();
+                let expected: Vec<Vec<TrajectorySample>> =
+                    (0..frames).map(|t| moments(&source, &of_places, t)).collect();
                 assert!(shown == expected, "{varying:?} vary, {frames_together} frames together");
             }
         }

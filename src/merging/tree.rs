@@ -14,7 +14,7 @@ const PARALLEL: usize = 1 << 14;
 
 /// A point and the index by which it is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Point {
+pub struct TreePoint {
     /// Its position.
     pub at: [f32; 3],
     /// Decides between equal distances.
@@ -22,7 +22,7 @@ pub struct Point {
 }
 
 /// A candidate: squared distance as bits, whose order is that of the values (≥ 0), then index.
-type Found = (u64, u32);
+type NeighborCandidate = (u64, u32);
 
 /// The nearest points found so far around a place, no more than are wanted.
 ///
@@ -32,8 +32,8 @@ pub struct Nearest {
     own: u32,
     at: [f64; 3],
     wanted: usize,
-    worst: Found,
-    found: Vec<Found>,
+    worst: NeighborCandidate,
+    found: Vec<NeighborCandidate>,
 }
 
 impl Nearest {
@@ -47,7 +47,7 @@ impl Nearest {
     }
 
     /// Looks at every one of `points`.
-    pub fn scan(&mut self, points: &[Point]) {
+    pub fn scan(&mut self, points: &[TreePoint]) {
         for point in points {
             let found = (squared(std::array::from_fn(|c| f64::from(point.at[c]) - self.at[c])), point.index);
             if found <= self.worst && point.index != self.own {
@@ -95,7 +95,7 @@ pub struct Tree {
 
 impl Tree {
     /// Brings `points` into the order of a tree over them.
-    pub fn new(points: &mut [Point]) -> Self {
+    pub fn new(points: &mut [TreePoint]) -> Self {
         let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
         let empty = Node { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], smallest: u32::MAX };
         let mut nodes = vec![empty; (2usize << depth) - 1];
@@ -104,11 +104,11 @@ impl Tree {
     }
 
     /// Looks at those of `points`, in the order of the tree, that can be among the `nearest`.
-    pub fn search(&self, points: &[Point], nearest: &mut Nearest) {
+    pub fn search(&self, points: &[TreePoint], nearest: &mut Nearest) {
         self.visit(0, self.depth, points, self.nodes[0].nearest_possible(nearest.at), nearest);
     }
 
-    fn visit(&self, node: usize, depth: u32, points: &[Point], bound: Found, nearest: &mut Nearest) {
+    fn visit(&self, node: usize, depth: u32, points: &[TreePoint], bound: NeighborCandidate, nearest: &mut Nearest) {
         if bound > nearest.worst {
             return;
         }
@@ -133,7 +133,7 @@ impl Tree {
 impl Node {
     /// A lower bound of (distance, index) below this node. Each step of the sum is monotone in f64,
     /// so rounding cannot lift the bound above the distance of a point in the box.
-    fn nearest_possible(&self, at: [f64; 3]) -> Found {
+    fn nearest_possible(&self, at: [f64; 3]) -> NeighborCandidate {
         let outside = |c: usize| (f64::from(self.low[c]) - at[c]).max(at[c] - f64::from(self.high[c])).max(0.0);
         (squared(std::array::from_fn(outside)), self.smallest)
     }
@@ -145,7 +145,7 @@ fn squared(d: [f64; 3]) -> u64 {
 
 /// Fills `nodes`, the preorder of a perfect subtree over `points`, splitting at the median of the
 /// widest side; equal coordinates split by index, so that low indices are met first.
-fn build(points: &mut [Point], nodes: &mut [Node]) {
+fn build(points: &mut [TreePoint], nodes: &mut [Node]) {
     let Some((node, below)) = nodes.split_first_mut() else { return };
     for point in points.iter() {
         for c in 0..3 {

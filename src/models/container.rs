@@ -2,15 +2,15 @@
 
 use gseq::{Encoding, Reader, TileId};
 
-use super::family::{ColumnInfo, Entry, Family, Residence, Timing};
-use super::linked::Linked;
+use super::family::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
+use super::linked::LinkedFrames;
 use super::size::bytes_of;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::container::Container;
 use crate::source::FrameSource;
 
 /// A container.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a .gseq",
     recognises: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
@@ -18,13 +18,13 @@ pub(super) const ENTRY: Entry = Entry {
         options.refuse_for(path)?;
         if options.link.is_asked() && container.info().times.len() > 1 {
             let joins = options.link.joins();
-            return Ok(Box::new(Linked::anew(&container, "linked gseq container", joins, &options.ply())?));
+            return Ok(Box::new(LinkedFrames::anew(&container, "linked gseq container", joins, &options.ply())?));
         }
         Ok(Box::new(container))
     },
 };
 
-impl Family for Container {
+impl InputModel for Container {
     fn kind(&self) -> &'static str {
         "gseq container"
     }
@@ -49,14 +49,14 @@ impl Family for Container {
         true
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         let layout = self.reader().layout();
         // The tiles decide what is decoded together.
-        Residence {
+        MemoryProfile {
             gaussian_block: layout.gaussian_block.into(),
             columns: layout.columns.len() as u64,
             decoded: self.decoded_bytes(),
-            ..Residence::of_tiles(layout.frame_block.into())
+            ..MemoryProfile::of_tiles(layout.frame_block.into())
         }
     }
 
@@ -68,7 +68,7 @@ impl Family for Container {
         Timing::Stamped
     }
 
-    fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Err(Error::usage(format!("{}: a container says itself when its frames are", self.path().shown())))
     }
 

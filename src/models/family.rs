@@ -14,15 +14,15 @@ use crate::limits::{Limits, ReadLimit};
 use crate::model::{Columns, Gaussians};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// An open input of some kind.
 ///
 /// What has a body here is right for explicit trajectories, of which each state stands in every frame; a family whose
 /// frames follow from raw parameters has its own.
-pub trait Family: Send + Sync {
+pub trait InputModel: Send + Sync {
     /// What it is, for people.
     fn kind(&self) -> &'static str;
 
@@ -44,12 +44,12 @@ pub trait Family: Send + Sync {
     /// The same by part.
     ///
     /// # Errors
-    /// Those of [`Family::bytes`].
+    /// Those of [`InputModel::bytes`].
     fn size(&self) -> Result<Size> {
         Ok(Size::of_frames(self.bytes()?))
     }
 
-    /// Bytes, by part, of what [`Family::write`] wrote to `path` as a result of `kind`, with nothing beside it yet.
+    /// Bytes, by part, of what [`InputModel::write`] wrote to `path` as a result of `kind`, with nothing beside it yet.
     ///
     /// # Errors
     /// A file that is not there any more.
@@ -67,9 +67,9 @@ pub trait Family: Send + Sync {
     }
 
     /// What it keeps in memory, and how it is read.
-    fn residence(&self) -> Residence;
+    fn residence(&self) -> MemoryProfile;
 
-    /// Lets values that were decoded stay in memory, where [`Residence::decoded`] says that they can.
+    /// Lets values that were decoded stay in memory, where [`MemoryProfile::decoded`] says that they can.
     fn hold_decoded(&self) {}
 
     /// Where its frames get their times.
@@ -89,7 +89,7 @@ pub trait Family: Send + Sync {
     ///
     /// # Errors
     /// Times that are not finite or do not increase; another number of them than there are frames.
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>>;
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>>;
 
     /// Things a person should know of it.
     fn notes(&self) -> Vec<String> {
@@ -151,7 +151,7 @@ pub trait Family: Send + Sync {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         let _ = (clusters, reference, rule);
         Ok(Proxies::default())
     }
@@ -173,7 +173,7 @@ pub trait Family: Send + Sync {
     ///
     /// # Errors
     /// An input that no archive holds; files that cannot be read.
-    fn content(&self, reduction: &Reduction) -> Result<Content> {
+    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         let _ = reduction;
         Err(Error::usage(NO_ARCHIVE))
     }
@@ -192,7 +192,7 @@ pub trait Family: Send + Sync {
         false
     }
 
-    /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`Reduction::course`]).
+    /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`CompressedModel::course`]).
     fn stands_in_frames(&self) -> bool {
         false
     }
@@ -206,7 +206,7 @@ pub trait Family: Send + Sync {
     ///
     /// # Errors
     /// A field that cannot be evaluated.
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(reduced_trajectories(self.source(), reduction))
     }
 
@@ -215,7 +215,13 @@ pub trait Family: Send + Sync {
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         write_trajectories(self.source(), reduction, kind, path, limits)
     }
 }
@@ -233,7 +239,7 @@ pub enum Timing {
 
 /// What an open input keeps in memory, and how it is read.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Residence {
+pub struct MemoryProfile {
     /// Bytes per Gaussian that are resident while it is open.
     pub per_gaussian: u64,
     /// Bytes per Gaussian while it is opened, beside these.
@@ -260,10 +266,10 @@ pub struct Residence {
     pub decoded: u64,
 }
 
-impl Residence {
+impl MemoryProfile {
     /// Of a container in tiles of `frame_block` frames.
-    pub fn of_tiles(frame_block: u64) -> Residence {
-        Residence {
+    pub fn of_tiles(frame_block: u64) -> MemoryProfile {
+        MemoryProfile {
             per_gaussian: 0,
             opening: 0,
             reader: 8,
@@ -307,17 +313,17 @@ pub struct ColumnInfo {
 }
 
 /// How a family takes part.
-pub(super) struct Entry {
+pub(super) struct ModelFormat {
     /// What to give, for the message that nothing fits; empty: nothing that would be read.
     pub(super) expected: &'static str,
     /// Whether a path is of this family, told by what is there.
-    pub(super) recognises: fn(&Found) -> bool,
+    pub(super) recognises: fn(&FoundInput) -> bool,
     /// Opens it; without frames where [`Timing::Continuous`].
-    pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn Family>>,
+    pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }
 
 /// What lies at a path.
-pub(super) struct Found<'a> {
+pub(super) struct FoundInput<'a> {
     pub(super) path: &'a Path,
     pub(super) is_folder: bool,
     /// The first bytes of a file.
@@ -326,7 +332,7 @@ pub(super) struct Found<'a> {
     pub(super) memory: ReadLimit,
 }
 
-impl Found<'_> {
+impl FoundInput<'_> {
     /// Whether a file looks like one of `torch.save`: an archive that is not numpy's.
     pub(super) fn is_checkpoint(&self) -> bool {
         let of_numpy = self.path.extension().is_some_and(|found| found.eq_ignore_ascii_case("npz"));

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use super::family::Entry;
+use super::family::ModelFormat;
 use crate::error::Error;
 use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
@@ -14,7 +14,7 @@ const WAY: &str = "write its frames as PLY files, one per frame and all with the
                    frame stream, with its own renderer, and give those";
 
 /// A checkpoint of another kind, or a folder of one.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "",
     recognises: |found| match found.is_folder {
         true => in_folder(found.path).is_some(),

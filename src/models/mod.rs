@@ -30,17 +30,17 @@ use std::io::Read;
 use std::path::Path;
 
 use deform_folder::Arguments;
-pub use family::{ColumnInfo, Conventions, Family, Link, OpenOptions, Residence, Timing};
+pub use family::{ColumnInfo, Conventions, InputModel, Link, MemoryProfile, OpenOptions, Timing};
 pub use four_d_gaussians::ModelFolder;
-pub use linked::Linked;
+pub use linked::LinkedFrames;
 pub use size::Size;
 
 use crate::error::{Error, Result, ShowPath};
 use crate::files::open::open_file;
-use family::{Entry, Found};
+use family::{FoundInput, ModelFormat};
 
 /// Every family that lies in files; the first that recognises a path opens it.
-const FAMILIES: [Entry; 14] = [
+const FAMILIES: [ModelFormat; 14] = [
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
     sc_gs::ENTRY,
@@ -69,7 +69,7 @@ pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
 ///
 /// # Errors
 /// Nothing there, or of no family; whatever is wrong with it.
-pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
+pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let is_folder = fs::metadata(path).map_err(Error::io("open", path))?.is_dir();
     let mut head = Vec::new();
     if !is_folder {
@@ -79,7 +79,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
     if is_folder {
         refuse_inside_a_model(path)?;
     }
-    let found = Found { path, is_folder, head, memory: options.memory };
+    let found = FoundInput { path, is_folder, head, memory: options.memory };
     match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None => {

@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::archive::files::add_cloud;
-use super::family::{Entry, Family, Link, OpenOptions, Residence, Timing};
-use super::linked::Linked;
+use super::family::{InputModel, Link, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use super::linked::LinkedFrames;
 use super::size::bytes_of;
 use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
 use crate::archive::Content;
@@ -24,12 +24,12 @@ use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{HeldFrames, gather_all};
 use crate::progress::Progress;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::source::{FrameSource, Ids};
-use crate::tracking::{Identity, identity};
+use crate::tracking::{OrderDifference, identity};
 
 /// A folder with one PLY per frame.
-pub(super) const FOLDER: Entry = Entry {
+pub(super) const FOLDER: ModelFormat = ModelFormat {
     expected: "a folder of PLY files",
     recognises: |found| found.is_folder,
     open: |path, options| {
@@ -39,25 +39,27 @@ pub(super) const FOLDER: Entry = Entry {
 };
 
 /// One PLY.
-pub(super) const FILE: Entry = Entry {
+pub(super) const FILE: ModelFormat = ModelFormat {
     expected: "a .ply",
     recognises: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };
 
 /// Opens frames as they are if the same place means the same Gaussian in all of them, else linked.
-fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn Family>> {
+fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     options.refuse_for(path)?;
     let order = match options.link {
-        _ if frames.paths().len() == 1 => Order::Believed,
-        link if link.is_asked() => Order::Lost("as asked".to_owned()),
+        _ if frames.paths().len() == 1 => FrameOrder::Believed,
+        link if link.is_asked() => FrameOrder::Lost("as asked".to_owned()),
         Link::Auto => order(&frames)?,
-        _ => Order::Believed,
+        _ => FrameOrder::Believed,
     };
     match order {
-        Order::Believed => Ok(Box::new(PlySequence::new(frames)?)),
-        Order::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
-        Order::Lost(why) => Ok(Box::new(Linked::open(frames, path, &why, options.link.joins(), &options.ply())?)),
+        FrameOrder::Believed => Ok(Box::new(PlySequence::new(frames)?)),
+        FrameOrder::Kept(note) => Ok(Box::new(PlySequence::new(frames)?.with_note(note))),
+        FrameOrder::Lost(why) => {
+            Ok(Box::new(LinkedFrames::open(frames, path, &why, options.link.joins(), &options.ply())?))
+        }
     }
 }
 
@@ -65,7 +67,7 @@ fn open_frames(frames: PlyFrames, path: &Path, options: &OpenOptions) -> Result<
 const MEASURED: usize = 5;
 
 /// Whether the order of frames tells which Gaussian is which.
-enum Order {
+enum FrameOrder {
     /// Nobody looked.
     Believed,
     /// It does, as the note says.
@@ -76,10 +78,10 @@ enum Order {
 
 /// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighbouring frames, of five that
 /// are evenly spread.
-fn order(frames: &PlyFrames) -> Result<Order> {
+fn order(frames: &PlyFrames) -> Result<FrameOrder> {
     if let Some(other) = frames.other_count() {
         let (counts, name) = (frames.counts(), shown_name(&frames.paths()[other]));
-        return Ok(Order::Lost(format!("{name} has {} Gaussians, the first {}", counts[other], counts[0])));
+        return Ok(FrameOrder::Lost(format!("{name} has {} Gaussians, the first {}", counts[other], counts[0])));
     }
     let pairs = frames.paths().len() - 1;
     let mut found = Vec::new();
@@ -94,23 +96,24 @@ fn order(frames: &PlyFrames) -> Result<Order> {
     }
     let lost = found.iter().filter(|identity| !identity.holds).count();
     let is_lost = 2 * lost > found.len();
-    let Some(Identity { moved, apart, unlike, strangers, .. }) = found.iter().find(|found| found.holds != is_lost)
+    let Some(OrderDifference { moved, apart, unlike, strangers, .. }) =
+        found.iter().find(|found| found.holds != is_lost)
     else {
-        return Ok(Order::Believed);
+        return Ok(FrameOrder::Believed);
     };
     let apart = format!("({moved:.1} sizes, {apart:.1})");
     Ok(match is_lost {
-        true => Order::Lost(format!(
+        true => FrameOrder::Lost(format!(
             "those of the same place are as far apart as strangers {apart} or look as different ({unlike:.2}, {strangers:.2})"
         )),
-        false => Order::Kept(format!(
+        false => FrameOrder::Kept(format!(
             "frames are in one order: those of the same place are nearer than strangers {apart} and look more alike \
              ({unlike:.2}, {strangers:.2})"
         )),
     })
 }
 
-impl Family for PlySequence {
+impl InputModel for PlySequence {
     fn kind(&self) -> &'static str {
         "PLY frames"
     }
@@ -139,8 +142,8 @@ impl Family for PlySequence {
         self.paths().len() > 1
     }
 
-    fn residence(&self) -> Residence {
-        Residence {
+    fn residence(&self) -> MemoryProfile {
+        MemoryProfile {
             per_gaussian: 0,
             opening: 0,
             reader: 4,
@@ -161,7 +164,7 @@ impl Family for PlySequence {
         Timing::Numbered
     }
 
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(PlySequence::with_times(*self, times)?))
     }
 
@@ -172,7 +175,7 @@ impl Family for PlySequence {
         }
     }
 
-    fn content(&self, reduction: &Reduction) -> Result<Content> {
+    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         let mut content = Content { times: [0.0, 1.0], ..Content::default() };
         content.cloud = gather_all(&*self.reduced(reduction)?, 0, Columns::all())?;
         add_cloud(&mut content, &self.frame(0)?, reduction.kept.iter().copied())?;
@@ -186,7 +189,13 @@ impl Family for PlySequence {
         Ok(Box::new(frames))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Ply | OutputKind::PlySequence => write_files(self, reduction, kind, path).map(|()| Vec::new()),
             _ => write_trajectories(self, reduction, kind, path, limits),
@@ -195,7 +204,7 @@ impl Family for PlySequence {
 }
 
 /// Writes every frame's file again with the properties, comments and names it had.
-fn write_files(sequence: &PlySequence, reduction: &Reduction, kind: OutputKind, path: &Path) -> Result<()> {
+fn write_files(sequence: &PlySequence, reduction: &CompressedModel, kind: OutputKind, path: &Path) -> Result<()> {
     let result = merged(sequence, reduction);
     let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
     let rows = out_rows(reduction);

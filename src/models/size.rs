@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::archive::Parts;
+use crate::archive::ArchiveSize;
 use crate::error::{Error, Result};
 
 /// Bytes of everything that a renderer opens of a model, by part. What only training reads is no part of it.
@@ -21,8 +21,8 @@ pub struct Size {
     pub rest: u64,
 }
 
-impl From<Parts> for Size {
-    fn from(Parts { cloud, field, rest }: Parts) -> Size {
+impl From<ArchiveSize> for Size {
+    fn from(ArchiveSize { cloud, field, rest }: ArchiveSize) -> Size {
         Size { cloud, field, rest, ..Size::default() }
     }
 }

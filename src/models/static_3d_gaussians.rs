@@ -6,7 +6,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::family::{Entry, Family, OpenOptions, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::files::copy;
 use super::four_d_gaussians::cfg_args;
 use super::iterations::iteration;
@@ -16,14 +16,14 @@ use crate::error::{Error, Result};
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::outputs::kind::OutputKind;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::source::FrameSource;
 
 const CLOUDS: &str = "point_cloud";
 const CLOUD: &str = "point_cloud.ply";
 
 /// A model folder with a cloud, and nothing that deforms it.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 3D Gaussian Splatting model folder",
     recognises: |found| {
         let is_whole = |folder: &Path| folder.join(CLOUD).is_file() && !folder.join("deformation.pth").exists();
@@ -68,7 +68,7 @@ impl Static {
     }
 }
 
-impl Family for Static {
+impl InputModel for Static {
     fn kind(&self) -> &'static str {
         "3D Gaussian Splatting model"
     }
@@ -87,7 +87,7 @@ impl Family for Static {
 
     fn size(&self) -> Result<Size> {
         let rest = self.beside().collect::<Vec<_>>();
-        let (cloud, rest) = (Family::bytes(&self.cloud)?, bytes_of(rest.iter().map(PathBuf::as_path))?);
+        let (cloud, rest) = (InputModel::bytes(&self.cloud)?, bytes_of(rest.iter().map(PathBuf::as_path))?);
         Ok(Size { cloud, rest, ..Size::default() })
     }
 
@@ -101,7 +101,7 @@ impl Family for Static {
         }
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         self.cloud.residence()
     }
 
@@ -109,7 +109,7 @@ impl Family for Static {
         Timing::Numbered
     }
 
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(Static { cloud: self.cloud.with_times(times)?, ..*self }))
     }
 
@@ -128,7 +128,7 @@ impl Family for Static {
         self.root.join("cfg_args").exists().then_some("cfg_args says how many there are")
     }
 
-    fn content(&self, reduction: &Reduction) -> Result<Content> {
+    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         self.cloud.content(reduction)
     }
 
@@ -136,11 +136,17 @@ impl Family for Static {
         self.cloud.showing(content)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         self.cloud.reduced(reduction)
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         if kind != OutputKind::Model {
             return self.cloud.write(reduction, kind, path, limits);
         }
@@ -180,7 +186,7 @@ mod tests {
         assert_eq!((model.kind(), model.own_output()), ("3D Gaussian Splatting model", OutputKind::Model));
         let result = folder.path().join("result");
         fs::create_dir(&result).unwrap();
-        let reduction = Reduction::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
+        let reduction = CompressedModel::pruned(vec![1, 3], &Recipe::preset("default").unwrap().merge);
         model.write(&reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
         let [all, left] =
             [&root, &result].map(|path| gather_all(open(path, None).unwrap().source(), 0, Columns::all()).unwrap());

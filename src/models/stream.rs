@@ -11,7 +11,7 @@ use std::thread;
 use crossbeam_channel::bounded;
 use gseq::Compression;
 
-use super::family::{Family, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, Timing};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFile;
 use crate::files::container::Container;
@@ -56,7 +56,7 @@ impl Streamed {
     }
 }
 
-impl Family for Streamed {
+impl InputModel for Streamed {
     fn kind(&self) -> &'static str {
         "frame stream"
     }
@@ -66,7 +66,7 @@ impl Family for Streamed {
     }
 
     fn digest(&self) -> Result<String> {
-        Family::digest(&self.container)
+        InputModel::digest(&self.container)
     }
 
     fn bytes(&self) -> Result<u64> {
@@ -85,19 +85,19 @@ impl Family for Streamed {
         true
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         self.container.residence()
     }
 
     fn hold_decoded(&self) {
-        Family::hold_decoded(&self.container);
+        InputModel::hold_decoded(&self.container);
     }
 
     fn timing(&self) -> Timing {
         Timing::Stamped
     }
 
-    fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, _: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Err(Error::usage("a frame stream says itself when its frames are"))
     }
 }

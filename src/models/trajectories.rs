@@ -19,8 +19,8 @@ use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Changed, HeldFrames, States, gather_all};
 use crate::progress::Progress;
-use crate::reduction::{Course, Reduction};
-use crate::source::{FrameSource, Wanted};
+use crate::reduction::{CompressedModel, TrajectoryDelta};
+use crate::source::{FrameSource, ReadPlan};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
 const LEVEL: i32 = 1;
@@ -38,7 +38,7 @@ pub fn state_bytes(sh_degree: usize, of: Columns) -> u64 {
 }
 
 /// What is left of `source`, merged.
-pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a Reduction) -> MergedSequence<'a> {
+pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a CompressedModel) -> MergedSequence<'a> {
     let members = reduction.clusters.iter().map(|cluster| (cluster.output, &cluster.members[..]));
     MergedSequence::new(source, &reduction.kept, members, &reduction.rule)
 }
@@ -46,9 +46,9 @@ pub(super) fn merged<'a>(source: &'a dyn FrameSource, reduction: &'a Reduction) 
 /// What is left of `source`, merged and changed, with what stays of its harmonics.
 pub(super) fn reduced_trajectories<'a>(
     source: &'a dyn FrameSource,
-    reduction: &'a Reduction,
+    reduction: &'a CompressedModel,
 ) -> Box<dyn FrameSource + 'a> {
-    let Reduction { change, course, sh_degree, .. } = reduction;
+    let CompressedModel { change, course, sh_degree, .. } = reduction;
     Box::new(Changed::new(Box::new(merged(source, reduction)), change, course, *sh_degree))
 }
 
@@ -70,7 +70,7 @@ pub(super) fn check_output(frames: usize, kind: OutputKind, path: &Path) -> Resu
 /// Writes what is left of `source` as `kind`, to `path`; gives things a person should know.
 pub(super) fn write_trajectories(
     source: &dyn FrameSource,
-    reduction: &Reduction,
+    reduction: &CompressedModel,
     kind: OutputKind,
     path: &Path,
     limits: &Limits,
@@ -84,7 +84,7 @@ pub(super) fn write_trajectories(
 
 /// A container with proxies, whose members lie anywhere: a frame block at a time, of as many Gaussians together as
 /// `most` allows.
-fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, most: usize) -> Result<()> {
+fn write_merged(source: &dyn FrameSource, reduction: &CompressedModel, path: &Path, most: usize) -> Result<()> {
     let merged = merged(source, reduction);
     let SequenceInfo { count, times, sh_degree, varying } = merged.info();
     let (compression, left) = (Compression::Zstd(LEVEL), reduction.sh_degree.min(*sh_degree));
@@ -95,7 +95,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
         let of_block = start..times.len().min(start + FRAME_BLOCK);
         writer.begin(&times[of_block.clone()])?;
         for part in &parts {
-            let mut frames = merged.together(part.clone(), &Wanted::of(of_block.clone()).holding(FRAME_BLOCK))?;
+            let mut frames = merged.together(part.clone(), &ReadPlan::of(of_block.clone()).holding(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
                 frames.read(start, Columns::all().difference(*varying), &mut constant)?;
@@ -110,7 +110,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &Reduction, path: &Path, mo
             let places: Vec<u32> = (part.start as u32..part.end as u32).collect();
             let change = reduction.change.pick(&places);
             // Where there are proxies there is no course.
-            let course = Course::default();
+            let course = TrajectoryDelta::default();
             let held = Changed::new(Box::new(held), &change, &course, reduction.sh_degree);
             writer.add(&held, part.start, 0..of_block.len(), |done| progress.advance(done))?;
         }
@@ -158,7 +158,7 @@ pub fn write_sequence(source: &dyn FrameSource, kind: OutputKind, path: &Path, h
         _ => (),
     }
     let progress = Progress::new("emit", "frames", info.times.len() as u64);
-    let mut states = States::open(source, &Wanted::every().holding(held))?;
+    let mut states = States::open(source, &ReadPlan::every().holding(held))?;
     for frame in 0..info.times.len() {
         let file = match kind {
             OutputKind::Ply => path.to_owned(),

@@ -12,7 +12,7 @@ use gseq::{ColumnSpec, Compression, EncodedTile, Layout, TileId, Writer, encode_
 use rayon::prelude::*;
 
 use super::bounds::Bounds;
-use crate::cache::{Key, Spill, Spilling};
+use crate::cache::{CacheKey, Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 use crate::source::{FrameSource, Ids};
@@ -62,14 +62,14 @@ impl Packing {
     }
 
     /// What tiles follow from, beside their values.
-    pub fn key(&self) -> Key {
+    pub fn key(&self) -> CacheKey {
         let of_column = |column| match self.column(column) {
             Compression::Raw => (0, 0.0, 0),
             Compression::Zstd(level) => (1, 0.0, level),
             Compression::Bounded { max_error, level } => (2, max_error, level),
         };
         let columns: Vec<(u8, f64, i32)> = Columns::all().iter().map(of_column).collect();
-        Key::of(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
+        CacheKey::of(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
     }
 
     /// How a column is encoded.
@@ -107,7 +107,7 @@ pub fn spill_blocks(
     source: &dyn FrameSource,
     packing: Packing,
     blocks: Range<usize>,
-    to: &mut Spilling,
+    to: &mut SpillWriter,
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     for block in blocks {
@@ -236,7 +236,7 @@ impl ContainerWriter {
         source: &dyn FrameSource,
         frames: Range<usize>,
         times: &[f64],
-        lives: &[Lives],
+        lives: &[BlockPresence],
     ) -> Result<()> {
         self.begin(times)?;
         let packing = self.packing;
@@ -262,7 +262,7 @@ impl ContainerWriter {
 
 /// How a block of Gaussians goes through a block of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Lives {
+pub enum BlockPresence {
     /// It changes in its columns that vary; others are those of the frame block before.
     Varying,
     /// It changes in its columns that vary, and others are new.
@@ -274,9 +274,9 @@ pub enum Lives {
 }
 
 /// Every block of Gaussians of `source`, in the first block of frames or a later one.
-fn all_blocks(source: &dyn FrameSource, is_first: bool) -> Vec<Lives> {
+fn all_blocks(source: &dyn FrameSource, is_first: bool) -> Vec<BlockPresence> {
     // A column that never varies is encoded for the first block alone.
-    let lives = if is_first { Lives::New } else { Lives::Varying };
+    let lives = if is_first { BlockPresence::New } else { BlockPresence::Varying };
     vec![lives; source.info().count.div_ceil(GAUSSIAN_BLOCK)]
 }
 
@@ -292,7 +292,7 @@ pub fn of_block(count: usize, block: usize) -> Range<usize> {
 fn encode_frames(
     source: &dyn FrameSource,
     frames: Range<usize>,
-    lives: &[Lives],
+    lives: &[BlockPresence],
     packing: &Packing,
     advance: impl Fn(u64) + Sync,
     mut each: impl FnMut(u32, u32, Option<&EncodedTile>) -> Result<()>,
@@ -307,10 +307,10 @@ fn encode_frames(
                 let gaussians = of_block(info.count, block as usize);
                 let count = gaussians.len();
                 let (columns, frames) = match lives[block as usize] {
-                    Lives::New => (Columns::all(), frames.clone()),
-                    Lives::Varying => (info.varying, frames.clone()),
-                    Lives::Still => (Columns::all(), frames.start..frames.start + 1),
-                    Lives::Repeating => (Columns::empty(), 0..0),
+                    BlockPresence::New => (Columns::all(), frames.clone()),
+                    BlockPresence::Varying => (info.varying, frames.clone()),
+                    BlockPresence::Still => (Columns::all(), frames.start..frames.start + 1),
+                    BlockPresence::Repeating => (Columns::empty(), 0..0),
                 };
                 let tiles = encode_block(source, gaussians, frames.clone(), columns, packing);
                 advance((count * frames.len()) as u64);

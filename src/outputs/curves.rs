@@ -7,9 +7,9 @@ use std::path::Path;
 
 use crate::error::Result;
 use crate::files::accuracy::Accuracy;
-use crate::files::splatv::Row;
+use crate::files::splatv::SplatvGaussian;
 use crate::files::splatv::write::{measure, seen_whole, words, write};
-use crate::fit::{Curve, Misfit, Tolerance, curved};
+use crate::fit::{CubicTrack, Misfit, Tolerance, curved};
 use crate::model::{Columns, colour};
 use crate::passes::{gather_all, tracks};
 use crate::progress::Progress;
@@ -29,7 +29,7 @@ pub fn write_curves(source: &dyn FrameSource, path: &Path) -> Result<String> {
         (curved(track, &tolerance, &mut misfit), misfit)
     })?;
     let misfit = found.iter().map(|(_, misfit)| *misfit).fold(Misfit::default(), Misfit::and);
-    let rows: Vec<Row> = found.iter().flat_map(|(curves, _)| curves).map(row).collect();
+    let rows: Vec<SplatvGaussian> = found.iter().flat_map(|(curves, _)| curves).map(row).collect();
     let first = gather_all(source, 0, Columns::POSITION)?;
     let mut accuracy = Accuracy::new(&first.position);
     let of_rows = found.iter().enumerate().flat_map(|(id, (curves, _))| curves.iter().map(move |_| id));
@@ -60,10 +60,10 @@ fn within_one(times: &[f64]) -> Vec<f64> {
     }
 }
 
-fn row(curve: &Curve) -> Row {
+fn row(curve: &CubicTrack) -> SplatvGaussian {
     let narrow = |value: f64| value as f32;
     let [place, motion @ ..] = curve.position;
-    Row {
+    SplatvGaussian {
         position: place.map(narrow),
         motion: std::array::from_fn(|k| narrow(motion[k / 3][k % 3])),
         rotation: curve.rotation[0].map(narrow),
@@ -99,7 +99,7 @@ mod tests {
         let said = write_curves(&scene, &path).unwrap();
         assert!(said.starts_with("300 Gaussians became"), "{said}");
         let file = Splatv::open(&path).unwrap();
-        let rows: Vec<Row> = (0..file.count()).map(|k| Row::of_words(&file.words(k))).collect();
+        let rows: Vec<SplatvGaussian> = (0..file.count()).map(|k| SplatvGaussian::of_words(&file.words(k))).collect();
         let (mut apart, mut depth) = (0.0, 0.0);
         let mut seen = 0;
         for frame in 0..30 {

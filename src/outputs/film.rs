@@ -73,23 +73,23 @@ impl FilmFormat {
 }
 
 /// A film that is being written.
-pub struct Film {
+pub struct FilmOutput {
     /// As the user named it.
     shown: PathBuf,
     size: (u32, u32),
     fps: u32,
     frames: u32,
     added: u32,
-    writer: Writer,
+    writer: FilmWriter,
 }
 
-enum Writer {
+enum FilmWriter {
     Apng(Box<png::Writer<BufWriter<File>>>),
     Gif(Box<gif::Encoder<BufWriter<File>>>),
-    Encoder(Encoder),
+    Encoder(FrameEncoder),
 }
 
-impl Film {
+impl FilmOutput {
     /// Begins a film of `frames` frames of `size` (width, height), `fps` a second, in the file `path`; errors name `shown`.
     ///
     /// # Errors
@@ -100,7 +100,7 @@ impl Film {
         size: (u32, u32),
         frames: u32,
         fps: u32,
-    ) -> Result<Film> {
+    ) -> Result<FilmOutput> {
         let failed = |error: io::Error| Error::io("write", shown)(error);
         let file = || File::create(path).map(BufWriter::new).map_err(Error::io("create", shown));
         let writer = match format {
@@ -113,20 +113,20 @@ impl Film {
                     encoder.set_frame_delay(1, fps.try_into().unwrap_or(u16::MAX))
                 };
                 begin().map_err(|error| failed(of_png(error)))?;
-                Writer::Apng(Box::new(encoder.write_header().map_err(|error| failed(of_png(error)))?))
+                FilmWriter::Apng(Box::new(encoder.write_header().map_err(|error| failed(of_png(error)))?))
             }
             FilmFormat::Gif => {
                 let [width, height] = gif_size(size).map_err(failed)?;
                 let mut encoder =
                     gif::Encoder::new(file()?, width, height, &[]).map_err(|error| failed(of_gif(error)))?;
                 encoder.set_repeat(gif::Repeat::Infinite).map_err(|error| failed(of_gif(error)))?;
-                Writer::Gif(Box::new(encoder))
+                FilmWriter::Gif(Box::new(encoder))
             }
             FilmFormat::Encoded(program, codec) => {
-                Writer::Encoder(Encoder::start(program, *codec, path, size, fps).map_err(failed)?)
+                FilmWriter::Encoder(FrameEncoder::start(program, *codec, path, size, fps).map_err(failed)?)
             }
         };
-        Ok(Film { shown: shown.to_owned(), size, fps, frames, added: 0, writer })
+        Ok(FilmOutput { shown: shown.to_owned(), size, fps, frames, added: 0, writer })
     }
 
     /// Adds a frame.
@@ -151,8 +151,8 @@ impl Film {
     fn write(&mut self, image: &Image) -> io::Result<()> {
         let bytes = rgb(image);
         match &mut self.writer {
-            Writer::Apng(writer) => writer.write_image_data(&bytes).map_err(of_png),
-            Writer::Gif(encoder) => {
+            FilmWriter::Apng(writer) => writer.write_image_data(&bytes).map_err(of_png),
+            FilmWriter::Gif(encoder) => {
                 let [width, height] = gif_size(self.size)?;
                 let mut frame = gif::Frame::from_rgb_speed(width, height, &bytes, GIF_SPEED);
                 // Of the whole film as long as it should be, to half a hundredth of a second.
@@ -160,7 +160,7 @@ impl Film {
                 frame.delay = (until(self.added + 1) - until(self.added)) as u16;
                 encoder.write_frame(&frame).map_err(of_gif)
             }
-            Writer::Encoder(encoder) => encoder.write(&bytes),
+            FilmWriter::Encoder(encoder) => encoder.write(&bytes),
         }
     }
 
@@ -174,9 +174,9 @@ impl Film {
             return Err(Error::io("write", &self.shown)(few));
         }
         let finished = match self.writer {
-            Writer::Apng(writer) => writer.finish().map_err(of_png),
-            Writer::Gif(encoder) => encoder.into_inner().map_err(of_gif).and_then(|mut file| file.flush()),
-            Writer::Encoder(encoder) => encoder.finish(),
+            FilmWriter::Apng(writer) => writer.finish().map_err(of_png),
+            FilmWriter::Gif(encoder) => encoder.into_inner().map_err(of_gif).and_then(|mut file| file.flush()),
+            FilmWriter::Encoder(encoder) => encoder.finish(),
         };
         finished.map_err(Error::io("write", &self.shown))
     }
@@ -197,7 +197,7 @@ fn of_gif(error: gif::EncodingError) -> io::Error {
 }
 
 /// The encoder at work.
-struct Encoder {
+struct FrameEncoder {
     child: Child,
     /// None: there is nothing more to come.
     to: Option<ChildStdin>,
@@ -205,8 +205,14 @@ struct Encoder {
     said: Option<JoinHandle<String>>,
 }
 
-impl Encoder {
-    fn start(program: &Path, codec: Codec, path: &Path, (width, height): (u32, u32), fps: u32) -> io::Result<Encoder> {
+impl FrameEncoder {
+    fn start(
+        program: &Path,
+        codec: Codec,
+        path: &Path,
+        (width, height): (u32, u32),
+        fps: u32,
+    ) -> io::Result<FrameEncoder> {
         let mut command = Command::new(program);
         command.args(["-hide_banner", "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
         command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "pipe:0", "-an"]);
@@ -230,7 +236,7 @@ impl Encoder {
                 String::from_utf8_lossy(&said).into_owned()
             })
         });
-        Ok(Encoder { child, to, said })
+        Ok(FrameEncoder { child, to, said })
     }
 
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
@@ -257,7 +263,7 @@ impl Encoder {
     }
 }
 
-impl Drop for Encoder {
+impl Drop for FrameEncoder {
     fn drop(&mut self) {
         // After `end` there is nobody to be stopped.
         let _ = self.child.kill();
@@ -273,7 +279,7 @@ mod tests {
     fn a_gif_lasts_as_long_as_its_frames_a_second_say() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.gif");
-        let mut film = Film::create((&path, &path), &FilmFormat::Gif, (4, 3), 60, 24).unwrap();
+        let mut film = FilmOutput::create((&path, &path), &FilmFormat::Gif, (4, 3), 60, 24).unwrap();
         for _ in 0..60 {
             film.add(&Image { width: 4, height: 3, data: vec![0.25; 36] }).unwrap();
         }
@@ -296,7 +302,7 @@ mod tests {
         assert_eq!(FilmFormat::of(Path::new("A.APNG")).unwrap(), FilmFormat::Apng);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.png");
-        let mut film = Film::create((&path, &path), &FilmFormat::Apng, (4, 3), 2, 10).unwrap();
+        let mut film = FilmOutput::create((&path, &path), &FilmFormat::Apng, (4, 3), 2, 10).unwrap();
         let message = film.add(&Image { width: 3, height: 3, data: vec![0.0; 27] }).unwrap_err().to_string();
         assert!(message.contains("4x3") && message.contains("3x3"), "{message}");
         assert!(film.finish().is_err(), "a film of two frames has none");

@@ -12,7 +12,7 @@ use fourdgs::{GaussianSet, SceneExtras, WriteOptions, write_to_vec};
 use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::{Accuracy, Drawn};
-use crate::fit::{Misfit, Piece, Tolerance, straight};
+use crate::fit::{LinearPiece, Misfit, Tolerance, straight};
 use crate::model::{Column, colour};
 use crate::passes::tracks;
 use crate::progress::Progress;
@@ -103,7 +103,7 @@ fn check_positions(set: &GaussianSet, wanted: &[f32], ids: impl Iterator<Item = 
 }
 
 /// Adds `piece`; `starts`: when each frame begins, and the last one ends.
-fn add(set: &mut GaussianSet, piece: &Piece, starts: &[f64]) {
+fn add(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     let narrow = |value: f64| value as f32;
     set.positions.extend(piece.position.map(narrow));
     set.motions.extend(piece.velocity.map(narrow));

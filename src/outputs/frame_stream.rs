@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
-use crate::files::frame_stream::{Mark, StreamHeader};
+use crate::files::frame_stream::{FrameMark, StreamHeader};
 use crate::model::{Column, Columns, Gaussians};
 
 /// A stream being written. What it has written is no stream until [`StreamWriter::finish`].
@@ -36,9 +36,9 @@ impl<W: Write> StreamWriter<W> {
     /// A time that is not finite or not above the last; columns of another length; more than 2³² − 1 frames;
     /// a failed write.
     pub fn frame(&mut self, time: f64, state: &Gaussians) -> Result<()> {
-        let mark = Mark::Frame { index: self.frames, time, bytes: self.header.frame_bytes() }.to_bytes();
+        let mark = FrameMark::Frame { index: self.frames, time, bytes: self.header.frame_bytes() }.to_bytes();
         // A reader would refuse it for the same reason.
-        if let Err(illegal) = Mark::from_bytes(&mark, &self.header, self.frames, self.last_time) {
+        if let Err(illegal) = FrameMark::from_bytes(&mark, &self.header, self.frames, self.last_time) {
             let (frame, expected, found) = (self.frames, illegal.expected, illegal.found);
             return Err(Error::usage(format!("frame {frame}: expected {expected}, found {found}")));
         }
@@ -53,7 +53,7 @@ impl<W: Write> StreamWriter<W> {
 
     /// Writes the end mark and whatever was held back.
     pub fn finish(mut self) -> Result<()> {
-        self.put(&Mark::End(self.frames).to_bytes())?;
+        self.put(&FrameMark::End(self.frames).to_bytes())?;
         self.to.flush().map_err(Error::io("write", &self.name))
     }
 

@@ -34,26 +34,26 @@ pub struct RowTable<'a> {
 
 /// One column of the table.
 #[derive(Clone, Copy)]
-enum Values<'a> {
+enum TableColumn<'a> {
     F64(&'a [f64]),
     U32(&'a [u32]),
     Bool(&'a [bool]),
 }
 
-impl Values<'_> {
+impl TableColumn<'_> {
     fn len(&self) -> usize {
         match self {
-            Values::F64(values) => values.len(),
-            Values::U32(values) => values.len(),
-            Values::Bool(values) => values.len(),
+            TableColumn::F64(values) => values.len(),
+            TableColumn::U32(values) => values.len(),
+            TableColumn::Bool(values) => values.len(),
         }
     }
 
     fn text(&self, id: usize) -> String {
         match self {
-            Values::F64(values) => format!("{:?}", values[id]),
-            Values::U32(values) => values[id].to_string(),
-            Values::Bool(values) => values[id].to_string(),
+            TableColumn::F64(values) => format!("{:?}", values[id]),
+            TableColumn::U32(values) => values[id].to_string(),
+            TableColumn::Bool(values) => values[id].to_string(),
         }
     }
 }
@@ -81,17 +81,17 @@ impl RowTable<'_> {
     }
 
     /// The columns in order, as both formats name them.
-    fn columns(&self) -> Vec<(&'static str, Values<'_>)> {
+    fn columns(&self) -> Vec<(&'static str, TableColumn<'_>)> {
         let column = |of: Statistic| match of.values() {
-            model::Values::F64(values, _) => (of.column(), Values::F64(values(self.rows))),
-            model::Values::U32(values, _) => (of.column(), Values::U32(values(self.rows))),
+            model::Values::F64(values, _) => (of.column(), TableColumn::F64(values(self.rows))),
+            model::Values::U32(values, _) => (of.column(), TableColumn::U32(values(self.rows))),
         };
         let mut columns: Vec<_> = Statistic::ALL.into_iter().filter(|&of| of != Statistic::W).map(column).collect();
         columns.extend([
-            ("static_score", Values::F64(self.static_score)),
-            ("dynamic_score", Values::F64(self.dynamic_score)),
-            ("score", Values::F64(self.score)),
-            ("keep", Values::Bool(self.keep)),
+            ("static_score", TableColumn::F64(self.static_score)),
+            ("dynamic_score", TableColumn::F64(self.dynamic_score)),
+            ("score", TableColumn::F64(self.score)),
+            ("keep", TableColumn::Bool(self.keep)),
         ]);
         columns.extend((!self.rows.w.is_empty()).then(|| column(Statistic::W)));
         columns
@@ -117,9 +117,9 @@ impl RowTable<'_> {
             .large_file(large);
         for (name, values) in self.columns() {
             match values {
-                Values::F64(values) => add(&mut archive, name, options, values)?,
-                Values::U32(values) => add(&mut archive, name, options, values)?,
-                Values::Bool(values) => add(&mut archive, name, options, values)?,
+                TableColumn::F64(values) => add(&mut archive, name, options, values)?,
+                TableColumn::U32(values) => add(&mut archive, name, options, values)?,
+                TableColumn::Bool(values) => add(&mut archive, name, options, values)?,
             }
         }
         archive.zip_writer().finish()?.close()
@@ -194,12 +194,12 @@ mod tests {
                 let array = archive.by_name(name).unwrap().unwrap();
                 assert_eq!(array.shape(), [N as u64], "{name}");
                 match values {
-                    Values::F64(values) => {
+                    TableColumn::F64(values) => {
                         let bits = |values: &[f64]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
                         assert_eq!(bits(&array.into_vec().unwrap()), bits(values), "{name}");
                     }
-                    Values::U32(values) => assert_eq!(array.into_vec::<u32>().unwrap(), values, "{name}"),
-                    Values::Bool(values) => assert_eq!(array.into_vec::<bool>().unwrap(), values, "{name}"),
+                    TableColumn::U32(values) => assert_eq!(array.into_vec::<u32>().unwrap(), values, "{name}"),
+                    TableColumn::Bool(values) => assert_eq!(array.into_vec::<bool>().unwrap(), values, "{name}"),
                 }
             }
         });
@@ -220,12 +220,12 @@ mod tests {
                 assert_eq!(cells[0], id.to_string());
                 for (cell, (_, column)) in cells[1..].iter().zip(table.columns()) {
                     match column {
-                        Values::F64(values) => {
+                        TableColumn::F64(values) => {
                             let read: f64 = cell.parse().unwrap();
                             assert_eq!(read.to_bits(), values[id].to_bits(), "{cell} for {}", values[id]);
                         }
-                        Values::U32(values) => assert_eq!(cell.parse::<u32>().unwrap(), values[id]),
-                        Values::Bool(values) => assert_eq!(cell.parse::<bool>().unwrap(), values[id]),
+                        TableColumn::U32(values) => assert_eq!(cell.parse::<u32>().unwrap(), values[id]),
+                        TableColumn::Bool(values) => assert_eq!(cell.parse::<bool>().unwrap(), values[id]),
                     }
                 }
             }

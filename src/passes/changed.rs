@@ -2,14 +2,14 @@
 
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::reduction::{Change, Course};
-use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
+use crate::reduction::{ParamDelta, TrajectoryDelta};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// A source whose parameters are changed, the same at every frame and along a course.
 pub struct Changed<'a> {
     source: Box<dyn FrameSource + 'a>,
-    change: &'a Change,
-    course: &'a Course,
+    change: &'a ParamDelta,
+    course: &'a TrajectoryDelta,
     info: SequenceInfo,
 }
 
@@ -18,8 +18,8 @@ impl<'a> Changed<'a> {
     /// to add and none above: the source as it is.
     pub fn new(
         source: Box<dyn FrameSource + 'a>,
-        change: &'a Change,
-        course: &'a Course,
+        change: &'a ParamDelta,
+        course: &'a TrajectoryDelta,
         sh_degree: usize,
     ) -> Changed<'a> {
         let mut info = source.info().clone();
@@ -32,7 +32,12 @@ impl<'a> Changed<'a> {
         self.change.is_empty() && self.course.is_empty() && self.drops().is_none()
     }
 
-    fn reader<'b>(&self, reader: Box<dyn BlockReader + 'b>, change: Change, course: Course) -> ChangedReader<'b> {
+    fn reader<'b>(
+        &self,
+        reader: Box<dyn BlockReader + 'b>,
+        change: ParamDelta,
+        course: TrajectoryDelta,
+    ) -> ChangedReader<'b> {
         ChangedReader { reader, change, course, frames: self.info.times.len(), all_sh: self.drops() }
     }
 
@@ -56,7 +61,7 @@ impl FrameSource for Changed<'_> {
         Ok(Box::new(self.reader(self.source.open(ids)?, self.change.pick(&places), self.course.pick(&places))))
     }
 
-    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         let opened = self.source.open_all(wanted)?;
         if self.is_plain() {
             return Some(opened);
@@ -74,8 +79,8 @@ impl FrameSource for Changed<'_> {
 
 struct ChangedReader<'a> {
     reader: Box<dyn BlockReader + 'a>,
-    change: Change,
-    course: Course,
+    change: ParamDelta,
+    course: TrajectoryDelta,
     /// How many there are.
     frames: usize,
     /// Where harmonics are read into, of which some go.
@@ -104,7 +109,7 @@ impl BlockReader for ChangedReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.reader.expect(wanted);
     }
 }
@@ -125,8 +130,8 @@ mod tests {
             by.opacity_logit.set_row(i, [-(i as f32)]);
             by.sh.set_row(i, [0.125 * i as f32; 3]);
         }
-        let change = Change(by);
-        let straight = Course::default();
+        let change = ParamDelta(by);
+        let straight = TrajectoryDelta::default();
         let changed = Changed::new(Box::new(Scene::new(40, 3)), &change, &straight, ALL_HARMONICS);
         for ids in [Ids::List(&[39, 5, 0]), Ids::Range(7..12)] {
             let read = |source: &dyn FrameSource| {
@@ -154,7 +159,7 @@ mod tests {
             fewer.open(ids.clone()).unwrap().read(1, Columns::all(), &mut got).unwrap();
             assert!(got == expected, "{ids:?}");
         }
-        let none = Change::default();
+        let none = ParamDelta::default();
         let mut untouched = Gaussians::zeros(40, plain.info().sh_degree);
         let unchanged = Changed::new(Box::new(Scene::new(40, 3)), &none, &straight, ALL_HARMONICS);
         unchanged.open(Ids::Range(0..40)).unwrap().read(1, Columns::all(), &mut untouched).unwrap();
@@ -169,9 +174,9 @@ mod tests {
         let knot = |scale: f32| {
             let mut by = Gaussians::zeros(0, 0);
             by.log_scale = Column::from_planes(3, (0..90).map(|k| scale * k as f32).collect());
-            Change(by)
+            ParamDelta(by)
         };
-        let (change, course) = (knot(0.5), Course(vec![knot(0.0), knot(1.0), knot(-1.0)]));
+        let (change, course) = (knot(0.5), TrajectoryDelta(vec![knot(0.0), knot(1.0), knot(-1.0)]));
         assert!(!plain.info().varying.contains(Columns::LOG_SCALE));
         let changed = Changed::new(Box::new(Scene::new(30, 5)), &change, &course, ALL_HARMONICS);
         assert_eq!(changed.info().varying, plain.info().varying | Columns::LOG_SCALE);

@@ -3,24 +3,29 @@
 use rayon::prelude::*;
 
 use super::BLOCK;
-use super::parts::Parts;
+use super::parts::BlockSlices;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// Readers over Gaussians of a source, open for all the frames that are wanted of it.
 ///
 /// Memory: per Gaussian its reader; per thread one block's state at one frame.
-pub struct Frames<'a> {
+pub struct FrameReaders<'a> {
     info: &'a SequenceInfo,
     columns: Columns,
     count: usize,
     readers: Vec<Box<dyn BlockReader + 'a>>,
 }
 
-impl<'a> Frames<'a> {
+impl<'a> FrameReaders<'a> {
     /// Opens readers for the columns `columns` of the Gaussians `ids` at the frames `wanted`.
-    pub fn open(source: &'a dyn FrameSource, ids: Ids<'_>, columns: Columns, wanted: &Wanted) -> Result<Frames<'a>> {
+    pub fn open(
+        source: &'a dyn FrameSource,
+        ids: Ids<'_>,
+        columns: Columns,
+        wanted: &ReadPlan,
+    ) -> Result<FrameReaders<'a>> {
         let count = ids.len();
         let readers = (0..count.div_ceil(BLOCK))
             .into_par_iter()
@@ -35,7 +40,7 @@ impl<'a> Frames<'a> {
                 Ok(reader)
             })
             .collect::<Result<_>>()?;
-        Ok(Frames { info: source.info(), columns, count, readers })
+        Ok(FrameReaders { info: source.info(), columns, count, readers })
     }
 
     /// A state to read into.
@@ -49,7 +54,7 @@ impl<'a> Frames<'a> {
     }
 }
 
-impl BlockReader for Frames<'_> {
+impl BlockReader for FrameReaders<'_> {
     /// Of the columns `want` those that were opened.
     fn read(&mut self, frame: usize, want: Columns, state: &mut Gaussians) -> Result<()> {
         let want = want & self.columns;
@@ -57,7 +62,7 @@ impl BlockReader for Frames<'_> {
             return Ok(());
         }
         let sh_degree = self.sh_degree();
-        self.readers.par_iter_mut().zip(Parts::of(state, want, self.count)).try_for_each_init(
+        self.readers.par_iter_mut().zip(BlockSlices::of(state, want, self.count)).try_for_each_init(
             || Gaussians::zeros(0, sh_degree),
             |block, (reader, parts)| {
                 reader.read(frame, want, block)?;
@@ -67,21 +72,21 @@ impl BlockReader for Frames<'_> {
         )
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.readers.iter_mut().for_each(|reader| reader.expect(wanted));
     }
 }
 
 /// A reader of the columns `columns` of all Gaussians of a source at the frames `wanted`, to be kept open over them.
 ///
-/// Memory: that of [`Frames`], or of the source's own ([`FrameSource::open_all`]).
+/// Memory: that of [`FrameReaders`], or of the source's own ([`FrameSource::open_all`]).
 pub(super) fn open_all<'a>(
     source: &'a dyn FrameSource,
     columns: Columns,
-    wanted: &Wanted,
+    wanted: &ReadPlan,
 ) -> Result<Box<dyn BlockReader + 'a>> {
     match source.open_all(wanted) {
         Some(opened) => opened,
-        None => Ok(Box::new(Frames::open(source, Ids::Range(0..source.info().count), columns, wanted)?)),
+        None => Ok(Box::new(FrameReaders::open(source, Ids::Range(0..source.info().count), columns, wanted)?)),
     }
 }

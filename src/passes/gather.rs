@@ -1,14 +1,14 @@
 //! The state of many Gaussians at one frame, read in blocks on all threads. Whoever reads more than a frame keeps
-//! readers open instead ([`super::Frames`], [`super::States`]), so that no tile is decoded for each.
+//! readers open instead ([`super::FrameReaders`], [`super::States`]), so that no tile is decoded for each.
 
 use rayon::prelude::*;
 
 use super::BLOCK;
 use super::frames::open_all;
-use super::parts::Parts;
+use super::parts::BlockSlices;
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians};
-use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// Columns `want` of the Gaussians `ids` at `frame`; all other columns are empty.
 ///
@@ -16,8 +16,8 @@ use crate::source::{BlockReader, FrameSource, Ids, Wanted};
 pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns) -> Result<Gaussians> {
     let sh_degree = source.info().sh_degree;
     let mut all = Gaussians::zeros(0, sh_degree);
-    let parts = Parts::of(&mut all, want, ids.len());
-    let wanted = Wanted::of([frame]);
+    let parts = BlockSlices::of(&mut all, want, ids.len());
+    let wanted = ReadPlan::of([frame]);
     ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
         || Gaussians::zeros(0, sh_degree),
         |block, (ids, parts)| {
@@ -34,7 +34,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
 /// Columns `want` of all Gaussians at `frame`; all other columns are empty.
 pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
     let mut all = Gaussians::zeros(0, source.info().sh_degree);
-    open_all(source, want, &Wanted::of([frame]))?.read(frame, want, &mut all)?;
+    open_all(source, want, &ReadPlan::of([frame]))?.read(frame, want, &mut all)?;
     Ok(all)
 }
 

@@ -11,11 +11,11 @@ mod states;
 mod tracks;
 
 pub use changed::Changed;
-pub use frames::Frames;
+pub use frames::FrameReaders;
 pub use gather::{InBlocks, gather, gather_all};
 pub use held::HeldFrames;
-pub use parts::Parts;
-pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, View, show};
+pub use parts::BlockSlices;
+pub use pictures::{Batch, PICTURES_PER_THREAD, Subject, ViewStates, show};
 pub use sample::{Sampler, VIEWS_AT_ONCE, frames_to_see, looked_at, spread, spread_over};
 pub use states::States;
 pub use tracks::{TRACKED, tracks};

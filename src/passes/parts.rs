@@ -4,12 +4,12 @@ use super::BLOCK;
 use crate::model::{Columns, Gaussians};
 
 /// Where the values of one block go: a slice for every component of every column, in their order.
-pub struct Parts<'a>(Vec<&'a mut [f32]>);
+pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
-impl<'a> Parts<'a> {
+impl<'a> BlockSlices<'a> {
     /// The parts of the columns `want` of `state`, which are resized to `count` Gaussians: one for each [`BLOCK`].
-    pub fn of(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<Parts<'a>> {
-        let mut parts: Vec<Parts<'a>> = (0..count.div_ceil(BLOCK)).map(|_| Parts(Vec::new())).collect();
+    pub fn of(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<BlockSlices<'a>> {
+        let mut parts: Vec<BlockSlices<'a>> = (0..count.div_ceil(BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
         for column in state.columns_mut(want) {
             column.resize(count);
             for plane in column.planes_mut().chunks_exact_mut(count.max(1)) {

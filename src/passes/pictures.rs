@@ -9,13 +9,13 @@ use std::sync::{Mutex, PoisonError};
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::Frames;
+use super::FrameReaders;
 use super::frames::open_all;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Camera, Column, Columns, Gaussians, Picture};
 use crate::render::{Image, blend_features, render};
-use crate::source::{BlockReader, Decoder, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FeatureDecoder, FrameSource, Ids, ReadPlan};
 
 /// Pictures of a batch for each thread: enough that the last ones to finish cost little.
 pub const PICTURES_PER_THREAD: usize = 4;
@@ -38,13 +38,13 @@ impl<'a> Subject<'a> {
     }
 
     /// What decodes its features, where all Gaussians are looked at and have some.
-    fn decoder(&self) -> Option<&'a dyn Decoder> {
+    fn decoder(&self) -> Option<&'a dyn FeatureDecoder> {
         self.source.decoder().filter(|_| self.ids.is_none())
     }
 
-    fn open(&self, wanted: &Wanted) -> Result<Box<dyn BlockReader + 'a>> {
+    fn open(&self, wanted: &ReadPlan) -> Result<Box<dyn BlockReader + 'a>> {
         Ok(match &self.ids {
-            Some(ids) => Box::new(Frames::open(self.source, ids.clone(), self.columns, wanted)?),
+            Some(ids) => Box::new(FrameReaders::open(self.source, ids.clone(), self.columns, wanted)?),
             None => open_all(self.source, self.columns, wanted)?,
         })
     }
@@ -88,7 +88,7 @@ impl Batch {
 
 /// A picture to make, with the states of `S` subjects at its frame.
 #[derive(Clone, Copy)]
-pub struct View<'a, const S: usize> {
+pub struct ViewStates<'a, const S: usize> {
     /// Which picture.
     pub picture: Picture,
     /// What takes it.
@@ -96,10 +96,10 @@ pub struct View<'a, const S: usize> {
     /// What it shows.
     pub states: [&'a Gaussians; S],
     /// Of subjects with features in the place of colours, what decodes them, and the features.
-    decoded: [Option<(&'a dyn Decoder, &'a Column)>; S],
+    decoded: [Option<(&'a dyn FeatureDecoder, &'a Column)>; S],
 }
 
-impl<const S: usize> View<'_, S> {
+impl<const S: usize> ViewStates<'_, S> {
     /// The picture of the subject numbered `subject` before `background`, on all threads of the pool, as its own renderer
     /// makes it: of one with features these are blended and decoded, and there is no background.
     pub fn render(&self, subject: usize, background: [f32; 3]) -> Image {
@@ -111,7 +111,7 @@ impl<const S: usize> View<'_, S> {
         self.decoded[subject].map(|(_, features)| features)
     }
 
-    /// [`View::render`] of that subject in another `state`, of as many Gaussians as `features`.
+    /// [`ViewStates::render`] of that subject in another `state`, of as many Gaussians as `features`.
     pub fn render_as(
         &self,
         subject: usize,
@@ -138,7 +138,7 @@ impl<const S: usize> View<'_, S> {
 }
 
 /// States of all subjects at a frame, to be read into again.
-struct Slot<const S: usize> {
+struct StateSlot<const S: usize> {
     frame: usize,
     states: [Gaussians; S],
     /// Features of subjects that have some.
@@ -157,14 +157,14 @@ pub fn show<const S: usize>(
     cameras: &[Camera],
     pictures: &[Picture],
     most: Batch,
-    mut visit: impl FnMut(&[View<'_, S>]) -> Result<()>,
+    mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = Wanted::of(pictures.iter().map(|picture| picture.frame)).holding(most.held);
+    let wanted = ReadPlan::of(pictures.iter().map(|picture| picture.frame)).holding(most.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);
     }
-    let mut slots: Vec<Slot<S>> = Vec::new();
+    let mut slots: Vec<StateSlot<S>> = Vec::new();
     let mut rest = pictures;
     while !rest.is_empty() {
         let (batch, later) = rest.split_at(most.first(rest));
@@ -178,7 +178,7 @@ pub fn show<const S: usize>(
             let is_new = place == slots.len();
             if is_new {
                 let states = std::array::from_fn(|k| Gaussians::zeros(0, subjects[k].source.info().sh_degree));
-                slots.push(Slot { frame, states, features: std::array::from_fn(|_| Column::default()) });
+                slots.push(StateSlot { frame, states, features: std::array::from_fn(|_| Column::default()) });
             } else if slots[place].frame == frame {
                 continue;
             }
@@ -196,10 +196,10 @@ pub fn show<const S: usize>(
             slot.frame = frame;
         }
         let of_frames = batch.chunk_by(|a, b| a.frame == b.frame).zip(&slots);
-        let views: Vec<View<'_, S>> = of_frames
-            .flat_map(|(of_frame, Slot { states, features, .. })| {
+        let views: Vec<ViewStates<'_, S>> = of_frames
+            .flat_map(|(of_frame, StateSlot { states, features, .. })| {
                 let decoded = std::array::from_fn(|k| Some((subjects[k].decoder()?, &features[k])));
-                of_frame.iter().map(move |&picture| View {
+                of_frame.iter().map(move |&picture| ViewStates {
                     picture,
                     camera: &cameras[picture.camera as usize],
                     states: states.each_ref(),
@@ -244,7 +244,8 @@ impl<W: Send> Workers<W> {
             (0..workers.min(views.len())).into_par_iter().with_max_len(1).for_each(|_| {
                 let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
                 let mut worker = free.unwrap_or_else(&new_worker);
-                while let Some(&View { camera, states: [state], .. }) = views.get(next.fetch_add(1, Ordering::Relaxed))
+                while let Some(&ViewStates { camera, states: [state], .. }) =
+                    views.get(next.fetch_add(1, Ordering::Relaxed))
                 {
                     see(&mut worker, state, camera);
                 }
@@ -286,7 +287,7 @@ mod tests {
                 assert!(views.len() <= most.max(1), "{} pictures of at most {most}", views.len());
                 let of_frames = views.chunk_by(|a, b| a.picture.frame == b.picture.frame).count();
                 assert!(of_frames <= frames.max(1), "{of_frames} frames of at most {frames}");
-                for View { picture, camera, states: [state, places], .. } in views {
+                for ViewStates { picture, camera, states: [state, places], .. } in views {
                     assert!(**state == expected[picture.frame], "frame {}", picture.frame);
                     assert!(places.position == state.position && places.sh.is_empty());
                     assert!(std::ptr::eq(*camera, &rig.cameras[picture.camera as usize]));
@@ -311,12 +312,12 @@ mod tests {
             self.0.open(ids)
         }
 
-        fn decoder(&self) -> Option<&dyn Decoder> {
+        fn decoder(&self) -> Option<&dyn FeatureDecoder> {
             Some(self)
         }
     }
 
-    impl Decoder for Rays {
+    impl FeatureDecoder for Rays {
         fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
             *out = Column::zeros(2, self.info().count);
             out.plane_mut(1).fill(frame as f32);

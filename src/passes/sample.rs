@@ -19,7 +19,7 @@ impl Sampler {
     /// The strides of `scan`: of the frames that have pictures the first and every `frame_stride`-th, of the
     /// pictures of each every `view_stride`-th, from one that moves on from frame to frame, so that all views
     /// take their turns.
-    pub fn new(scan: &recipe::Scan) -> Self {
+    pub fn new(scan: &recipe::ScanParams) -> Self {
         Self::with_strides(scan.frame_stride.get() as usize, scan.view_stride.get() as usize)
     }
 
@@ -51,7 +51,7 @@ impl Sampler {
 
 /// The pictures of `schedule` that `scan` looks at: those that its strides leave (see [`Sampler`]), or as many of these as it
 /// looks at most, spread over `frames` frames or more, see [`spread_over`].
-pub fn looked_at(schedule: &Schedule, scan: &recipe::Scan, frames: usize) -> Vec<Picture> {
+pub fn looked_at(schedule: &Schedule, scan: &recipe::ScanParams, frames: usize) -> Vec<Picture> {
     let left = Sampler::new(scan).thin(schedule);
     if scan.look_pictures == 0 || left.pairs() <= scan.look_pictures {
         let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> Vec<Picture> {
@@ -176,7 +176,8 @@ mod tests {
     fn a_look_takes_what_strides_leave_up_to_so_many() {
         let taken = |look_pictures: usize, view_stride: u32| {
             let view_stride = std::num::NonZeroU32::new(view_stride).unwrap();
-            let scan = recipe::Scan { look_pictures, view_stride, ..recipe::Recipe::preset("paper").unwrap().scan };
+            let scan =
+                recipe::ScanParams { look_pictures, view_stride, ..recipe::Recipe::preset("paper").unwrap().scan };
             looked_at(&schedule(60, 12), &scan, 1)
         };
         assert_eq!(

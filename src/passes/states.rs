@@ -3,7 +3,7 @@
 use super::frames::open_all;
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
-use crate::source::{BlockReader, FrameSource, Wanted};
+use crate::source::{BlockReader, FrameSource, ReadPlan};
 
 /// All columns of all Gaussians at one frame after the other; what does not vary is read once.
 ///
@@ -21,7 +21,7 @@ impl<'a> States<'a> {
     ///
     /// # Errors
     /// A source that cannot be opened.
-    pub fn open(source: &'a dyn FrameSource, wanted: &Wanted) -> Result<States<'a>> {
+    pub fn open(source: &'a dyn FrameSource, wanted: &ReadPlan) -> Result<States<'a>> {
         let info = source.info();
         Ok(States {
             reader: open_all(source, Columns::all(), wanted)?,
@@ -64,7 +64,7 @@ mod tests {
         let constant = Columns::all().difference(container.info().varying);
         assert!(!constant.is_empty(), "the scene has no constant column to tell by");
         let frames = [0, 3, 31, 32, 39];
-        let mut states = States::open(&container, &Wanted::of(frames)).unwrap();
+        let mut states = States::open(&container, &ReadPlan::of(frames)).unwrap();
         assert!(states.now().is_empty());
         for frame in frames {
             let expected = gather_all(&scene, frame, Columns::all()).unwrap();

@@ -5,7 +5,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use crate::error::Result;
-use crate::fit::Track;
+use crate::fit::FittedTrack;
 use crate::model::{Columns, Gaussians};
 use crate::progress::Progress;
 use crate::source::{FrameSource, Ids};
@@ -23,7 +23,7 @@ pub fn tracks<R: Send>(
     source: &dyn FrameSource,
     times: &[f64],
     progress: &Progress,
-    make: impl Fn(&Track) -> R + Sync,
+    make: impl Fn(&FittedTrack) -> R + Sync,
 ) -> Result<Vec<R>> {
     let info = source.info();
     let of_block = |ids: Range<usize>| -> Result<Vec<R>> {
@@ -38,7 +38,7 @@ pub fn tracks<R: Send>(
             states.push(state);
         }
         progress.advance((ids.len() * states.len()) as u64);
-        Ok((0..ids.len()).map(|row| make(&Track::of(times, &states, row))).collect())
+        Ok((0..ids.len()).map(|row| make(&FittedTrack::of(times, &states, row))).collect())
     };
     let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKED))
         .into_par_iter()

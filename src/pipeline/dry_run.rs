@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::request::{Goal, Quality, Request};
 use super::summary::CameraSummary;
 use crate::TOOL;
-use crate::budget::{Budget, Plan, Tell, Workload};
+use crate::budget::{Budget, Plan, Verbosity, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::Forecast;
@@ -16,7 +16,7 @@ use crate::journal::records::LeftOut;
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::plan::Job;
 use crate::pipeline::stages::emit::beside_names;
-use crate::pipeline::stages::measure::{Outlook, Stages};
+use crate::pipeline::stages::measure::{InputMeta, Stages};
 use crate::pipeline::throughput::measured;
 use crate::scene::{InputOptions, open_scene};
 
@@ -72,13 +72,13 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     }
     let input = InputOptions { work: None, ..request.input.clone() };
     let mut scene = open_scene(&input)?;
-    let outlook = Outlook::of(&scene);
+    let outlook = InputMeta::of(&scene);
     let job = Job::within(request, outlook, &scene.workload())?;
     job.emit.check(&[&request.input.path])?;
     job.emit.kind.check_frames(scene.source().info().times.len(), &request.output)?;
     scene.input.check_output(job.emit.kind, &request.output)?;
     let needs = |work: &Workload, limits: &_| job.needs(work, limits);
-    let plan = Plan::fit(scene.workload(), Budget { tell: Tell::Nothing, ..input.memory }, needs)?;
+    let plan = Plan::fit(scene.workload(), Budget { tell: Verbosity::Nothing, ..input.memory }, needs)?;
     scene.follow(&plan);
     let forecast = measured(&mut scene, &plan, &job, 0)?;
     let mut journal = Journal::default();
@@ -159,7 +159,7 @@ impl Foreseen {
         for note in &self.notes {
             let _ = writeln!(out, "  note: {note}");
         }
-        out += &self.forecast.text(Tell::Time);
+        out += &self.forecast.text(Verbosity::Time);
         let would_write: Vec<String> =
             self.would_write.iter().map(|path| Path::new(path).shown().to_string()).collect();
         let _ = writeln!(out, "would write {}", would_write.join(", "));

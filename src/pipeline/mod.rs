@@ -16,11 +16,11 @@ pub mod time_estimate;
 pub use dry_run::foresee;
 pub use open::open_to_measure;
 pub use plan::Job;
-pub use record::{Record, Run};
+pub use record::{RecipeRecord, RunOptions};
 pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
-use crate::budget::{Budget, Tell, Workload, seconds};
+use crate::budget::{Budget, Verbosity, Workload, seconds};
 use crate::error::{Error, Result};
 use crate::files::names::name_of;
 use crate::journal::Journal;
@@ -30,14 +30,14 @@ use crate::progress::begin_run;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::{Precision, Recipe, WhichBands};
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::scene::{InputOptions, Scene};
 use open::measured_already;
-use search::size::Space;
+use search::size::ByteLimit;
 use stages::archive::Archived;
-use stages::measure::{Measure, Measured, Outlook, Stages};
+use stages::measure::{InputMeta, Measure, Measured, Stages};
 use stages::merge::Outcome;
-use stages::near::{Asked, LEFT_BY_SEARCH};
+use stages::near::{ArchiveTarget, LEFT_BY_SEARCH};
 use summary::{CameraSummary, InputSummary, Summary};
 
 /// Writes a smaller model and says what was done.
@@ -60,7 +60,7 @@ pub fn compress(request: &Request) -> Result<Summary> {
 /// # Errors
 /// Those of [`compress`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
-    let job = Job::within(request, Outlook::of(scene), &scene.workload())?;
+    let job = Job::within(request, InputMeta::of(scene), &scene.workload())?;
     job.emit.check(&[&scene.path])?;
     reduce(scene, &job, None, request, Journal::default())
 }
@@ -71,7 +71,7 @@ pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<
 /// Those of opening the input; nothing else is read.
 pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
     let plan = |outlook, work: &Workload| Job::within(request, outlook, work);
-    let memory = Budget { tell: Tell::Nothing, ..request.input.memory };
+    let memory = Budget { tell: Verbosity::Nothing, ..request.input.memory };
     let input = InputOptions { work: None, memory, ..request.input.clone() };
     let (scene, job, _) = open_to_measure(&input, plan, &mut Journal::default())?;
     Ok(job.divided(&scene))
@@ -82,7 +82,7 @@ pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
 /// # Errors
 /// A budget that cannot work, and those of [`Job::new`].
 pub fn keep_to_budget(scene: &mut Scene, request: &Request) -> Result<()> {
-    let job = Job::within(request, Outlook::of(scene), &scene.workload())?;
+    let job = Job::within(request, InputMeta::of(scene), &scene.workload())?;
     scene.keep_to(request.input.memory, |work, limits| job.needs(work, limits))
 }
 
@@ -115,29 +115,29 @@ fn reduce(
         let own = &input.digest;
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
     }
-    let recipe = Record::of(request, &job.measure.score.user, input.digest.clone());
+    let recipe = RecipeRecord::of(request, &job.measure.score.user, input.digest.clone());
     let recipe = recipe.text(request, &job.emit.recipe_folder());
 
     let sh_degree = match request.recipe.bands.bands {
         WhichBands::UpTo(degree) => crate::pipeline::stages::bands::highest(scene, degree, &mut journal),
         WhichBands::All | WhichBands::Needed => ALL_HARMONICS,
     };
-    let mut like = Reduction { sh_degree, ..Reduction::pruned(Vec::new(), &request.recipe.merge) };
+    let mut like = CompressedModel { sh_degree, ..CompressedModel::pruned(Vec::new(), &request.recipe.merge) };
     let emit = job.emit.clone();
     let space = match request.goal {
-        Some(Goal::Bytes(most)) => Some(Space { emit: &emit, most, recipe: recipe.len() as u64 }),
+        Some(Goal::Bytes(most)) => Some(ByteLimit { emit: &emit, most, recipe: recipe.len() as u64 }),
         _ => None,
     };
     if let Some(search) = &job.search {
         search.check(scene)?;
     }
     let scored = job.measure.run(scene, arrived, &mut journal)?;
-    let outlook = Outlook::of(scene);
+    let outlook = InputMeta::of(scene);
     let (mut job, fits) = match &space {
         Some(space) => {
             // A field that is to stay exact takes its room at the end.
             let field = if job.field.is_some() { Precision::Half } else { Precision::Exact };
-            let like = Reduction { field, ..like.clone() };
+            let like = CompressedModel { field, ..like.clone() };
             let fits = space.fits(scene, &scored.present(), &like, job.degree.is_some(), &mut journal)?;
             (job.again(request, outlook, fits[0].gaussians)?, fits)
         }
@@ -184,9 +184,9 @@ fn reduce(
     let archived = match &job.archive {
         Some(archive) => {
             let asked = match (&goal, &request.goal) {
-                (Some(goal), _) => Asked::Loss(goal.searched - goal.asked),
-                (None, Some(Goal::Bytes(most))) => Asked::Bytes(*most),
-                _ => Asked::Nothing,
+                (Some(goal), _) => ArchiveTarget::Loss(goal.searched - goal.asked),
+                (None, Some(Goal::Bytes(most))) => ArchiveTarget::Bytes(*most),
+                _ => ArchiveTarget::Nothing,
             };
             Some(archive.run(scene, &reduction, asked, &mut journal)?)
         }
@@ -261,9 +261,9 @@ fn follow(map: &mut [Option<u32>], order: &[u32]) {
 fn of_size(
     scene: &Scene,
     job: &Job,
-    space: Option<&Space<'_>>,
+    space: Option<&ByteLimit<'_>>,
     (scored, ranked): (&Scored, &Ranking),
-    like: &Reduction,
+    like: &CompressedModel,
     journal: &mut Journal,
 ) -> Result<Outcome> {
     let wanted = job.prune.run(scene, scored, ranked, journal)?;
@@ -301,7 +301,7 @@ pub(crate) mod tests {
     use crate::diagnostics::demo_scene;
     use crate::files::container::Container;
     use crate::model::{Columns, SequenceInfo, Split};
-    use crate::models::Residence;
+    use crate::models::MemoryProfile;
     use crate::outputs::container::{FRAME_BLOCK, write_container};
 
     /// A small dynamic scene with its cameras.
@@ -334,7 +334,7 @@ pub(crate) mod tests {
             pictures: 1200,
             rig: 560,
             threads: 2,
-            ..Workload::new(&info, Residence::of_tiles(FRAME_BLOCK as u64))
+            ..Workload::new(&info, MemoryProfile::of_tiles(FRAME_BLOCK as u64))
         }
     }
 }

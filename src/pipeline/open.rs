@@ -12,7 +12,7 @@ use std::io::Stdin;
 
 use glam::DVec3;
 
-use crate::budget::{Budget, Plan, Tell, Workload, size};
+use crate::budget::{Budget, Plan, Verbosity, Workload, size};
 use crate::error::Result;
 use crate::files::cameras;
 use crate::files::frame_stream::FrameStream;
@@ -22,12 +22,12 @@ use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::models::stream::{AHEAD, Streamed, frame_block};
 use crate::models::trajectories::OWN_OUTPUT;
 use crate::passes::{HeldFrames, Sampler};
-use crate::pipeline::stages::measure::{Measure, Measured, Outlook, Stages};
+use crate::pipeline::stages::measure::{InputMeta, Measure, Measured, Stages};
 use crate::pipeline::throughput::measured;
 use crate::pruning::contribution::RunningContribution;
 use crate::recipe;
 use crate::scene::{
-    InputOptions, Opened, Room, Scene, is_linked, link_stream, load_cameras, open_scene, open_stream, receiving,
+    FrameQuota, InputOptions, Opened, Scene, is_linked, link_stream, load_cameras, open_scene, open_stream, receiving,
     scene_of,
 };
 use crate::source::{FrameSource, Reads};
@@ -41,7 +41,7 @@ use crate::statistics::pass::RunningScan;
 /// Whatever is wrong with input, cameras or budget; those of `plan`, before any frame of a stream is read.
 pub fn open_to_measure<S: Stages>(
     options: &InputOptions,
-    plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
+    plan: impl FnOnce(InputMeta, &Workload) -> Result<S>,
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
     let start = Clock::start();
@@ -58,7 +58,7 @@ pub fn open_to_measure<S: Stages>(
     } else {
         open_scene(options)?
     };
-    let stages = plan(Outlook::of(&scene), &scene.workload())?;
+    let stages = plan(InputMeta::of(&scene), &scene.workload())?;
     let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
     scene.follow(&plan);
     // What measuring beforehand reads is no part of the plan.
@@ -85,7 +85,7 @@ fn foretell(
     let tell = options.memory.tell;
     // Of a part nobody knows how much of the run it is.
     let is_part = options.work.as_ref().is_some_and(|work| work.part.is_some());
-    if tell != Tell::Nothing && !is_part {
+    if tell != Verbosity::Nothing && !is_part {
         let forecast = measured(scene, plan, stages, done)?;
         crate::progress::tell(forecast.text(tell).trim_end());
         journal.forecast = Some(forecast);
@@ -99,7 +99,7 @@ fn receive_measured<S: Stages>(
     stream: FrameStream<Stdin>,
     loaded: Option<Rig>,
     options: &InputOptions,
-    plan: impl FnOnce(Outlook, &Workload) -> Result<S>,
+    plan: impl FnOnce(InputMeta, &Workload) -> Result<S>,
     journal: &mut Journal,
 ) -> Result<(Scene, S, Option<Measured>)> {
     let has_cameras = loaded.is_some();
@@ -109,20 +109,20 @@ fn receive_measured<S: Stages>(
     let header = *stream.header();
     let counting = |frames| Workload::of_stream(&header, block, &of_rig, frames);
     let work = counting(0);
-    let stages = plan(Outlook { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
+    let stages = plan(InputMeta { gaussians: count, has_cameras, own_output: OWN_OUTPUT }, &work)?;
     let Measure { scan, visible, .. } = stages.measure();
     let visible = visible.as_ref().filter(|visible| visible.can_look_on_arrival());
     let held = (block + AHEAD) as u64;
-    let fit = |tell: Tell, measuring: Option<bool>| {
+    let fit = |tell: Verbosity, measuring: Option<bool>| {
         Plan::fit(work, Budget { tell, ..options.memory }, |work, limits| {
             let mut all = vec![receiving(work, limits, held, measuring, 0)];
             all.extend(stages.needs(work, limits));
             all
         })
     };
-    let measures = fit(Tell::Nothing, Some(visible.is_some())).is_ok();
+    let measures = fit(Verbosity::Nothing, Some(visible.is_some())).is_ok();
     let memory = fit(options.memory.tell, measures.then_some(visible.is_some()))?;
-    if options.memory.tell == Tell::Time {
+    if options.memory.tell == Verbosity::Time {
         crate::progress::tell(&format!(
             "memory: at most {}; nobody knows how many frames will arrive",
             size(memory.peak())
@@ -132,12 +132,13 @@ fn receive_measured<S: Stages>(
         let limits = memory.limits;
         Plan::closest(work, budget, |work, _| vec![receiving(work, &limits, held, measuring, frames)]).peak()
     };
-    let mut room = Room::new(options.memory, |budget, frames| {
+    let mut room = FrameQuota::new(options.memory, |budget, frames| {
         let later = Plan::closest(counting(frames), budget, |work, limits| stages.needs(work, limits));
         later.peak().max(receive(budget, None, frames))
     });
-    let to_measure = Room::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
-    if options.memory.tell == Tell::Plan {
+    let to_measure =
+        FrameQuota::new(options.memory, |budget, frames| receive(budget, Some(visible.is_some()), frames)).most;
+    if options.memory.tell == Verbosity::Plan {
         crate::progress::tell(&format!(
             "frames: there is memory for {}, for {to_measure} to be measured as they arrive",
             room.most
@@ -171,7 +172,7 @@ fn receive_measured<S: Stages>(
     let opened = Opened { rig: rig_given, input: Box::new(streamed), notes: Vec::new() };
     let mut scene = scene_of(opened, options)?;
     // Now that the frames are counted.
-    let counted = Budget { tell: Tell::Nothing, ..options.memory };
+    let counted = Budget { tell: Verbosity::Nothing, ..options.memory };
     let later = Plan::fit(scene.workload(), counted, |work, limits| stages.needs(work, limits))?;
     scene.follow(&later);
     if measures && measuring.is_none() && room.arrived() > 0 {
@@ -230,7 +231,7 @@ impl<'a> Measuring<'a> {
         rig: &'a Rig,
         split: Option<Split>,
         plan: &'a ScanPlan,
-        scan: &recipe::Scan,
+        scan: &recipe::ScanParams,
         seen: Option<RunningContribution>,
     ) -> Self {
         Measuring {

@@ -2,22 +2,22 @@
 
 use super::ids::parse_ids;
 use super::request::{Goal, Only, Quality, Request, decibels};
-use super::search::Search;
-use crate::budget::{Need, Plan, Workload};
+use super::search::SearchStage;
+use crate::budget::{Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::records::Saved;
 use crate::limits::Limits;
 use crate::outputs::kind::OutputKind;
-use crate::pipeline::stages::archive::Archive;
-use crate::pipeline::stages::bands::Bands;
+use crate::pipeline::stages::archive::ArchiveStage;
+use crate::pipeline::stages::bands::ShDegreeStage;
 use crate::pipeline::stages::choose::Choose;
 use crate::pipeline::stages::degree::Degree;
 use crate::pipeline::stages::emit::Emit;
-use crate::pipeline::stages::field::Field;
-use crate::pipeline::stages::measure::{Measure, Outlook, Stages};
+use crate::pipeline::stages::field::FieldPrecisionStage;
+use crate::pipeline::stages::measure::{InputMeta, Measure, Stages};
 use crate::pipeline::stages::merge;
-use crate::pipeline::stages::merge::Merge;
+use crate::pipeline::stages::merge::MergeStage;
 use crate::pipeline::stages::near::LEFT_BY_SEARCH;
 use crate::pipeline::stages::scan;
 use crate::pruning::prune::Prune;
@@ -27,7 +27,7 @@ use crate::pruning::visible;
 use crate::pruning::visible::Visible;
 use crate::recipe::Coverage;
 use crate::refinement;
-use crate::refinement::Refine;
+use crate::refinement::RefineStage;
 use crate::scene::Scene;
 use crate::statistics::pass::scan_units;
 
@@ -43,47 +43,47 @@ pub struct Job {
     /// Says how many survive.
     pub prune: Prune,
     /// Merges survivors.
-    pub merge: Option<Merge>,
+    pub merge: Option<MergeStage>,
     /// Lets pictures choose.
     pub choose: Option<Choose>,
     /// Moves what is stored of what is left.
-    pub refine: Option<Refine>,
+    pub refine: Option<RefineStage>,
     /// Rounds the field of what is left.
-    pub field: Option<Field>,
+    pub field: Option<FieldPrecisionStage>,
     /// Drops bands of spherical harmonics that nobody sees.
-    pub bands: Option<Bands>,
+    pub bands: Option<ShDegreeStage>,
     /// Finds the size, instead of all from `prune` on.
-    pub search: Option<Search>,
+    pub search: Option<SearchStage>,
     /// Says on which grids an archive's values lie.
-    pub archive: Option<Archive>,
+    pub archive: Option<ArchiveStage>,
     /// Writes.
     pub emit: Emit,
     /// Part of the Gaussians that stays at most.
     left: f64,
     has_cameras: bool,
-    spared: Spared,
+    spared: MemoryFallback,
 }
 
-/// What of refining a budget of memory is too small for, and what there would have to be.
+/// Parts of refinement that are left out because they do not fit within the memory limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-enum Spared {
-    /// Nothing.
+enum MemoryFallback {
+    /// No part is left out.
     #[default]
     Nothing,
-    /// That things change along time.
-    Course {
-        /// Bytes that it would take.
-        least: u64,
+    /// Parameter deltas are constant in time.
+    ConstantInTime {
+        /// Memory with which deltas could vary in time, bytes.
+        required_bytes: u64,
     },
-    /// And that colours change with direction.
-    Bands {
-        /// Bytes that it would take.
-        least: u64,
+    /// SH coefficients above degree 0 are not refined either.
+    WithoutHarmonics {
+        /// Memory with which they could be, bytes.
+        required_bytes: u64,
     },
-    /// All of it.
-    Refining {
-        /// Bytes that it would take.
-        least: u64,
+    /// Nothing is refined.
+    WithoutRefinement {
+        /// Memory with which it could be, bytes.
+        required_bytes: u64,
     },
 }
 
@@ -92,12 +92,12 @@ impl Job {
     ///
     /// # Errors
     /// A recipe out of range; a target or ids that such an input does not have.
-    pub fn new(request: &Request, outlook: Outlook) -> Result<Job> {
-        Job::sparing(request, outlook, Spared::Nothing)
+    pub fn new(request: &Request, outlook: InputMeta) -> Result<Job> {
+        Job::sparing(request, outlook, MemoryFallback::Nothing)
     }
 
     /// [`Job::new`] without what is `spared`.
-    fn sparing(request: &Request, outlook: Outlook, spared: Spared) -> Result<Job> {
+    fn sparing(request: &Request, outlook: InputMeta, spared: MemoryFallback) -> Result<Job> {
         let target = request.target.map(|target| target.count(outlook.gaussians)).transpose()?;
         Job::down_to(request, outlook, target, spared)
     }
@@ -108,30 +108,30 @@ impl Job {
     ///
     /// # Errors
     /// Those of [`Job::new`].
-    pub fn within(request: &Request, outlook: Outlook, work: &Workload) -> Result<Job> {
+    pub fn within(request: &Request, outlook: InputMeta, work: &Workload) -> Result<Job> {
         let of = |spared| Job::sparing(request, outlook, spared);
         let budget = request.input.memory;
-        let asked = of(Spared::Nothing)?;
+        let asked = of(MemoryFallback::Nothing)?;
         if !asked.refines() || Plan::fits(*work, budget, |work, limits| asked.needs(work, limits)) {
             return Ok(asked);
         }
         let least = |job: &Job| Plan::closest(*work, 1, |work, limits| job.needs(work, limits)).peak();
         let of_all = least(&asked);
-        let alike = of(Spared::Course { least: of_all })?;
+        let alike = of(MemoryFallback::ConstantInTime { required_bytes: of_all })?;
         let of_alike = least(&alike);
         if of_alike < of_all && Plan::fits(*work, budget, |work, limits| alike.needs(work, limits)) {
             return Ok(alike);
         }
-        let bands = of(Spared::Bands { least: of_alike })?;
+        let bands = of(MemoryFallback::WithoutHarmonics { required_bytes: of_alike })?;
         if work.sh_degree > 0 && Plan::fits(*work, budget, |work, limits| bands.needs(work, limits)) {
             return Ok(bands);
         }
-        let none = of(Spared::Refining { least: least(&bands) })?;
+        let none = of(MemoryFallback::WithoutRefinement { required_bytes: least(&bands) })?;
         Ok(if Plan::fits(*work, budget, |work, limits| none.needs(work, limits)) { none } else { asked })
     }
 
     /// [`Job::sparing`] down to `target` Gaussians, whatever the request's own target.
-    fn down_to(request: &Request, outlook: Outlook, target: Option<usize>, spared: Spared) -> Result<Job> {
+    fn down_to(request: &Request, outlook: InputMeta, target: Option<usize>, spared: MemoryFallback) -> Result<Job> {
         let Request { recipe, only, .. } = request;
         recipe.validate().map_err(Error::usage)?;
         if request.goal.is_some() && (*only == Only::Merge || request.target.is_some()) {
@@ -147,11 +147,11 @@ impl Job {
         let looks = measure.visible.is_some();
         let prunes = *only != Only::Merge;
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
-        let refine = Refine::of(recipe, part, looks && prunes).and_then(|refine| match spared {
-            Spared::Nothing => Some(refine),
-            Spared::Course { .. } => Some(refine.without_course()),
-            Spared::Bands { .. } => Some(refine.without_course().without_bands()),
-            Spared::Refining { .. } => None,
+        let refine = RefineStage::of(recipe, part, looks && prunes).and_then(|refine| match spared {
+            MemoryFallback::Nothing => Some(refine),
+            MemoryFallback::ConstantInTime { .. } => Some(refine.without_course()),
+            MemoryFallback::WithoutHarmonics { .. } => Some(refine.without_course().without_bands()),
+            MemoryFallback::WithoutRefinement { .. } => None,
         });
         if request.kind.is_none() {
             OutputKind::check_name(&request.output)?;
@@ -185,19 +185,19 @@ impl Job {
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
         let prune = Prune { prunes, merges, target };
         let emit = Emit::new(request, outlook.own_output, merges);
-        let field = Field::of(request, emit.kind);
-        let bands = Bands::of(request, emit.kind);
+        let field = FieldPrecisionStage::of(request, emit.kind);
+        let bands = ShDegreeStage::of(request, emit.kind);
         Ok(Job {
             rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
             degree: Degree::of(request, refine.as_ref()),
-            merge: merges.then(|| Merge::after(&prune, recipe)),
+            merge: merges.then(|| MergeStage::after(&prune, recipe)),
             prune,
             choose: (looks && prunes && merges && recipe.select.choose_by_views)
                 .then_some(Choose { has_target: target.is_some() }),
             search: match &goal {
                 Some(Goal::Quality(quality)) => {
                     let (refine, field, bands) = (refine.clone(), field.clone(), bands.clone());
-                    Some(Search {
+                    Some(SearchStage {
                         quality: quality.clone(),
                         pictures: recipe.refine.refine_pictures,
                         refine,
@@ -210,7 +210,7 @@ impl Job {
             refine: refine.filter(|_| !searches),
             field: field.filter(|_| !searches),
             bands: bands.filter(|_| !searches),
-            archive: is_archive.then_some(Archive { psnr: request.archive_psnr }),
+            archive: is_archive.then_some(ArchiveStage { psnr: request.archive_psnr }),
             emit,
             left: part.unwrap_or(1.0).min(1.0),
             measure,
@@ -228,7 +228,7 @@ impl Job {
     ///
     /// # Errors
     /// Those of [`Job::new`].
-    pub fn again(&self, request: &Request, outlook: Outlook, target: usize) -> Result<Job> {
+    pub fn again(&self, request: &Request, outlook: InputMeta, target: usize) -> Result<Job> {
         Job::down_to(request, outlook, Some(target), self.spared)
     }
 
@@ -267,7 +267,8 @@ impl Job {
 
     /// Writes down the stages that the request leaves out of such a workload.
     pub fn write_down(&self, request: &Request, work: &Workload, limits: &Limits, journal: &mut Journal) {
-        let saved = |need: Need| Saved::Stage { seconds: need.seconds / work.threads as f64, reads: need.reads };
+        let saved =
+            |need: ResourceEstimate| Saved::Stage { seconds: need.seconds / work.threads as f64, reads: need.reads };
         if !self.prune.prunes {
             journal.leave_out("pruning", "--merge-only");
         }
@@ -282,20 +283,24 @@ impl Job {
             match request.recipe.merge.passes.is_empty() {
                 true => journal.leave_out(what, why),
                 false => {
-                    let merge = Merge::after(&self.prune, &request.recipe);
+                    let merge = MergeStage::after(&self.prune, &request.recipe);
                     journal.spare(what, why, saved(merge.need(work, limits)));
                 }
             }
         }
         let takes = |least: u64| format!("memory: expected at least {}MiB for it (--memory)", least.div_ceil(1 << 20));
         match self.spared {
-            Spared::Nothing => (),
-            Spared::Course { least } => journal.leave_out("refining along time", takes(least)),
-            Spared::Bands { least } => {
-                journal.leave_out("refining along time", takes(least));
-                journal.leave_out("refining of harmonics above the first", takes(least));
+            MemoryFallback::Nothing => (),
+            MemoryFallback::ConstantInTime { required_bytes } => {
+                journal.leave_out("refining along time", takes(required_bytes))
             }
-            Spared::Refining { least } => journal.leave_out("refinement", takes(least)),
+            MemoryFallback::WithoutHarmonics { required_bytes } => {
+                journal.leave_out("refining along time", takes(required_bytes));
+                journal.leave_out("refining of harmonics above the first", takes(required_bytes));
+            }
+            MemoryFallback::WithoutRefinement { required_bytes } => {
+                journal.leave_out("refinement", takes(required_bytes))
+            }
         }
         if request.recipe.scan.coverage == Coverage::Auto && !self.has_cameras {
             let why = "no cameras given or found: a virtual rig may see only what is in front of the scene";
@@ -310,7 +315,7 @@ impl Stages for Job {
         &self.measure
     }
 
-    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need> {
+    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         let mut needs = self.measure.needs(work, limits);
         needs.extend(self.rounds.as_ref().map(|stage| stage.need(work, limits)));
         needs.extend(self.degree.as_ref().map(|stage| stage.need(work, limits)));
@@ -328,7 +333,7 @@ impl Stages for Job {
     }
 
     /// What is close enough already is not refined.
-    fn easiest(&self, work: &Workload, limits: &Limits, hardly_seen: f64) -> Vec<Need> {
+    fn easiest(&self, work: &Workload, limits: &Limits, hardly_seen: f64) -> Vec<ResourceEstimate> {
         match self.left >= 1.0 - hardly_seen {
             true => Job { refine: None, ..self.clone() }.needs(work, limits),
             false => self.needs(work, limits),
@@ -349,7 +354,7 @@ mod tests {
     use crate::recipe::Recipe;
     use crate::scene::InputOptions;
 
-    const OUTLOOK: Outlook = Outlook { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
+    const OUTLOOK: InputMeta = InputMeta { gaussians: 1000, has_cameras: true, own_output: OutputKind::Gseq };
 
     fn request(recipe: Recipe) -> Request {
         Request::new(InputOptions::default(), "out.gseq".into(), recipe)
@@ -360,7 +365,7 @@ mod tests {
     }
 
     /// Everything compressing does under `preset`.
-    fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<Need> {
+    fn everything(preset: &str) -> impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate> {
         let recipe = Recipe::preset(preset).unwrap();
         let job = Job::new(&request(recipe), OUTLOOK).unwrap();
         move |work, limits| job.needs(work, limits)
@@ -394,34 +399,42 @@ mod tests {
                 |what: &str| journal.left_out.iter().find(|left| left.what == what).map(|left| left.why.clone());
             let whats = ["refining along time", "refining of harmonics above the first", "refinement"];
             let [time, bands, all] = whats.map(left_out);
-            assert_eq!(job.refine.as_ref().is_some_and(|refine| refine.knots > 0), job.spared == Spared::Nothing);
+            assert_eq!(
+                job.refine.as_ref().is_some_and(|refine| refine.knots > 0),
+                job.spared == MemoryFallback::Nothing
+            );
             (job.spared, job.refine.map(|refine| refine.sh_degree), time.filter(|_| bands.is_none()).or(bands), all)
         };
-        let least = |spared: Spared| match spared {
-            Spared::Course { least } | Spared::Bands { least } | Spared::Refining { least } => least,
-            Spared::Nothing => 0,
+        let least = |spared: MemoryFallback| match spared {
+            MemoryFallback::ConstantInTime { required_bytes }
+            | MemoryFallback::WithoutHarmonics { required_bytes }
+            | MemoryFallback::WithoutRefinement { required_bytes } => required_bytes,
+            MemoryFallback::Nothing => 0,
         };
         let whole = Plan::closest(work, 1, everything("default")).peak();
-        assert_eq!(within(whole).0, Spared::Nothing);
+        assert_eq!(within(whole).0, MemoryFallback::Nothing);
         let (spared, degree, named, none) = within(whole - 1);
-        assert_eq!((spared, degree, none), (Spared::Course { least: whole }, Some(ALL_HARMONICS), None));
+        assert_eq!(
+            (spared, degree, none),
+            (MemoryFallback::ConstantInTime { required_bytes: whole }, Some(ALL_HARMONICS), None)
+        );
         assert!(named.unwrap().contains(&format!("{}MiB", whole.div_ceil(1 << 20))));
         let (spared, ..) = (1..).map(|k| within(whole - k * (1 << 20))).find(|found| found.1 == Some(0)).unwrap();
         let all = least(spared);
-        assert!(matches!(spared, Spared::Bands { .. }) && all < whole, "{spared:?}");
-        assert!(matches!(within(all).0, Spared::Course { .. }));
+        assert!(matches!(spared, MemoryFallback::WithoutHarmonics { .. }) && all < whole, "{spared:?}");
+        assert!(matches!(within(all).0, MemoryFallback::ConstantInTime { .. }));
         let (spared, degree, named, none) = within(all - 1);
-        assert_eq!((spared, degree, none), (Spared::Bands { least: all }, Some(0), None));
+        assert_eq!((spared, degree, none), (MemoryFallback::WithoutHarmonics { required_bytes: all }, Some(0), None));
         assert!(named.unwrap().contains(&format!("{}MiB", all.div_ceil(1 << 20))));
         let (spared, ..) = (1..).map(|k| within(all - k * (1 << 20))).find(|found| found.1.is_none()).unwrap();
         let bands = least(spared);
-        assert!(matches!(spared, Spared::Refining { .. }) && bands < all, "{spared:?}");
-        assert!(matches!(within(bands).0, Spared::Bands { .. }));
+        assert!(matches!(spared, MemoryFallback::WithoutRefinement { .. }) && bands < all, "{spared:?}");
+        assert!(matches!(within(bands).0, MemoryFallback::WithoutHarmonics { .. }));
         let (spared, refine, _, named) = within(bands - 1);
-        assert_eq!((spared, refine), (Spared::Refining { least: bands }, None));
+        assert_eq!((spared, refine), (MemoryFallback::WithoutRefinement { required_bytes: bands }, None));
         assert!(named.unwrap().contains(&format!("{}MiB", bands.div_ceil(1 << 20))));
         // What nothing can be done about is refused as it was asked for.
-        assert_eq!(within(1 << 20).0, Spared::Nothing);
+        assert_eq!(within(1 << 20).0, MemoryFallback::Nothing);
     }
 
     #[test]

@@ -28,7 +28,7 @@ pub struct Provenance {
 /// What decides a result beside its hyper-parameters. What is none was not asked for.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct Run {
+pub struct RunOptions {
     /// Which of pruning and merging was done.
     pub mode: Only,
     /// Exact number of Gaussians in the output.
@@ -80,16 +80,16 @@ pub struct Run {
 
 /// A recipe file's tables beside its hyper-parameters.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Record {
+pub struct RecipeRecord {
     /// Where it comes from.
     #[serde(default)]
     pub provenance: Option<Provenance>,
     /// What was asked for.
     #[serde(default)]
-    pub run: Option<Run>,
+    pub run: Option<RunOptions>,
 }
 
-impl Run {
+impl RunOptions {
     /// The exact size that was asked for.
     pub fn target(&self) -> Option<Target> {
         self.target_count.map(Target::Count).or(self.target_ratio.map(Target::Ratio))
@@ -118,9 +118,9 @@ impl Run {
     }
 }
 
-impl Run {
+impl RunOptions {
     /// Replaces every path by what `path` makes of it.
-    fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> Run {
+    fn with_paths(mut self, path: impl Fn(&Path) -> PathBuf) -> RunOptions {
         self.cameras = self.cameras.as_deref().map(&path);
         self.ground_truth = self.ground_truth.as_deref().map(&path);
         self.times = self.times.as_deref().map(|times| match Times::named(times) {
@@ -131,15 +131,15 @@ impl Run {
     }
 }
 
-impl Record {
+impl RecipeRecord {
     /// Of `request`, whose ids are those of `user`.
-    pub(super) fn of(request: &Request, user: &UserOverrides, input_digest: String) -> Record {
+    pub(super) fn of(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
         let (target_count, target_ratio) = match request.target {
             None => (None, None),
             Some(Target::Count(count)) => (Some(count), None),
             Some(Target::Ratio(ratio)) => (None, Some(ratio)),
         };
-        let mut run = Run::default();
+        let mut run = RunOptions::default();
         match &request.goal {
             None => (),
             Some(Goal::Bytes(most)) => run.target_size = Some(*most),
@@ -150,7 +150,7 @@ impl Record {
         }
         let ids = |ids: &[u32]| (!ids.is_empty()).then(|| ranges(ids).join(","));
         let input = &request.input;
-        let run = Run {
+        let run = RunOptions {
             mode: request.only,
             target_count,
             target_ratio,
@@ -171,22 +171,25 @@ impl Record {
             ..run
         };
         let tool = TOOL.to_owned();
-        Record { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
+        RecipeRecord { provenance: Some(Provenance { tool, input_digest }), run: Some(run) }
     }
 
     /// Parses what the text of a recipe file in `folder` says beside its hyper-parameters. Files that it names by relative
     /// paths are those that `folder` leads to.
     ///
     /// # Errors
-    /// A table that is not as [`Run`] has it, in words.
-    pub fn read(text: &str, folder: &Path) -> std::result::Result<Record, String> {
-        let record: Record = toml::from_str(text).map_err(|error| error.to_string())?;
-        Ok(Record { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
+    /// A table that is not as [`RunOptions`] has it, in words.
+    pub fn read(text: &str, folder: &Path) -> std::result::Result<RecipeRecord, String> {
+        let record: RecipeRecord = toml::from_str(text).map_err(|error| error.to_string())?;
+        Ok(RecipeRecord { run: record.run.map(|run| run.with_paths(|path| folder.join(path))), ..record })
     }
 
     /// Returns the record for a recipe file in `folder`: with paths seen from there, without those of this machine.
-    fn seen_from(&self, folder: &Path) -> Record {
-        Record { run: self.run.clone().map(|run| run.with_paths(|path| from_folder(path, folder))), ..self.clone() }
+    fn seen_from(&self, folder: &Path) -> RecipeRecord {
+        RecipeRecord {
+            run: self.run.clone().map(|run| run.with_paths(|path| from_folder(path, folder))),
+            ..self.clone()
+        }
     }
 
     /// Returns the text of `recipe.toml` in `folder`.
@@ -220,15 +223,15 @@ mod tests {
         (request.only, request.target) = (Only::Prune, Some(Target::Ratio(0.3)));
         (request.keep_box, request.kind) = (Some([-1.0, 0.0, 0.5, 1.0, 2.0, 1e9]), Some(OutputKind::PlySequence));
         let user = UserOverrides { keep: vec![1, 2, 3, 9], drop: Vec::new(), keep_box: request.keep_box };
-        let record = Record::of(&request, &user, "00ff".to_owned());
+        let record = RecipeRecord::of(&request, &user, "00ff".to_owned());
         let folder = Path::new("/somewhere/else");
         let text = record.text(&request, folder);
         // The folder is far from the working directory, so that the cameras keep their name alone.
-        let read = Record::read(&text, folder).unwrap();
+        let read = RecipeRecord::read(&text, folder).unwrap();
         assert_eq!(read.run.as_ref().unwrap().cameras.as_deref(), Some(&*folder.join("data, \"odd\" name")), "{text}");
         let cameras = record.run.as_ref().unwrap().cameras.clone();
-        let run = read.run.map(|run| Run { cameras, ..run });
-        assert_eq!(Record { run, ..read }, record, "{text}");
+        let run = read.run.map(|run| RunOptions { cameras, ..run });
+        assert_eq!(RecipeRecord { run, ..read }, record, "{text}");
         assert_eq!(Recipe::from_toml(&text, "default").unwrap(), request.recipe, "{text}");
         assert_eq!(record.run.unwrap().keep_ids.as_deref(), Some("1-3,9"));
     }
@@ -236,28 +239,30 @@ mod tests {
     #[test]
     fn a_recipe_names_files_seen_from_its_folder() {
         let here = std::env::current_dir().unwrap();
-        let run = Run {
+        let run = RunOptions {
             cameras: Some(here.join("data/cameras.json")),
             ground_truth: Some("photos".into()),
             times: Some("table.csv".to_owned()),
-            ..Run::default()
+            ..RunOptions::default()
         };
-        let record = Record { run: Some(run), ..Record::default() };
+        let record = RecipeRecord { run: Some(run), ..RecipeRecord::default() };
         let seen = record.seen_from(&here.join("out/small")).run.unwrap();
         assert_eq!(seen.cameras.as_deref(), Some(Path::new("../../data/cameras.json")));
         assert_eq!(seen.ground_truth.as_deref(), Some(Path::new("../../photos")));
         assert_eq!(seen.times.as_deref(), Some("../../table.csv"));
-        let text = toml::to_string(&Record { run: Some(seen), ..Record::default() }).unwrap();
-        let read = Record::read(&text, &here.join("out/small")).unwrap().run.unwrap();
+        let text = toml::to_string(&RecipeRecord { run: Some(seen), ..RecipeRecord::default() }).unwrap();
+        let read = RecipeRecord::read(&text, &here.join("out/small")).unwrap().run.unwrap();
         assert_eq!(read.cameras, Some(here.join("out/small/../../data/cameras.json")));
-        let named =
-            Record { run: Some(Run { times: Some("names".to_owned()), ..Run::default() }), ..Record::default() };
+        let named = RecipeRecord {
+            run: Some(RunOptions { times: Some("names".to_owned()), ..RunOptions::default() }),
+            ..RecipeRecord::default()
+        };
         assert_eq!(named.seen_from(Path::new("/x/y/z")).run.unwrap().times.as_deref(), Some("names"));
     }
 
     #[test]
     fn a_misspelt_option_of_a_run_is_named() {
-        let message = Record::read("[run]\ntarget_rato = 0.3\n", Path::new("")).unwrap_err();
+        let message = RecipeRecord::read("[run]\ntarget_rato = 0.3\n", Path::new("")).unwrap_err();
         assert!(message.contains("target_rato"), "{message}");
     }
 

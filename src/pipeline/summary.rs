@@ -11,15 +11,15 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::{Deserialize, Serialize};
 
-use crate::archive::Parts;
+use crate::archive::ArchiveSize;
 use crate::error::{Result, ShowPath};
 use crate::files::names::name_of;
 use crate::journal::records::{
-    BandsSummary, FieldSummary, FlagSummary, Forecast, LeftOut, RefinedSummary, Stage, TermSummary, number, sizes,
+    BandsSummary, FieldSummary, FlagSummary, Forecast, LeftOut, RefinedSummary, StageRecord, TermSummary, number, sizes,
 };
 use crate::merging::PassCounts;
 use crate::metrics::{PSNR_CAP_DB, decibels_text};
-use crate::models::{Family, Size};
+use crate::models::{InputModel, Size};
 use crate::progress::duration;
 use crate::pruning::Counts;
 use crate::recipe::ProxyOpacity;
@@ -59,7 +59,7 @@ pub struct ArchiveSummary {
     pub loss: f64,
     /// Bytes of its parts; none of frames, which are one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub parts: Option<Parts>,
+    pub parts: Option<ArchiveSize>,
     /// Of frames the bound of every column, by name, in its unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bounds: Option<BTreeMap<String, f64>>,
@@ -99,7 +99,7 @@ impl InputSummary {
     ///
     /// # Errors
     /// A file that cannot be read.
-    pub fn of(input: &dyn Family, path: &Path, digest: String) -> Result<InputSummary> {
+    pub fn of(input: &dyn InputModel, path: &Path, digest: String) -> Result<InputSummary> {
         let info = input.source().info();
         Ok(InputSummary {
             path: path.to_string_lossy().into_owned(),
@@ -219,7 +219,7 @@ pub struct Summary {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub forecast: Option<Forecast>,
     /// Everything in order.
-    pub stages: Vec<Stage>,
+    pub stages: Vec<StageRecord>,
     /// Percentiles of every term.
     pub terms: Vec<TermSummary>,
     /// Odd Gaussians.

@@ -8,7 +8,7 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use crate::budget::{LOOK, Pace, Plan, REMOVE, RENDER, Workload};
+use crate::budget::{LOOK, Plan, REMOVE, RENDER, Throughput, Workload};
 use crate::error::Result;
 use crate::journal::Clock;
 use crate::journal::records::Forecast;
@@ -18,7 +18,7 @@ use crate::pipeline::stages::measure::Stages;
 use crate::pipeline::time_estimate::core_seconds;
 use crate::render::{Contribution, RemovalError, Renderer};
 use crate::scene::Scene;
-use crate::source::{Ids, Wanted};
+use crate::source::{Ids, ReadPlan};
 
 /// Part of what a run is expected to take that may go into finding out, ...
 const PART: f64 = 0.04;
@@ -56,14 +56,14 @@ pub(super) fn measured(scene: &mut Scene, plan: &Plan, stages: &impl Stages, don
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Calibration {
     /// How fast.
-    pace: Pace,
+    pace: Throughput,
     /// Part of the Gaussians that pictures hardly differ without; 0 if nothing was looked at.
     hardly_seen: f64,
 }
 
 impl Calibration {
     /// Of nothing.
-    const NONE: Calibration = Calibration { pace: Pace::UNKNOWN, hardly_seen: 0.0 };
+    const NONE: Calibration = Calibration { pace: Throughput::UNKNOWN, hardly_seen: 0.0 };
 
     /// Of `scene`, for a run that is expected to take so many seconds on all threads; of a short one nothing but the states
     /// of some Gaussians is looked at.
@@ -78,7 +78,7 @@ impl Calibration {
         let room = (PART * expected).min(MOST_SECONDS) * work.threads as f64;
         let mut spent = Spent::default();
         let states = states(scene, &work, room, &mut spent)?;
-        let machine = Pace { states, look: states, remove: states, render: states, processors: None };
+        let machine = Throughput { states, look: states, remove: states, render: states, processors: None };
         let work = Workload { pace: machine, ..work };
         let each = PICTURES as f64 * work.threads as f64;
         let pictures = [LOOK, REMOVE, RENDER].map(|way| work.picturing(each, work.count(), way));
@@ -164,7 +164,7 @@ fn states(scene: &Scene, work: &Workload, room: f64, spent: &mut Spent) -> Resul
     let open = |k: usize| -> Result<_> {
         let start = k * all / blocks * BLOCK;
         let mut reader = source.open(Ids::Range(start..source.info().count.min(start + BLOCK)))?;
-        reader.expect(&Wanted::of(0..frames));
+        reader.expect(&ReadPlan::of(0..frames));
         let mut state = Gaussians::zeros(0, source.info().sh_degree);
         reader.read(0, columns, &mut state)?;
         Ok((reader, state))

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::budget::{Need, Tell, Workload, size};
+use crate::budget::{ResourceEstimate, Verbosity, Workload, size};
 use crate::journal::records::{Forecast, Range, StageForecast};
 use crate::progress::duration;
 
@@ -20,7 +20,13 @@ const AT_LEAST: f64 = 0.5;
 
 impl Forecast {
     /// Of stages that need what `needs` says, or at best take `least` core-seconds.
-    pub(super) fn of(work: &Workload, needs: &[Need], least: f64, searches: bool, memory_bytes: u64) -> Forecast {
+    pub(super) fn of(
+        work: &Workload,
+        needs: &[ResourceEstimate],
+        least: f64,
+        searches: bool,
+        memory_bytes: u64,
+    ) -> Forecast {
         let likely = core_seconds(needs);
         let measured = work.pace.processors;
         let off = match (searches, measured) {
@@ -47,7 +53,7 @@ impl Forecast {
     }
 
     /// For a person: time and memory, a line each; stage by stage too where everything is to be explained.
-    pub fn text(&self, tell: Tell) -> String {
+    pub fn text(&self, tell: Verbosity) -> String {
         let Forecast { seconds, core_seconds: core, threads, stages, .. } = self;
         let mut out = String::new();
         // Writing to a String cannot fail.
@@ -63,7 +69,7 @@ impl Forecast {
                 digits(core.most)
             ),
         };
-        if tell == Tell::Plan {
+        if tell == Verbosity::Plan {
             let named = stages.iter().map(|stage| format!("{} {:.1}", stage.name, stage.core_seconds));
             let _ = writeln!(out, "core-seconds: {}", named.collect::<Vec<_>>().join(" + "));
         }
@@ -73,7 +79,7 @@ impl Forecast {
 }
 
 /// Seconds of all processors together that stages take, about.
-pub(super) fn core_seconds(needs: &[Need]) -> f64 {
+pub(super) fn core_seconds(needs: &[ResourceEstimate]) -> f64 {
     needs.iter().map(|need| need.seconds).sum()
 }
 
@@ -101,17 +107,18 @@ fn rounded(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Pace;
+    use crate::budget::Throughput;
     use crate::pipeline::tests::work;
 
-    fn need(seconds: f64) -> Need {
-        Need { stage: "scan", reads: 0.0, seconds, per_gaussian: Vec::new(), fixed: Vec::new() }
+    fn need(seconds: f64) -> ResourceEstimate {
+        ResourceEstimate { stage: "scan", reads: 0.0, seconds, per_gaussian: Vec::new(), fixed: Vec::new() }
     }
 
     #[test]
     fn a_range_holds_what_is_likely_and_is_wider_where_less_is_known() {
         let unmeasured = work(1000);
-        let measured = crate::budget::Workload { pace: Pace { processors: Some(1.5), ..Pace::UNKNOWN }, ..unmeasured };
+        let measured =
+            crate::budget::Workload { pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN }, ..unmeasured };
         let of = |work: &Workload, searches| Forecast::of(work, &[need(40.0)], 40.0, searches, 1 << 20);
         let all = [of(&measured, false), of(&unmeasured, false), of(&measured, true)];
         for Forecast { seconds, core_seconds, .. } in &all {
@@ -121,10 +128,10 @@ mod tests {
         }
         let width = |forecast: &Forecast| forecast.core_seconds.most / forecast.core_seconds.least;
         assert!(width(&all[0]) < width(&all[1]) && width(&all[0]) < width(&all[2]));
-        let text = all[0].text(Tell::Plan);
+        let text = all[0].text(Verbosity::Plan);
         assert!(text.starts_with("time: about ") && text.contains(" core-seconds\n"), "{text}");
         assert!(text.contains("\ncore-seconds: scan 40.0\n") && text.ends_with("memory: at most 1.0 MiB\n"), "{text}");
-        assert!(!all[0].text(Tell::Time).contains("scan"));
+        assert!(!all[0].text(Verbosity::Time).contains("scan"));
     }
 
     #[test]

@@ -13,7 +13,7 @@ use glam::DVec3;
 use hashbrown::HashMap;
 use serde::Serialize;
 
-use super::track::Track;
+use super::track::PageSequence;
 use crate::TOOL;
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
@@ -42,7 +42,7 @@ const SHADERS: [(&str, &str); 5] = [
 
 /// One model as the page is told of it.
 #[derive(Debug, Serialize)]
-pub struct Shown {
+pub struct PageModel {
     /// What it is: `original` or `compressed`.
     pub role: &'static str,
     /// Name of its file or folder.
@@ -54,18 +54,18 @@ pub struct Shown {
     /// Degree of harmonics that it has.
     pub degree: usize,
     /// What is shown.
-    pub track: Track,
+    pub track: PageSequence,
 }
 
 /// What the page is told.
 #[derive(Debug, Serialize)]
-pub struct Stage {
+pub struct PageScene {
     /// What made the page.
     pub tool: &'static str,
     /// One, or the original and the compressed one.
-    pub models: Vec<Shown>,
+    pub models: Vec<PageModel>,
     /// Where cameras stood.
-    pub cameras: Vec<Look>,
+    pub cameras: Vec<PageCamera>,
     /// Behind the scene, red, green, blue in [0, 1].
     pub background: [f32; 3],
     /// Middle of the scene.
@@ -80,7 +80,7 @@ pub struct Stage {
 
 /// A camera, as the page is told.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Look {
+pub struct PageCamera {
     view: u32,
     split: Split,
     /// When its only picture was taken.
@@ -95,9 +95,9 @@ pub struct Look {
 }
 
 /// The cameras of a rig, one for each place and size.
-pub fn looks(rig: &Rig) -> Vec<Look> {
+pub fn looks(rig: &Rig) -> Vec<PageCamera> {
     let mut places: HashMap<(u32, u32), usize> = HashMap::new();
-    let mut found: Vec<(Look, usize)> = Vec::new();
+    let mut found: Vec<(PageCamera, usize)> = Vec::new();
     for shot in &rig.shots {
         let place = *places.entry((shot.view, shot.camera)).or_insert(found.len());
         if let Some((look, shots)) = found.get_mut(place) {
@@ -106,7 +106,7 @@ pub fn looks(rig: &Rig) -> Vec<Look> {
             continue;
         }
         let camera = &rig.cameras[shot.camera as usize];
-        let look = Look {
+        let look = PageCamera {
             view: shot.view,
             split: shot.split,
             time: shot.time,
@@ -181,7 +181,7 @@ impl Chunks {
     ///
     /// # Errors
     /// A disk that is full.
-    pub fn write_page(&self, stage: &Stage, path: &Path) -> Result<u64> {
+    pub fn write_page(&self, stage: &PageScene, path: &Path) -> Result<u64> {
         let failed = || Error::io("write", path);
         let mut to = BufWriter::new(File::create(path).map_err(failed())?);
         to.write_all(head(stage, &self.digests).as_bytes()).map_err(failed())?;
@@ -199,7 +199,7 @@ impl Chunks {
     ///
     /// # Errors
     /// A disk that is full.
-    pub fn write_folder(&self, stage: &mut Stage, folder: &Path) -> Result<(Vec<String>, u64)> {
+    pub fn write_folder(&self, stage: &mut PageScene, folder: &Path) -> Result<(Vec<String>, u64)> {
         stage.files = self.ordered().into_iter().map(|(model, chunk)| name(model, chunk)).collect();
         for file in &stage.files {
             let (from, to) = (self.folder.path().join(file), folder.join(file));
@@ -219,7 +219,7 @@ fn name(model: usize, chunk: usize) -> String {
 }
 
 /// Returns the page up to its chunks; its policy allows its own scripts, and those of `chunks`.
-fn head(stage: &Stage, chunks: &[String]) -> String {
+fn head(stage: &PageScene, chunks: &[String]) -> String {
     let shaders: serde_json::Map<String, serde_json::Value> =
         SHADERS.iter().map(|&(name, text)| (name.to_owned(), text.into())).collect();
     let json = serde_json::to_value(stage).expect("plain data");
@@ -253,8 +253,8 @@ mod tests {
     use super::*;
     use crate::player::lattice::Steps;
 
-    fn stage(name: &str) -> Stage {
-        let track = Track {
+    fn stage(name: &str) -> PageScene {
+        let track = PageSequence {
             count: 0,
             sh_degree: 0,
             times: vec![0.0],
@@ -263,9 +263,9 @@ mod tests {
             groups: vec![1],
             unseen: 0,
         };
-        Stage {
+        PageScene {
             tool: TOOL,
-            models: vec![Shown { role: "original", name: name.to_owned(), bytes: 0, frames: 1, degree: 0, track }],
+            models: vec![PageModel { role: "original", name: name.to_owned(), bytes: 0, frames: 1, degree: 0, track }],
             cameras: Vec::new(),
             background: [0.0; 3],
             middle: [0.0; 3],

@@ -23,7 +23,7 @@ use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians};
 use crate::passes::States;
 use crate::progress::Progress;
-use crate::source::{FrameSource, Wanted};
+use crate::source::{FrameSource, ReadPlan};
 
 /// Lattice points of a group's frames that lie ready together.
 pub const GROUP_VALUES: usize = 1 << 23;
@@ -38,7 +38,7 @@ const WIDE: u8 = 16;
 
 /// What the page is told of a sequence before its chunks.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Track {
+pub struct PageSequence {
     /// N.
     pub count: usize,
     /// Degree of the harmonics that are shown.
@@ -56,9 +56,9 @@ pub struct Track {
     pub unseen: usize,
 }
 
-impl Track {
+impl PageSequence {
     /// How `frames` of `source` are divided, with harmonics of at most `sh_degree`.
-    pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: Steps) -> Track {
+    pub fn plan(source: &dyn FrameSource, frames: &[usize], sh_degree: usize, steps: Steps) -> PageSequence {
         let info = source.info();
         let sh_degree = sh_degree.min(info.sh_degree);
         let of_frame = info.varying.width(sh_degree).max(1) * info.count.max(1);
@@ -66,7 +66,7 @@ impl Track {
         // All alike in length, for each costs about the same to begin.
         let groups = (frames.len().saturating_sub(1)).div_ceil(together);
         let varying = if groups == 0 { Columns::empty() } else { changing(info.varying) };
-        Track {
+        PageSequence {
             count: info.count,
             sh_degree,
             times: frames.iter().map(|&frame| info.times[frame]).collect(),
@@ -96,13 +96,13 @@ fn changing(varying: Columns) -> Columns {
 pub fn encode(
     source: &dyn FrameSource,
     frames: &[usize],
-    track: &mut Track,
+    track: &mut PageSequence,
     held: usize,
     mut sink: impl FnMut(usize, Vec<u8>) -> Result<()>,
 ) -> Result<()> {
     let Some(&first) = frames.first() else { return Ok(()) };
     let progress = Progress::new("view", "frames", frames.len() as u64);
-    let mut states = States::open(source, &Wanted::of(frames.iter().copied()).holding(held))?;
+    let mut states = States::open(source, &ReadPlan::of(frames.iter().copied()).holding(held))?;
     let mut shown = Gaussians::default();
     let (count, degree) = (track.count, track.sh_degree);
     let mut points = vec![0; width(degree) * count];
@@ -201,7 +201,7 @@ mod tests {
     use crate::passes::gather_all;
 
     /// Every frame of the chunks, `[frames][width][N]`: the words of the header of this file, one value at a time.
-    fn unpacked(track: &Track, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
+    fn unpacked(track: &PageSequence, chunks: &[Vec<u8>]) -> Vec<Vec<Vec<i64>>> {
         let (count, width) = (track.count, width(track.sh_degree));
         let chunk = |k: usize, moving: &[usize], frames: usize, base: &[Vec<i64>]| {
             let mut bytes = Vec::new();
@@ -243,8 +243,8 @@ mod tests {
         frames
     }
 
-    fn encoded(source: &dyn FrameSource, frames: &[usize], degree: usize) -> (Track, Vec<Vec<u8>>) {
-        let mut track = Track::plan(source, frames, degree, Steps::of_extent(2.0));
+    fn encoded(source: &dyn FrameSource, frames: &[usize], degree: usize) -> (PageSequence, Vec<Vec<u8>>) {
+        let mut track = PageSequence::plan(source, frames, degree, Steps::of_extent(2.0));
         let mut chunks = Vec::new();
         let sink = |place: usize, bytes| {
             assert_eq!(place, chunks.len());

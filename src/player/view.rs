@@ -4,16 +4,16 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::TOOL;
-use crate::budget::{Need, Plan, Workload};
+use crate::budget::{Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::evaluation::open_compressed;
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
 use crate::model::{ALL_HARMONICS, Columns, SequenceInfo};
-use crate::models::Family;
+use crate::models::InputModel;
 use crate::player::lattice::{Steps, width};
-use crate::player::page::{Chunks, INDEX, Shown, Stage, looks, upwards};
-use crate::player::track::{GROUP_VALUES, Track, encode};
+use crate::player::page::{Chunks, INDEX, PageModel, PageScene, looks, upwards};
+use crate::player::track::{GROUP_VALUES, PageSequence, encode};
 use crate::scene::pictures::background;
 use crate::scene::{InputOptions, first_box, open_scene, scratch_beside};
 
@@ -107,10 +107,10 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
     };
     let scratch = scratch_beside(&options.output).unwrap_or_else(|| scene.scratch.clone());
     let (mut chunks, mut notes) = (Chunks::new(&scratch)?, std::mem::take(&mut scene.notes));
-    let asked = Asked { role: "original", path: &scene.path, frames, degree };
+    let asked = ModelView { role: "original", path: &scene.path, frames, degree };
     let mut models = vec![show(&*scene.input, 0, &asked, steps, &limits, &mut chunks)?];
     if let Some((path, model)) = options.compressed.as_deref().zip(compressed.as_deref()) {
-        let asked = Asked { role: "compressed", path, frames: all, degree: ALL_HARMONICS };
+        let asked = ModelView { role: "compressed", path, frames: all, degree: ALL_HARMONICS };
         models.push(show(model, 1, &asked, steps, &limits, &mut chunks)?);
     }
     for model in models.iter().filter(|model| model.track.unseen > 0) {
@@ -118,7 +118,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
         notes.push(format!("{name}: {unseen} Gaussians are not finite, or too far away to be shown"));
     }
     let frames = models.iter().map(|model| model.track.times.len()).max().unwrap_or(0);
-    let mut stage = Stage {
+    let mut stage = PageScene {
         tool: TOOL,
         models,
         cameras: looks(&scene.rig),
@@ -152,7 +152,7 @@ pub fn view(options: &ViewOptions) -> Result<Viewed> {
 }
 
 /// How a model is to be shown.
-struct Asked<'a> {
+struct ModelView<'a> {
     role: &'static str,
     path: &'a Path,
     frames: usize,
@@ -161,24 +161,31 @@ struct Asked<'a> {
 
 /// Makes the chunks of model `place` of the page.
 fn show(
-    model: &dyn Family,
+    model: &dyn InputModel,
     place: usize,
-    asked: &Asked<'_>,
+    asked: &ModelView<'_>,
     steps: Steps,
     limits: &Limits,
     chunks: &mut Chunks,
-) -> Result<Shown> {
+) -> Result<PageModel> {
     let source = model.source();
     let SequenceInfo { times, sh_degree, .. } = source.info();
     let frames = evenly(times.len(), asked.frames);
-    let mut track = Track::plan(source, &frames, asked.degree, steps);
+    let mut track = PageSequence::plan(source, &frames, asked.degree, steps);
     let groups = track.groups.clone();
     encode(source, &frames, &mut track, limits.frames_held, |chunk, bytes| {
         let since = chunk.checked_sub(1).map_or(0.0, |group| groups[group] as f64 / frames.len() as f64);
         chunks.add(place, chunk, since, &bytes)
     })?;
     let name = asked.path.file_name().unwrap_or(asked.path.as_os_str()).to_string_lossy().into_owned();
-    Ok(Shown { role: asked.role, name, bytes: model.size()?.whole(), frames: times.len(), degree: *sh_degree, track })
+    Ok(PageModel {
+        role: asked.role,
+        name,
+        bytes: model.size()?.whole(),
+        frames: times.len(),
+        degree: *sh_degree,
+        track,
+    })
 }
 
 /// `count` of `frames` frames at most, evenly from first to last.
@@ -189,10 +196,10 @@ fn evenly(frames: usize, count: usize) -> Vec<usize> {
 }
 
 /// What it takes to turn frames into chunks.
-fn need(work: &Workload, limits: &Limits) -> Need {
+fn need(work: &Workload, limits: &Limits) -> ResourceEstimate {
     let points = 4 * width(work.sh_degree) as u64;
     let of_all = points / 4 * work.gaussians * work.frames.max(1);
-    Need {
+    ResourceEstimate {
         stage: NAME,
         reads: 1.0,
         seconds: work.reading(work.count(), work.frames as f64),

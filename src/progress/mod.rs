@@ -35,7 +35,7 @@ static BARS: LazyLock<MultiProgress> =
 static QUIET: AtomicBool = AtomicBool::new(true);
 /// Of those that are told of line by line, how many go on.
 static LOGS: AtomicUsize = AtomicUsize::new(0);
-static RUN: Mutex<Option<Run>> = Mutex::new(None);
+static RUN: Mutex<Option<RunPosition>> = Mutex::new(None);
 
 /// What this process shows of its progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,17 +49,17 @@ pub enum Mode {
 /// Names the stages that a run is made of, in order, with the seconds that each takes, about: as long as what it gives
 /// lives, a bar or line of one of them says `[k/n]`, and a bar how long the whole run will take yet.
 pub fn begin_run(stages: Vec<(&'static str, f64)>) -> RunOfStages {
-    *run() = Some(Run { stages, start: Instant::now(), at: None });
+    *run() = Some(RunPosition { stages, start: Instant::now(), at: None });
     RunOfStages(())
 }
 
-fn run() -> MutexGuard<'static, Option<Run>> {
+fn run() -> MutexGuard<'static, Option<RunPosition>> {
     RUN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Where a run is.
 #[derive(Debug)]
-struct Run {
+struct RunPosition {
     /// Names, and about how many seconds they take.
     stages: Vec<(&'static str, f64)>,
     start: Instant,
@@ -67,7 +67,7 @@ struct Run {
     at: Option<(usize, Instant)>,
 }
 
-impl Run {
+impl RunPosition {
     /// A stage's name with its place among the stages, if it is one of them: the one that runs now.
     fn enter(&mut self, what: &str, now: Instant) -> String {
         let Some(place) = self.stages.iter().position(|(stage, _)| *stage == what) else { return what.to_owned() };
@@ -107,9 +107,9 @@ impl Drop for RunOfStages {
 /// Silence, and whether there was silence before.
 #[must_use = "it is quiet as long as this lives"]
 #[derive(Debug)]
-pub struct Hush(bool);
+pub struct QuietGuard(bool);
 
-impl Drop for Hush {
+impl Drop for QuietGuard {
     fn drop(&mut self) {
         QUIET.store(self.0, Ordering::Relaxed);
     }
@@ -117,10 +117,10 @@ impl Drop for Hush {
 
 /// Progress through `total` units of work, e.g. Gaussians × frames. Cheap to advance from any thread.
 #[derive(Debug)]
-pub struct Progress(Shown);
+pub struct Progress(ProgressDisplay);
 
 #[derive(Debug)]
-enum Shown {
+enum ProgressDisplay {
     Nothing,
     Bar(ProgressBar),
     Lines(Log),
@@ -133,8 +133,8 @@ impl Progress {
     }
 
     /// Nothing is shown of what begins while what this gives lives.
-    pub fn hush() -> Hush {
-        Hush(QUIET.swap(true, Ordering::Relaxed))
+    pub fn hush() -> QuietGuard {
+        QuietGuard(QUIET.swap(true, Ordering::Relaxed))
     }
 
     /// A bar named after what it does; `unit` is plural ("states").
@@ -149,11 +149,11 @@ impl Progress {
 
     fn begin(what: &'static str, unit: &str, total: Option<u64>) -> Self {
         if QUIET.load(Ordering::Relaxed) {
-            return Progress(Shown::Nothing);
+            return Progress(ProgressDisplay::Nothing);
         }
         let name = run().as_mut().map_or_else(|| what.to_owned(), |run| run.enter(what, Instant::now()));
         if !is_terminal() {
-            return Progress(Shown::Lines(Log::new(name, unit, total)));
+            return Progress(ProgressDisplay::Lines(Log::new(name, unit, total)));
         }
         let bar = BARS.add(total.map_or_else(ProgressBar::no_length, ProgressBar::new));
         if let Ok(style) = ProgressStyle::with_template("{line}") {
@@ -164,24 +164,24 @@ impl Progress {
                 let columns = Term::stderr().size_checked().map_or(USUAL_COLUMNS, |(_, columns)| columns);
                 // Writing to what is drawn cannot fail. The last column stays free: some terminals go on to the next line.
                 let _ = out.write_str(
-                    &Moment::of(state, (&name, is_stage), &unit).line(usize::from(columns).saturating_sub(1)),
+                    &BarSnapshot::of(state, (&name, is_stage), &unit).line(usize::from(columns).saturating_sub(1)),
                 );
             };
             bar.set_style(style.with_key("line", line));
         }
         bar.enable_steady_tick(Duration::from_millis(200));
-        Progress(Shown::Bar(bar))
+        Progress(ProgressDisplay::Bar(bar))
     }
 
     /// Begins anew, with `total` units.
     pub fn restart(&mut self, total: u64) {
         match &mut self.0 {
-            Shown::Nothing => (),
-            Shown::Bar(bar) => {
+            ProgressDisplay::Nothing => (),
+            ProgressDisplay::Bar(bar) => {
                 bar.set_length(total);
                 bar.reset();
             }
-            Shown::Lines(log) => {
+            ProgressDisplay::Lines(log) => {
                 log.sum_up();
                 (log.total, log.start, log.done) = (Some(total), Instant::now(), AtomicU64::new(0));
                 log.next = AtomicU64::new(LINE_EVERY);
@@ -205,9 +205,9 @@ impl Progress {
     /// Marks `units` as done.
     pub fn advance(&self, units: u64) {
         match &self.0 {
-            Shown::Nothing => (),
-            Shown::Bar(bar) => bar.inc(units),
-            Shown::Lines(log) => log.advance(units),
+            ProgressDisplay::Nothing => (),
+            ProgressDisplay::Bar(bar) => bar.inc(units),
+            ProgressDisplay::Lines(log) => log.advance(units),
         }
     }
 }
@@ -215,18 +215,18 @@ impl Progress {
 impl Drop for Progress {
     fn drop(&mut self) {
         match &self.0 {
-            Shown::Nothing => (),
-            Shown::Bar(bar) => {
+            ProgressDisplay::Nothing => (),
+            ProgressDisplay::Bar(bar) => {
                 bar.finish_and_clear();
                 BARS.remove(bar);
             }
-            Shown::Lines(log) => log.end(),
+            ProgressDisplay::Lines(log) => log.end(),
         }
     }
 }
 
 /// What a bar shows.
-struct Moment<'a> {
+struct BarSnapshot<'a> {
     name: &'a str,
     unit: &'a str,
     done: u64,
@@ -237,19 +237,19 @@ struct Moment<'a> {
     run: Option<f64>,
 }
 
-impl<'a> Moment<'a> {
-    fn of(state: &ProgressState, (name, is_stage): (&'a str, bool), unit: &'a str) -> Moment<'a> {
+impl<'a> BarSnapshot<'a> {
+    fn of(state: &ProgressState, (name, is_stage): (&'a str, bool), unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
         // Of what has not begun to move nobody knows how fast it is.
         let left = total.filter(|&total| done > 0 && total > done).map(|_| state.eta().as_secs_f64());
         let run = run().as_ref().filter(|_| is_stage).map(|run| run.left(left.unwrap_or(0.0), Instant::now()));
-        Moment { name, unit, done, total, per_second: state.per_sec(), left, run }
+        BarSnapshot { name, unit, done, total, per_second: state.per_sec(), left, run }
     }
 
     /// All of it that has room in so many columns: its name always, then how much is done, how long it takes yet, how
     /// much, how fast, how long the run takes, and a bar.
     fn line(&self, columns: usize) -> String {
-        let Moment { name, unit, done, total, per_second, left, run } = self;
+        let BarSnapshot { name, unit, done, total, per_second, left, run } = self;
         let soon = |seconds: &&f64| **seconds >= 1.0;
         // What has no steps yet is being prepared.
         let total = total.filter(|&total| total > 0);
@@ -413,7 +413,7 @@ mod tests {
 
     #[test]
     fn a_bar_is_never_longer_than_its_room_says_most_in_most_and_no_time_of_no_seconds() {
-        let moment = Moment {
+        let moment = BarSnapshot {
             name: "[3/9] rounds",
             unit: "pictures",
             done: 1234,
@@ -433,9 +433,9 @@ mod tests {
         );
         assert_eq!(moment.line(79), "[3/9] rounds  24% 1,234/5,000 pictures, 12 pictures/s, 5 min 13 s left");
         assert_eq!(moment.line(30), "[3/9] rounds [==       ]  24%");
-        let nearly = Moment { left: Some(0.4), run: Some(0.2), ..moment };
+        let nearly = BarSnapshot { left: Some(0.4), run: Some(0.2), ..moment };
         assert!(!nearly.line(119).contains("left") && !nearly.line(119).contains("run"), "{}", nearly.line(119));
-        let counting = Moment { total: None, left: None, run: None, ..nearly };
+        let counting = BarSnapshot { total: None, left: None, run: None, ..nearly };
         assert_eq!(counting.line(119), "[3/9] rounds 1,234 pictures, 12 pictures/s");
     }
 
@@ -444,7 +444,7 @@ mod tests {
         let start = Instant::now();
         let after = |seconds| start + Duration::from_secs(seconds);
         let stages = vec![("scan", 10.0), ("score", 0.0), ("rounds", 30.0), ("emit", 5.0)];
-        let mut run = Run { stages, start, at: None };
+        let mut run = RunPosition { stages, start, at: None };
         assert_eq!(run.enter("motion", start), "motion");
         assert_eq!(run.left(2.0, start), 2.0);
         assert_eq!(run.enter("scan", start), "[1/4] scan");

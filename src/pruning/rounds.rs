@@ -11,8 +11,8 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::score::{Scored, scored};
-use crate::budget::{Need, REMOVE, Workload};
-use crate::cache::Key;
+use crate::budget::{REMOVE, ResourceEstimate, Workload};
+use crate::cache::CacheKey;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
@@ -65,7 +65,7 @@ impl Rounds {
     }
 
     /// The ranking, and pictures of all that is left.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (looking, fixed) = work.looking(limits, Columns::all(), 8);
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);
@@ -80,7 +80,7 @@ impl Rounds {
         let frames = all.min(work.frames).div_ceil(turns);
         let later = f64::from(self.rounds(self.fewest).saturating_sub(1));
         let reads = work.scattered_reads(frames * turns, limits) + later * work.scattered_reads(frames, limits);
-        Need { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
+        ResourceEstimate { stage: NAME, reads, seconds: seconds.sum(), per_gaussian, fixed }
     }
 
     /// Returns the number of rounds after which at most a part `fewest` is left. At most 2207, for a recipe's fraction is
@@ -124,7 +124,7 @@ impl Rounds {
     ) -> Result<Ranking> {
         let protected = &scored.protected;
         let is_free = |id: &u32| !scored.is_protected(*id);
-        let mut state = State {
+        let mut state = RoundState {
             free: before.order().iter().copied().filter(is_free).collect(),
             gone: Vec::new(),
             errors: Vec::new(),
@@ -148,7 +148,7 @@ impl Rounds {
         let pictures =
             (done..sizes.len()).map(|round| looking(&turns, round).map(|turn| turns[turn].len()).sum::<usize>());
         let progress = Progress::new(NAME, "pictures", pictures.sum::<usize>() as u64);
-        let State { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
+        let RoundState { free, gone, .. } = journal.stage(NAME, first, scene.source(), |_| {
             for (round, &left) in sizes.iter().enumerate().skip(done) {
                 state = self.round(scene, scored, (state, &turns), round, (key, left), &progress)?;
             }
@@ -175,11 +175,11 @@ impl Rounds {
         &self,
         scene: &Scene,
         scored: &Scored,
-        (mut state, turns): (State, &[Vec<Picture>]),
+        (mut state, turns): (RoundState, &[Vec<Picture>]),
         round: usize,
-        (key, left): (Key, usize),
+        (key, left): (CacheKey, usize),
         progress: &Progress,
-    ) -> Result<State> {
+    ) -> Result<RoundState> {
         let mut ids: Vec<u32> = state.free.iter().chain(&scored.protected).copied().collect();
         ids.sort_unstable();
         let looking: Vec<usize> = looking(turns, round).collect();
@@ -227,7 +227,7 @@ impl Rounds {
 
 /// What a round leaves.
 #[derive(Serialize, Deserialize)]
-struct State {
+struct RoundState {
     /// Neither protected nor gone, best first.
     free: Vec<u32>,
     /// Worst last.

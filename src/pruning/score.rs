@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::budget::{Need, Part, Workload};
+use crate::budget::{MemoryPart, ResourceEstimate, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::{FlagSummary, Saved, TermSummary};
@@ -16,12 +16,12 @@ use crate::models::trajectories::state_bytes;
 use crate::passes::{frames_to_see, gather};
 use crate::progress::Progress;
 use crate::pruning;
-use crate::pruning::contribution::Seen;
+use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
 use crate::recipe::{self, NonFinite};
 use crate::reduction::Reference;
 use crate::scene::Scene;
-use crate::statistics::aside::Statistics;
+use crate::statistics::aside::StatisticsRows;
 use crate::statistics::pass::Scanned;
 use crate::statistics::score::{Scores, Term, score};
 use crate::statistics::{fill_anisotropy, snap, ulp};
@@ -33,14 +33,14 @@ pub(crate) const NAME: &str = "score";
 pub const SCORED: u64 = (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
 /// What stays of scoring: the selection, and the statistics unless they are set aside.
-pub fn scored(limits: &Limits) -> Vec<Part> {
+pub fn scored(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.rows_aside { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }
 
 /// The scoring of a run.
 #[derive(Debug, Clone)]
-pub struct Score {
+pub struct ScoreStage {
     /// Whether the scan reads what does not change again.
     pub rereads: bool,
     /// Whether motion within rounding is taken as none.
@@ -48,7 +48,7 @@ pub struct Score {
     /// What becomes of Gaussians with NaN or infinity.
     pub non_finite: NonFinite,
     /// Normalisation and weights.
-    pub score: recipe::Score,
+    pub score: recipe::ScoreParams,
     /// Stages 1 and 2 of the selection.
     pub select: recipe::Select,
     /// What the user knows better.
@@ -62,7 +62,7 @@ const SHORT_LIFE: usize = 4;
 #[derive(Serialize, Deserialize)]
 pub struct Scored {
     /// Statistics, noise snapped as the recipe says.
-    statistics: Statistics,
+    statistics: StatisticsRows,
     /// T.
     frames: usize,
     /// See [`frames_to_see`].
@@ -96,10 +96,10 @@ pub struct UserOverrides {
     pub keep_box: Option<[f64; 6]>,
 }
 
-impl Score {
+impl ScoreStage {
     /// Statistics, scores and a selection, and the states at one frame.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
-        Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
+        ResourceEstimate {
             stage: NAME,
             reads: work.reads(1, limits),
             seconds: 2e-6 * work.count(),
@@ -122,7 +122,13 @@ impl Score {
     /// # Errors
     /// Values that are not finite, unless the recipe says what to do with them; cameras that see nothing; ids that are
     /// to be kept and to be dropped.
-    pub fn run(&self, scene: &Scene, scanned: Scanned, seen: Option<Seen>, journal: &mut Journal) -> Result<Scored> {
+    pub fn run(
+        &self,
+        scene: &Scene,
+        scanned: Scanned,
+        seen: Option<VisibleContribution>,
+        journal: &mut Journal,
+    ) -> Result<Scored> {
         let source = scene.source();
         let info = source.info();
         let mut rows = scanned.rows;
@@ -175,8 +181,8 @@ impl Score {
                 terms: scores.terms,
                 flags: flags(&rows),
                 statistics: match scene.limits.rows_aside {
-                    true => Statistics::aside(rows, &scene.scratch)?,
-                    false => Statistics::Memory(rows),
+                    true => StatisticsRows::aside(rows, &scene.scratch)?,
+                    false => StatisticsRows::Memory(rows),
                 },
                 selection,
                 protected,
@@ -254,8 +260,8 @@ impl Scored {
     /// A scratch file that cannot be written.
     pub(crate) fn within(self, limits: &Limits, folder: &Path) -> Result<Scored> {
         Ok(match self.statistics {
-            Statistics::Memory(rows) if limits.rows_aside => {
-                Scored { statistics: Statistics::aside(rows, folder)?, ..self }
+            StatisticsRows::Memory(rows) if limits.rows_aside => {
+                Scored { statistics: StatisticsRows::aside(rows, folder)?, ..self }
             }
             _ => self,
         })
@@ -301,7 +307,7 @@ impl Scored {
     ///
     /// # Errors
     /// Those of [`Scored::rows`].
-    pub fn scores(&self, recipe: &recipe::Score) -> Result<Scores> {
+    pub fn scores(&self, recipe: &recipe::ScoreParams) -> Result<Scores> {
         let rows = self.rows()?;
         Ok(score(&rows, self.frames, recipe))
     }

@@ -2,13 +2,13 @@
 
 use std::ops::Range;
 
-use crate::budget::{LOOK, Need, Workload};
+use crate::budget::{LOOK, ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::model::{Columns, Rows, Statistic};
 use crate::passes::{frames_to_see, looked_at};
-use crate::pruning::contribution::{Seen, visible_contribution};
+use crate::pruning::contribution::{VisibleContribution, visible_contribution};
 use crate::recipe::{self, Coverage};
 use crate::render::Contribution;
 use crate::scene::Scene;
@@ -20,12 +20,12 @@ pub(crate) const NAME: &str = "visible";
 #[derive(Debug, Clone)]
 pub struct Visible {
     /// Its parameters.
-    pub recipe: recipe::Scan,
+    pub recipe: recipe::ScanParams,
 }
 
 impl Visible {
     /// The stage, if `recipe` measures C by pictures; `has_cameras`: these are the scene's own, not a virtual rig.
-    pub fn of(recipe: &recipe::Scan, has_cameras: bool) -> Option<Visible> {
+    pub fn of(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<Visible> {
         let looks = match recipe.coverage {
             Coverage::Auto => has_cameras,
             Coverage::Visible => true,
@@ -35,7 +35,7 @@ impl Visible {
     }
 
     /// The rows scanned so far, C and W, and pictures in the making.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let (mut per_gaussian, mut fixed) = work.looking(limits, Columns::all().difference(Columns::SH), 12);
         let every = (self.recipe.frame_stride.get() * self.recipe.view_stride.get()) as f64;
         let strided = work.pictures as f64 / every;
@@ -53,7 +53,7 @@ impl Visible {
             fixed.push(("schedule", 2 * (16 * work.frames + 8 * strided as u64)));
         }
         let seconds = work.reading(work.count(), frames as f64) + work.picturing(strided.min(most), work.count(), LOOK);
-        Need { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
+        ResourceEstimate { stage: NAME, reads: work.reads(frames, limits), seconds, per_gaussian, fixed }
     }
 
     /// Whether a frame's pictures are known as it arrives: of how many they are the ones to look at is only known at the end.
@@ -65,7 +65,7 @@ impl Visible {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(&self, scene: &Scene, life: &[u32], journal: &mut Journal) -> Result<Seen> {
+    pub fn run(&self, scene: &Scene, life: &[u32], journal: &mut Journal) -> Result<VisibleContribution> {
         let source = scene.source();
         let count = source.info().count;
         let frames = frames_to_see(life, source.info().times.len());
@@ -73,14 +73,14 @@ impl Visible {
         let stride = self.recipe.pixel_stride;
         let cameras = &scene.schedule.cameras[..];
         let look = |some: Range<usize>| visible_contribution(source, (cameras, &pictures[some]), stride, scene.limits);
-        let seen: Result<Seen> = journal.stage(NAME, count, source, |_| {
+        let seen: Result<VisibleContribution> = journal.stage(NAME, count, source, |_| {
             let key = scene.work.key(&(&pictures, stride));
             let found = scene.work.divided(NAME, key, pictures.len(), look, |parts| {
                 let mut sum = Contribution::new(count);
                 for part in parts {
                     sum.merge(&part?);
                 }
-                Ok(Seen::of(&sum, pictures.len(), stride))
+                Ok(VisibleContribution::of(&sum, pictures.len(), stride))
             })?;
             Ok((found, count))
         });
@@ -127,7 +127,7 @@ mod tests {
     #[test]
     fn pictures_of_a_virtual_rig_are_looked_at_only_when_asked_for() {
         let mut recipe = Recipe::preset("default").unwrap().scan;
-        let looks = |recipe: &recipe::Scan| [true, false].map(|cameras| Visible::of(recipe, cameras).is_some());
+        let looks = |recipe: &recipe::ScanParams| [true, false].map(|cameras| Visible::of(recipe, cameras).is_some());
         assert_eq!(looks(&recipe), [true, false]);
         recipe.coverage = Coverage::Visible;
         assert_eq!(looks(&recipe), [true, true]);

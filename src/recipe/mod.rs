@@ -46,28 +46,28 @@ const REMOVED: [(&str, &str, &str); 3] = [
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
     /// The pass over all frames.
-    pub scan: Scan,
+    pub scan: ScanParams,
     /// Normalisation and weights.
-    pub score: Score,
+    pub score: ScoreParams,
     /// Stages 1 and 2.
     pub select: Select,
     /// Stage 3.
-    pub merge: Merge,
+    pub merge: MergeParams,
     /// Everything that is stored of what is left.
-    pub refine: Refine,
+    pub refine: RefineParams,
     /// What deforms it.
-    pub field: Field,
+    pub field: FieldParams,
     /// How its colours change with direction.
-    pub bands: Bands,
+    pub bands: ShDegreeParams,
 }
 
 /// Parameters of the pass over all frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Scan {
+pub struct ScanParams {
     pub alpha_min: f64,
-    pub motion: Motion,
+    pub motion: MotionParams,
     pub snap_noise: bool,
     pub coverage: Coverage,
     pub pixel_stride: NonZeroU32,
@@ -81,7 +81,7 @@ pub struct Scan {
 /// Which steps count as motion and what they are divided by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Motion {
+pub enum MotionParams {
     /// The paper's divisors; steps across gaps of the life span count.
     Literal,
     /// Only steps inside one run of life frames, divided by their number.
@@ -117,7 +117,7 @@ pub enum NonFinite {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Score {
+pub struct ScoreParams {
     pub static_term: StaticTerm,
     pub w_static: f64,
     pub w_dynamic: f64,
@@ -183,7 +183,7 @@ pub enum LowPriority {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Merge {
+pub struct MergeParams {
     pub length_unit: LengthUnit,
     pub max_neighbors: usize,
     pub max_scale_ratio: f64,
@@ -202,8 +202,8 @@ pub struct Merge {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Refine {
-    pub refine: Groups,
+pub struct RefineParams {
+    pub refine: AttributeGroups,
     pub refine_steps: u32,
     pub refine_cut_steps: u32,
     pub refine_pictures: usize,
@@ -215,7 +215,7 @@ pub struct Refine {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Field {
+pub struct FieldParams {
     pub field: Precision,
     pub field_margin: f64,
 }
@@ -224,7 +224,7 @@ pub struct Field {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[expect(missing_docs, reason = "paper.toml documents each parameter beside its value")]
-pub struct Bands {
+pub struct ShDegreeParams {
     pub bands: WhichBands,
     pub bands_margin: f64,
 }
@@ -281,7 +281,7 @@ pub enum Precision {
 /// `none`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub struct Groups(pub Columns);
+pub struct AttributeGroups(pub Columns);
 
 /// Every group and its column.
 const GROUPS: [(&str, Columns); 5] = [
@@ -292,10 +292,10 @@ const GROUPS: [(&str, Columns); 5] = [
     ("position", Columns::POSITION),
 ];
 
-impl TryFrom<String> for Groups {
+impl TryFrom<String> for AttributeGroups {
     type Error = String;
 
-    fn try_from(text: String) -> std::result::Result<Groups, String> {
+    fn try_from(text: String) -> std::result::Result<AttributeGroups, String> {
         let mut columns = Columns::empty();
         for name in text.split([',', ' ']).filter(|&name| text != "none" && !name.is_empty()) {
             let group = GROUPS.iter().find(|group| group.0 == name).ok_or_else(|| {
@@ -304,12 +304,12 @@ impl TryFrom<String> for Groups {
             })?;
             columns |= group.1;
         }
-        Ok(Groups(columns))
+        Ok(AttributeGroups(columns))
     }
 }
 
-impl From<Groups> for String {
-    fn from(groups: Groups) -> String {
+impl From<AttributeGroups> for String {
+    fn from(groups: AttributeGroups) -> String {
         let names: Vec<&str> = GROUPS.iter().filter(|group| groups.0.contains(group.1)).map(|group| group.0).collect();
         if names.is_empty() { "none".to_owned() } else { names.join(",") }
     }
@@ -430,7 +430,7 @@ impl Recipe {
     /// The same, but that what stays keeps its values.
     pub fn unrefined(&self) -> Recipe {
         let mut recipe = self.clone();
-        recipe.refine.refine = Groups(Columns::empty());
+        recipe.refine.refine = AttributeGroups(Columns::empty());
         recipe
     }
 
@@ -457,7 +457,8 @@ impl Recipe {
         let finite = |x: f64| x.is_finite() && x >= 0.0;
         // Sums of weighted norms stay finite, and 0 times a weight is 0.
         let weight = |x: f64| (0.0..=1e6).contains(&x);
-        let Merge { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } = self.merge;
+        let MergeParams { max_scale_ratio, max_color_difference, motion_noise, max_drift, max_dead_time, .. } =
+            self.merge;
         let mut checks = vec![
             ("scan.alpha_min", self.scan.alpha_min, in_unit(self.scan.alpha_min), "0 to 1"),
             ("score.w_static", self.score.w_static, weight(self.score.w_static), "0 to 1e6"),

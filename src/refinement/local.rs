@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use crate::cache::{Spill, Spilling};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian};
 
@@ -62,22 +62,22 @@ pub(super) struct Locals {
     varying: Columns,
     /// The first frame's, of all Gaussians: what does not vary, and the shape of what does.
     first: Option<Local>,
-    frames: Vec<Place>,
+    frames: Vec<StoredFrame>,
 }
 
 /// Where a frame's is in the file, and of how many Gaussians, if not of all: those come first.
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct StoredFrame {
     at: u64,
     there: Option<usize>,
 }
 
 /// [`Locals`] that are being kept.
 pub(super) struct Keeping {
-    file: Spilling,
+    file: SpillWriter,
     varying: Columns,
     first: Option<Local>,
-    frames: Vec<Place>,
+    frames: Vec<StoredFrame>,
     end: u64,
 }
 
@@ -87,7 +87,7 @@ impl Keeping {
     /// # Errors
     /// A scratch file that cannot be made in `scratch`.
     pub(super) fn new(scratch: &Path, varying: Columns) -> Result<Keeping> {
-        Ok(Keeping { file: Spilling::new(scratch)?, varying, first: None, frames: Vec::new(), end: 0 })
+        Ok(Keeping { file: SpillWriter::new(scratch)?, varying, first: None, frames: Vec::new(), end: 0 })
     }
 
     /// Whether nothing is kept yet.
@@ -113,7 +113,7 @@ impl Keeping {
         let mut thinned = if self.is_empty() { None } else { next.thinned() };
         self.first.get_or_insert_with(|| next.clone());
         let next = thinned.as_mut().unwrap_or(next);
-        self.frames.push(Place { at: self.end, there: next.there.as_ref().map(Vec::len) });
+        self.frames.push(StoredFrame { at: self.end, there: next.there.as_ref().map(Vec::len) });
         self.write(bytemuck::cast_slice(next.there.as_deref().unwrap_or_default()))?;
         next.kept(self.varying).try_for_each(|column| self.write(bytemuck::cast_slice(column.planes())))
     }
@@ -139,7 +139,7 @@ impl Locals {
     /// A scratch file that cannot be read.
     pub(super) fn read(&self, k: usize, to: &mut Local) -> Result<()> {
         let Some(first) = &self.first else { return Ok(()) };
-        let Place { mut at, there } = self.frames[k];
+        let StoredFrame { mut at, there } = self.frames[k];
         let mut read = |values: &mut [u8]| {
             at += values.len() as u64;
             self.file.read(at - values.len() as u64, values)

@@ -18,7 +18,7 @@ pub(super) struct Loss {
 
 /// How close pictures are to the original's.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-pub(super) struct Closeness {
+pub(super) struct RenderQuality {
     /// Mean, dB.
     pub(super) psnr: f64,
     /// Root of the mean square error of all.
@@ -58,17 +58,17 @@ impl Loss {
     }
 
     /// Whether pictures as close as `now` are closer than `best`: by mean dB, or by the loss where that has more to it.
-    pub(super) fn is_closer(&self, now: &Closeness, best: &Closeness) -> bool {
-        let loss = |of: &Closeness| (1.0 - self.ssim) * SQUARED * of.error.powi(2) + self.ssim * of.unlike;
+    pub(super) fn is_closer(&self, now: &RenderQuality, best: &RenderQuality) -> bool {
+        let loss = |of: &RenderQuality| (1.0 - self.ssim) * SQUARED * of.error.powi(2) + self.ssim * of.unlike;
         if self.ssim > 0.0 { loss(now) < loss(best) } else { now.psnr > best.psnr }
     }
 }
 
-impl Closeness {
+impl RenderQuality {
     /// Of pictures with a [`Loss::of`] each.
-    pub(super) fn of(pictures: &[[f64; 2]]) -> Closeness {
+    pub(super) fn of(pictures: &[[f64; 2]]) -> RenderQuality {
         let mean = |of: &dyn Fn(&[f64; 2]) -> f64| pictures.iter().map(of).sum::<f64>() / pictures.len().max(1) as f64;
-        Closeness {
+        RenderQuality {
             psnr: mean(&|&[square, _]| decibels(square)),
             error: mean(&|&[square, _]| square).sqrt(),
             unlike: mean(&|&[_, unlike]| unlike),
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn closer_is_by_decibels_alone_or_by_the_loss() {
-        let close = |square: f64, unlike: f64| Closeness::of(&[[square, unlike], [square, unlike]]);
+        let close = |square: f64, unlike: f64| RenderQuality::of(&[[square, unlike], [square, unlike]]);
         let (sharp, soft) = (close(1e-3, 0.02), close(0.9e-3, 0.08));
         assert!((sharp.psnr - 30.0).abs() < 1e-9 && (sharp.error - 1e-3f64.sqrt()).abs() < 1e-12);
         assert!(Loss { ssim: 0.0 }.is_closer(&soft, &sharp) && !Loss { ssim: 0.0 }.is_closer(&sharp, &sharp));

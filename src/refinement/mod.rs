@@ -20,8 +20,8 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, REMOVE, RENDER, Workload, of_left};
-use crate::cache::Key;
+use crate::budget::{MemoryPart, PICTURE_ON_ALL_THREADS, REMOVE, RENDER, ResourceEstimate, Workload, of_left};
+use crate::cache::CacheKey;
 use crate::error::Result;
 use crate::journal::records::RefinedSummary;
 use crate::limits::Limits;
@@ -30,14 +30,14 @@ use crate::model::{ALL_HARMONICS, Columns};
 use crate::progress::Progress;
 use crate::pruning::score::{Scored, scored};
 use crate::recipe;
-use crate::reduction::{Change, Course, Reduction};
-use crate::refinement::optimizer::Schedule;
+use crate::reduction::{CompressedModel, ParamDelta, TrajectoryDelta};
+use crate::refinement::optimizer::RateSchedule;
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 use crate::scene::Scene;
-use crate::scene::between::Dice;
+use crate::scene::between::SplitMix64;
 use crate::source::FrameSource;
-use loss::{Closeness, Loss};
-use moving::{Manner, Moving, knots};
+use loss::{Loss, RenderQuality};
+use moving::{OptimizerState, StepParams, knots};
 use targets::{Parted, Targets};
 
 /// What the stage is called.
@@ -71,7 +71,7 @@ const LAST_RATE: [f32; 2] = [1.0, 0.05];
 
 /// The refinement of a run.
 #[derive(Debug, Clone)]
-pub struct Refine {
+pub struct RefineStage {
     /// What moves.
     pub columns: Columns,
     /// Up to which harmonics move.
@@ -94,12 +94,12 @@ pub struct Refine {
     pub target: Option<f64>,
 }
 
-impl Refine {
+impl RefineStage {
     /// The stage, unless `recipe` lets nothing move. Of a run that ranks by pictures (`cuts`), down to the part `target`.
-    pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<Refine> {
-        let recipe::Refine { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
+    pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
+        let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;
-        let refine = Refine {
+        let refine = RefineStage {
             columns: refine.0,
             sh_degree: ALL_HARMONICS,
             loss: Loss { ssim: refine_ssim },
@@ -115,29 +115,29 @@ impl Refine {
     }
 
     /// The same, but that colours' change with direction stays.
-    pub fn without_bands(self) -> Refine {
-        Refine { sh_degree: 0, ..self }
+    pub fn without_bands(self) -> RefineStage {
+        RefineStage { sh_degree: 0, ..self }
     }
 
     /// The same, but that all times change alike.
-    pub fn without_course(self) -> Refine {
-        Refine { knots: 0, ..self }
+    pub fn without_course(self) -> RefineStage {
+        RefineStage { knots: 0, ..self }
     }
 
     /// The same in a `part` of the steps, and all times alike.
-    pub fn in_part(&self, part: f64) -> Refine {
+    pub fn in_part(&self, part: f64) -> RefineStage {
         let of = |steps: usize| (part * steps as f64).ceil() as usize;
-        Refine { steps: of(self.steps), cut_steps: of(self.cut_steps), ..self.clone() }.without_course()
+        RefineStage { steps: of(self.steps), cut_steps: of(self.cut_steps), ..self.clone() }.without_course()
     }
 
     /// What it does follows from this, and what it is done to.
-    pub(crate) fn key(&self) -> Key {
+    pub(crate) fn key(&self) -> CacheKey {
         let of_steps = (self.steps, self.cut_steps, self.pictures, self.cuts, self.knots);
-        Key::of(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, of_steps))
+        CacheKey::of(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, of_steps))
     }
 
-    fn manner(&self) -> Manner {
-        Manner { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
+    fn manner(&self) -> StepParams {
+        StepParams { columns: self.columns, sh_degree: self.sh_degree, loss: self.loss }
     }
 
     /// Steps at the end where a part `kept` of the Gaussians stays: the fewer go, the fewer.
@@ -168,11 +168,11 @@ impl Refine {
     }
 
     /// States, the descent, and a picture that is differentiated.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let read = [("readers", work.input.reader), ("held", work.held(limits, Columns::all()))];
         let original = [("states", whole), ("pictures", PICTURE_ON_ALL_THREADS)];
-        let original: Vec<Part> = read.into_iter().chain(original).collect();
+        let original: Vec<MemoryPart> = read.into_iter().chain(original).collect();
         let left = [
             ("states", (6 + work.threads) * whole),
             ("jacobians", (3 + work.threads) * work.input.jacobian),
@@ -181,7 +181,7 @@ impl Refine {
             ("pictures", 2 * GRADIENT_BYTES_PER_VISIBLE as u64),
         ];
         // First the original is looked at, then only what is left, of which there are fewer; at the end along time.
-        let of = |part: f64, more: Option<Part>| -> Vec<Part> {
+        let of = |part: f64, more: Option<MemoryPart>| -> Vec<MemoryPart> {
             let parts = read.into_iter().chain(left).chain(more);
             parts.map(|(name, bytes)| (name, of_left(part, bytes))).collect()
         };
@@ -191,7 +191,7 @@ impl Refine {
             + work.state(self.columns.difference(Columns::SH))
             + 12;
         let along = (knots > 0).then(|| of(wanted, Some(("course", knots as u64 * course))));
-        let bytes = |parts: &Vec<Part>| parts.iter().map(|part| part.1).sum::<u64>();
+        let bytes = |parts: &Vec<MemoryPart>| parts.iter().map(|part| part.1).sum::<u64>();
         let stages = [Some(original), Some(of(wanted.max(CUTS_FROM), None)), along];
         let per_gaussian = stages.into_iter().flatten().max_by_key(bytes).unwrap_or_default();
         let [own, between] = targets::numbers(self.pictures, work.pixels);
@@ -212,7 +212,7 @@ impl Refine {
                 + work.picturing(renders + STEP * steps as f64, of, RENDER)
                 + work.picturing(ranked, of, REMOVE)
         };
-        Need {
+        ResourceEstimate {
             stage: NAME,
             reads: 2.0 * work.scattered_reads(frames, limits),
             seconds: 2.0 * work.reading(work.count(), frames as f64)
@@ -237,10 +237,10 @@ impl Refine {
         &self,
         scene: &Scene,
         scored: &Scored,
-        reduction: Reduction,
+        reduction: CompressedModel,
         wanted: usize,
         journal: &mut Journal,
-    ) -> Result<Reduction> {
+    ) -> Result<CompressedModel> {
         let count = reduction.len();
         let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
         if count == 0 || scene.schedule.pairs() == 0 {
@@ -256,7 +256,7 @@ impl Refine {
             journal.stage(NAME, count, scene.source(), |journal| {
                 let targets = Targets::new(scene, self.pictures)?;
                 scene.work.not_divided(NAME)?;
-                let mut walk = Walk::new(NAME, self, scene, scored, &targets, targets.parted(false));
+                let mut walk = RefineRun::new(NAME, self, scene, scored, &targets, targets.parted(false));
                 Ok((walk.all(&reduction, wanted, steps, journal)?.0, wanted))
             })
         };
@@ -266,18 +266,18 @@ impl Refine {
     /// How close to the original's, dB, pictures kept apart come that way, as a part of `stage`.
     ///
     /// # Errors
-    /// Those of [`Refine::run`].
+    /// Those of [`RefineStage::run`].
     pub(crate) fn closeness(
         &self,
         stage: &'static str,
         scene: &Scene,
         scored: &Scored,
         targets: &Targets,
-        reduction: &Reduction,
+        reduction: &CompressedModel,
         wanted: usize,
     ) -> Result<f64> {
         let steps = self.last_steps(wanted as f64 / scored.count().max(1) as f64);
-        let mut walk = Walk::new(stage, self, scene, scored, targets, targets.parted(false));
+        let mut walk = RefineRun::new(stage, self, scene, scored, targets, targets.parted(false));
         let key = walk.key(reduction, wanted, wanted).and(&steps);
         let all = || Ok(walk.all(reduction, wanted, steps, &mut Journal::default())?.1);
         scene.work.known(&format!("{stage}-size"), key, all)
@@ -300,17 +300,17 @@ fn sizes(first: usize, last: usize) -> Vec<usize> {
 }
 
 /// Which picture comes next: all in an order, then all in another.
-struct Turns {
+struct EpochSampler {
     pictures: Vec<usize>,
     at: usize,
-    dice: Dice,
+    dice: SplitMix64,
     /// How many were taken.
     taken: usize,
 }
 
-impl Turns {
-    fn of(pictures: Vec<usize>) -> Turns {
-        Turns { at: pictures.len(), pictures, dice: Dice(1), taken: 0 }
+impl EpochSampler {
+    fn of(pictures: Vec<usize>) -> EpochSampler {
+        EpochSampler { at: pictures.len(), pictures, dice: SplitMix64(1), taken: 0 }
     }
 
     fn next(&mut self) -> usize {
@@ -332,25 +332,25 @@ impl Turns {
 }
 
 /// What all legs of the way share.
-pub(crate) struct Walk<'a> {
-    refine: &'a Refine,
+pub(crate) struct RefineRun<'a> {
+    refine: &'a RefineStage,
     scene: &'a Scene,
     scored: &'a Scored,
     targets: &'a Targets,
-    turns: Turns,
+    turns: EpochSampler,
     /// The pictures kept apart.
     apart: Vec<usize>,
     /// The stage that goes it.
     stage: &'static str,
     progress: Progress,
     /// What every way of it follows from.
-    key: Key,
+    key: CacheKey,
 }
 
 /// A way in the going, leg after leg: where it is, is kept from time to time, so that one that was cut short goes on.
-struct Trail {
+struct CheckpointTimer {
     /// What it follows from.
-    key: Key,
+    key: CacheKey,
     leg: usize,
     /// When it was kept last, and after how long it is again.
     kept: Instant,
@@ -359,24 +359,24 @@ struct Trail {
 
 /// Where a way was within a leg.
 #[derive(Serialize, Deserialize)]
-struct Kept<Standing, End> {
+struct ResumePoint<Standing, BestState> {
     leg: usize,
     /// Steps of it that are done.
     steps: usize,
     taken: usize,
-    schedule: Schedule,
+    schedule: RateSchedule,
     standing: Standing,
     /// Of the last leg.
-    end: Option<End>,
+    end: Option<BestState>,
 }
 
 /// What the last leg knows beside where it is.
 #[derive(Clone, Serialize, Deserialize)]
-struct End<Best, Along> {
-    before: Closeness,
-    best: Closeness,
+struct BestState<Best, Along> {
+    before: RenderQuality,
+    best: RenderQuality,
     /// The best of all times alike.
-    alike: Closeness,
+    alike: RenderQuality,
     /// What is to be added for the best.
     kept: Best,
     /// Of the rates.
@@ -386,23 +386,23 @@ struct End<Best, Along> {
 }
 
 /// Steps of a leg that are done, their rates, and what the last leg knows beside.
-type Reached = (usize, Schedule, Option<End<Change, Course>>);
+type Reached = (usize, RateSchedule, Option<BestState<ParamDelta, TrajectoryDelta>>);
 
-impl<'a> Walk<'a> {
+impl<'a> RefineRun<'a> {
     /// Of `stage`, along the pictures of `parts`.
     pub(crate) fn new(
         stage: &'static str,
-        refine: &'a Refine,
+        refine: &'a RefineStage,
         scene: &'a Scene,
         scored: &'a Scored,
         targets: &'a Targets,
         parts: Parted,
-    ) -> Walk<'a> {
+    ) -> RefineRun<'a> {
         let along = (&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart);
         let key = scene.work.key(&(refine.key(), along, &scored.protected));
-        let (turns, apart) = (Turns::of(parts.stepped), parts.apart);
+        let (turns, apart) = (EpochSampler::of(parts.stepped), parts.apart);
         let progress = Progress::new(stage, "steps", 0);
-        Walk { refine, scene, scored, targets, turns, apart, stage, progress, key }
+        RefineRun { refine, scene, scored, targets, turns, apart, stage, progress, key }
     }
 
     /// Shows how far it is of so many steps.
@@ -411,32 +411,32 @@ impl<'a> Walk<'a> {
     }
 
     /// What moves of `reduction`, which `result` shows.
-    fn begin<'b>(&self, reduction: &Reduction, result: &'b dyn FrameSource) -> Result<Moving<'b>>
+    fn begin<'b>(&self, reduction: &CompressedModel, result: &'b dyn FrameSource) -> Result<OptimizerState<'b>>
     where
         'a: 'b,
     {
         let fixed = reduction.kept.iter().map(|id| self.scored.is_protected(*id)).collect();
-        Moving::new(self.scene, result, self.targets, self.refine.manner(), fixed)
+        OptimizerState::new(self.scene, result, self.targets, self.refine.manner(), fixed)
     }
 
     /// What a way from `reduction` to `size`, on the way to `wanted`, follows from.
-    fn key(&self, reduction: &Reduction, size: usize, wanted: usize) -> Key {
+    fn key(&self, reduction: &CompressedModel, size: usize, wanted: usize) -> CacheKey {
         self.key.and(&(reduction, size, wanted, self.turns.taken))
     }
 
-    fn trail(&self, key: Key) -> Trail {
-        Trail { key, leg: 0, kept: Instant::now(), every: KEEP_EVERY[0] }
+    fn trail(&self, key: CacheKey) -> CheckpointTimer {
+        CheckpointTimer { key, leg: 0, kept: Instant::now(), every: KEEP_EVERY[0] }
     }
 
     /// Goes all the way: cuts `reduction` down to `wanted`, and `steps` steps at the end. Also gives how close to the
     /// original's, dB, pictures kept apart are then.
     fn all(
         &mut self,
-        reduction: &Reduction,
+        reduction: &CompressedModel,
         wanted: usize,
         steps: usize,
         journal: &mut Journal,
-    ) -> Result<(Reduction, f64)> {
+    ) -> Result<(CompressedModel, f64)> {
         let mut trail = self.trail(self.key(reduction, wanted, wanted).and(&steps));
         let result = self.scene.input.reduced(reduction)?;
         let mut moving = self.begin(reduction, &*result)?;
@@ -448,13 +448,18 @@ impl<'a> Walk<'a> {
             let steps = self.refine.steps_before(pair[0], wanted);
             left = left.pick(&self.cut(&mut moving, &mut trail, steps, pair[1])?);
         }
-        let End { kept, course, best, .. } = self.finish(&mut moving, &mut trail, steps, journal)?;
+        let BestState { kept, course, best, .. } = self.finish(&mut moving, &mut trail, steps, journal)?;
         (left.change, left.course) = (left.change.and(kept), left.course.and(course));
         Ok((left, best.psnr))
     }
 
     /// Cuts `reduction` down to `size`, on the way to `wanted`, after as many steps as that takes.
-    pub(crate) fn cut_down(&mut self, reduction: &Reduction, size: usize, wanted: usize) -> Result<Reduction> {
+    pub(crate) fn cut_down(
+        &mut self,
+        reduction: &CompressedModel,
+        size: usize,
+        wanted: usize,
+    ) -> Result<CompressedModel> {
         let key = self.key(reduction, size, wanted);
         let (left, taken) = self.scene.work.known(&format!("{}-cut", self.stage), key, || {
             let mut trail = self.trail(key);
@@ -471,7 +476,7 @@ impl<'a> Walk<'a> {
     }
 
     /// `reduction` at its best: as the last steps leave it.
-    pub(crate) fn best_of(&mut self, mut reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+    pub(crate) fn best_of(&mut self, mut reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         let steps = self.refine.last_steps(reduction.len() as f64 / self.scored.count().max(1) as f64);
         let (key, work) = (self.key(&reduction, reduction.len(), reduction.len()), &self.scene.work);
         let (change, course, taken) = journal.kept(work, &format!("{}-best", self.stage), key, |journal| {
@@ -479,7 +484,7 @@ impl<'a> Walk<'a> {
             let mut trail = self.trail(key);
             let result = self.scene.input.reduced(&reduction)?;
             let mut moving = self.begin(&reduction, &*result)?;
-            let End { kept, course, .. } = self.finish(&mut moving, &mut trail, steps, journal)?;
+            let BestState { kept, course, .. } = self.finish(&mut moving, &mut trail, steps, journal)?;
             Ok((kept, course, self.turns.taken))
         })?;
         self.turns.skip_to(taken);
@@ -500,7 +505,7 @@ impl<'a> Walk<'a> {
         if self.knots() > 0 { along_time(steps) } else { 0 }
     }
 
-    fn step(&mut self, moving: &mut Moving<'_>, schedule: &Schedule) -> Result<()> {
+    fn step(&mut self, moving: &mut OptimizerState<'_>, schedule: &RateSchedule) -> Result<()> {
         moving.step(self.turns.next(), schedule)?;
         self.progress.advance(1);
         Ok(())
@@ -512,8 +517,9 @@ impl<'a> Walk<'a> {
     }
 
     /// Goes to where the leg was when it was kept last, if it was.
-    fn go_on(&mut self, moving: &mut Moving<'_>, trail: &Trail) -> Result<Option<Reached>> {
-        let kept: Option<Kept<moving::Kept, End<Change, Course>>> = self.scene.work.find(&self.name(), trail.key)?;
+    fn go_on(&mut self, moving: &mut OptimizerState<'_>, trail: &CheckpointTimer) -> Result<Option<Reached>> {
+        let kept: Option<ResumePoint<moving::KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
+            self.scene.work.find(&self.name(), trail.key)?;
         let Some(kept) = kept.filter(|kept| kept.leg == trail.leg) else { return Ok(None) };
         moving.go_on(kept.standing)?;
         self.turns.skip_to(kept.taken);
@@ -524,16 +530,16 @@ impl<'a> Walk<'a> {
     /// Keeps where the leg is after so many steps, if it is time to.
     fn keep(
         &self,
-        moving: &Moving<'_>,
-        trail: &mut Trail,
-        (steps, schedule): (usize, Schedule),
-        end: Option<End<&Change, &Course>>,
+        moving: &OptimizerState<'_>,
+        trail: &mut CheckpointTimer,
+        (steps, schedule): (usize, RateSchedule),
+        end: Option<BestState<&ParamDelta, &TrajectoryDelta>>,
     ) -> Result<()> {
         if !self.scene.work.keeps() || trail.kept.elapsed() < trail.every {
             return Ok(());
         }
         let (leg, taken) = (trail.leg, self.turns.taken);
-        let kept = Kept { leg, steps, taken, schedule, standing: moving.standing(), end };
+        let kept = ResumePoint { leg, steps, taken, schedule, standing: moving.standing(), end };
         let start = Instant::now();
         self.scene.work.keep(&self.name(), trail.key, &kept)?;
         trail.kept = Instant::now();
@@ -543,9 +549,15 @@ impl<'a> Walk<'a> {
 
     /// Takes `steps` steps, and lets go of all but the `size` Gaussians that pictures would lose most with; gives their
     /// places.
-    fn cut(&mut self, moving: &mut Moving<'_>, trail: &mut Trail, steps: usize, size: usize) -> Result<Vec<u32>> {
+    fn cut(
+        &mut self,
+        moving: &mut OptimizerState<'_>,
+        trail: &mut CheckpointTimer,
+        steps: usize,
+        size: usize,
+    ) -> Result<Vec<u32>> {
         let (name, key, work) = (format!("{}-cut-{:02}", self.stage, trail.leg + 1), trail.key, &self.scene.work);
-        let kept: Option<(moving::Kept, Vec<u32>, usize)> = work.find(&name, key)?;
+        let kept: Option<(moving::KeptCheckpoint, Vec<u32>, usize)> = work.find(&name, key)?;
         let left = match kept {
             Some((standing, left, taken)) => {
                 moving.go_on(standing)?;
@@ -559,7 +571,7 @@ impl<'a> Walk<'a> {
                     None => {
                         let some = self.apart.iter().step_by(self.apart.len().div_ceil(LOOKED_AT).max(1));
                         let error = moving.closeness(&some.copied().collect::<Vec<_>>())?.error;
-                        (0, Schedule::new(steps, LAST_RATE[0], error))
+                        (0, RateSchedule::new(steps, LAST_RATE[0], error))
                     }
                 };
                 for step in done..steps {
@@ -582,11 +594,11 @@ impl<'a> Walk<'a> {
     /// kept apart like best, and how close they are then.
     fn finish(
         &mut self,
-        moving: &mut Moving<'_>,
-        trail: &mut Trail,
+        moving: &mut OptimizerState<'_>,
+        trail: &mut CheckpointTimer,
         steps: usize,
         journal: &mut Journal,
-    ) -> Result<End<Change, Course>> {
+    ) -> Result<BestState<ParamDelta, TrajectoryDelta>> {
         let count = self.apart.len();
         let (done, mut schedule, mut end) = match self.go_on(moving, trail)? {
             Some((done, schedule, Some(end))) => (done, schedule, end),
@@ -596,14 +608,14 @@ impl<'a> Walk<'a> {
                 if before.psnr.is_nan() {
                     let why = format!("{count} pictures kept apart have {}", decibels_text(before.psnr, 2));
                     journal.leave_out("refinement", why);
-                    return Ok(End::new(before, moving.change()));
+                    return Ok(BestState::new(before, moving.change()));
                 }
                 if before.psnr >= CLOSE_ENOUGH {
                     let why = format!("{count} pictures kept apart keep {:.2} dB without", before.psnr);
                     journal.leave_out("refinement", why);
-                    return Ok(End::new(before, moving.change()));
+                    return Ok(BestState::new(before, moving.change()));
                 }
-                (0, Schedule::new(steps, LAST_RATE[1], before.error), End::new(before, moving.change()))
+                (0, RateSchedule::new(steps, LAST_RATE[1], before.error), BestState::new(before, moving.change()))
             }
         };
         let judge_every = steps.div_ceil(3).clamp(JUDGE_EVERY[0], JUDGE_EVERY[1]);
@@ -617,7 +629,7 @@ impl<'a> Walk<'a> {
                 } else if step < steps {
                     end.part *= TOO_FAST;
                     moving.turn_back(&end.kept)?;
-                    schedule = Schedule::new(steps - step, LAST_RATE[1], end.best.error).times(end.part);
+                    schedule = RateSchedule::new(steps - step, LAST_RATE[1], end.best.error).times(end.part);
                 }
             }
             end.alike = end.best;
@@ -645,10 +657,10 @@ impl<'a> Walk<'a> {
     /// as the pictures kept apart like them; gives whether any are.
     fn follow_time(
         &mut self,
-        moving: &mut Moving<'_>,
-        trail: &mut Trail,
-        (done, mut schedule): (usize, Schedule),
-        end: &mut End<Change, Course>,
+        moving: &mut OptimizerState<'_>,
+        trail: &mut CheckpointTimer,
+        (done, mut schedule): (usize, RateSchedule),
+        end: &mut BestState<ParamDelta, TrajectoryDelta>,
         steps: usize,
     ) -> Result<bool> {
         let along = self.steps_along(steps);
@@ -662,7 +674,7 @@ impl<'a> Walk<'a> {
                 return Ok(false);
             }
             // Each picture is a step of two knots.
-            schedule = Schedule::new(2 * along / knots, LAST_RATE[1], end.alike.error);
+            schedule = RateSchedule::new(2 * along / knots, LAST_RATE[1], end.alike.error);
         }
         let judge_every = along.div_ceil(3);
         for step in done.saturating_sub(steps) + 1..=along {
@@ -681,23 +693,23 @@ impl<'a> Walk<'a> {
     }
 }
 
-impl End<Change, Course> {
+impl BestState<ParamDelta, TrajectoryDelta> {
     /// Nothing gained yet.
-    fn new(before: Closeness, kept: Change) -> Self {
-        End { before, best: before, alike: before, kept, part: 1.0, course: Course::default() }
+    fn new(before: RenderQuality, kept: ParamDelta) -> Self {
+        BestState { before, best: before, alike: before, kept, part: 1.0, course: TrajectoryDelta::default() }
     }
 
     /// To be kept.
-    fn standing(&self) -> End<&Change, &Course> {
-        let End { before, best, alike, ref kept, part, ref course } = *self;
-        End { before, best, alike, kept, part, course }
+    fn standing(&self) -> BestState<&ParamDelta, &TrajectoryDelta> {
+        let BestState { before, best, alike, ref kept, part, ref course } = *self;
+        BestState { before, best, alike, kept, part, course }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cache::Asked;
+    use crate::cache::CacheRequest;
     use crate::diagnostics::demo_scene;
     use crate::files::container::Container;
     use crate::metrics::psnr;
@@ -715,17 +727,17 @@ mod tests {
     use crate::source::{BlockReader, Ids};
 
     /// The first `count` of the ranking of `scene`, refined in `steps` steps; `keep` are protected.
-    fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (Reduction, Journal) {
+    fn refined(scene: &Scene, count: usize, steps: usize, keep: Vec<u32>) -> (CompressedModel, Journal) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
-        let reduction = Reduction::pruned(scored.ranked().take(count), &recipe.merge);
+        let reduction = CompressedModel::pruned(scored.ranked().take(count), &recipe.merge);
         let mut journal = Journal::default();
-        let refine = Refine { steps, ..Refine::of(&recipe, None, false).unwrap() };
+        let refine = RefineStage { steps, ..RefineStage::of(&recipe, None, false).unwrap() };
         (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
     }
 
     /// Mean PSNR of `reduction` over the pictures of `rig` that the scene is not scored by.
-    fn held_out(scene: &Scene, rig: &Rig, reduction: &Reduction) -> f64 {
+    fn held_out(scene: &Scene, rig: &Rig, reduction: &CompressedModel) -> f64 {
         let schedule = rig.schedule(&scene.source().info().times, Some(Split::Test)).unwrap();
         let result = scene.input.reduced(reduction).unwrap();
         let of_frame = |(frame, views): (usize, &[(u32, u32)])| -> f64 {
@@ -787,7 +799,7 @@ mod tests {
         drop(scene(folder.path()));
         // States that follow from what is stored by a sum, by a field, and along time.
         for (number, path, steps, pictures) in [(0, short, 120, 60), (1, model, 120, 60), (2, long, 300, 300)] {
-            let open = |work: Option<Asked>| {
+            let open = |work: Option<CacheRequest>| {
                 let cameras = (number == 1).then(|| path.clone());
                 let options = InputOptions { path: path.clone(), cameras, work, ..Default::default() };
                 let mut opened = open_scene(&options).unwrap();
@@ -797,19 +809,20 @@ mod tests {
                 }
                 opened
             };
-            let run = |scene: &Scene| -> Result<Reduction> {
+            let run = |scene: &Scene| -> Result<CompressedModel> {
                 let recipe = Recipe::preset("default").unwrap();
                 let scored = crate::pipeline::score_scene(scene, &recipe, &UserOverrides::default())?;
                 let count = scored.count();
-                let reduction = Reduction::pruned(scored.ranked().take(2 * count / 5), &recipe.merge);
-                let few = Refine { steps, cut_steps: 40, pictures, ..Refine::of(&recipe, None, true).unwrap() };
+                let reduction = CompressedModel::pruned(scored.ranked().take(2 * count / 5), &recipe.merge);
+                let few =
+                    RefineStage { steps, cut_steps: 40, pictures, ..RefineStage::of(&recipe, None, true).unwrap() };
                 few.run(scene, &scored, reduction, count / 4, &mut Journal::default())
             };
             let start = Instant::now();
             let expected = run(&open(None)).unwrap();
             let whole = start.elapsed();
             let (place, away) = (folder.path().join(format!("work{number}")), folder.path().join("away"));
-            let asked = || Some(Asked { folder: place.clone(), part: None });
+            let asked = || Some(CacheRequest { folder: place.clone(), part: None });
             let (mut cuts, mut found) = (0, None);
             for delay in (0..40).map(|k| whole.mul_f64(0.1 * 1.15f64.powi(k))) {
                 let scene = open(asked());
@@ -881,8 +894,8 @@ mod tests {
             let scene = Scene::new(path, input, rig, Some(Split::Train)).unwrap();
             let recipe = Recipe::preset("default").unwrap();
             let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-            let reduction = Reduction::pruned(scored.ranked().take(600), &recipe.merge);
-            let few = Refine { steps: 100, cut_steps: 40, ..Refine::of(&recipe, None, true).unwrap() };
+            let reduction = CompressedModel::pruned(scored.ranked().take(600), &recipe.merge);
+            let few = RefineStage { steps: 100, cut_steps: 40, ..RefineStage::of(&recipe, None, true).unwrap() };
             few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
         });
         assert!(!away.change.is_empty() && away.change == unseen.change);
@@ -920,8 +933,8 @@ mod tests {
             };
             let kept: Vec<u32> = (0..given[0].len() as u32).filter(part).collect();
             let [alike, along] = [0, 4].map(|knots| {
-                let reduction = Reduction::pruned(kept.clone(), &recipe.merge);
-                let few = Refine { steps: 300, knots, ..Refine::of(&recipe, None, false).unwrap() };
+                let reduction = CompressedModel::pruned(kept.clone(), &recipe.merge);
+                let few = RefineStage { steps: 300, knots, ..RefineStage::of(&recipe, None, false).unwrap() };
                 few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()
             });
             assert_eq!((alike.course.0.len(), along.course.0.len()), (0, 4));
@@ -961,9 +974,9 @@ mod tests {
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
-        let reduction = Reduction::pruned(scored.ranked().take(300), &recipe.merge);
+        let reduction = CompressedModel::pruned(scored.ranked().take(300), &recipe.merge);
         let (mut journal, count) = (Journal::default(), reduction.len());
-        let refine = Refine { steps: 100, ..Refine::of(&recipe, None, false).unwrap() }.without_bands();
+        let refine = RefineStage { steps: 100, ..RefineStage::of(&recipe, None, false).unwrap() }.without_bands();
         let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
         assert_eq!((moved.change.0.sh.width(), moved.change.0.sh.len()), (3, count));
         assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
@@ -990,15 +1003,15 @@ mod tests {
             let targets = Targets::new(&scene, 520).unwrap();
             let count = scene.source().info().count;
             let kept = (0..count as u32).step_by(2).collect();
-            let reduction = Reduction::pruned(kept, &Recipe::preset("default").unwrap().merge);
+            let reduction = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
             let result = scene.input.reduced(&reduction).unwrap();
-            let refine = Refine::of(&Recipe::preset("default").unwrap(), None, false).unwrap();
+            let refine = RefineStage::of(&Recipe::preset("default").unwrap(), None, false).unwrap();
             let fixed = vec![false; reduction.len()];
-            let mut moving = Moving::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
-            let (of, schedule) = ([0, 7, 20], Schedule::new(20, 1.0, 1.0));
+            let mut moving = OptimizerState::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
+            let (of, schedule) = ([0, 7, 20], RateSchedule::new(20, 1.0, 1.0));
             let start = moving.closeness(&of).unwrap().psnr;
             let nowhere = moving.change();
-            let walk = |moving: &mut Moving<'_>| (0..20).for_each(|k| moving.step(k, &schedule).unwrap());
+            let walk = |moving: &mut OptimizerState<'_>| (0..20).for_each(|k| moving.step(k, &schedule).unwrap());
             walk(&mut moving);
             moving.find().unwrap();
             moving.turn_back(&nowhere).unwrap();
@@ -1017,10 +1030,10 @@ mod tests {
             let whole = moving.change();
             moving.pick(&some).unwrap();
             let picked = moving.closeness(&of).unwrap().psnr;
-            let thinned = Reduction { change: whole.pick(&some), ..reduction.pick(&some) };
+            let thinned = CompressedModel { change: whole.pick(&some), ..reduction.pick(&some) };
             let result = scene.input.reduced(&thinned).unwrap();
             let fixed = vec![false; some.len()];
-            let anew = Moving::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
+            let anew = OptimizerState::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
             let expected = anew.closeness(&of).unwrap().psnr;
             assert!((picked - expected).abs() < 1e-3, "got {picked:.4} dB, expected {expected:.4}");
         }

@@ -4,20 +4,20 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::local::{Keeping, Local, Locals};
-use super::loss::{Closeness, Loss};
+use super::loss::{Loss, RenderQuality};
 use super::targets::Targets;
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, Gradients, Raw, SequenceInfo};
 use crate::passes::States;
-use crate::reduction::{Change, Course};
-use crate::refinement::optimizer::{Descent, Schedule};
+use crate::reduction::{ParamDelta, TrajectoryDelta};
+use crate::refinement::optimizer::{Descent, RateSchedule};
 use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
-use crate::source::{Deformation, FrameSource, Wanted};
+use crate::source::{Deformation, FrameSource, ReadPlan};
 
 /// How what is left moves.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Manner {
+pub(super) struct StepParams {
     /// What moves.
     pub(super) columns: Columns,
     /// Up to which harmonics.
@@ -26,7 +26,7 @@ pub(super) struct Manner {
     pub(super) loss: Loss,
 }
 
-/// A knot of a [`Course`] for every so many frames, at most.
+/// A knot of a [`TrajectoryDelta`] for every so many frames, at most.
 const FRAMES_PER_KNOT: usize = 4;
 
 /// How many knots the course of a sequence of `frames` frames has, of at most `most`; none where there would be one.
@@ -46,7 +46,7 @@ pub(super) const FOUND_EVERY: usize = 200;
 ///
 /// Memory: six states, [`Descent`], and a differentiated picture; on a scratch file a state for every frame shown, of those
 /// that are there if they are few.
-pub(super) struct Moving<'a> {
+pub(super) struct OptimizerState<'a> {
     scene: &'a Scene,
     targets: &'a Targets,
     deformation: Option<&'a dyn Deformation>,
@@ -58,10 +58,10 @@ pub(super) struct Moving<'a> {
     /// What is stored, before `descent` moved anything, where states follow from it by more than a sum.
     stored: Raw,
     /// What was added to what is stored before that.
-    before: Change,
+    before: ParamDelta,
     fixed: Vec<bool>,
     /// Of what the states have.
-    manner: Manner,
+    manner: StepParams,
     descent: Descent,
     /// The knots of the course along time, if there is one.
     course: Vec<Descent>,
@@ -80,13 +80,13 @@ pub(super) struct Moving<'a> {
 /// What states follow from: what was stored when they were found last and what had been added by then, none as long as
 /// that is what a leg began with; what the descent added, with its means and steps; the steps since states were found; and
 /// what each knot of the course added.
-type Standing<Stored, Added, Means> =
+type OptimizerCheckpoint<Stored, Added, Means> =
     (Option<(Stored, Added)>, (Added, Means, usize), usize, Vec<(Added, Means, usize)>);
 
-/// A [`Standing`] that was kept.
-pub(super) type Kept = Standing<Raw, Change, [Gaussians; 2]>;
+/// A [`OptimizerCheckpoint`] that was kept.
+pub(super) type KeptCheckpoint = OptimizerCheckpoint<Raw, ParamDelta, [Gaussians; 2]>;
 
-impl<'a> Moving<'a> {
+impl<'a> OptimizerState<'a> {
     /// What `result` shows of `targets`, to move in that manner but for those `fixed`.
     ///
     /// # Errors
@@ -95,9 +95,9 @@ impl<'a> Moving<'a> {
         scene: &'a Scene,
         result: &'a dyn FrameSource,
         targets: &'a Targets,
-        Manner { columns, sh_degree, loss }: Manner,
+        StepParams { columns, sh_degree, loss }: StepParams,
         fixed: Vec<bool>,
-    ) -> Result<Moving<'a>> {
+    ) -> Result<OptimizerState<'a>> {
         let mut frames: Vec<usize> = targets.pictures.iter().map(|picture| picture.frame).collect();
         frames.dedup();
         let deformation = result.deformation();
@@ -105,13 +105,13 @@ impl<'a> Moving<'a> {
         let sh_degree = sh_degree.min(of_state);
         let columns = columns & deformation.map_or(Columns::all(), Deformation::movable);
         let nothing = Gaussians::zeros(0, of_state);
-        let mut moving = Moving {
+        let mut moving = OptimizerState {
             scene,
             targets,
             deformation,
             locals: Keeping::new(&scene.scratch, varying)?.finish()?,
             stored: deformation.map_or_else(|| nothing.clone().into(), |deformation| deformation.stored().clone()),
-            before: Change::default(),
+            before: ParamDelta::default(),
             descent: Descent::new(&nothing, columns, sh_degree, &[]),
             course: Vec::new(),
             changing: vec![Columns::empty(); fixed.len()],
@@ -123,12 +123,12 @@ impl<'a> Moving<'a> {
             frames,
             varying,
             fixed,
-            manner: Manner { columns, sh_degree, loss },
+            manner: StepParams { columns, sh_degree, loss },
         };
         if deformation.is_some() {
             moving.find()?;
         } else {
-            let wanted = Wanted::of(moving.frames.clone()).holding(scene.limits.frames_held);
+            let wanted = ReadPlan::of(moving.frames.clone()).holding(scene.limits.frames_held);
             let mut states = States::open(result, &wanted)?;
             let mut locals = Keeping::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
@@ -156,7 +156,7 @@ impl<'a> Moving<'a> {
     fn begin(&mut self) {
         self.found = false;
         let Some(Local { state, .. }) = self.locals.first() else { return };
-        let Manner { columns, sh_degree, .. } = self.manner;
+        let StepParams { columns, sh_degree, .. } = self.manner;
         self.descent = Descent::new(state, columns, sh_degree, &self.fixed);
         self.gradients = Gradients::new(state.len(), columns, sh_degree);
     }
@@ -171,13 +171,13 @@ impl<'a> Moving<'a> {
     }
 
     /// What is to be added along time.
-    pub(super) fn course(&self) -> Course {
-        Course(self.course.iter().map(|knot| knot.change().clone()).collect())
+    pub(super) fn course(&self) -> TrajectoryDelta {
+        TrajectoryDelta(self.course.iter().map(|knot| knot.change().clone()).collect())
     }
 
     /// The knots that tell of the frame in place `k`, with their weights.
     fn around(&self, k: usize) -> [(usize, f32); 2] {
-        Course::weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
+        TrajectoryDelta::weights(self.course.len(), self.frames[k], self.scene.source().info().times.len())
     }
 
     /// Which Gaussians stay as they are.
@@ -186,7 +186,7 @@ impl<'a> Moving<'a> {
     }
 
     /// What is to be added to what is stored.
-    pub(super) fn change(&self) -> Change {
+    pub(super) fn change(&self) -> ParamDelta {
         let before = self.before.clone();
         if self.descent.has_moved() { before.and(self.descent.change().clone()) } else { before }
     }
@@ -211,11 +211,12 @@ impl<'a> Moving<'a> {
         Ok(())
     }
 
-    /// What is needed to go on from here, for [`Moving::go_on`].
+    /// What is needed to go on from here, for [`OptimizerState::go_on`].
     pub(super) fn standing(&self) -> impl Serialize + '_ {
         let found = self.found.then_some((&self.stored, &self.before));
         let course = self.course.iter().map(Descent::standing).collect();
-        let standing: Standing<&Raw, &Change, &[Gaussians; 2]> = (found, self.descent.standing(), self.steps, course);
+        let standing: OptimizerCheckpoint<&Raw, &ParamDelta, &[Gaussians; 2]> =
+            (found, self.descent.standing(), self.steps, course);
         standing
     }
 
@@ -223,7 +224,7 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be written.
-    pub(super) fn go_on(&mut self, (found, descent, steps, course): Kept) -> Result<()> {
+    pub(super) fn go_on(&mut self, (found, descent, steps, course): KeptCheckpoint) -> Result<()> {
         if let Some((stored, before)) = found {
             self.descent.take();
             (self.stored, self.before) = (stored, before);
@@ -238,11 +239,11 @@ impl<'a> Moving<'a> {
         Ok(())
     }
 
-    /// Begins anew from where `change` led, a [`Moving::change`] since the last cut.
+    /// Begins anew from where `change` led, a [`OptimizerState::change`] since the last cut.
     ///
     /// # Errors
     /// A scratch file that cannot be written.
-    pub(super) fn turn_back(&mut self, change: &Change) -> Result<()> {
+    pub(super) fn turn_back(&mut self, change: &ParamDelta) -> Result<()> {
         self.descent.restart(&change.since(&self.before));
         self.find()
     }
@@ -311,7 +312,7 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be read or written.
-    pub(super) fn step(&mut self, k: usize, schedule: &Schedule) -> Result<()> {
+    pub(super) fn step(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
         if self.steps == FOUND_EVERY {
             self.find()?;
         }
@@ -325,7 +326,7 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be read.
-    pub(super) fn step_along(&mut self, k: usize, schedule: &Schedule) -> Result<()> {
+    pub(super) fn step_along(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
         self.differentiate(k)?;
         // What does not change with time goes nowhere.
         for column in self.manner.columns.iter() {
@@ -348,7 +349,7 @@ impl<'a> Moving<'a> {
         let mut now = std::mem::take(&mut self.now);
         self.show(self.place(k), &mut now)?;
         self.gradients.clear();
-        let Manner { columns, sh_degree, loss } = self.manner;
+        let StepParams { columns, sh_degree, loss } = self.manner;
         let mut of_those = now.there.as_ref().map(|there| Gradients::new(there.len(), columns, sh_degree));
         let gradients = of_those.as_mut().unwrap_or(&mut self.gradients);
         let pull = |picture: &_| (0.0, loss.slope(picture, &target));
@@ -365,14 +366,14 @@ impl<'a> Moving<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be read.
-    pub(super) fn closeness(&self, of: &[usize]) -> Result<Closeness> {
+    pub(super) fn closeness(&self, of: &[usize]) -> Result<RenderQuality> {
         let lost = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
             self.show(self.place(k), now)?;
             let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
             Ok(self.manner.loss.of(&picture, &self.targets.values(k)?))
         };
         let losses: Vec<[f64; 2]> = of.par_iter().map_init(|| self.worker(), lost).collect::<Result<_>>()?;
-        Ok(Closeness::of(&losses))
+        Ok(RenderQuality::of(&losses))
     }
 
     /// What the pictures numbered `of` would lose with each.

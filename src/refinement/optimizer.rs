@@ -1,6 +1,6 @@
 //! Descending a gradient: how far what is stored of Gaussians moves, given how a number changes with it.
 //!
-//! In: derivatives of one picture's loss after another ([`Gradients`]). Out: a [`Change`] of what is stored. Adam
+//! In: derivatives of one picture's loss after another ([`Gradients`]). Out: a [`ParamDelta`] of what is stored. Adam
 //! (Kingma and Ba, "Adam: A Method for Stochastic Optimization", 2015) with a rate for each group of values and no
 //! correction but its own. Memory: [`bytes_per_gaussian`].
 
@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
-use crate::reduction::Change;
+use crate::reduction::ParamDelta;
 
 /// Decay of the means of a derivative and of its square, and what keeps a division from 0.
 const BETAS: [f32; 2] = [0.9, 0.999];
@@ -21,22 +21,22 @@ const FULL_ERROR: f64 = 0.045;
 
 /// How rates change from step to step.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-pub struct Schedule {
+pub struct RateSchedule {
     steps: usize,
     last: f32,
     factor: f32,
 }
 
-impl Schedule {
+impl RateSchedule {
     /// Of `steps` steps, down to `last` of the first's rates. `error` is the root mean square error of the pictures at
     /// the start.
-    pub fn new(steps: usize, last: f32, error: f64) -> Schedule {
-        Schedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
+    pub fn new(steps: usize, last: f32, error: f64) -> RateSchedule {
+        RateSchedule { steps, last, factor: (error / FULL_ERROR).min(1.0) as f32 }
     }
 
     /// With rates that are `part` of these.
-    pub fn times(self, part: f32) -> Schedule {
-        Schedule { factor: part * self.factor, ..self }
+    pub fn times(self, part: f32) -> RateSchedule {
+        RateSchedule { factor: part * self.factor, ..self }
     }
 
     /// What rates are multiplied by in step `done`.
@@ -49,7 +49,7 @@ impl Schedule {
 /// What is stored of Gaussians on its way down.
 #[derive(Debug)]
 pub struct Descent {
-    change: Change,
+    change: ParamDelta,
     /// Means of the derivatives, and of their squares.
     means: [Gaussians; 2],
     /// `[N]`, by what rates are multiplied: 1, and of positions four hundredths of the mean extent; 0 of what stays.
@@ -74,11 +74,11 @@ impl Descent {
         let free: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { 1.0 }).collect();
         let of_positions = |(i, free): (usize, &f32)| free * 0.04 * extent(i).clamp(-80.0, 80.0).exp();
         let reach = [free.iter().enumerate().map(of_positions).collect(), free];
-        Descent { means: [change.clone(), change.clone()], change: Change(change), reach, columns, done: 0 }
+        Descent { means: [change.clone(), change.clone()], change: ParamDelta(change), reach, columns, done: 0 }
     }
 
     /// What is to be added to the start.
-    pub fn change(&self) -> &Change {
+    pub fn change(&self) -> &ParamDelta {
         &self.change
     }
 
@@ -88,14 +88,14 @@ impl Descent {
     }
 
     /// What is to be added to the start, which from now on counts as the start's own.
-    pub fn take(&mut self) -> Change {
+    pub fn take(&mut self) -> ParamDelta {
         let moved = self.change.clone();
         self.change.0.columns_mut(self.columns).for_each(|column| column.planes_mut().fill(0.0));
         moved
     }
 
     /// Begins anew with `change` already added to the start; columns that it does not have are where they began.
-    pub fn restart(&mut self, change: &Change) {
+    pub fn restart(&mut self, change: &ParamDelta) {
         self.take();
         for column in (self.columns & change.columns()).iter() {
             self.change.0.column_mut(column).clone_from(change.0.column(column));
@@ -107,12 +107,12 @@ impl Descent {
     }
 
     /// How far it is: the change, the means, and the steps done, from which [`Descent::go_on`] goes on.
-    pub fn standing(&self) -> (&Change, &[Gaussians; 2], usize) {
+    pub fn standing(&self) -> (&ParamDelta, &[Gaussians; 2], usize) {
         (&self.change, &self.means, self.done)
     }
 
     /// Goes on from where another descent of the same start was.
-    pub fn go_on(&mut self, (change, means, done): (Change, [Gaussians; 2], usize)) {
+    pub fn go_on(&mut self, (change, means, done): (ParamDelta, [Gaussians; 2], usize)) {
         (self.change, self.means, self.done) = (change, means, done);
     }
 
@@ -120,7 +120,7 @@ impl Descent {
     ///
     /// # Panics
     /// If they are of other Gaussians or fewer columns.
-    pub fn step(&mut self, gradients: &Gradients, weight: f32, schedule: &Schedule) {
+    pub fn step(&mut self, gradients: &Gradients, weight: f32, schedule: &RateSchedule) {
         let factor = schedule.at(self.done);
         self.done += 1;
         // Of means that began at 0.
@@ -185,7 +185,7 @@ mod tests {
         for _ in 0..2000 {
             let mut now = start.clone();
             descent.change().add_to(&mut now, Columns::all());
-            descent.step(&slopes(&now, 0.25), 1.0, &Schedule::new(2000, 0.05, 1.0));
+            descent.step(&slopes(&now, 0.25), 1.0, &RateSchedule::new(2000, 0.05, 1.0));
         }
         let mut end = start.clone();
         descent.change().add_to(&mut end, Columns::all());
@@ -208,7 +208,7 @@ mod tests {
             let mut gradients = Gradients::new(1, Columns::OPACITY, 0);
             let slope = (k as f64 * 0.7).sin() + 0.3;
             gradients.column_mut(Columns::OPACITY).set_row(0, [slope as f32]);
-            descent.step(&gradients, 1.0, &Schedule::new(steps, 0.05, error));
+            descent.step(&gradients, 1.0, &RateSchedule::new(steps, 0.05, error));
             mean = 0.9 * mean + 0.1 * slope;
             square = 0.999 * square + 0.001 * slope * slope;
             let t = k as i32 + 1;
@@ -228,7 +228,7 @@ mod tests {
             for column in Columns::all().iter() {
                 gradients.column_mut(column).planes_mut().fill(slope);
             }
-            descent.step(&gradients, 1.0, &Schedule::new(10, 0.05, 1.0));
+            descent.step(&gradients, 1.0, &RateSchedule::new(10, 0.05, 1.0));
         }
         let change = descent.change();
         assert!(Columns::all().iter().all(|column| change.0.column(column).planes().iter().all(|x| x.is_finite())));

@@ -4,13 +4,13 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::cache::{Spill, Spilling};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Camera, Picture};
-use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, View, show, spread};
+use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
 use crate::render::{Image, render};
 use crate::scene::Scene;
-use crate::scene::between::{Dice, between};
+use crate::scene::between::{SplitMix64, between};
 
 /// What they are called in a work folder.
 pub(crate) const NAME: &str = "targets";
@@ -59,10 +59,10 @@ impl Targets {
     /// Frames that cannot be read; a scratch file that cannot be written.
     pub(crate) fn new(scene: &Scene, most: usize) -> Result<Targets> {
         let (cameras, pictures) = looked_at(scene, most);
-        let make = |some: Range<usize>, values: &mut Spilling| {
+        let make = |some: Range<usize>, values: &mut SpillWriter| {
             let subject = [Subject::all(scene.source())];
             show(subject, &cameras, &pictures[some], Batch::of_frame(&scene.limits), |views| {
-                let picture = |view: &View<'_, 1>| narrow(&render(view.states[0], view.camera, scene.background));
+                let picture = |view: &ViewStates<'_, 1>| narrow(&render(view.states[0], view.camera, scene.background));
                 let made: Vec<Vec<u16>> = views.par_iter().map(picture).collect();
                 made.iter().try_for_each(|picture| values.write(bytemuck::cast_slice(picture)))
             })
@@ -115,7 +115,7 @@ fn looked_at(scene: &Scene, most: usize) -> (Vec<Camera>, Vec<Picture>) {
     for picture in &mut pictures {
         picture.camera = used.binary_search(&picture.camera).unwrap_or_default() as u32;
     }
-    let (seen, mut dice) = (pictures.len(), Dice(2));
+    let (seen, mut dice) = (pictures.len(), SplitMix64(2));
     for camera in between(&cameras, if seen == 0 { 0 } else { more }) {
         let frame = pictures[dice.below(seen)].frame;
         pictures.push(Picture { frame, view: u32::MAX, camera: cameras.len() as u32 });

@@ -26,7 +26,7 @@ const LOOKS: usize = 9;
 
 /// A direction of a plot.
 #[derive(Debug, Clone, Default)]
-pub struct Axis {
+pub struct ChartAxis {
     /// What it measures, with the unit.
     pub label: String,
     /// Whether equal steps are equal ratios; values that are not positive are then left out.
@@ -56,9 +56,9 @@ pub struct Plot {
     /// What it shows, for those who do not see it.
     pub title: String,
     /// Along.
-    pub x: Axis,
+    pub x: ChartAxis,
     /// Up.
-    pub y: Axis,
+    pub y: ChartAxis,
     /// In the order of the legend.
     pub series: Vec<Series>,
 }
@@ -80,7 +80,7 @@ pub struct Stack {
     /// What it shows.
     pub title: String,
     /// The values that the bins part.
-    pub x: Axis,
+    pub x: ChartAxis,
     /// One more than there are bins, increasing.
     pub edges: Vec<f64>,
     /// Groups from the bottom, each with a count per bin.
@@ -88,7 +88,7 @@ pub struct Stack {
 }
 
 /// An axis with its range, and where on the picture it lies.
-struct Scale {
+struct AxisScale {
     log: bool,
     low: f64,
     high: f64,
@@ -96,9 +96,9 @@ struct Scale {
     to: f64,
 }
 
-impl Scale {
+impl AxisScale {
     /// Covers `values` with a little room, from pixel `from` to pixel `to`.
-    fn of(axis: &Axis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<Scale> {
+    fn of(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
             values.filter(fits).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
@@ -117,7 +117,7 @@ impl Scale {
         }
         let room = 0.04 * (high - low);
         let flat = axis.from_zero && !axis.log;
-        Some(Scale {
+        Some(AxisScale {
             log: axis.log,
             low: if flat && low == 0.0 { low } else { low - room },
             high: if flat && high == 0.0 { high } else { high + room },
@@ -178,16 +178,16 @@ impl Plot {
     /// The chart.
     pub fn svg(&self) -> String {
         let looks = self.looks();
-        let legend: Vec<Entry<'_>> = self
+        let legend: Vec<LegendEntry<'_>> = self
             .series
             .iter()
             .zip(&looks)
-            .map(|(of, &look)| Entry { name: &of.name, look, joined: of.joined })
+            .map(|(of, &look)| LegendEntry { name: &of.name, look, joined: of.joined })
             .collect();
         let mut out = Drawing::new(&self.title, &legend, HEIGHT);
         let points = || self.series.iter().flat_map(|series| series.points.iter().copied());
-        let x = Scale::of(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
-        let y = Scale::of(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
+        let x = AxisScale::of(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
+        let y = AxisScale::of(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
         let (Some(mut x), Some(y)) = (x, y) else { return out.empty() };
         let longest = self.series.iter().flat_map(|series| &series.labels).map(|label| label.chars().count()).max();
         x.leave(longest.unwrap_or(0) as f64 * LETTER);
@@ -211,12 +211,12 @@ impl Plot {
     }
 
     /// The look of every series.
-    fn looks(&self) -> Vec<Look> {
+    fn looks(&self) -> Vec<SeriesStyle> {
         let mut colours = 0;
         let look = |series: &Series| {
             let hollow = series.paired && colours > 0;
             colours += usize::from(!hollow);
-            Look { hollow, ..Look::of(colours - 1) }
+            SeriesStyle { hollow, ..SeriesStyle::of(colours - 1) }
         };
         self.series.iter().map(look).collect()
     }
@@ -230,9 +230,9 @@ impl Bars {
         let mut out = Drawing::new(&self.title, &[], height);
         let longest = self.bars.iter().map(|bar| bar.0.chars().count()).max().unwrap_or(0) as f64;
         let left = (longest * LETTER + 14.0).max(LEFT);
-        let axis = Axis { from_zero: true, ..Axis::default() };
+        let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
         let values = self.bars.iter().map(|bar| bar.1);
-        let Some(x) = Scale::of(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
+        let Some(x) = AxisScale::of(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
         out.x_axis(&x, &self.label, [8.0, height - BOTTOM]);
         for (row, (name, value)) in self.bars.iter().enumerate() {
             let (Some(start), Some(end)) = (x.at(0.0), x.at(*value)) else { continue };
@@ -259,15 +259,16 @@ impl Stack {
     /// The chart.
     pub fn svg(&self) -> String {
         let names = self.groups.iter().enumerate();
-        let legend: Vec<Entry<'_>> =
-            names.map(|(number, of)| Entry { name: &of.0, look: Look::of(number), joined: false }).collect();
+        let legend: Vec<LegendEntry<'_>> = names
+            .map(|(number, of)| LegendEntry { name: &of.0, look: SeriesStyle::of(number), joined: false })
+            .collect();
         let mut out = Drawing::new(&self.title, &legend, HEIGHT);
         let bins = self.edges.len().saturating_sub(1);
         let count = |group: &(String, Vec<usize>), bin: usize| group.1.get(bin).copied().unwrap_or(0);
         let total = |bin| self.groups.iter().map(|group| count(group, bin)).sum::<usize>() as f64;
-        let up = Axis { from_zero: true, ..Axis::default() };
-        let x = Scale::of(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
-        let y = Scale::of(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
+        let up = ChartAxis { from_zero: true, ..ChartAxis::default() };
+        let x = AxisScale::of(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
+        let y = AxisScale::of(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
         let (Some(x), Some(y)) = (x, y) else { return out.empty() };
         out.axes(&x, &y, &self.x.label, "Gaussians");
         for bin in 0..bins {
@@ -282,7 +283,7 @@ impl Stack {
                     out.push(&format!(
                         "<rect class=\"area {}\" x=\"{left:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
                          <title>{}: {here} from {} to {}</title></rect>",
-                        Look::of(number),
+                        SeriesStyle::of(number),
                         (right - left - 0.6).max(0.4),
                         bottom - top,
                         escape(&group.0),
@@ -298,29 +299,29 @@ impl Stack {
 
 /// How a series is drawn: class names of [`STYLE`].
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Look {
+struct SeriesStyle {
     /// Below [`LOOKS`].
     number: usize,
     hollow: bool,
 }
 
-impl Look {
+impl SeriesStyle {
     /// Of the series of that number, alone.
-    fn of(number: usize) -> Look {
-        Look { number: number % LOOKS, hollow: false }
+    fn of(number: usize) -> SeriesStyle {
+        SeriesStyle { number: number % LOOKS, hollow: false }
     }
 }
 
-impl fmt::Display for Look {
+impl fmt::Display for SeriesStyle {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "s{}{}", self.number, if self.hollow { " hollow" } else { "" })
     }
 }
 
 /// A line of a legend.
-struct Entry<'a> {
+struct LegendEntry<'a> {
     name: &'a str,
-    look: Look,
+    look: SeriesStyle,
     joined: bool,
 }
 
@@ -335,7 +336,7 @@ struct Drawing {
 }
 
 impl Drawing {
-    fn new(title: &str, legend: &[Entry<'_>], height: f64) -> Drawing {
+    fn new(title: &str, legend: &[LegendEntry<'_>], height: f64) -> Drawing {
         let title = escape(title);
         let mut out = Drawing {
             text: format!("<svg class=\"chart\" viewBox=\"0 0 {WIDTH} {height}\" role=\"img\" aria-label=\"{title}\">"),
@@ -344,7 +345,7 @@ impl Drawing {
             labels: Vec::new(),
         };
         let (mut x, mut y) = (LEFT, 17.0);
-        for Entry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
+        for LegendEntry { name, look, joined } in legend.iter().filter(|entry| !entry.name.is_empty()) {
             // The mark, with a piece of the line through it.
             let sample = if *joined { 26.0 } else { 12.0 };
             let wide = name.chars().count() as f64 * LETTER + sample + 22.0;
@@ -367,7 +368,7 @@ impl Drawing {
     }
 
     /// A point in the shape of its series.
-    fn mark(&mut self, look: Look, x: f64, y: f64, tip: &str) {
+    fn mark(&mut self, look: SeriesStyle, x: f64, y: f64, tip: &str) {
         let shape = match look.number % 4 {
             0 => format!("<circle class=\"mark {look}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"3.4\">"),
             1 => format!(
@@ -407,7 +408,7 @@ impl Drawing {
         }
     }
 
-    fn axes(&mut self, x: &Scale, y: &Scale, x_label: &str, y_label: &str) {
+    fn axes(&mut self, x: &AxisScale, y: &AxisScale, x_label: &str, y_label: &str) {
         let bottom = HEIGHT - BOTTOM;
         for tick in y.ticks() {
             let Some(at) = y.at(tick) else { continue };
@@ -430,7 +431,7 @@ impl Drawing {
     }
 
     /// Ticks, grid and label of a horizontal axis over rows from `top` to `bottom`.
-    fn x_axis(&mut self, x: &Scale, label: &str, [top, bottom]: [f64; 2]) {
+    fn x_axis(&mut self, x: &AxisScale, label: &str, [top, bottom]: [f64; 2]) {
         for tick in x.ticks() {
             let Some(at) = x.at(tick) else { continue };
             let _ = write!(
@@ -498,7 +499,7 @@ mod tests {
             labels: ["first", "lost", "last"].map(String::from).to_vec(),
         };
         let plot = Plot { series: [false, true, false, true].map(series).to_vec(), ..Plot::default() };
-        let looks: Vec<String> = plot.looks().iter().map(Look::to_string).collect();
+        let looks: Vec<String> = plot.looks().iter().map(SeriesStyle::to_string).collect();
         assert_eq!(looks, ["s0", "s0 hollow", "s1", "s1 hollow"]);
         let svg = plot.svg();
         let times = |label: &str| svg.matches(&format!(">{label}</text>")).count();
@@ -506,27 +507,27 @@ mod tests {
         assert_eq!(["first", "lost", "last"].map(times), [1, 0, 4], "{svg}");
         // A pair needs a first.
         let alone = Plot { series: vec![series(true)], ..Plot::default() };
-        assert_eq!(alone.looks(), [Look::of(0)]);
+        assert_eq!(alone.looks(), [SeriesStyle::of(0)]);
     }
 
     #[test]
     fn ticks_are_round_and_inside() {
         for (low, high) in [(0.0, 1.0), (-3.0, 17.0), (48.2, 48.9), (1e-7, 3e-7), (0.0, 5e9)] {
-            let scale = Scale { log: false, low, high, from: 0.0, to: 100.0 };
+            let scale = AxisScale { log: false, low, high, from: 0.0, to: 100.0 };
             let ticks = scale.ticks();
             assert!((2..=12).contains(&ticks.len()), "{low} to {high}: {ticks:?}");
             assert!(ticks.iter().all(|&tick| tick >= low - 1e-9 * high && tick <= high * (1.0 + 1e-9)));
         }
-        let narrow = Scale { log: true, low: 62f64.log10(), high: 82f64.log10(), from: 0.0, to: 100.0 };
+        let narrow = AxisScale { log: true, low: 62f64.log10(), high: 82f64.log10(), from: 0.0, to: 100.0 };
         assert_eq!(narrow.ticks(), [65.0, 70.0, 75.0, 80.0]);
-        let log = Scale { log: true, low: -7.0, high: 2.0, from: 0.0, to: 100.0 };
+        let log = AxisScale { log: true, low: -7.0, high: 2.0, from: 0.0, to: 100.0 };
         assert!((3..=8).contains(&log.ticks().len()), "{:?}", log.ticks());
     }
 
     #[test]
     fn higher_values_lie_higher_and_bins_stand_on_one_another() {
-        let axis = Axis { from_zero: true, ..Axis::default() };
-        let scale = Scale::of(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
+        let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
+        let scale = AxisScale::of(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
         assert_eq!(scale.at(0.0), Some(200.0));
         assert!(scale.at(4.0) < scale.at(1.0));
         let groups = vec![("kept".to_owned(), vec![3, 0]), ("dropped".to_owned(), vec![1, 2])];

@@ -10,8 +10,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::traits::{Kind, Traits};
-use crate::evaluation::Taken;
+use super::traits::{GaussianKind, Traits};
+use crate::evaluation::RenderedViews;
 use crate::metrics::{PSNR_CAP_DB, clamped, psnr};
 use crate::model::{Camera, Column, Gaussians, SH_C0};
 use crate::render::{Image, render};
@@ -30,15 +30,15 @@ pub const CROP: u32 = 64;
 /// Error sums of one picture, in f64 over pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Observed {
-    /// By [`Kind::ALL`].
-    kinds: [Sums; 3],
+    /// By [`GaussianKind::ALL`].
+    kinds: [FailureSums; 3],
     /// Σ e², e² the mean over channels of the squared difference.
     error: f64,
     pixels: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-struct Sums {
+struct FailureSums {
     /// Σ w.
     weight: f64,
     /// Σ w e².
@@ -66,7 +66,7 @@ pub enum Verdict {
 
 /// The place in a picture where a failure is worst.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Worst {
+pub struct WorstPlace {
     /// Index into the evaluation's pictures.
     #[serde(skip)]
     pub place: usize,
@@ -107,12 +107,12 @@ pub struct FailureMode {
     /// 0 where they exaggerate.
     pub detail_lost: Option<f64>,
     /// The picture in which it is worst.
-    pub worst: Option<Worst>,
+    pub worst: Option<WorstPlace>,
 }
 
 /// What is known of a kind's Gaussians before any picture is made.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Members {
+pub struct KindMembers {
     /// How many there are.
     pub count: usize,
     /// Dropped and merged ones, where that is known.
@@ -142,7 +142,7 @@ pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -
 ///
 /// # Panics
 /// If the sizes differ.
-pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &Taken) -> Observed {
+pub fn observe(state: &Gaussians, traits: &[Traits], camera: &Camera, taken: &RenderedViews) -> Observed {
     let shares = shares_of_pixels(state, traits, camera);
     let (original, compressed) = (brightness(&taken.original), brightness(&taken.compressed));
     let (width, height) = (camera.width as usize, camera.height as usize);
@@ -180,10 +180,10 @@ fn brightness(image: &Image) -> Vec<f64> {
 }
 
 /// Judges one kind by the pictures `seen`, whose (frame, view) are `names`.
-pub fn judge(kind: Kind, members: Members, seen: &[Observed], names: &[(usize, u32)]) -> FailureMode {
+pub fn judge(kind: GaussianKind, members: KindMembers, seen: &[Observed], names: &[(usize, u32)]) -> FailureMode {
     let (name, happens_to) = described(kind);
     let at = kind as usize;
-    let sum = |value: fn(&Sums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
+    let sum = |value: fn(&FailureSums) -> f64| seen.iter().map(|of| value(&of.kinds[at])).sum::<f64>();
     let (weight, error) = (sum(|s| s.weight), sum(|s| s.error));
     let pixels: f64 = seen.iter().map(|of| of.pixels).sum();
     let all_error: f64 = seen.iter().map(|of| of.error).sum();
@@ -195,7 +195,7 @@ pub fn judge(kind: Kind, members: Members, seen: &[Observed], names: &[(usize, u
         .filter(|&place| seen[place].kinds[at].weight >= SHOWN * seen[place].pixels)
         .filter_map(|place| Some((place, db(seen[place].kinds[at].error, seen[place].kinds[at].weight)?)))
         .min_by(|a, b| a.1.total_cmp(&b.1))
-        .map(|(place, psnr)| Worst { place, frame: names[place].0, view: names[place].1, psnr });
+        .map(|(place, psnr)| WorstPlace { place, frame: names[place].0, view: names[place].1, psnr });
     let lost = members.fates.is_some().then_some(members.shares.1);
     let apart = psnr_there
         .zip(psnr_elsewhere)
@@ -229,10 +229,10 @@ pub fn judge(kind: Kind, members: Members, seen: &[Observed], names: &[(usize, u
 }
 
 /// The mode's name, and the Gaussians it happens to.
-fn described(kind: Kind) -> (&'static str, String) {
+fn described(kind: GaussianKind) -> (&'static str, String) {
     use super::traits::{COLOUR_CHANGE, FAST, NEIGHBOURS, NON_RIGID, OPACITY_CHANGE, STILL, THIN};
     match kind {
-        Kind::Motion => (
+        GaussianKind::Motion => (
             "fast, non-rigid motion",
             format!(
                 "Gaussians that move by {}% of the scene extent per frame or more (root mean square), while the \
@@ -241,8 +241,8 @@ fn described(kind: Kind) -> (&'static str, String) {
                 100.0 * NON_RIGID
             ),
         ),
-        Kind::Thin => ("thin structures", format!("Gaussians {THIN} times as long as wide or more")),
-        Kind::Appearance => (
+        GaussianKind::Thin => ("thin structures", format!("Gaussians {THIN} times as long as wide or more")),
+        GaussianKind::Appearance => (
             "fine changes of appearance",
             format!(
                 "Gaussians that stand still (up to {}% of the extent per frame) while their opacity varies by {} or \
@@ -262,7 +262,7 @@ fn db(error: f64, weight: f64) -> Option<f64> {
 
 /// Corner of the square of [`CROP`] pixels, or less in a smaller picture, that holds most of the error
 /// that is a kind's: Σ w e². Of equals the first by rows.
-pub fn worst_corner(taken: &Taken, shares: &Image, kind: Kind) -> (u32, u32) {
+pub fn worst_corner(taken: &RenderedViews, shares: &Image, kind: GaussianKind) -> (u32, u32) {
     let (width, height) = (taken.original.width as usize, taken.original.height as usize);
     let (across, down) = ((CROP as usize).min(width), (CROP as usize).min(height));
     // sums[y][x] over the rectangle above and left of (x, y).
@@ -301,7 +301,7 @@ pub fn crop(image: &Image, (left, top): (u32, u32)) -> Image {
 }
 
 /// PSNR of the part of both pictures that [`crop`] gives, dB.
-pub fn crop_psnr(taken: &Taken, corner: (u32, u32)) -> f64 {
+pub fn crop_psnr(taken: &RenderedViews, corner: (u32, u32)) -> f64 {
     psnr(&crop(&taken.compressed, corner), &crop(&taken.original, corner))
 }
 

@@ -9,10 +9,10 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
-use super::shown::{Shown, brighter, difference, shrink, shrinkage};
+use super::shown::{ShownImage, brighter, difference, shrink, shrinkage};
 use crate::budget::Workload;
 use crate::error::{Error, Result};
-use crate::evaluation::SideBySide;
+use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
 use crate::metrics::psnr;
 use crate::model::Picture;
@@ -32,7 +32,7 @@ pub const QUALITY: u8 = 80;
 
 /// A film of the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Film {
+pub struct FilmPanel {
     /// Why its view was chosen: "worst picture", ...
     pub why: Vec<String>,
     /// View number.
@@ -70,11 +70,11 @@ pub fn bytes(work: &Workload) -> u64 {
 ///
 /// # Errors
 /// A source that cannot be read.
-pub fn films(side: &SideBySide, shown: &[Shown]) -> Result<Vec<Film>> {
+pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
     let every = side.scene.source().info().times.len();
-    let mut films: Vec<Film> = Vec::new();
+    let mut films: Vec<FilmPanel> = Vec::new();
     let mut cameras = Vec::new();
-    for (k, Shown { choice, factor, .. }) in shown.iter().enumerate() {
+    for (k, ShownImage { choice, factor, .. }) in shown.iter().enumerate() {
         let Picture { view, camera, .. } = side.picture(choice.place);
         let wanted = k == 0 || choice.why.iter().any(|why| why == "median picture");
         if every < 2 || !wanted || cameras.contains(&camera) || films.len() == VIEWS {
@@ -94,7 +94,7 @@ pub fn films(side: &SideBySide, shown: &[Shown]) -> Result<Vec<Film>> {
         })?;
         let shrunk = made.first().map_or(1, |made| made.1);
         let of = &side.scene.rig.cameras[camera as usize];
-        films.push(Film {
+        films.push(FilmPanel {
             why: choice.why.clone(),
             view,
             camera_of_frame: choice.frame,

@@ -3,16 +3,16 @@
 use serde::Serialize;
 
 use super::failure::FailureMode;
-use super::film::Film;
+use super::film::FilmPanel;
 use super::histogram::Histogram;
 use super::shown::Choice;
 use crate::evaluation::found::{Evaluation, PictureScores};
-use crate::evaluation::precision::Precision;
+use crate::evaluation::precision::PrecisionDiagram;
 use crate::evaluation::trade_off::TradeOff;
 
 /// Everything the page shows, as data.
 #[derive(Debug, Serialize)]
-pub struct Report {
+pub struct ReportData {
     /// Program and version.
     pub tool: String,
     /// The result in a sentence or two.
@@ -24,8 +24,8 @@ pub struct Report {
     /// Pictures that the page shows.
     pub shown: Vec<Choice>,
     /// Films that it shows.
-    pub films: Vec<Film>,
-    /// The failure modes, by [`super::traits::Kind::ALL`].
+    pub films: Vec<FilmPanel>,
+    /// The failure modes, by [`super::traits::GaussianKind::ALL`].
     pub failure_modes: Vec<FailureMode>,
     /// The scores of what was kept, merged and dropped; none where that is not known.
     pub histograms: Option<Vec<Histogram>>,
@@ -37,7 +37,7 @@ pub struct Report {
     pub trade_off: Option<TradeOff>,
     /// Work-precision diagrams of the original.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub precision: Option<Precision>,
+    pub precision: Option<PrecisionDiagram>,
     /// Things a person should know.
     pub notes: Vec<String>,
     /// The same of the work folder, which are no part of the result.

@@ -28,10 +28,10 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 
-use crate::cache::Key;
+use crate::cache::CacheKey;
 use crate::error::{Error, Result};
 use crate::evaluation;
-use crate::evaluation::{EvaluateOptions, SideBySide, Taken};
+use crate::evaluation::{EvaluateOptions, ModelPair, RenderedViews};
 use crate::files::atomic::{Kind as TargetKind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::text::read_text;
 use crate::journal::Journal;
@@ -42,14 +42,14 @@ use crate::pipeline::stages::measure::{Measure, Stages};
 use crate::pruning::score::{SCORED, Scored, UserOverrides};
 use crate::recipe::{NonFinite, Recipe};
 use crate::scene::Scene;
-pub use findings::Report;
+pub use findings::ReportData;
 
-use failure::{FailureMode, Members, judge, observe};
+use failure::{FailureMode, KindMembers, judge, observe};
 use findings::Close;
 use histogram::histograms;
-use run::{Fate, Run};
-use shown::{Choice, Shown, choices, show};
-use traits::{Kind, Traits, shares, traits};
+use run::{Fate, RunFiles};
+use shown::{Choice, ShownImage, choices, show};
+use traits::{GaussianKind, Traits, shares, traits};
 
 /// The page's name in the folder.
 pub const PAGE: &str = "report.html";
@@ -73,7 +73,7 @@ pub struct ReportOptions {
 ///
 /// # Errors
 /// Whatever is wrong with inputs, cameras, pictures, sweep or output. Nothing is left behind then.
-pub fn report(options: &ReportOptions) -> Result<Report> {
+pub fn report(options: &ReportOptions) -> Result<ReportData> {
     let mut inputs = options.evaluate.inputs();
     inputs.extend(options.sweep.as_deref());
     inputs.extend(options.precision.as_deref());
@@ -81,10 +81,10 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     check_target(&options.output, TargetKind::Folder, &inputs, options.overwrite)?;
     let trade_off = options.sweep.as_deref().map(|path| read_found(path, "sweep")).transpose()?;
     let precision = options.precision.as_deref().map(|path| read_found(path, "precision")).transpose()?;
-    let mut side = SideBySide::open(&options.evaluate)?;
+    let mut side = ModelPair::open(&options.evaluate)?;
     let info = side.scene.source().info();
     let (count, frames) = (info.count, info.times.len());
-    let run = Run::beside(&options.evaluate.compressed, count, side.compressed_count());
+    let run = RunFiles::beside(&options.evaluate.compressed, count, side.compressed_count());
     let mut notes = notes_on(&run, &side.scene)?;
 
     let recipe = recipe_to_score_with(&run)?;
@@ -104,7 +104,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     if in_parts {
         // What comes now follows from this too; the comparison is that of `evaluate`.
-        side.scene.work.follow_from(Key::of(&(&side.scene.schedule, &recipe)));
+        side.scene.work.follow_from(CacheKey::of(&(&side.scene.schedule, &recipe)));
     }
     let scored = measure.run(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));
@@ -112,7 +112,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     let traits = side.scene.work.known("traits", side.scene.work.key(&()), find_traits)?;
     let rows = scored.rows()?;
     let members = members(&rows, &traits, run.fates.as_deref());
-    let look = |state: &Gaussians, camera: &Camera, taken: &Taken| observe(state, &traits, camera, taken);
+    let look = |state: &Gaussians, camera: &Camera, taken: &RenderedViews| observe(state, &traits, camera, taken);
     let (evaluation, seen) = match compared {
         None => side.observe(look)?,
         Some(compared) => (compared, side.observe_in_parts("failure", look)?),
@@ -120,7 +120,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
     side.scene.work.not_divided("the page")?;
     let names: Vec<(usize, u32)> = evaluation.pictures.iter().map(|picture| (picture.frame, picture.view)).collect();
     let failure_modes: Vec<FailureMode> =
-        Kind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
+        GaussianKind::ALL.iter().zip(members).map(|(&kind, members)| judge(kind, members, &seen, &names)).collect();
     let choices = choices(&evaluation);
     let (shown, close) = show_again(&side, &choices, &failure_modes, &traits)?;
     let films = film::films(&side, &shown)?;
@@ -131,7 +131,7 @@ pub fn report(options: &ReportOptions) -> Result<Report> {
         Some(fates) => Some(histograms(&rows, &scored.scores(&recipe.score)?, frames, fates)),
         None => None,
     };
-    let report = Report {
+    let report = ReportData {
         tool: evaluation.tool.clone(),
         verdict: verdict::verdict(&evaluation, &failure_modes),
         pictures: evaluation.pictures.clone(),
@@ -165,7 +165,7 @@ fn read_found<T: DeserializeOwned>(path: &Path, verb: &str) -> Result<T> {
 }
 
 /// What beside the result does not fit these two models.
-fn notes_on(run: &Run, scene: &Scene) -> Result<Vec<String>> {
+fn notes_on(run: &RunFiles, scene: &Scene) -> Result<Vec<String>> {
     let Some((summary, _)) = &run.summary else { return Ok(Vec::new()) };
     let digest = scene.input.digest()?;
     Ok(match summary.input.digest == digest {
@@ -179,7 +179,7 @@ fn notes_on(run: &Run, scene: &Scene) -> Result<Vec<String>> {
 
 /// The recipe of the result, else the usual one. The report looks at what is there: values that are not
 /// finite do not stop it.
-fn recipe_to_score_with(run: &Run) -> Result<Recipe> {
+fn recipe_to_score_with(run: &RunFiles) -> Result<Recipe> {
     let mut recipe = match &run.recipe {
         Some(recipe) => recipe.clone(),
         None => Recipe::preset("default")?,
@@ -190,7 +190,7 @@ fn recipe_to_score_with(run: &Run) -> Result<Recipe> {
 
 /// The pictures that the run scored with: the split that has as many as its summary says, else those of
 /// training, else all.
-fn scored_pictures(scene: &Scene, run: &Run) -> Result<Schedule> {
+fn scored_pictures(scene: &Scene, run: &RunFiles) -> Result<Schedule> {
     let times = &scene.source().info().times;
     let wanted = run.summary.as_ref().map(|(summary, _)| summary.cameras.pairs);
     let mut first = None;
@@ -208,7 +208,7 @@ fn scored_pictures(scene: &Scene, run: &Run) -> Result<Schedule> {
 }
 
 /// A term whose percentiles are not those of the run: the scores shown are then not those that decided.
-fn differing_terms(run: &Run, scored: &Scored) -> Option<String> {
+fn differing_terms(run: &RunFiles, scored: &Scored) -> Option<String> {
     // Numbers lose their last bit on the way through JSON.
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs().max(b.abs());
     let (summary, _) = run.summary.as_ref()?;
@@ -225,12 +225,12 @@ fn differing_terms(run: &Run, scored: &Scored) -> Option<String> {
 }
 
 /// How many Gaussians of each kind there are, and what became of them.
-fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [Members; 3] {
+fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [KindMembers; 3] {
     let fate = |i: usize| fates.map_or(Fate::Kept, |fates| fates[i]);
     let shares = shares(rows, traits, |i| fate(i) != Fate::Kept);
     std::array::from_fn(|kind| {
         let with = |wanted: Fate| (0..traits.len()).filter(|&i| traits[i][kind] && fate(i) == wanted).count();
-        Members {
+        KindMembers {
             count: traits.iter().filter(|of| of[kind]).count(),
             fates: fates.map(|_| (with(Fate::Dropped), with(Fate::Merged))),
             shares: shares[kind],
@@ -240,11 +240,11 @@ fn members(rows: &Rows, traits: &[Traits], fates: Option<&[Fate]>) -> [Members; 
 
 /// Makes the pictures of the page, and of the failure modes' worst ones the worst part.
 fn show_again(
-    side: &SideBySide,
+    side: &ModelPair,
     choices: &[Choice],
     modes: &[FailureMode],
     traits: &[Traits],
-) -> Result<(Vec<Shown>, Vec<Close>)> {
+) -> Result<(Vec<ShownImage>, Vec<Close>)> {
     let worst = || modes.iter().enumerate().filter_map(|(mode, of)| Some((mode, of.worst?.place)));
     let places: Vec<usize> = choices.iter().map(|choice| choice.place).chain(worst().map(|(_, place)| place)).collect();
     let (mut shown, mut close) = (Vec::new(), Vec::new());
@@ -254,7 +254,7 @@ fn show_again(
         }
         for (mode, _) in worst().filter(|&(_, at)| at == place) {
             let shares = failure::shares_of_pixels(state, traits, camera);
-            let corner = failure::worst_corner(&taken, &shares, Kind::ALL[mode]);
+            let corner = failure::worst_corner(&taken, &shares, GaussianKind::ALL[mode]);
             let part = |image| shown::data_uri(&failure::crop(image, corner));
             let images = [part(&taken.original)?, part(&taken.compressed)?];
             close.push(Close { mode, corner, psnr: failure::crop_psnr(&taken, corner), images });
@@ -267,7 +267,7 @@ fn show_again(
     Ok((shown, close))
 }
 
-fn write(options: &ReportOptions, report: &Report, page: &str, run: &Run) -> Result<()> {
+fn write(options: &ReportOptions, report: &ReportData, page: &str, run: &RunFiles) -> Result<()> {
     let staged = StagedFolder::new(&options.output, options.overwrite)?;
     let mut json = serde_json::to_string_pretty(report).expect("a report is plain data");
     json.push('\n');

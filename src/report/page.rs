@@ -1,17 +1,17 @@
 //! The page of a report, section by section.
 
-use super::chart::{Axis, Bars, Plot, Series, Stack};
+use super::chart::{Bars, ChartAxis, Plot, Series, Stack};
 use super::document::{document, figure_of, links, list};
 use super::failure::{APART_DB, FailureMode, LOST, VISIBLE_DB, Verdict};
-use super::film::{Film, KINDS, QUALITY};
-use super::findings::{Close, Report};
+use super::film::{FilmPanel, KINDS, QUALITY};
+use super::findings::{Close, ReportData};
 use super::histogram::Histogram;
 use super::html::{bytes, count, escape, figure, file_name, percent};
-use super::run::Run;
-use super::shown::Shown;
+use super::run::RunFiles;
+use super::shown::ShownImage;
 use super::{precision, trade_off};
-use crate::evaluation::found::{Both, Comparison, FrameMeans, Means, ViewMeans};
-use crate::journal::records::Stage;
+use crate::evaluation::found::{Both, Comparison, FrameMeans, QualityMeans, ViewMeans};
+use crate::journal::records::StageRecord;
 use crate::models::Size;
 use crate::pipeline::summary::Summary;
 
@@ -21,7 +21,7 @@ const SCRIPT: &str = include_str!("page.js");
 const PLAY: &str = include_str!("film.js");
 
 /// Puts the page together.
-pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close]) -> String {
+pub(super) fn page(report: &ReportData, run: &RunFiles, shown: &[ShownImage], close: &[Close]) -> String {
     let title = format!("{} – what compression cost", file_name(&report.evaluation.path.compressed));
     let mut out = String::new();
     let sections = [
@@ -50,15 +50,16 @@ pub(super) fn page(report: &Report, run: &Run, shown: &[Shown], close: &[Close])
     document(&title, &out, &[SCRIPT, PLAY])
 }
 
-fn header(report: &Report) -> String {
+fn header(report: &ReportData) -> String {
     let found = &report.evaluation;
     let card = |label: &str, value: String, more: String| {
         format!("<div class=\"card\"><b>{value}</b><span>{label}</span><small>{more}</small></div>\n")
     };
     let from = |before: String, part: f64, whole: f64| format!("of {before} · {}", percent(part, whole));
     let (counts, sizes) = (found.count, found.bytes);
-    let worst =
-        |value: fn(&Means) -> f64| found.loss.per_frame.iter().map(|of| value(&of.means)).fold(f64::INFINITY, f64::min);
+    let worst = |value: fn(&QualityMeans) -> f64| {
+        found.loss.per_frame.iter().map(|of| value(&of.means)).fold(f64::INFINITY, f64::min)
+    };
     let mut out = format!(
         "<p class=\"paths\">{} → {}</p>\n<h1>What compression cost</h1>\n<p class=\"verdict\">{}</p>\n<div class=\"cards\">\n",
         escape(&found.path.original),
@@ -110,7 +111,7 @@ fn db(value: f64) -> String {
 }
 
 /// The slider: all images lie on one another, and which two are seen is a matter of classes.
-fn compare(shown: &[Shown]) -> String {
+fn compare(shown: &[ShownImage]) -> String {
     let mut out = String::from("<div class=\"bar\" role=\"group\" aria-label=\"picture\">\n");
     for (number, picture) in shown.iter().enumerate() {
         let choice = &picture.choice;
@@ -174,7 +175,7 @@ fn at_size(shrunk: u32) -> String {
 }
 
 /// Films with what plays them. Without a script their first frames are seen.
-fn films(films: &[Film]) -> String {
+fn films(films: &[FilmPanel]) -> String {
     let Some(first) = films.first() else { return String::new() };
     let mut out = String::new();
     if films.len() > 1 {
@@ -227,7 +228,7 @@ fn films(films: &[Film]) -> String {
     out
 }
 
-fn by_frame_and_view(report: &Report) -> String {
+fn by_frame_and_view(report: &ReportData) -> String {
     let found = &report.evaluation;
     let against: Vec<(&str, &Comparison)> = [("compressed to original", Some(&found.loss))]
         .into_iter()
@@ -236,7 +237,7 @@ fn by_frame_and_view(report: &Report) -> String {
         }))
         .filter_map(|(name, of)| Some((name, of?)))
         .collect();
-    let frames = |value: &dyn Fn(&Means) -> Option<f64>, label: &str, title: &str| {
+    let frames = |value: &dyn Fn(&QualityMeans) -> Option<f64>, label: &str, title: &str| {
         let point = |of: &FrameMeans| Some((of.frame as f64, value(&of.means)?));
         let series = against.iter().map(|(name, of)| Series {
             name: (*name).to_owned(),
@@ -244,7 +245,7 @@ fn by_frame_and_view(report: &Report) -> String {
             joined: true,
             ..Series::default()
         });
-        let axis = |label: &str| Axis { label: label.to_owned(), ..Axis::default() };
+        let axis = |label: &str| ChartAxis { label: label.to_owned(), ..ChartAxis::default() };
         Plot { title: title.to_owned(), x: axis("frame"), y: axis(label), series: series.collect() }.svg()
     };
     let views = |of: &Comparison, title: &str| {
@@ -342,7 +343,7 @@ fn absent(what: &str) -> String {
     format!("<p class=\"note\">{what}</p>\n")
 }
 
-fn stages(run: &Run) -> String {
+fn stages(run: &RunFiles) -> String {
     let Some((summary, _)) = &run.summary else {
         return absent(
             "There is no summary of a run beside the compressed model; <code>splatsieve compress</code> writes one.",
@@ -368,7 +369,7 @@ fn stages(run: &Run) -> String {
         "Time per stage",
         &stage_bars(summary, "seconds", |stage| Some((1e3 * stage.seconds).round() / 1e3)),
     );
-    let mib = |stage: &Stage| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
+    let mib = |stage: &StageRecord| Some(stage.peak_memory_bytes? as f64 / 1048576.0);
     out += &figure_of("Largest memory up to the end of each stage", &stage_bars(summary, "MiB", mib));
     out + "</div>\n"
 }
@@ -383,12 +384,12 @@ fn size_parts(size: &Both<Size>) -> Vec<(&'static str, u64, u64)> {
     if both.len() > 1 { both } else { Vec::new() }
 }
 
-fn stage_bars(summary: &Summary, label: &str, value: impl Fn(&Stage) -> Option<f64>) -> String {
+fn stage_bars(summary: &Summary, label: &str, value: impl Fn(&StageRecord) -> Option<f64>) -> String {
     let bars = summary.stages.iter().filter_map(|stage| Some((stage.name.clone(), value(stage)?))).collect();
     Bars { title: format!("{label} per stage"), label: label.to_owned(), bars }.svg()
 }
 
-fn score_histograms(report: &Report) -> String {
+fn score_histograms(report: &ReportData) -> String {
     let Some(histograms) = &report.histograms else {
         return absent(
             "Which Gaussians went is not known: there is no index map beside the compressed model that fits.",
@@ -414,8 +415,8 @@ fn histogram(of: &Histogram) -> String {
     Stack {
         title: format!("{} of kept, dropped and merged Gaussians", of.name),
         x: match of.log {
-            true => Axis { label: of.name.to_owned(), log: true, from_zero: false },
-            false => Axis { label: format!("{}, part of the frames", of.name), ..Axis::default() },
+            true => ChartAxis { label: of.name.to_owned(), log: true, from_zero: false },
+            false => ChartAxis { label: format!("{}, part of the frames", of.name), ..ChartAxis::default() },
         },
         edges: of.edges.clone(),
         groups: vec![
@@ -427,7 +428,7 @@ fn histogram(of: &Histogram) -> String {
     .svg()
 }
 
-fn left_out(report: &Report, run: &Run) -> String {
+fn left_out(report: &ReportData, run: &RunFiles) -> String {
     let mut out = String::new();
     if let Some((summary, _)) = &run.summary {
         let mut rows: Vec<[String; 2]> =
@@ -458,7 +459,7 @@ fn left_out(report: &Report, run: &Run) -> String {
     if out.is_empty() { absent("Nothing is known of the run.") } else { out }
 }
 
-fn sweep(report: &Report, run: &Run) -> String {
+fn sweep(report: &ReportData, run: &RunFiles) -> String {
     let searched = run.summary.as_ref().and_then(|(summary, _)| summary.goal.as_ref());
     let searched = searched.map_or(String::new(), trade_off::search);
     let Some(found) = &report.trade_off else {
@@ -473,7 +474,7 @@ fn sweep(report: &Report, run: &Run) -> String {
     searched + &trade_off::section(found)
 }
 
-fn data(report: &Report, run: &Run) -> String {
+fn data(report: &ReportData, run: &RunFiles) -> String {
     let mut names = vec!["report.json", "pictures.csv", "failure_modes.csv"];
     names.extend(report.histograms.as_ref().map(|_| "histograms.csv"));
     names.extend(run.summary.as_ref().map(|_| "stages.csv"));

@@ -1,29 +1,31 @@
 //! Work-precision diagrams as a page: error against time and memory, a curve for every way to turn a knob, a mark for every
 //! value.
 //!
-//! Data in: a [`Precision`]. Data out: charts as SVG, and a page with them.
+//! Data in: a [`PrecisionDiagram`]. Data out: charts as SVG, and a page with them.
 
-use super::chart::{Axis, Plot, Series};
+use super::chart::{ChartAxis, Plot, Series};
 use super::document::{document, figure_of, links, list};
 use super::html::{count, escape, figure, file_name};
 use super::trade_off::Chart;
-use crate::evaluation::precision::{ADDED, Curve, KEPT, Knob, Mark, PICTURES, Precision, STAYING, meaning};
+use crate::evaluation::precision::{
+    ADDED, KEPT, PICTURES, PrecisionCurve, PrecisionDiagram, PrecisionKnob, PrecisionSetting, STAYING, meaning,
+};
 
 /// The page's name in the folder of its data.
 pub const PAGE: &str = "precision.html";
 
 /// A measure of work: what it is called, and where it is found.
-type Work = (&'static str, fn(&Mark) -> Option<f64>);
+type WorkMeasure = (&'static str, fn(&PrecisionSetting) -> Option<f64>);
 
 /// What is drawn along the bottom.
-const WORK: [Work; 3] = [
+const WORK: [WorkMeasure; 3] = [
     ("time of all processors, s", |mark| mark.cost.processor_seconds.map(|seconds| seconds.median)),
     ("time on the wall, s", |mark| Some(mark.cost.seconds.median)),
     ("peak memory, MiB", |mark| mark.cost.peak_memory_bytes.map(|bytes| bytes as f64 / f64::from(1 << 20))),
 ];
 
 /// The page, to lie beside its data.
-pub fn page(found: &Precision) -> String {
+pub fn page(found: &PrecisionDiagram) -> String {
     let title = format!("{} – error against run time", file_name(&found.path));
     let mut body = format!(
         "<header>\n<h1>Error against run time: {}</h1>\n</header>\n{}",
@@ -47,15 +49,15 @@ pub fn page(found: &Precision) -> String {
 }
 
 /// All of it as a part of another page.
-pub(super) fn section(found: &Precision) -> String {
-    let knob = |knob: &Knob| {
+pub(super) fn section(found: &PrecisionDiagram) -> String {
+    let knob = |knob: &PrecisionKnob| {
         format!("<h3>{}</h3>\n{}", escape(&format!("{} ({} error)", knob.name, knob.source.name())), turned(knob))
     };
     conditions(found) + &found.knobs.iter().map(knob).collect::<String>()
 }
 
 /// What all of it was measured on, and the notes.
-fn conditions(found: &Precision) -> String {
+fn conditions(found: &PrecisionDiagram) -> String {
     let said = format!(
         "<p class=\"note\">{} Gaussians × {} frames; {} pictures of {} frames looked at, judged by {}: {}. Every setting \
          keeps {} Gaussians. {} threads; medians of up to {} runs, fewer where they took {} s.</p>\n",
@@ -74,7 +76,7 @@ fn conditions(found: &Precision) -> String {
 }
 
 /// What turning a knob showed.
-fn turned(knob: &Knob) -> String {
+fn turned(knob: &PrecisionKnob) -> String {
     let mut out = format!("<p>{}</p>\n<div class=\"charts\">\n", escape(&knob.about));
     for (caption, svg) in charts(knob) {
         out += &figure_of(&caption, &svg);
@@ -88,7 +90,7 @@ fn turned(knob: &Knob) -> String {
 
 /// Charts of a knob: its errors against the time of all processors, and the first one of them against the wall and memory
 /// too. What is 0 throughout has none.
-pub fn charts(knob: &Knob) -> Vec<Chart> {
+pub fn charts(knob: &PrecisionKnob) -> Vec<Chart> {
     let mut errors: Vec<&String> =
         knob.curves.iter().flat_map(|curve| &curve.marks).flat_map(|m| m.errors.keys()).collect();
     // What pictures say comes first.
@@ -105,9 +107,9 @@ pub fn charts(knob: &Knob) -> Vec<Chart> {
 }
 
 /// An error against work, both as ratios.
-fn chart(knob: &Knob, error: &str, (work, at): Work) -> Chart {
+fn chart(knob: &PrecisionKnob, error: &str, (work, at): WorkMeasure) -> Chart {
     let series = knob.curves.iter().map(|curve| {
-        let marks: Vec<(&Mark, f64, f64)> =
+        let marks: Vec<(&PrecisionSetting, f64, f64)> =
             curve.marks.iter().filter_map(|mark| Some((mark, at(mark)?, *mark.errors.get(error)?))).collect();
         Series {
             name: curve.name.clone(),
@@ -117,20 +119,20 @@ fn chart(knob: &Knob, error: &str, (work, at): Work) -> Chart {
             labels: marks.iter().map(|(mark, ..)| label(curve, mark)).collect(),
         }
     });
-    let log = |label: String| Axis { label, log: true, from_zero: false };
+    let log = |label: String| ChartAxis { label, log: true, from_zero: false };
     let title = format!("{}: {}, by {}", knob.name, meaning(error), work.split(',').next().unwrap_or(work));
     let plot = Plot { title: title.clone(), x: log(work.to_owned()), y: log(meaning(error)), series: series.collect() };
     (title, plot.svg())
 }
 
 /// A mark's value; the recipe's own with a star.
-fn label(curve: &Curve, mark: &Mark) -> String {
+fn label(curve: &PrecisionCurve, mark: &PrecisionSetting) -> String {
     let own = if curve.own == Some(mark.value) { "*" } else { "" };
     format!("{}{own}", figure(mark.value))
 }
 
 /// Every mark with all its numbers.
-fn table(curve: &Curve) -> String {
+fn table(curve: &PrecisionCurve) -> String {
     let mut errors: Vec<&String> = curve.marks.iter().flat_map(|mark| mark.errors.keys()).collect();
     errors.sort_unstable();
     errors.dedup();
@@ -182,19 +184,19 @@ mod tests {
     use crate::evaluation::cost::{Cost, Spread};
     use crate::evaluation::precision::Source;
 
-    fn mark(value: f64, errors: &[(&str, f64)]) -> Mark {
+    fn mark(value: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
         let seconds = Spread::of(vec![value]);
         let errors: BTreeMap<String, f64> = errors.iter().map(|&(of, error)| (of.to_owned(), error)).collect();
         let cost = Cost { runs: 1, seconds, processor_seconds: Some(seconds), peak_memory_bytes: Some(1 << 22) };
-        Mark { value, step: 1.0 / value, cost, errors, psnr: None }
+        PrecisionSetting { value, step: 1.0 / value, cost, errors, psnr: None }
     }
 
-    fn knob(marks: Vec<Mark>) -> Knob {
-        Knob {
+    fn knob(marks: Vec<PrecisionSetting>) -> PrecisionKnob {
+        PrecisionKnob {
             name: "look".to_owned(),
             about: "<b>".to_owned(),
             source: Source::Discretisation,
-            curves: vec![Curve::new("look_pictures", "all", marks, Some(2.0), &[])],
+            curves: vec![PrecisionCurve::new("look_pictures", "all", marks, Some(2.0), &[])],
         }
     }
 

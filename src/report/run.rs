@@ -31,7 +31,7 @@ pub enum Fate {
 
 /// What was found beside a result.
 #[derive(Debug, Default)]
-pub struct Run {
+pub struct RunFiles {
     /// The summary, and all of it as it stands in its file.
     pub summary: Option<(Summary, Value)>,
     /// The parameters.
@@ -42,13 +42,13 @@ pub struct Run {
     pub missing: Vec<String>,
 }
 
-impl Run {
+impl RunFiles {
     /// Looks beside `result`, made of `original` Gaussians into `compressed`.
     ///
     /// A file that is absent or does not fit is no failure: any two models can be compared.
-    pub fn beside(result: &Path, original: usize, compressed: usize) -> Run {
+    pub fn beside(result: &Path, original: usize, compressed: usize) -> RunFiles {
         let is_folder = result.is_dir();
-        let mut run = Run::default();
+        let mut run = RunFiles::default();
         let take = |name: &str| beside(result, is_folder, name);
         let (summary, recipe, map) = (take(MARKER), take(RECIPE), take(INDEX_MAP));
         match read_summary(&summary) {
@@ -134,17 +134,17 @@ mod tests {
     #[test]
     fn what_is_absent_or_of_another_scene_is_named_and_no_failure() {
         let folder = tempfile::tempdir().unwrap();
-        let run = Run::beside(folder.path(), 4, 2);
+        let run = RunFiles::beside(folder.path(), 4, 2);
         assert!(run.summary.is_none() && run.recipe.is_none() && run.fates.is_none());
         assert_eq!(run.missing.len(), 3);
         write_index_map(&[Some(0), None, Some(1)], &folder.path().join(INDEX_MAP)).unwrap();
         fs::write(folder.path().join(MARKER), "{\"tool\": \"splatsieve\"}").unwrap();
         fs::write(folder.path().join(RECIPE), "[select]\nkeep_fraction = 7.0").unwrap();
-        let run = Run::beside(folder.path(), 4, 2);
+        let run = RunFiles::beside(folder.path(), 4, 2);
         assert!(run.fates.is_none() && run.summary.is_none() && run.recipe.is_none());
         for part in ["original's 4 Gaussians, found [3]", "not a summary of compress", "keep_fraction"] {
             assert!(run.missing.iter().any(|why| why.contains(part)), "{part}: {:?}", run.missing);
         }
-        assert!(Run::beside(folder.path(), 3, 2).fates.is_some());
+        assert!(RunFiles::beside(folder.path(), 3, 2).fates.is_some());
     }
 }

@@ -10,8 +10,8 @@ use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::evaluation::Taken;
-use crate::evaluation::found::{Evaluation, Score};
+use crate::evaluation::RenderedViews;
+use crate::evaluation::found::{Evaluation, ImageScore};
 use crate::files::image::write::{ImageFormat, image_bytes};
 use crate::render::Image;
 
@@ -71,7 +71,7 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
             continue;
         }
         let of = &pictures[place];
-        let Score { psnr, ssim, flip, .. } = of.loss;
+        let ImageScore { psnr, ssim, flip, .. } = of.loss;
         chosen.push(Choice { why: vec![why.to_owned()], place, frame: of.frame, view: of.view, psnr, ssim, flip });
     }
     chosen
@@ -79,7 +79,7 @@ pub fn choices(found: &Evaluation) -> Vec<Choice> {
 
 /// A chosen picture, ready for the page.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Shown {
+pub struct ShownImage {
     /// Which it is.
     pub choice: Choice,
     /// What it shows and its data URI: original, compressed, difference and, if there is one, photograph.
@@ -96,7 +96,7 @@ pub struct Shown {
 ///
 /// # Errors
 /// A picture without pixels, which PNG does not know.
-pub fn show(choice: &Choice, taken: &Taken) -> Result<Shown> {
+pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
     let shrunk = shrinkage(&taken.original, MAX_PIXELS);
     let difference = difference(&taken.compressed, &taken.original);
     let factor = brightening(&difference);
@@ -113,7 +113,7 @@ pub fn show(choice: &Choice, taken: &Taken) -> Result<Shown> {
         }
     }
     let size = (taken.original.width.div_ceil(shrunk), taken.original.height.div_ceil(shrunk));
-    Ok(Shown { choice: choice.clone(), images, size, shrunk, factor })
+    Ok(ShownImage { choice: choice.clone(), images, size, shrunk, factor })
 }
 
 /// A picture as a PNG inside a URI.

@@ -2,7 +2,7 @@
 
 use super::failure::FailureMode;
 use crate::files::csv::{known, table};
-use crate::journal::records::Stage;
+use crate::journal::records::StageRecord;
 
 /// One line per failure mode.
 pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
@@ -44,8 +44,8 @@ pub(super) fn failure_modes(modes: &[FailureMode]) -> String {
 }
 
 /// One line per stage of the run.
-pub(super) fn stages(stages: &[Stage]) -> String {
-    let row = |of: &Stage| {
+pub(super) fn stages(stages: &[StageRecord]) -> String {
+    let row = |of: &StageRecord| {
         vec![
             of.name.clone(),
             of.gaussians_in.to_string(),
@@ -64,7 +64,7 @@ pub(super) fn stages(stages: &[Stage]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::failure::{Verdict, Worst};
+    use crate::report::failure::{Verdict, WorstPlace};
     use crate::source::Reads;
 
     #[test]
@@ -82,7 +82,7 @@ mod tests {
             psnr_there: Some(30.5),
             psnr_elsewhere: Some(40.0),
             detail_lost: Some(-0.5),
-            worst: Some(Worst { place: 0, frame: 4, view: 7, psnr: 12.0 }),
+            worst: Some(WorstPlace { place: 0, frame: 4, view: 7, psnr: 12.0 }),
         };
         let unknown = FailureMode {
             name: "slow",
@@ -107,7 +107,7 @@ mod tests {
 
     #[test]
     fn stages_are_these_bytes() {
-        let stage = Stage {
+        let stage = StageRecord {
             name: "scan".to_owned(),
             gaussians_in: 10,
             gaussians_out: 7,
@@ -119,7 +119,7 @@ mod tests {
             processor_seconds: Some(0.25),
             peak_memory_bytes: Some(4096),
         };
-        let merge = Stage {
+        let merge = StageRecord {
             name: "\"merge\"".to_owned(),
             seconds: 3.0,
             processor_seconds: None,

@@ -2,11 +2,11 @@
 //!
 //! Data in: a [`TradeOff`]. Data out: charts as SVG, which need [`super::chart::STYLE`] around them, and pages with them.
 
-use super::chart::{Axis, Plot, Series};
+use super::chart::{ChartAxis, Plot, Series};
 use super::document::{document, figure_of, links, list};
 use super::html::{bytes, count, escape, figure, file_name};
 use crate::evaluation::method::Method;
-use crate::evaluation::trade_off::{Knob, Point, TradeOff};
+use crate::evaluation::trade_off::{EffortCurve, TradeOff, TradeOffPoint};
 use crate::pipeline::summary::GoalSummary;
 
 /// The page's name in the folder of a sweep.
@@ -16,7 +16,7 @@ pub const PAGE: &str = "sweep.html";
 pub type Chart = (String, String);
 
 /// A coordinate of a point, if it is known.
-type Value<'a> = &'a dyn Fn(&Point) -> Option<f64>;
+type Value<'a> = &'a dyn Fn(&TradeOffPoint) -> Option<f64>;
 
 /// The page of a sweep, to lie beside its data.
 pub fn page(found: &TradeOff) -> String {
@@ -76,13 +76,13 @@ pub(super) fn search(goal: &GoalSummary) -> String {
 /// Every curve of a sweep, a series per method in the order of its points, and every knob.
 pub fn charts(found: &TradeOff) -> Vec<Chart> {
     let curves = curves(found);
-    let kept = |point: &Point| Some(100.0 * found.fraction(point));
-    let megabytes = |point: &Point| Some(point.bytes as f64 / 1e6);
-    let seconds = |point: &Point| Some(point.seconds);
-    let memory = |point: &Point| point.peak_memory_bytes.map(|bytes| bytes as f64 / (1 << 20) as f64);
-    let psnr = |point: &Point| Some(point.psnr);
-    let ssim = |point: &Point| Some(point.ssim);
-    let plot = |title: &str, x: Axis, y: Axis, of: [Value<'_>; 2], joined: bool| {
+    let kept = |point: &TradeOffPoint| Some(100.0 * found.fraction(point));
+    let megabytes = |point: &TradeOffPoint| Some(point.bytes as f64 / 1e6);
+    let seconds = |point: &TradeOffPoint| Some(point.seconds);
+    let memory = |point: &TradeOffPoint| point.peak_memory_bytes.map(|bytes| bytes as f64 / (1 << 20) as f64);
+    let psnr = |point: &TradeOffPoint| Some(point.psnr);
+    let ssim = |point: &TradeOffPoint| Some(point.ssim);
+    let plot = |title: &str, x: ChartAxis, y: ChartAxis, of: [Value<'_>; 2], joined: bool| {
         let series = curves.iter().map(|curve| Series {
             name: curve.name.to_owned(),
             points: curve.points.iter().filter_map(|p| Some((of[0](p)?, of[1](p)?))).collect(),
@@ -106,10 +106,10 @@ pub fn charts(found: &TradeOff) -> Vec<Chart> {
 }
 
 /// Error against run time as a parameter is turned, beside the same method without refining at that size.
-fn turned(knob: &Knob, found: &TradeOff) -> Chart {
-    let at = |point: &Point| (point.seconds, error(point));
+fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
+    let at = |point: &TradeOffPoint| (point.seconds, error(point));
     let first = knob.settings.first().map(|setting| &setting.point);
-    let is_beside = |point: &&Point| {
+    let is_beside = |point: &&TradeOffPoint| {
         let without = Method::ALL.into_iter().find(|method| method.name() == point.method);
         let refined = without.and_then(Method::refined).map(Method::name);
         first.is_some_and(|first| first.asked == point.asked && refined == Some(first.method.as_str()))
@@ -137,41 +137,42 @@ fn turned(knob: &Knob, found: &TradeOff) -> Chart {
 const ERROR: &str = "root mean square error";
 
 /// Of colours from 0 to 1, as the mean PSNR has it.
-fn error(point: &Point) -> f64 {
+fn error(point: &TradeOffPoint) -> f64 {
     10f64.powf(-point.psnr / 20.0)
 }
 
-fn linear(label: &str) -> Axis {
-    Axis { label: label.to_owned(), ..Axis::default() }
+fn linear(label: &str) -> ChartAxis {
+    ChartAxis { label: label.to_owned(), ..ChartAxis::default() }
 }
 
-fn log(label: &str) -> Axis {
-    Axis { label: label.to_owned(), log: true, from_zero: false }
+fn log(label: &str) -> ChartAxis {
+    ChartAxis { label: label.to_owned(), log: true, from_zero: false }
 }
 
 /// The points of a method.
-struct Curve<'a> {
+struct MethodCurve<'a> {
     name: &'a str,
     /// By count, rising.
-    points: Vec<&'a Point>,
+    points: Vec<&'a TradeOffPoint>,
     /// Whether it is what the method before it refines.
     paired: bool,
 }
 
 /// Methods as they come, behind one that is there with and without refining: that pair has the solid look.
-fn curves(found: &TradeOff) -> Vec<Curve<'_>> {
-    let mut curves: Vec<Curve<'_>> = Vec::new();
+fn curves(found: &TradeOff) -> Vec<MethodCurve<'_>> {
+    let mut curves: Vec<MethodCurve<'_>> = Vec::new();
     for point in &found.points {
         match curves.iter_mut().find(|curve| curve.name == point.method) {
             Some(curve) => curve.points.push(point),
-            None => curves.push(Curve { name: &point.method, points: vec![point], paired: false }),
+            None => curves.push(MethodCurve { name: &point.method, points: vec![point], paired: false }),
         }
     }
     curves.iter_mut().for_each(|curve| curve.points.sort_by_key(|point| point.count));
     for (method, refined) in Method::ALL.into_iter().filter_map(|method| Some((method, method.refined()?))) {
         let pair = [refined, method].map(Method::name);
         if pair.iter().all(|&name| curves.iter().any(|curve| curve.name == name)) {
-            let place = |curve: &Curve<'_>| pair.iter().position(|&name| name == curve.name).unwrap_or(pair.len());
+            let place =
+                |curve: &MethodCurve<'_>| pair.iter().position(|&name| name == curve.name).unwrap_or(pair.len());
             // Stable: the others stay in their order.
             curves.sort_by_key(place);
             curves[1].paired = true;
@@ -185,9 +186,9 @@ mod tests {
     use super::*;
     use crate::evaluation::trade_off::Setting;
 
-    fn point(method: &str, count: usize, psnr: f64, peak_memory_bytes: Option<u64>) -> Point {
+    fn point(method: &str, count: usize, psnr: f64, peak_memory_bytes: Option<u64>) -> TradeOffPoint {
         let bytes = count as u64 * 248;
-        Point {
+        TradeOffPoint {
             method: method.to_owned(),
             asked: None,
             count,
@@ -200,7 +201,7 @@ mod tests {
         }
     }
 
-    fn found(points: Vec<Point>, knobs: Vec<Knob>) -> TradeOff {
+    fn found(points: Vec<TradeOffPoint>, knobs: Vec<EffortCurve>) -> TradeOff {
         TradeOff {
             tool: String::new(),
             path: "<b>/scene".to_owned(),
@@ -249,7 +250,7 @@ mod tests {
     fn a_knob_is_drawn_with_its_values_beside_what_it_starts_from() {
         let setting = |(value, psnr): (u32, f64)| Setting { value, point: point("default", 10, psnr, None) };
         let settings = [(100, 20.0), (1500, 40.0)].map(setting).to_vec();
-        let knob = Knob { parameter: "refine_steps".to_owned(), settings };
+        let knob = EffortCurve { parameter: "refine_steps".to_owned(), settings };
         let mut other_size = point("no-refine", 50, 30.0, None);
         other_size.asked = Some(0.5);
         let points = vec![point("no-refine", 10, 15.0, None), other_size, point("random", 10, 5.0, None)];

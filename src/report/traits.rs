@@ -7,15 +7,15 @@
 
 use rayon::prelude::*;
 
-use crate::budget::{Need, Workload};
+use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::merging::neighbors::PointIndex;
-use crate::merging::tree::Point;
+use crate::merging::tree::TreePoint;
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
-use crate::passes::{Frames, gather};
+use crate::passes::{FrameReaders, gather};
 use crate::pruning::score::{SCORED, Scored};
-use crate::source::{BlockReader, FrameSource, Ids, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
 /// scene and 500 pixels across, a pixel per frame.
@@ -40,7 +40,7 @@ pub const SAMPLES: usize = 24;
 
 /// Kinds of Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum GaussianKind {
     /// Fast, and moving otherwise than its neighbours.
     Motion,
     /// Much longer than wide.
@@ -49,13 +49,13 @@ pub enum Kind {
     Appearance,
 }
 
-impl Kind {
+impl GaussianKind {
     /// Every kind, in the paper's order; a kind's place here is that of its numbers everywhere.
-    pub const ALL: [Kind; 3] = [Kind::Motion, Kind::Thin, Kind::Appearance];
+    pub const ALL: [GaussianKind; 3] = [GaussianKind::Motion, GaussianKind::Thin, GaussianKind::Appearance];
 }
 
 /// Memory that finding [`traits`] takes.
-pub fn need(work: &Workload) -> Need {
+pub fn need(work: &Workload) -> ResourceEstimate {
     let per_gaussian = vec![
         ("rows", SCORED),
         ("states", work.state(Columns::POSITION | Columns::LOG_SCALE)),
@@ -67,10 +67,10 @@ pub fn need(work: &Workload) -> Need {
     let frames = SAMPLES.min(work.frames as usize) as u64;
     let reads = work.scattered_reads(1, &Limits::NONE) + 2.0 * work.scattered_reads(frames, &Limits::NONE);
     let seconds = 2e-5 * work.count() + work.reading(work.count(), 2.0 * frames as f64);
-    Need { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
+    ResourceEstimate { stage: "traits", reads, seconds, per_gaussian, fixed: vec![work.arriving()] }
 }
 
-/// The kinds one Gaussian is of, by [`Kind::ALL`].
+/// The kinds one Gaussian is of, by [`GaussianKind::ALL`].
 pub type Traits = [bool; 3];
 
 /// The traits of every Gaussian that is ever visible; of the others none.
@@ -90,12 +90,12 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     let fast: Vec<u32> =
         all.iter().copied().filter(|&i| visible(i as usize) && rows.d[i as usize] >= FAST * extent).collect();
     for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
-        found[id as usize][Kind::Motion as usize] = bent >= NON_RIGID;
+        found[id as usize][GaussianKind::Motion as usize] = bent >= NON_RIGID;
     }
     let recoloured = colour_change(source, &all, &frames, alpha_min)?;
     for i in (0..rows.len()).filter(|&i| visible(i)) {
-        found[i][Kind::Thin as usize] = is_thin(reference.log_scale.row(i));
-        found[i][Kind::Appearance as usize] = rows.d[i] <= STILL * extent
+        found[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
+        found[i][GaussianKind::Appearance as usize] = rows.d[i] <= STILL * extent
             && (rows.v[i].sqrt() >= OPACITY_CHANGE || recoloured.get(i).is_some_and(|&c| c >= COLOUR_CHANGE));
     }
     Ok(found)
@@ -141,7 +141,7 @@ fn bending(
     if ids.is_empty() {
         return Ok(Vec::new());
     }
-    let point = |i: usize| Point { at: reference.position.row(i), index: i as u32 };
+    let point = |i: usize| TreePoint { at: reference.position.row(i), index: i as u32 };
     let index = PointIndex::new((0..reference.len()).filter(|&i| visible(i)).map(point).collect(), f64::INFINITY);
     let near: Vec<Vec<u32>> = ids
         .par_iter()
@@ -162,7 +162,8 @@ fn bending(
         let (a, b) = (p.row::<3>(i), p.row::<3>(j));
         (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum::<f64>().sqrt()
     };
-    let mut reader = Frames::open(source, Ids::List(&followed), Columns::POSITION, &Wanted::of(frames.to_vec()))?;
+    let mut reader =
+        FrameReaders::open(source, Ids::List(&followed), Columns::POSITION, &ReadPlan::of(frames.to_vec()))?;
     let mut state = reader.state();
     for &frame in frames {
         reader.read(frame, Columns::POSITION, &mut state)?;
@@ -194,7 +195,7 @@ fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_
     let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
     let columns = Columns::SH | Columns::OPACITY;
-    let mut reader = Frames::open(source, Ids::List(all), columns, &Wanted::of(frames.to_vec()))?;
+    let mut reader = FrameReaders::open(source, Ids::List(all), columns, &ReadPlan::of(frames.to_vec()))?;
     let mut now = reader.state();
     for &frame in frames {
         reader.read(frame, columns, &mut now)?;

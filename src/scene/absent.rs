@@ -8,7 +8,7 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
-use crate::source::{BlockReader, Ids, Wanted};
+use crate::source::{BlockReader, Ids, ReadPlan};
 
 /// Ids of the absent Gaussians, increasing.
 #[derive(Debug, Default)]
@@ -54,7 +54,7 @@ impl BlockReader for HidingReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.reader.expect(wanted);
     }
 

@@ -17,7 +17,7 @@ const WIDEST: f64 = -0.6;
 /// where all cameras stand at one place. The same for the same cameras.
 pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);
-    let mut dice = Dice(0);
+    let mut dice = SplitMix64(0);
     let mut found = Vec::with_capacity(count);
     for _ in 0..count {
         let Some(from) = cameras.get(dice.below(cameras.len())) else { break };
@@ -70,9 +70,9 @@ pub(super) fn meeting_point(cameras: &[Camera]) -> DVec3 {
 
 /// Numbers that look random and are always the same: SplitMix64 (Steele, Lea and Flood, 2014).
 #[derive(Debug, Clone)]
-pub struct Dice(pub u64);
+pub struct SplitMix64(pub u64);
 
-impl Dice {
+impl SplitMix64 {
     /// The next 64 bits.
     pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_shuffle_loses_nothing_and_numbers_stay_below_their_end() {
-        let mut dice = Dice(7);
+        let mut dice = SplitMix64(7);
         let mut values: Vec<usize> = (0..100).collect();
         dice.shuffle(&mut values);
         assert!(!values.is_sorted());

@@ -3,7 +3,7 @@
 use super::Scene;
 use crate::error::Result;
 use crate::model::SequenceInfo;
-use crate::source::{Ahead, BlockReader, Decoder, Deformation, FrameSource, Ids, Reads, Wanted};
+use crate::source::{BlockReader, Deformation, FeatureDecoder, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 
 impl Scene {
     /// Hides the Gaussians `ids`, in increasing order, from everything that reads the scene's frames from now on, and shows
@@ -28,7 +28,7 @@ impl FrameSource for Scene {
         Ok(self.absent.hiding(self.input.source().open(ids.clone())?, &ids))
     }
 
-    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         let opened = self.input.source().open_all(wanted)?;
         Some(opened.map(|reader| self.absent.hiding(reader, &Ids::Range(0..self.info().count))))
     }
@@ -37,7 +37,7 @@ impl FrameSource for Scene {
         self.input.source().deformation()
     }
 
-    fn decoder(&self) -> Option<&dyn Decoder> {
+    fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         self.input.source().decoder()
     }
 
@@ -45,7 +45,7 @@ impl FrameSource for Scene {
         self.input.source().reads()
     }
 
-    fn ahead(&self) -> Option<&dyn Ahead> {
+    fn ahead(&self) -> Option<&dyn Prefetch> {
         self.input.source().ahead()
     }
 }

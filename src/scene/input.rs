@@ -10,7 +10,7 @@ use crate::files::cameras;
 use crate::files::cameras::{CameraOptions, Clock, Times};
 use crate::model::{Rig, Split};
 use crate::models;
-use crate::models::{Conventions, Family, Link, OpenOptions};
+use crate::models::{Conventions, InputModel, Link, OpenOptions};
 
 /// What to read and from where to look.
 #[derive(Debug, Clone, Default)]
@@ -43,7 +43,7 @@ pub struct InputOptions {
     /// Memory that the run may take.
     pub memory: Budget,
     /// Where what stages find is kept; none: nowhere.
-    pub work: Option<cache::Asked>,
+    pub work: Option<cache::CacheRequest>,
 }
 
 impl InputOptions {
@@ -102,7 +102,7 @@ impl InputOptions {
 /// An input with its frames, and the cameras if there are any.
 pub struct Opened {
     /// The input.
-    pub input: Box<dyn Family>,
+    pub input: Box<dyn InputModel>,
     /// Cameras given or found.
     pub rig: Option<Rig>,
     /// Things a person should know.
@@ -120,15 +120,15 @@ pub fn load_cameras(
     path: Option<&Path>,
     times: Times,
     clock: Clock,
-    input: Option<&dyn Family>,
+    input: Option<&dyn InputModel>,
 ) -> Result<Option<Rig>> {
     let Some(path) = path else { return Ok(None) };
-    let frames = input.and_then(Family::data_frames).or(options.frames);
+    let frames = input.and_then(InputModel::data_frames).or(options.frames);
     let rig = cameras::load(
         path,
         &CameraOptions { size: options.size, frames, times, clock, memory: options.memory.read_limit() },
     )?;
-    let is_states = input.is_none_or(Family::stands_in_frames);
+    let is_states = input.is_none_or(InputModel::stands_in_frames);
     let beside = || is_states.then(|| models::trained_background(path)).flatten();
     Ok(Some(Rig { background: rig.background.or_else(beside), ..rig }))
 }

@@ -13,18 +13,18 @@ mod work;
 
 use std::path::PathBuf;
 
-use crate::budget::{Budget, Need, Pace, Plan, Workload};
-use crate::cache::Work;
+use crate::budget::{Budget, Plan, ResourceEstimate, Throughput, Workload};
+use crate::cache::Cache;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::{Rig, Schedule, Split};
-use crate::models::Family;
+use crate::models::InputModel;
 use crate::source::Reads;
 
 use absent::Absent;
 pub use input::{InputOptions, Opened, load_cameras};
 pub use open::{first_box, open_input, open_scene, scene_of, scratch_beside};
-pub use stream::{Room, is_linked, link_stream, open_stream, receiving, room_to_pack};
+pub use stream::{FrameQuota, is_linked, link_stream, open_stream, receiving, room_to_pack};
 pub use work::kept_work;
 pub(crate) use work::stamps;
 
@@ -33,7 +33,7 @@ pub struct Scene {
     /// Path as given.
     pub path: PathBuf,
     /// The input.
-    pub input: Box<dyn Family>,
+    pub input: Box<dyn InputModel>,
     /// All cameras.
     pub rig: Rig,
     /// The cameras of the chosen split, frame by frame.
@@ -49,11 +49,11 @@ pub struct Scene {
     /// Full reads of the input at most, of the plan that the limits are from.
     pub planned_reads: Option<f64>,
     /// How fast it is looked at here.
-    pub pace: Pace,
+    pub pace: Throughput,
     /// Folder for scratch files while the run lasts.
     pub scratch: PathBuf,
     /// Where what stages find is kept, if anywhere.
-    pub work: Work,
+    pub work: Cache,
     /// Digest of the input, where it is known already.
     digest: Option<String>,
     /// Things a person should know.
@@ -67,7 +67,7 @@ impl Scene {
     ///
     /// # Errors
     /// Cameras at times that are no frame's.
-    pub fn new(path: PathBuf, input: Box<dyn Family>, rig: Rig, split: Option<Split>) -> Result<Scene> {
+    pub fn new(path: PathBuf, input: Box<dyn InputModel>, rig: Rig, split: Option<Split>) -> Result<Scene> {
         let schedule = rig.schedule(&input.source().info().times, split)?;
         let background = rig.background.or(input.background()).unwrap_or([0.0; 3]);
         Ok(Scene {
@@ -79,9 +79,9 @@ impl Scene {
             background,
             limits: Limits::NONE,
             planned_reads: None,
-            pace: Pace::UNKNOWN,
+            pace: Throughput::UNKNOWN,
             scratch: std::env::temp_dir(),
-            work: Work::none(),
+            work: Cache::none(),
             digest: None,
             notes: Vec::new(),
             absent: Absent::default(),
@@ -98,7 +98,11 @@ impl Scene {
     ///
     /// # Errors
     /// A budget that cannot work.
-    pub fn keep_to(&mut self, budget: Budget, needs: impl Fn(&Workload, &Limits) -> Vec<Need>) -> Result<()> {
+    pub fn keep_to(
+        &mut self,
+        budget: Budget,
+        needs: impl Fn(&Workload, &Limits) -> Vec<ResourceEstimate>,
+    ) -> Result<()> {
         let plan = Plan::fit(self.workload(), budget, needs)?;
         plan.tell_time(budget.tell);
         self.follow(&plan);

@@ -14,7 +14,7 @@ use crate::files::cameras::{Clock, Times};
 use crate::model::RobustBox;
 use crate::model::{Columns, Rig, opacity};
 use crate::models;
-use crate::models::{Family, Timing};
+use crate::models::{InputModel, Timing};
 use crate::passes::gather_all;
 use crate::source::FrameSource;
 
@@ -66,7 +66,7 @@ pub fn open_input(options: &InputOptions) -> Result<Opened> {
 
 /// The cameras that `options` name or `input` leads to. Frames that carry their times may have those of a model that counts
 /// time as its cameras' file does: where divided times are no frame's, the file's own are tried.
-fn cameras_of(options: &InputOptions, input: &dyn Family) -> Result<Option<Rig>> {
+fn cameras_of(options: &InputOptions, input: &dyn InputModel) -> Result<Option<Rig>> {
     let path = camera_path(options, input);
     // Numbers in the names of a still scene's pictures are no times.
     let is_still = input.timing() != Timing::Continuous && input.source().info().times.len() == 1;
@@ -144,7 +144,7 @@ const DEFAULT_FRAMES: usize = 60;
 /// Most frames a model is evaluated at; each costs 8 bytes before any work.
 const MAX_FRAMES: usize = 1_000_000;
 
-fn camera_path(options: &InputOptions, input: &dyn Family) -> Option<PathBuf> {
+fn camera_path(options: &InputOptions, input: &dyn InputModel) -> Option<PathBuf> {
     options.cameras.clone().or_else(|| cameras::find(input.data_folder()?, &options.path))
 }
 

@@ -1,7 +1,7 @@
 //! Which pictures of a rig to make: at which frame, by which camera, over what background.
 
 use super::Scene;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
 use crate::model::{Columns, Picture, Rig, Split};
@@ -105,9 +105,9 @@ pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
 }
 
 /// Pictures of `models` models, each picture with `pixel` bytes per pixel.
-pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> Need {
+pub fn need(work: &Workload, limits: &Limits, stage: &'static str, models: u64, pixel: u64) -> ResourceEstimate {
     let pictures = work.threads.min(limits.pictures_together as u64);
-    Need {
+    ResourceEstimate {
         stage,
         reads: models as f64,
         seconds: models as f64

@@ -4,15 +4,15 @@ use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
 use super::input::{InputOptions, Opened, load_cameras};
-use crate::budget::{Budget, Need, Plan, Workload};
+use crate::budget::{Budget, Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
 use crate::model::{Columns, Rig};
-use crate::models::Residence;
+use crate::models::MemoryProfile;
 use crate::models::stream::{AHEAD, Streamed, frame_block};
-use crate::models::{Family, Linked};
+use crate::models::{InputModel, LinkedFrames};
 use crate::passes::BLOCK;
 use crate::statistics;
 
@@ -70,10 +70,13 @@ pub fn is_linked(header: &StreamHeader, options: &InputOptions) -> bool {
 pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Option<Rig>) -> Result<Opened> {
     let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
-        true => Linked::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
-        false => {
-            Linked::anew(&pack_arriving(stream, options)?, "linked frame stream", joins, &options.opening().ply())?
-        }
+        true => LinkedFrames::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
+        false => LinkedFrames::anew(
+            &pack_arriving(stream, options)?,
+            "linked frame stream",
+            joins,
+            &options.opening().ply(),
+        )?,
     };
     let notes = input.notes();
     Ok(Opened { input: Box::new(input), rig, notes })
@@ -83,14 +86,14 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
 ///
 /// # Errors
 /// A budget that does not hold the frames that are packed together.
-pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Room> {
+pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<FrameQuota> {
     let block = frame_block(header);
     let held = (block + AHEAD) as u64;
     let nobody = Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() };
     let work = |frames| Workload::of_stream(header, block, &nobody, frames);
     let receive = |frames| move |work: &Workload, limits: &Limits| vec![receiving(work, limits, held, None, frames)];
     Plan::fit(work(0), options.memory, receive(0))?;
-    Ok(Room::new(options.memory, |budget, frames| {
+    Ok(FrameQuota::new(options.memory, |budget, frames| {
         let packed = Plan::closest(work(frames), budget, |_, _| Vec::new()).peak();
         packed.max(Plan::closest(work(0), budget, receive(frames)).peak())
     }))
@@ -98,7 +101,7 @@ pub fn room_to_pack(options: &InputOptions, header: &StreamHeader) -> Result<Roo
 
 /// The frames of a stream that there is memory for: how many will come nobody knows when it begins.
 #[derive(Debug)]
-pub struct Room {
+pub struct FrameQuota {
     /// Frames that have come.
     arrived: u64,
     /// Frames that there is memory for.
@@ -108,9 +111,9 @@ pub struct Room {
     budget: Budget,
 }
 
-impl Room {
+impl FrameQuota {
     /// What `budget` has room for; `peak` says how much memory a run within a budget takes for so many frames.
-    pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> Room {
+    pub fn new(budget: Budget, peak: impl Fn(u64, u64) -> u64) -> FrameQuota {
         let bytes = budget.limit();
         // A stream has fewer than 2^32 frames.
         let most = (0..32).rev().fold(0, |most, bit| {
@@ -120,7 +123,7 @@ impl Room {
         let enough = (2 * most).max(1000);
         let least = peak(0, enough).div_ceil(1 << 20);
         let hint = format!("give it --memory {least}MiB, which is enough for {enough}, or send fewer frames");
-        Room { arrived: 0, most, hint, budget }
+        FrameQuota { arrived: 0, most, hint, budget }
     }
 
     /// Lets `frames` more frames in.
@@ -149,7 +152,13 @@ const PER_FRAME: u64 = 2 * (8 + 4);
 
 /// What it takes to pack a stream of which `held` frames are in memory together and `frames` come in all, and to scan it on
 /// the way unless `measuring` is none; if it says so, to look at pictures too.
-pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<bool>, frames: u64) -> Need {
+pub fn receiving(
+    work: &Workload,
+    limits: &Limits,
+    held: u64,
+    measuring: Option<bool>,
+    frames: u64,
+) -> ResourceEstimate {
     let whole = work.state(Columns::all());
     let mut per_gaussian =
         vec![("frames", held * work.state(work.varying)), ("constant columns", whole - work.state(work.varying))];
@@ -159,11 +168,11 @@ pub fn receiving(work: &Workload, limits: &Limits, held: u64, measuring: Option<
         per_gaussian.push(("accumulators", statistics::BYTES_PER_GAUSSIAN as u64));
         fixed.push(("blocks", work.threads * BLOCK as u64 * whole));
         if visible {
-            let nothing_held = Workload { input: Residence { frame_block: 0, ..work.input }, ..*work };
+            let nothing_held = Workload { input: MemoryProfile { frame_block: 0, ..work.input }, ..*work };
             let (more, pictures) = nothing_held.looking(limits, Columns::all().difference(Columns::SH), 12);
             per_gaussian.extend(more);
             fixed.extend(pictures);
         }
     }
-    Need { stage: "receive", reads: 0.0, seconds: 0.0, per_gaussian, fixed }
+    ResourceEstimate { stage: "receive", reads: 0.0, seconds: 0.0, per_gaussian, fixed }
 }

@@ -7,9 +7,9 @@ use std::time::UNIX_EPOCH;
 use super::Scene;
 use super::input::InputOptions;
 use crate::TOOL;
-use crate::cache::{Key, Work};
+use crate::cache::{Cache, CacheKey};
 use crate::error::{Error, Result, ShowPath};
-use crate::models::Family;
+use crate::models::InputModel;
 use crate::render;
 
 /// Under what the digest of an input is kept.
@@ -37,14 +37,14 @@ impl Scene {
     ///
     /// # Errors
     /// A file that cannot be read, and those of the work folder.
-    pub fn digest_of(&self, options: &InputOptions, input: &dyn Family) -> Result<String> {
+    pub fn digest_of(&self, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
         known_digest(&self.work, options, input)
     }
 
     /// From where the input is looked at.
-    fn key(&self) -> Key {
+    fn key(&self) -> CacheKey {
         let shots: Vec<_> = self.rig.shots.iter().map(|of| (of.view, of.camera, of.time, of.split)).collect();
-        Key::of(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
+        CacheKey::of(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
     }
 }
 
@@ -52,14 +52,14 @@ impl Scene {
 ///
 /// # Errors
 /// A file that cannot be read, and those of the work folder.
-pub fn kept_work(options: &InputOptions, input: &dyn Family) -> Result<(Work, Option<String>)> {
-    let Some(asked) = &options.work else { return Ok((Work::none(), None)) };
+pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cache, Option<String>)> {
+    let Some(asked) = &options.work else { return Ok((Cache::none(), None)) };
     let instructions = render::instructions();
-    let mut work = Work::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
+    let mut work = Cache::open(asked, format!("{} ({TOOL}, {instructions})", options.path.shown()))?;
     let digest = known_digest(&work, options, input)?;
     // This program and this machine, the input's content as it was opened; not where it lies.
     let info = input.source().info();
-    work.follow_from(Key::of(&(TOOL, instructions, &digest)).and(&(
+    work.follow_from(CacheKey::of(&(TOOL, instructions, &digest)).and(&(
         info.count,
         &info.times,
         info.sh_degree,
@@ -70,7 +70,7 @@ pub fn kept_work(options: &InputOptions, input: &dyn Family) -> Result<(Work, Op
 }
 
 /// Digest of `input`, which is read for it only if it may have changed since.
-fn known_digest(work: &Work, options: &InputOptions, input: &dyn Family) -> Result<String> {
+fn known_digest(work: &Cache, options: &InputOptions, input: &dyn InputModel) -> Result<String> {
     match work.keeps() {
         true => work.known(DIGEST, stamp(options)?, || input.digest()),
         false => input.digest(),
@@ -79,11 +79,11 @@ fn known_digest(work: &Work, options: &InputOptions, input: &dyn Family) -> Resu
 
 /// What says, without reading it, that an input is the one that it was: its path, and of all of its files names, lengths
 /// and times of their last change.
-fn stamp(options: &InputOptions) -> Result<Key> {
+fn stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
     stamps(&path, &mut files)?;
-    Ok(Key::of(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
+    Ok(CacheKey::of(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
 /// Of every file at `path` and below, in order: name, length, and when it was last changed, ns.

@@ -10,12 +10,12 @@ use bytemuck::{AnyBitPattern, NoUninit};
 use serde::ser::Error as _;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use crate::cache::{Spill, Spilling};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Flags, Rows, Statistic, Values};
 
 /// The rows of N Gaussians.
-pub(crate) enum Statistics {
+pub(crate) enum StatisticsRows {
     Memory(Rows),
     Aside(Aside),
 }
@@ -28,22 +28,22 @@ pub(crate) struct Aside {
     columns: Vec<Statistic>,
 }
 
-impl Serialize for Statistics {
+impl Serialize for StatisticsRows {
     fn serialize<S: Serializer>(&self, to: S) -> std::result::Result<S::Ok, S::Error> {
         self.rows().map_err(S::Error::custom)?.serialize(to)
     }
 }
 
-impl<'de> Deserialize<'de> for Statistics {
-    fn deserialize<D: Deserializer<'de>>(from: D) -> std::result::Result<Statistics, D::Error> {
-        Rows::deserialize(from).map(Statistics::Memory)
+impl<'de> Deserialize<'de> for StatisticsRows {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> std::result::Result<StatisticsRows, D::Error> {
+        Rows::deserialize(from).map(StatisticsRows::Memory)
     }
 }
 
-impl Statistics {
+impl StatisticsRows {
     /// Writes `rows` to a file in `folder`.
-    pub(crate) fn aside(rows: Rows, folder: &Path) -> Result<Statistics> {
-        let mut file = Spilling::new(folder)?;
+    pub(crate) fn aside(rows: Rows, folder: &Path) -> Result<StatisticsRows> {
+        let mut file = SpillWriter::new(folder)?;
         let bytes = |of: &Statistic| -> &[u8] {
             match of.values() {
                 Values::F64(of, _) => bytemuck::cast_slice(of(&rows)),
@@ -54,22 +54,22 @@ impl Statistics {
         columns.iter().try_for_each(|of| file.write(bytes(of)))?;
         rows.flags.iter().try_for_each(|flags| file.write(&[flags.bits()]))?;
         let file = file.finish()?;
-        Ok(Statistics::Aside(Aside { file, count: rows.len(), columns }))
+        Ok(StatisticsRows::Aside(Aside { file, count: rows.len(), columns }))
     }
 
     /// All rows.
     pub(crate) fn rows(&self) -> Result<Cow<'_, Rows>> {
         match self {
-            Statistics::Memory(rows) => Ok(Cow::Borrowed(rows)),
-            Statistics::Aside(aside) => aside.rows().map(Cow::Owned),
+            StatisticsRows::Memory(rows) => Ok(Cow::Borrowed(rows)),
+            StatisticsRows::Aside(aside) => aside.rows().map(Cow::Owned),
         }
     }
 
     /// C and Vis of every Gaussian.
     pub(crate) fn importance(&self) -> Result<[Cow<'_, [f64]>; 2]> {
         Ok(match self {
-            Statistics::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
-            Statistics::Aside(aside) => {
+            StatisticsRows::Memory(rows) => [Cow::Borrowed(&rows.c), Cow::Borrowed(&rows.vis)],
+            StatisticsRows::Aside(aside) => {
                 [Cow::Owned(aside.column(Statistic::C)?), Cow::Owned(aside.column(Statistic::Vis)?)]
             }
         })
@@ -78,8 +78,8 @@ impl Statistics {
     /// N.
     pub(crate) fn len(&self) -> usize {
         match self {
-            Statistics::Memory(rows) => rows.len(),
-            Statistics::Aside(aside) => aside.count,
+            StatisticsRows::Memory(rows) => rows.len(),
+            StatisticsRows::Aside(aside) => aside.count,
         }
     }
 }
@@ -133,9 +133,9 @@ mod tests {
                 vis: column(0.3),
                 flags: (0..count).map(|i| Flags::from_bits_retain(i as u8)).collect(),
             };
-            let statistics = Statistics::aside(rows.clone(), folder.path()).unwrap();
+            let statistics = StatisticsRows::aside(rows.clone(), folder.path()).unwrap();
             assert_eq!(statistics.len(), count);
-            let Statistics::Aside(aside) = &statistics else { panic!("it is aside") };
+            let StatisticsRows::Aside(aside) = &statistics else { panic!("it is aside") };
             let without = if peak { 0 } else { Statistic::W.bytes() };
             let bytes = ((Rows::BYTES_PER_GAUSSIAN - without) * count) as u64;
             let ends_before = |byte: u64| aside.file.read(byte, &mut [0]).is_err();
@@ -144,7 +144,7 @@ mod tests {
             assert_eq!(statistics.importance().unwrap(), [Cow::Borrowed(&rows.c[..]), Cow::Borrowed(&rows.vis[..])]);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         }
-        let message = Statistics::aside(Rows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
+        let message = StatisticsRows::aside(Rows::default(), &folder.path().join("nowhere")).err().unwrap().to_string();
         assert!(message.contains("nowhere"), "{message}");
     }
 }

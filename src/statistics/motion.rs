@@ -23,8 +23,8 @@ const ALIVE_BEFORE: u8 = 2;
 const BORN_BEFORE: u8 = 4;
 
 /// Running sums of a block.
-pub(super) struct Motion {
-    kind: recipe::Motion,
+pub(super) struct MotionSums {
+    kind: recipe::MotionParams,
     frames: u32,
     /// Runs only: frames after the first with the lives of the first that are not in `steps`, `turns` and `history` yet.
     steady: u32,
@@ -41,12 +41,12 @@ pub(super) struct Motion {
     history: Vec<u8>,
 }
 
-impl Motion {
+impl MotionSums {
     pub(super) const BYTES_PER_GAUSSIAN: usize =
         6 * size_of::<f32>() + 3 * size_of::<f64>() + 2 * size_of::<u32>() + size_of::<u8>();
 
-    pub(super) fn new(len: usize, kind: recipe::Motion) -> Self {
-        Motion {
+    pub(super) fn new(len: usize, kind: recipe::MotionParams) -> Self {
+        MotionSums {
             kind,
             frames: 0,
             steady: 0,
@@ -67,11 +67,11 @@ impl Motion {
     pub(super) fn frame(&mut self, position: &Column, opacity: &[f64], alpha_min: f64, steps: [f64; 2], steady: bool) {
         let even = steps == [1.0; 2];
         match self.kind {
-            recipe::Motion::Runs if steady && even => self.frame_of_steady::<true>(position, steps),
-            recipe::Motion::Runs if steady => self.frame_of_steady::<false>(position, steps),
-            recipe::Motion::Runs if even => self.frame_of_runs::<true>(position, opacity, alpha_min, steps),
-            recipe::Motion::Runs => self.frame_of_runs::<false>(position, opacity, alpha_min, steps),
-            recipe::Motion::Literal => self.frame_of_literal(position, opacity, alpha_min),
+            recipe::MotionParams::Runs if steady && even => self.frame_of_steady::<true>(position, steps),
+            recipe::MotionParams::Runs if steady => self.frame_of_steady::<false>(position, steps),
+            recipe::MotionParams::Runs if even => self.frame_of_runs::<true>(position, opacity, alpha_min, steps),
+            recipe::MotionParams::Runs => self.frame_of_runs::<false>(position, opacity, alpha_min, steps),
+            recipe::MotionParams::Literal => self.frame_of_literal(position, opacity, alpha_min),
         }
         std::mem::swap(&mut self.previous, &mut self.before);
         self.previous.planes_mut().copy_from_slice(position.planes());
@@ -100,7 +100,7 @@ impl Motion {
         }
     }
 
-    /// [`Motion::frame_of_runs`] where nothing is born and nothing dies: what counts is known without looking, so
+    /// [`MotionSums::frame_of_runs`] where nothing is born and nothing dies: what counts is known without looking, so
     /// that half of the memory is touched (`cargo bench --bench scan`).
     #[inline(always)]
     fn frame_of_steady<const EVEN: bool>(&mut self, position: &Column, steps: [f64; 2]) {
@@ -169,12 +169,12 @@ impl Motion {
     }
 
     fn is_literal(&self) -> bool {
-        self.kind == recipe::Motion::Literal
+        self.kind == recipe::MotionParams::Literal
     }
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let Motion {
+        let MotionSums {
             kind: _,
             frames: _,
             steady: _,

@@ -188,7 +188,7 @@ mod tests {
         let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
         let asked = Asked { scene, info, reads: Mutex::default() };
         let by = |reread: bool| {
-            let scan_recipe = recipe::Scan { reread, ..Recipe::preset("default").unwrap().scan };
+            let scan_recipe = recipe::ScanParams { reread, ..Recipe::preset("default").unwrap().scan };
             let plan = ScanPlan::new(&scan_recipe, &asked.info.times, &schedule).unwrap();
             let found = scan(&asked, &schedule, &plan).unwrap();
             (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *asked.reads.lock().unwrap()))

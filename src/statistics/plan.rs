@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::model::{Camera, Columns, Schedule};
-use crate::recipe::{Motion, Scan};
+use crate::recipe::{MotionParams, ScanParams};
 
 /// Deviation of a time step from the mean step, as a fraction of it, up to which frames count as
 /// even. Stamps i/T stored as f32 are off by 6e-3 of a step at T = 1e5; real gaps are far larger.
@@ -25,7 +25,7 @@ pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScanPlan {
     pub(super) alpha_min: f64,
-    pub(super) motion: Motion,
+    pub(super) motion: MotionParams,
     reread: bool,
     /// Step into frame t in units of the mean step; empty when frames are even.
     pub(super) steps: Vec<f64>,
@@ -37,14 +37,14 @@ pub struct ScanPlan {
 impl ScanPlan {
     /// The scan of frames at `times` (strictly increasing) seen by the cameras of `schedule`.
     ///
-    /// Motion is measured per mean step: under [`Motion::Runs`] a step that lasts h mean steps is
-    /// divided by h, so that even frames give the plain formula exactly. [`Motion::Literal`] knows
+    /// Motion is measured per mean step: under [`MotionParams::Runs`] a step that lasts h mean steps is
+    /// divided by h, so that even frames give the plain formula exactly. [`MotionParams::Literal`] knows
     /// no time stamps.
     ///
     /// # Errors
     /// [`Error::Usage`] for time stamps that do not increase, or of which two are nothing apart beside the others; for a
     /// schedule of another number of frames, or more than 2³² (frame, view) pairs.
-    pub fn new(scan: &Scan, times: &[f64], schedule: &Schedule) -> Result<Self> {
+    pub fn new(scan: &ScanParams, times: &[f64], schedule: &Schedule) -> Result<Self> {
         if let Some(t) =
             (1..times.len()).find(|&t| times[t - 1].partial_cmp(&times[t]) != Some(std::cmp::Ordering::Less))
         {
@@ -64,7 +64,7 @@ impl ScanPlan {
         }
         let pairs = u32::try_from(schedule.pairs())
             .map_err(|_| Error::usage(format!("{} (frame, view) pairs: 2^32 is the limit", schedule.pairs())))?;
-        let steps = if scan.motion == Motion::Runs { uneven_steps(times) } else { Vec::new() };
+        let steps = if scan.motion == MotionParams::Runs { uneven_steps(times) } else { Vec::new() };
         if let Some(t) = steps.iter().position(|step| step.is_nan() || *step < LEAST_STEP) {
             return Err(Error::usage(format!(
                 "time stamps must not be nothing apart beside the others: frame {} has {:e}, frame {t} has {:e}, and all \
@@ -80,7 +80,7 @@ impl ScanPlan {
 
     /// The scan of frames that are still to come, as it is if they prove to be even: then the plan that knows
     /// them all can finish what this one began.
-    pub fn arriving(scan: &Scan, cameras: &[Camera]) -> Self {
+    pub fn arriving(scan: &ScanParams, cameras: &[Camera]) -> Self {
         let image_px = cameras.iter().map(|c| f64::from(c.width) * f64::from(c.height)).fold(1.0, f64::max);
         ScanPlan {
             alpha_min: scan.alpha_min,
@@ -198,6 +198,6 @@ mod tests {
         assert!(plan(&[0.0, 1.0, 2.0]).unwrap().finishes(&arriving));
         assert!(plan(&[]).unwrap().finishes(&arriving));
         assert!(!plan(&[0.0, 1.0, 3.0]).unwrap().finishes(&arriving));
-        assert!(!plan(&[0.0]).unwrap().finishes(&ScanPlan::arriving(&Scan { alpha_min: 0.5, ..scan }, &[])));
+        assert!(!plan(&[0.0]).unwrap().finishes(&ScanPlan::arriving(&ScanParams { alpha_min: 0.5, ..scan }, &[])));
     }
 }

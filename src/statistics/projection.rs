@@ -31,7 +31,7 @@ const ROUNDER: f64 = 4_503_599_627_370_496.0;
 
 /// Planes over a block of Gaussians at one frame; all of one length.
 #[derive(Debug, Clone, Copy)]
-pub struct Footprints<'a> {
+pub struct FootprintPlanes<'a> {
     /// World positions, planes x, y, z.
     pub position: [&'a [f32]; 3],
     /// R·S: column k is the k-th axis of the Gaussian times its scale; plane 3·row + k.
@@ -40,9 +40,9 @@ pub struct Footprints<'a> {
     pub opacity: &'a [f64],
 }
 
-/// Sums over the pairs (frame, view) so far; of the same length as the [`Footprints`].
+/// Sums over the pairs (frame, view) so far; of the same length as the [`FootprintPlanes`].
 #[derive(Debug)]
-pub struct Sums<'a> {
+pub struct CoverageSums<'a> {
     /// Σ A·opacity in units of 2^−exponent px.
     pub coverage: &'a mut [u64],
     /// Pairs in which the Gaussian is alive and its box touches the picture.
@@ -51,7 +51,7 @@ pub struct Sums<'a> {
 
 /// What a contribution is measured by.
 #[derive(Debug, Clone, Copy)]
-pub struct Scale {
+pub struct CoverageScale {
     /// Contributions are rounded to multiples of 2^−exponent px; picture area · 2^exponent < 2⁵².
     pub exponent: i32,
     /// Least opacity of a living Gaussian.
@@ -65,8 +65,8 @@ pub struct Scale {
 ///
 /// # Panics
 /// If the planes differ in length.
-pub fn project(camera: &Camera, from: &Footprints<'_>, scale: Scale, sums: &mut Sums<'_>) {
-    let view = View::new(camera);
+pub fn project(camera: &Camera, from: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
+    let view = ScanView::new(camera);
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the line above saw that this processor has AVX2.
@@ -79,12 +79,12 @@ pub fn project(camera: &Camera, from: &Footprints<'_>, scale: Scale, sums: &mut 
 /// [`project_planes`] compiled for AVX2: the same operations, four lanes at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn project_avx2(view: &View, from: &Footprints<'_>, scale: Scale, sums: &mut Sums<'_>) {
+fn project_avx2(view: &ScanView, from: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     project_planes(view, from, scale, sums);
 }
 
 /// A camera as the loop wants it.
-struct View {
+struct ScanView {
     rotation: [[f64; 3]; 3],
     translation: [f64; 3],
     focal: [f64; 2],
@@ -94,11 +94,11 @@ struct View {
     near: f64,
 }
 
-impl View {
+impl ScanView {
     fn new(camera: &Camera) -> Self {
         let size = [f64::from(camera.width), f64::from(camera.height)];
         let focal = [camera.fx, camera.fy];
-        View {
+        ScanView {
             rotation: camera.rotation.transpose().to_cols_array_2d(),
             translation: camera.translation.to_array(),
             focal,
@@ -112,21 +112,21 @@ impl View {
 
 /// The definition, in stages over [`LANES`] Gaussians; inlined into each instruction set's copy.
 #[inline(always)]
-fn project_planes(view: &View, from: &Footprints<'_>, scale: Scale, sums: &mut Sums<'_>) {
+fn project_planes(view: &ScanView, from: &FootprintPlanes<'_>, scale: CoverageScale, sums: &mut CoverageSums<'_>) {
     let n = from.opacity.len();
     let blocks = n / LANES;
-    let mut stage = Stage::<LANES>::new();
+    let mut stage = ProjectedBlock::<LANES>::new();
     for block in 0..blocks {
         stage.project(view, from, scale, sums, block);
     }
-    let mut stage = Stage::<1>::new();
+    let mut stage = ProjectedBlock::<1>::new();
     for i in blocks * LANES..n {
         stage.project(view, from, scale, sums, i);
     }
 }
 
 /// What the stages hand on about `N` Gaussians.
-struct Stage<const N: usize> {
+struct ProjectedBlock<const N: usize> {
     depth: [f64; N],
     /// 1/depth; 1 for a culled Gaussian.
     inverse_depth: [f64; N],
@@ -138,15 +138,22 @@ struct Stage<const N: usize> {
     root_det: [f64; N],
 }
 
-impl<const N: usize> Stage<N> {
+impl<const N: usize> ProjectedBlock<N> {
     fn new() -> Self {
         let zeros = [0.0; N];
-        Stage { depth: zeros, inverse_depth: zeros, slope: [zeros; 2], sigma: [zeros; 2], root_det: zeros }
+        ProjectedBlock { depth: zeros, inverse_depth: zeros, slope: [zeros; 2], sigma: [zeros; 2], root_det: zeros }
     }
 
     /// Projects the `block`-th `N` Gaussians.
     #[inline(always)]
-    fn project(&mut self, view: &View, from: &Footprints<'_>, scale: Scale, sums: &mut Sums<'_>, block: usize) {
+    fn project(
+        &mut self,
+        view: &ScanView,
+        from: &FootprintPlanes<'_>,
+        scale: CoverageScale,
+        sums: &mut CoverageSums<'_>,
+        block: usize,
+    ) {
         self.place(view, from.position.map(|plane| &plane.as_chunks().0[block]));
         self.spread(view, from.axes.map(|plane| &plane.as_chunks().0[block]));
         self.accumulate(
@@ -160,8 +167,8 @@ impl<const N: usize> Stage<N> {
 
     /// Where the centers lie in the camera.
     #[inline(always)]
-    fn place(&mut self, view: &View, [px, py, pz]: [&[f32; N]; 3]) {
-        let View { rotation: [w0, w1, w2], translation: t, near, .. } = view;
+    fn place(&mut self, view: &ScanView, [px, py, pz]: [&[f32; N]; 3]) {
+        let ScanView { rotation: [w0, w1, w2], translation: t, near, .. } = view;
         for i in 0..N {
             let world = [f64::from(px[i]), f64::from(py[i]), f64::from(pz[i])];
             let z = dot(w2, world) + t[2];
@@ -176,8 +183,8 @@ impl<const N: usize> Stage<N> {
     /// The 2-D covariance.
     #[inline(always)]
     #[expect(clippy::needless_range_loop, reason = "i runs over many planes at once")]
-    fn spread(&mut self, view: &View, axes: [&[f64; N]; 9]) {
-        let View { rotation: [w0, w1, w2], focal, slope_limit, .. } = view;
+    fn spread(&mut self, view: &ScanView, axes: [&[f64; N]; 9]) {
+        let ScanView { rotation: [w0, w1, w2], focal, slope_limit, .. } = view;
         for i in 0..N {
             let row = |k: usize, w: &[f64; 3]| {
                 let slope = clamp(self.slope[k][i], slope_limit[k]);
@@ -201,13 +208,13 @@ impl<const N: usize> Stage<N> {
     #[inline(always)]
     fn accumulate(
         &self,
-        view: &View,
+        view: &ScanView,
         opacity: &[f64; N],
-        scale: Scale,
+        scale: CoverageScale,
         coverage: &mut [u64; N],
         touched: &mut [u32; N],
     ) {
-        let View { focal, principal, size, near, .. } = view;
+        let ScanView { focal, principal, size, near, .. } = view;
         let unit = 2f64.powi(scale.exponent);
         for i in 0..N {
             let sigma = [self.sigma[0][i], self.sigma[1][i]];
@@ -269,7 +276,9 @@ mod tests {
     }
 
     /// Runs `with` on Gaussians around a camera, some behind it, some giant.
-    fn run(with: impl Fn(&View, &Footprints<'_>, Scale, &mut Sums<'_>)) -> (Vec<u64>, Vec<u32>) {
+    fn run(
+        with: impl Fn(&ScanView, &FootprintPlanes<'_>, CoverageScale, &mut CoverageSums<'_>),
+    ) -> (Vec<u64>, Vec<u32>) {
         let camera = Camera {
             width: 320,
             height: 256,
@@ -289,14 +298,14 @@ mod tests {
         let opacity: Vec<f64> = (0..LEN).map(|i| random(i + 99)).collect();
         let (mut coverage, mut touched) = (vec![0; LEN], vec![0; LEN]);
         with(
-            &View::new(&camera),
-            &Footprints {
+            &ScanView::new(&camera),
+            &FootprintPlanes {
                 position: position.each_ref().map(|plane| &plane[..]),
                 axes: axes.each_ref().map(|plane| &plane[..]),
                 opacity: &opacity,
             },
-            Scale { exponent: 34, alpha_min: 0.01 },
-            &mut Sums { coverage: &mut coverage, touched: &mut touched },
+            CoverageScale { exponent: 34, alpha_min: 0.01 },
+            &mut CoverageSums { coverage: &mut coverage, touched: &mut touched },
         );
         (coverage, touched)
     }

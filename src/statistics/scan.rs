@@ -3,16 +3,16 @@
 use std::mem::size_of;
 
 use super::life::Life;
-use super::motion::Motion;
+use super::motion::MotionSums;
 use super::plan::{PAIRS_PER_CARRY, ScanPlan};
-use super::projection::{Footprints, Scale, Sums, project};
-use super::state::{CHUNK, State};
+use super::projection::{CoverageScale, CoverageSums, FootprintPlanes, project};
+use super::state::{BlockState, CHUNK};
 use crate::model::{Camera, Columns, Flags, Gaussians, Rows};
 
 /// Resident bytes of a [`BlockScan`] per Gaussian, whatever the number of frames.
-pub const BYTES_PER_GAUSSIAN: usize = State::BYTES_PER_GAUSSIAN
+pub const BYTES_PER_GAUSSIAN: usize = BlockState::BYTES_PER_GAUSSIAN
     + Life::BYTES_PER_GAUSSIAN
-    + Motion::BYTES_PER_GAUSSIAN
+    + MotionSums::BYTES_PER_GAUSSIAN
     + size_of::<u64>()
     + 2 * size_of::<u32>();
 
@@ -32,9 +32,9 @@ pub struct BlockScan<'a> {
     next_frame: usize,
     /// Whether opacities are those of the first frame.
     steady: bool,
-    state: State,
+    state: BlockState,
     life: Life,
-    motion: Motion,
+    motion: MotionSums,
     /// Σ A·opacity in fixed point is `carried · 2^CARRY_BITS + coverage`.
     coverage: Vec<u64>,
     carried: Vec<u32>,
@@ -67,9 +67,9 @@ impl<'a> BlockScan<'a> {
             first_id,
             next_frame: 0,
             steady: true,
-            state: State::new(len),
+            state: BlockState::new(len),
             life: Life::new(len),
-            motion: Motion::new(len, plan.motion),
+            motion: MotionSums::new(len, plan.motion),
             coverage: vec![0; len],
             carried: vec![0; len],
             uncarried: 0,
@@ -150,7 +150,7 @@ impl<'a> BlockScan<'a> {
     }
 
     fn project(&mut self, gaussians: &Gaussians, cameras: &[&Camera]) {
-        let scale = Scale { exponent: self.plan.coverage_exponent, alpha_min: self.plan.alpha_min };
+        let scale = CoverageScale { exponent: self.plan.coverage_exponent, alpha_min: self.plan.alpha_min };
         let len = self.coverage.len();
         for start in (0..len).step_by(CHUNK) {
             let range = start..len.min(start + CHUNK);
@@ -159,12 +159,13 @@ impl<'a> BlockScan<'a> {
                 continue;
             }
             self.state.turn(gaussians, range.clone());
-            let from = Footprints {
+            let from = FootprintPlanes {
                 position: std::array::from_fn(|axis| &gaussians.position.plane(axis)[range.clone()]),
                 axes: std::array::from_fn(|plane| &self.state.axes[plane][range.clone()]),
                 opacity: &self.state.opacity[range.clone()],
             };
-            let mut sums = Sums { coverage: &mut self.coverage[range.clone()], touched: &mut self.touched[range] };
+            let mut sums =
+                CoverageSums { coverage: &mut self.coverage[range.clone()], touched: &mut self.touched[range] };
             for camera in cameras {
                 project(camera, &from, scale, &mut sums);
             }
@@ -233,7 +234,7 @@ mod tests {
     use super::*;
     use crate::model::Schedule;
     use crate::model::hash_id;
-    use crate::recipe::{Motion, Recipe, Scan};
+    use crate::recipe::{MotionParams, Recipe, ScanParams};
 
     fn random(k: usize) -> f32 {
         (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
@@ -253,8 +254,8 @@ mod tests {
 
     #[test]
     fn opacities_that_are_not_named_as_changed_count_as_if_they_were() {
-        for motion in [Motion::Literal, Motion::Runs] {
-            let scan = Scan { motion, ..Recipe::preset("default").unwrap().scan };
+        for motion in [MotionParams::Literal, MotionParams::Runs] {
+            let scan = ScanParams { motion, ..Recipe::preset("default").unwrap().scan };
             // The frame whose opacities each frame has: for ever the first's; changed late, and steady again; from the
             // second frame on; one frame.
             let cases: [&[usize]; 4] = [&[0; 7], &[0, 0, 0, 3, 3, 3, 6], &[0, 1, 1, 1], &[0]];
@@ -282,9 +283,9 @@ mod tests {
     #[test]
     fn avx2_gives_the_bits_of_the_baseline() {
         const LEN: usize = 77;
-        for motion in [Motion::Literal, Motion::Runs] {
+        for motion in [MotionParams::Literal, MotionParams::Runs] {
             for times in [[0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1.0, 1.5, 4.0, 4.5]] {
-                let scan = Scan { motion, ..Recipe::preset("default").unwrap().scan };
+                let scan = ScanParams { motion, ..Recipe::preset("default").unwrap().scan };
                 let mut schedule = Schedule::default();
                 schedule.push(times.len(), &[]);
                 let plan = ScanPlan::new(&scan, &times, &schedule).unwrap();

@@ -15,7 +15,7 @@ const MAX_LOG_SCALE: f64 = 100.0;
 pub(super) const CHUNK: usize = 256;
 
 /// Decoded state of a block at the current frame.
-pub(super) struct State {
+pub(super) struct BlockState {
     /// Opacity in [0, 1].
     pub(super) opacity: Vec<f64>,
     /// R·S, plane 3·row + axis; of a chunk when it was last turned.
@@ -27,11 +27,11 @@ pub(super) struct State {
     pub(super) largest_coordinate: f32,
 }
 
-impl State {
+impl BlockState {
     pub(super) const BYTES_PER_GAUSSIAN: usize = 10 * size_of::<f64>() + size_of::<Flags>();
 
     pub(super) fn new(len: usize) -> Self {
-        State {
+        BlockState {
             opacity: vec![0.0; len],
             axes: std::array::from_fn(|_| vec![0.0; len]),
             turned: vec![false; len.div_ceil(CHUNK)],
@@ -41,7 +41,7 @@ impl State {
     }
 
     /// Takes over the columns `changed`, and flags what is odd in them. The axes are for projections only: they wait for
-    /// [`State::turn`].
+    /// [`BlockState::turn`].
     #[inline(always)]
     pub(super) fn update(&mut self, gaussians: &Gaussians, changed: Columns) {
         for column in changed.iter() {
@@ -106,7 +106,7 @@ impl State {
 
     #[cfg(test)]
     pub(super) fn resident_bytes(&self) -> usize {
-        let State { opacity, axes, turned: _, flags, largest_coordinate: _ } = self;
+        let BlockState { opacity, axes, turned: _, flags, largest_coordinate: _ } = self;
         size_of_val(&opacity[..])
             + axes.iter().map(|plane| size_of_val(&plane[..])).sum::<usize>()
             + size_of_val(&flags[..])

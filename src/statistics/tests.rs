@@ -7,10 +7,10 @@ use super::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, ScanPlan, snap, ulp}
 use crate::diagnostics::selfcheck::oracle::statistics as oracle;
 use crate::model::hash_id;
 use crate::model::{Camera, Columns, Flags, Gaussians, Schedule};
-use crate::recipe::{Motion, Recipe, Scan};
+use crate::recipe::{MotionParams, Recipe, ScanParams};
 
-fn recipe(motion: Motion) -> Scan {
-    Scan { motion, ..Recipe::preset("default").unwrap().scan }
+fn recipe(motion: MotionParams) -> ScanParams {
+    ScanParams { motion, ..Recipe::preset("default").unwrap().scan }
 }
 
 /// The `k`-th of a fixed stream of numbers in [0, 1).
@@ -67,7 +67,7 @@ fn even_times(frames: usize) -> Vec<f64> {
     (0..frames).map(|t| t as f64).collect()
 }
 
-fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, scan: &Scan) -> BlockStatistics {
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> BlockStatistics {
     let plan = ScanPlan::new(scan, times, schedule).unwrap();
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
@@ -77,12 +77,17 @@ fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, scan: &Scan
     block.finish()
 }
 
-fn scan(frames: &[Gaussians], schedule: &Schedule, scan: &Scan) -> BlockStatistics {
+fn scan(frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> BlockStatistics {
     scan_at(&even_times(frames.len()), frames, schedule, scan)
 }
 
 /// One Gaussian, at x(t) with opacity α(t), seen by nobody.
-fn lone(frames: usize, x: impl Fn(usize) -> f32, opacity: impl Fn(usize) -> f64, motion: Motion) -> BlockStatistics {
+fn lone(
+    frames: usize,
+    x: impl Fn(usize) -> f32,
+    opacity: impl Fn(usize) -> f64,
+    motion: MotionParams,
+) -> BlockStatistics {
     let plan = ScanPlan::new(&recipe(motion), &even_times(frames), &schedule(frames, 0)).unwrap();
     let mut block = BlockScan::new(1, 0, &plan);
     let mut g = Gaussians::zeros(1, 0);
@@ -103,7 +108,7 @@ fn close(what: &str, got: f64, expected: f64, relative: f64, absolute: f64) {
 
 const ALIVE: f64 = 0.5;
 const DEAD: f64 = 0.001;
-const BOTH: [Motion; 2] = [Motion::Literal, Motion::Runs];
+const BOTH: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
 #[test]
 fn rows_equal_the_slow_definitions_to_1e_9() {
@@ -134,7 +139,7 @@ fn sinusoid_over_100_000_steps_has_its_analytic_motion() {
     for motion in BOTH {
         let rows = lone(steps + 1, |t| (omega * t as f64).sin() as f32, |_| ALIVE, motion).rows;
         // Mean of (sin ωt − sin ω(t−1))² over whole periods: 2 sin²(ω/2). The paper divides by |life|.
-        let divisor = steps + usize::from(motion == Motion::Literal);
+        let divisor = steps + usize::from(motion == MotionParams::Literal);
         close("D", rows.d[0], half * (2.0 * steps as f64 / divisor as f64).sqrt(), 1e-6, 0.0);
         // Second difference 4 sin²(ω/2)·|sin ωt|; the mean of |sin| over 1000 samples is cot(ω/2)/500. Frame 0,
         // where it vanishes, is no centre.
@@ -147,13 +152,13 @@ fn sinusoid_over_100_000_steps_has_its_analytic_motion() {
 #[test]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     for alpha in [0.3, 0.999, 1.0 - 1e-7] {
-        assert_eq!(lone(100_000, |_| 0.0, |_| alpha, Motion::Runs).rows.v[0], 0.0);
+        assert_eq!(lone(100_000, |_| 0.0, |_| alpha, MotionParams::Runs).rows.v[0], 0.0);
     }
 }
 
 #[test]
 fn nearly_constant_opacity_keeps_its_variance() {
-    let rows = lone(10_000, |_| 0.0, |t| 0.999 + 1e-5 * (t % 2) as f64, Motion::Runs).rows;
+    let rows = lone(10_000, |_| 0.0, |t| 0.999 + 1e-5 * (t % 2) as f64, MotionParams::Runs).rows;
     // f32 logits around 7 place the two opacities to 5e-10, 5e-5 of their distance.
     close("V", rows.v[0], 2.5e-11, 1e-3, 0.0);
 }
@@ -164,18 +169,18 @@ fn one_frame_has_no_motion_and_two_have_one_step() {
         let rows = lone(1, |_| 5.0, |_| ALIVE, motion).rows;
         assert_eq!((rows.d[0], rows.kappa[0], rows.v[0], rows.life[0]), (0.0, 0.0, 0.0, 1));
     }
-    let rows = lone(2, |t| 3.0 * t as f32, |_| ALIVE, Motion::Runs).rows;
+    let rows = lone(2, |t| 3.0 * t as f32, |_| ALIVE, MotionParams::Runs).rows;
     assert_eq!((rows.d[0], rows.kappa[0]), (3.0, 0.0));
-    let rows = lone(2, |t| 3.0 * t as f32, |_| ALIVE, Motion::Literal).rows;
+    let rows = lone(2, |t| 3.0 * t as f32, |_| ALIVE, MotionParams::Literal).rows;
     assert_eq!((rows.d[0], rows.kappa[0]), ((9.0f64 / 2.0).sqrt(), 0.0), "the paper divides one step by |life| = 2");
 }
 
 #[test]
 fn teleport_while_dead_is_no_motion_and_while_alive_is() {
     let x = |t: usize| if t < 5 { 0.0 } else { 100.0 };
-    let dead = lone(10, x, |t| if t == 4 || t == 5 { DEAD } else { ALIVE }, Motion::Runs).rows;
+    let dead = lone(10, x, |t| if t == 4 || t == 5 { DEAD } else { ALIVE }, MotionParams::Runs).rows;
     assert_eq!((dead.d[0], dead.kappa[0]), (0.0, 0.0));
-    let alive = lone(10, x, |_| ALIVE, Motion::Runs).rows;
+    let alive = lone(10, x, |_| ALIVE, MotionParams::Runs).rows;
     assert_eq!((alive.d[0], alive.kappa[0]), ((1e4f64 / 9.0).sqrt(), 200.0 / 8.0));
 }
 
@@ -193,10 +198,10 @@ fn life_of_1_2_3_frames_has_0_0_1_curvature_terms() {
 #[test]
 fn alternating_life_has_no_interior_triples() {
     let alive = |t: usize| if t.is_multiple_of(2) { ALIVE } else { DEAD };
-    let rows = lone(9, |t| (t * t) as f32, alive, Motion::Runs).rows;
+    let rows = lone(9, |t| (t * t) as f32, alive, MotionParams::Runs).rows;
     assert_eq!((rows.d[0], rows.kappa[0], rows.life[0]), (0.0, 0.0, 5));
     // To the letter, neighbours of a centre need not live: centres 2, 4 and 6 turn by 2 each.
-    assert_eq!(lone(9, |t| (t * t) as f32, alive, Motion::Literal).rows.kappa[0], 2.0);
+    assert_eq!(lone(9, |t| (t * t) as f32, alive, MotionParams::Literal).rows.kappa[0], 2.0);
 }
 
 #[test]
@@ -213,9 +218,9 @@ fn turn_about_the_last_life_frame_is_discarded() {
 
 #[test]
 fn opacity_0_and_1_give_zeros_and_no_nan() {
-    let nothing = lone(20, |t| t as f32, |_| 1e-30, Motion::Runs).rows;
+    let nothing = lone(20, |t| t as f32, |_| 1e-30, MotionParams::Runs).rows;
     assert_eq!((nothing.d[0], nothing.kappa[0], nothing.v[0], nothing.life[0]), (0.0, 0.0, 0.0, 0));
-    let plan = ScanPlan::new(&recipe(Motion::Runs), &even_times(20), &schedule(20, 0)).unwrap();
+    let plan = ScanPlan::new(&recipe(MotionParams::Runs), &even_times(20), &schedule(20, 0)).unwrap();
     let mut block = BlockScan::new(1, 0, &plan);
     let mut g = Gaussians::zeros(1, 0);
     g.opacity_logit.set_row(0, [80.0]);
@@ -226,7 +231,7 @@ fn opacity_0_and_1_give_zeros_and_no_nan() {
 
 #[test]
 fn non_finite_values_in_any_column_and_frame_are_flagged_zeroed_and_leave_others_alone() {
-    let (clean, schedule, recipe) = (wanderers(300, 6, 2), schedule(6, 2), recipe(Motion::Runs));
+    let (clean, schedule, recipe) = (wanderers(300, 6, 2), schedule(6, 2), recipe(MotionParams::Runs));
     let expected = scan(&clean, &schedule, &recipe);
     for (k, column) in Columns::all().iter().enumerate() {
         for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
@@ -249,7 +254,7 @@ fn non_finite_values_in_any_column_and_frame_are_flagged_zeroed_and_leave_others
 
 #[test]
 fn zero_quaternion_is_the_identity_and_flagged() {
-    let (mut frames, schedule, recipe) = (wanderers(2, 4, 3), schedule(4, 3), recipe(Motion::Runs));
+    let (mut frames, schedule, recipe) = (wanderers(2, 4, 3), schedule(4, 3), recipe(MotionParams::Runs));
     for frame in &mut frames {
         frame.rotation.set_row(0, [1.0, 0.0, 0.0, 0.0]);
     }
@@ -266,7 +271,7 @@ fn picture(position: DVec3, scale: [f64; 3], rotation: [f32; 4]) -> (f64, f64, f
     g.position.set_row(0, position.to_array().map(|x| x as f32));
     g.log_scale.set_row(0, scale.map(|s| s.ln() as f32));
     g.rotation.set_row(0, rotation);
-    let rows = scan(std::slice::from_ref(&g), &schedule, &recipe(Motion::Runs)).rows;
+    let rows = scan(std::slice::from_ref(&g), &schedule, &recipe(MotionParams::Runs)).rows;
     // The opacity is ½.
     (2.0 * rows.c[0], rows.vis[0], oracle::area(&g, 0, &schedule.cameras[0]))
 }
@@ -311,7 +316,7 @@ fn needle_keeps_the_digits_of_its_area() {
     g.log_scale.set_row(0, [f64::ln(length) as f32, -30.0, -30.0]);
     let mut schedule = Schedule::new(vec![camera.clone()]);
     schedule.push(1, &[(0, 0)]);
-    let area = 2.0 * scan(std::slice::from_ref(&g), &schedule, &recipe(Motion::Runs)).rows.c[0];
+    let area = 2.0 * scan(std::slice::from_ref(&g), &schedule, &recipe(MotionParams::Runs)).rows.c[0];
     // A diagonal line: det = 0.3·(Σ_xx + Σ_yy − 0.3), clipped to the picture's share of its box.
     let (sx, sy) = (250.0 * length / depth / 2f64.sqrt(), 260.0 * length / depth / 2f64.sqrt());
     let det = 0.3 * (sx * sx + sy * sy);
@@ -324,12 +329,12 @@ fn needle_keeps_the_digits_of_its_area() {
 fn offset_up_to_1e7_leaves_motion_finite_and_snaps_only_noise() {
     for offset in [1e2, 1e4, 1e6, 1e7] {
         let noise = ulp(offset as f32);
-        let resting = lone(2000, |t| (offset + noise * random(4, t as u64)) as f32, |_| ALIVE, Motion::Runs);
+        let resting = lone(2000, |t| (offset + noise * random(4, t as u64)) as f32, |_| ALIVE, MotionParams::Runs);
         let mut rows = resting.rows;
         assert!(rows.d[0] > 0.0 && rows.d[0] < 2.0 * noise && rows.kappa[0] < 4.0 * noise, "{rows:?}");
         let snapped = snap(&mut rows, resting.largest_coordinate);
         assert_eq!((snapped.d, snapped.kappa, rows.d[0], rows.kappa[0]), (1, 1, 0.0, 0.0));
-        let moving = lone(2000, |t| (offset + 8.0 * noise * (t * t % 7) as f64) as f32, |_| ALIVE, Motion::Runs);
+        let moving = lone(2000, |t| (offset + 8.0 * noise * (t * t % 7) as f64) as f32, |_| ALIVE, MotionParams::Runs);
         let mut rows = moving.rows;
         assert_eq!(snap(&mut rows, moving.largest_coordinate).d, 0);
         assert!(rows.d[0].is_finite() && rows.kappa[0].is_finite());
@@ -349,13 +354,13 @@ fn uneven_frames_are_measured_in_real_time() {
             g
         })
         .collect();
-    let rows = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(Motion::Runs)).rows;
+    let rows = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(MotionParams::Runs)).rows;
     close("kappa", rows.kappa[0], 2.0 * unit * unit, 1e-12, 0.0);
     // The mean velocity over a step is the sum of its two stamps.
     let squares = stamps.windows(2).map(|pair| (pair[0] + pair[1]).powi(2) + 4.0).sum::<f64>();
     close("D", rows.d[0], unit * (squares / 6.0).sqrt(), 1e-12, 0.0);
-    let literal = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(Motion::Literal)).rows;
-    let even = scan(&frames, &schedule(7, 0), &recipe(Motion::Literal)).rows;
+    let literal = scan_at(&stamps, &frames, &schedule(7, 0), &recipe(MotionParams::Literal)).rows;
+    let even = scan(&frames, &schedule(7, 0), &recipe(MotionParams::Literal)).rows;
     assert_eq!(literal, even, "the paper's formulas know no time stamps");
 }
 
@@ -366,7 +371,7 @@ fn coverage_of_very_many_pictures_is_that_of_one() {
     frames[0].log_scale.planes_mut().fill(2.0);
     let mut many = Schedule::new(one.cameras.clone());
     many.push(1, &[(0, 0); 300_000]);
-    let [one, many] = [one, many].map(|schedule| scan(&frames, &schedule, &recipe(Motion::Runs)).rows);
+    let [one, many] = [one, many].map(|schedule| scan(&frames, &schedule, &recipe(MotionParams::Runs)).rows);
     assert!(one.c.iter().filter(|&&c| c * 300_000.0 > 2f64.powi(64 - 34)).count() > 10, "the case must overflow");
     for i in 0..40 {
         close("C", many.c[i], one.c[i], 1e-15, 0.0);
@@ -382,7 +387,7 @@ fn unchanged_columns_need_not_be_announced() {
         frame.rotation = first.rotation.clone();
         frame.opacity_logit = first.opacity_logit.clone();
     }
-    let recipe = recipe(Motion::Runs);
+    let recipe = recipe(MotionParams::Runs);
     let plan = ScanPlan::new(&recipe, &even_times(5), &schedule).unwrap();
     let mut block = BlockScan::new(300, 0, &plan);
     for (t, frame) in frames.iter().enumerate() {
@@ -394,7 +399,7 @@ fn unchanged_columns_need_not_be_announced() {
 
 #[test]
 fn bytes_per_gaussian_are_what_is_declared() {
-    let plan = ScanPlan::new(&recipe(Motion::Runs), &even_times(3), &schedule(3, 1)).unwrap();
+    let plan = ScanPlan::new(&recipe(MotionParams::Runs), &even_times(3), &schedule(3, 1)).unwrap();
     assert_eq!(BlockScan::new(1000, 0, &plan).resident_bytes(), 1000 * BYTES_PER_GAUSSIAN);
 }
 
@@ -405,7 +410,7 @@ proptest! {
     fn blocks_may_be_cut_anywhere(n in 1usize..600, cut in 0usize..600, seed in any::<u64>(), literal in any::<bool>()) {
         let cut = cut.min(n);
         let (frames, schedule) = (wanderers(n, 5, seed), schedule(5, 2));
-        let recipe = recipe(if literal { Motion::Literal } else { Motion::Runs });
+        let recipe = recipe(if literal { MotionParams::Literal } else { MotionParams::Runs });
         let whole = scan(&frames, &schedule, &recipe);
         let part = |range: std::ops::Range<usize>| {
             let frames: Vec<Gaussians> = frames.iter().map(|frame| slice(frame, range.clone())).collect();
@@ -421,7 +426,7 @@ proptest! {
 
     #[test]
     fn rigid_motion_of_the_whole_scene_changes_no_statistic(seed in any::<u64>(), angle in 0.0..6.0f64, shift in -3.0..3.0f64) {
-        let (frames, before, recipe) = (wanderers(60, 6, seed), schedule(6, 2), recipe(Motion::Runs));
+        let (frames, before, recipe) = (wanderers(60, 6, seed), schedule(6, 2), recipe(MotionParams::Runs));
         let turn = DQuat::from_axis_angle(DVec3::new(0.6, -0.48, 0.64), angle);
         let offset = DVec3::new(shift, -shift, 0.5 * shift);
         let moved: Vec<Gaussians> = frames.iter().map(|frame| moved(frame, turn, offset)).collect();

@@ -4,7 +4,7 @@
 
 use std::ops::RangeInclusive;
 
-use super::look::{Look, mix};
+use super::look::{ComparedAppearance, mix};
 
 /// Of more Gaussians in a cell, only so many are looked at.
 const CROWD: usize = 64;
@@ -12,25 +12,25 @@ const CROWD: usize = 64;
 const MOST_CELLS: i64 = 8;
 
 /// Some Gaussians of a frame by their cells.
-pub(super) struct Grid {
+pub(super) struct CellGrid {
     reach: f64,
     mask: usize,
     /// Where the Gaussians of each bucket start; one more at the end.
     starts: Vec<u32>,
     /// Of each Gaussian its cell: apart from the rest, so that those of other cells are passed over in the cache.
     cells: Vec<u64>,
-    points: Vec<Point>,
+    points: Vec<CellEntry>,
 }
 
 /// A Gaussian in a cell.
-struct Point {
-    look: Look,
+struct CellEntry {
+    look: ComparedAppearance,
     number: u32,
 }
 
-impl Grid {
+impl CellGrid {
     /// The Gaussians `numbers` of `looks`, in cells that suit searches within `reach` times the size.
-    pub(super) fn new(looks: &[Look], numbers: &[u32], reach: f32) -> Grid {
+    pub(super) fn new(looks: &[ComparedAppearance], numbers: &[u32], reach: f32) -> CellGrid {
         let reach = f64::from(reach);
         let buckets = (2 * numbers.len()).next_power_of_two();
         let mask = buckets - 1;
@@ -56,15 +56,21 @@ impl Grid {
                 });
             }
         }
-        let points = order.iter().map(|&place| Point { look: *look(place), number: numbers[place as usize] });
+        let points = order.iter().map(|&place| CellEntry { look: *look(place), number: numbers[place as usize] });
         let points = points.collect();
         let cells = order.iter().map(|&place| cells[place as usize]).collect();
-        Grid { reach, mask, starts, cells, points }
+        CellGrid { reach, mask, starts, cells, points }
     }
 
     /// Hands `each` the Gaussians, with their numbers, that lie within `radius` of `at` along each axis, or further, of
     /// about the size of `look`.
-    pub(super) fn near(&self, look: &Look, at: [f32; 3], radius: f32, mut each: impl FnMut(u32, &Look)) {
+    pub(super) fn near(
+        &self,
+        look: &ComparedAppearance,
+        at: [f32; 3],
+        radius: f32,
+        mut each: impl FnMut(u32, &ComparedAppearance),
+    ) {
         let brightness = look.brightness();
         for level in levels(look.ln_size) {
             let side = side(level, self.reach);
@@ -73,7 +79,7 @@ impl Grid {
                 let low = cell(f64::from(at[c]) - f64::from(radius));
                 low..=cell(f64::from(at[c]) + f64::from(radius)).min(low.saturating_add(MOST_CELLS - 1))
             };
-            let (along, level) = ([along(0), along(1), along(2)], Name::of(level));
+            let (along, level) = ([along(0), along(1), along(2)], CellKey::of(level));
             for x in along[0].clone() {
                 let x = level.then(x);
                 for y in along[1].clone() {
@@ -86,7 +92,7 @@ impl Grid {
         }
     }
 
-    fn of_cell(&self, cell: u64, brightness: f32, each: &mut impl FnMut(u32, &Look)) {
+    fn of_cell(&self, cell: u64, brightness: f32, each: &mut impl FnMut(u32, &ComparedAppearance)) {
         let bucket = cell as usize & self.mask;
         let mut places = self.starts[bucket] as usize..self.starts[bucket + 1] as usize;
         if places.len() > CROWD {
@@ -121,10 +127,10 @@ fn side(level: i64, reach: f64) -> f64 {
     2.0 * reach * ((level + 1) as f64).exp2()
 }
 
-fn own_cell(look: &Look, reach: f64) -> u64 {
+fn own_cell(look: &ComparedAppearance, reach: f64) -> u64 {
     let level = floor(f64::from(look.ln_size) / std::f64::consts::LN_2);
     let side = side(level, reach);
-    look.position.iter().fold(Name::of(level), |name, &x| name.then(floor(f64::from(x) / side))).cell()
+    look.position.iter().fold(CellKey::of(level), |name, &x| name.then(floor(f64::from(x) / side))).cell()
 }
 
 /// The largest integer that is not above `x`, inlined where the machine's own instruction may not be counted on.
@@ -136,18 +142,18 @@ fn floor(x: f64) -> i64 {
 /// What a cell is called, from its level and its place along each axis: two that share it would cost time and change
 /// nothing. The eight cells of a cube differ in the last bits alone, so that they are neighbours in the table.
 #[derive(Clone, Copy)]
-struct Name {
+struct CellKey {
     cube: u64,
     within: u64,
 }
 
-impl Name {
-    fn of(level: i64) -> Name {
-        Name { cube: mix(level as u64), within: 0 }
+impl CellKey {
+    fn of(level: i64) -> CellKey {
+        CellKey { cube: mix(level as u64), within: 0 }
     }
 
-    fn then(self, place: i64) -> Name {
-        Name { cube: mix(self.cube ^ (place >> 1) as u64), within: self.within << 1 | (place & 1) as u64 }
+    fn then(self, place: i64) -> CellKey {
+        CellKey { cube: mix(self.cube ^ (place >> 1) as u64), within: self.within << 1 | (place & 1) as u64 }
     }
 
     fn cell(self) -> u64 {

@@ -1,6 +1,6 @@
 //! Whether the order of Gaussians in frames tells which is which.
 
-use super::look::Look;
+use super::look::ComparedAppearance;
 use crate::model::Gaussians;
 
 /// Gaussians of a pair of frames that are compared.
@@ -14,7 +14,7 @@ const NOTHING: f64 = 1e-3;
 
 /// What pairs of one order differ by, in the median.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Identity {
+pub struct OrderDifference {
     /// Distance between both, in sizes.
     pub moved: f64,
     /// The same of strangers: each with the one that stands half of all further.
@@ -30,8 +30,8 @@ pub struct Identity {
 
 /// Compares two frames of equally many Gaussians, place by place, at up to 4096 places. Fewer than 16 Gaussians hold; so do
 /// frames in which strangers differ as little as anything does.
-pub fn identity(before: &Gaussians, after: &Gaussians) -> Identity {
-    let (before, after) = (Look::of_all(before), Look::of_all(after));
+pub fn identity(before: &Gaussians, after: &Gaussians) -> OrderDifference {
+    let (before, after) = (ComparedAppearance::of_all(before), ComparedAppearance::of_all(after));
     let count = before.len().min(after.len());
     let places: Vec<usize> = (0..count).step_by(count.div_ceil(COMPARED).max(1)).collect();
     let differences = |offset: usize| {
@@ -41,11 +41,11 @@ pub fn identity(before: &Gaussians, after: &Gaussians) -> Identity {
     let ((moved, unlike), (apart, strangers)) = (differences(0), differences(count / 2));
     let is_less = |own: f64, others: f64| own <= NOTHING || own <= MOST_OF_STRANGERS * others;
     let holds = count < FEWEST || (is_less(moved, apart) && is_less(unlike, strangers));
-    Identity { moved, apart, unlike, strangers, holds }
+    OrderDifference { moved, apart, unlike, strangers, holds }
 }
 
 /// In sizes of the smaller one.
-fn distance(a: &Look, b: &Look) -> f64 {
+fn distance(a: &ComparedAppearance, b: &ComparedAppearance) -> f64 {
     let squared: f64 = (0..3).map(|c| f64::from(a.position[c] - b.position[c]).powi(2)).sum();
     squared.sqrt() / f64::from(a.size.min(b.size))
 }

@@ -4,10 +4,10 @@ use std::mem::size_of;
 
 use rayon::prelude::*;
 
-use super::grid::Grid;
+use super::grid::CellGrid;
 use super::linker::Linker;
-use super::look::Look;
-use super::track::{NAMED, NONE, Offer, Offers, Round, Track};
+use super::look::ComparedAppearance;
+use super::track::{NAMED, NONE, Offer, Offers, OpenTrack, Round};
 use crate::model::{Column, Gaussians};
 
 /// r and q of lives that may be one, and of those that are one to the eye.
@@ -23,13 +23,13 @@ const TOGETHER: u8 = 4;
 const RULES: [&Round; 2] = [&ALIKE, &CLOSE];
 
 /// Watches a [`Linker`] for lives that are one.
-pub struct Joiner([Lives; 2]);
+pub struct Joiner([JoinedTracks; 2]);
 
 /// Lives that are one by a rule.
-struct Lives {
+struct JoinedTracks {
     rule: &'static Round,
     /// By the track that has begun, then by cost.
-    pairs: Vec<Pair>,
+    pairs: Vec<TrackPair>,
     /// Of every track the one that it goes on from.
     from: Vec<u32>,
     /// Of every track whether another goes on from its end.
@@ -38,7 +38,7 @@ struct Lives {
 
 /// A track that has begun, and one it may go on from.
 #[derive(Debug, Clone, Copy)]
-struct Pair {
+struct TrackPair {
     track: u32,
     other: u32,
     cost: f32,
@@ -52,7 +52,7 @@ struct Pair {
 
 impl Default for Joiner {
     fn default() -> Joiner {
-        let none = |rule| Lives { rule, pairs: Vec::new(), from: Vec::new(), goes_on: Vec::new() };
+        let none = |rule| JoinedTracks { rule, pairs: Vec::new(), from: Vec::new(), goes_on: Vec::new() };
         Joiner(RULES.map(none))
     }
 }
@@ -61,9 +61,9 @@ impl Joiner {
     /// Bytes for each track there has been, in lists that grow by being copied to twice their length, and what they end as.
     pub const BYTES_PER_TRACK: usize = 2 * RULES.len() * (size_of::<u32>() + size_of::<bool>());
     /// Bytes for each track that may go on.
-    pub const BYTES_PER_LIVING: usize = 2 * size_of::<Look>()
+    pub const BYTES_PER_LIVING: usize = 2 * size_of::<ComparedAppearance>()
         + 6 * size_of::<u32>()
-        + RULES.len() * NAMED * (size_of::<Offer>() + 2 * size_of::<Pair>());
+        + RULES.len() * NAMED * (size_of::<Offer>() + 2 * size_of::<TrackPair>());
 
     /// Takes in the frame that `linker` has linked last.
     pub fn see(&mut self, linker: &Linker) {
@@ -80,14 +80,14 @@ impl Joiner {
     }
 
     /// Pairs tracks that begin with those that may end here.
-    fn name(&mut self, old: &[Track], new: &[Track]) {
+    fn name(&mut self, old: &[OpenTrack], new: &[OpenTrack]) {
         if old.is_empty() || new.is_empty() {
             return;
         }
-        let looks: Vec<Look> = old.iter().map(|track| track.look.at(track.now())).collect();
+        let looks: Vec<ComparedAppearance> = old.iter().map(|track| track.look.at(track.now())).collect();
         // Who has been succeeded is not again by what begins later.
         let numbers: Vec<u32> = (0..old.len() as u32).filter(|&at| !old[at as usize].is_succeeded).collect();
-        let grid = Grid::new(&looks, &numbers, ALIKE.reach);
+        let grid = CellGrid::new(&looks, &numbers, ALIKE.reach);
         let named = new.par_iter().with_min_len(256).map(|track| {
             let mut offers = RULES.map(|_| Offers::default());
             grid.near(&track.look, track.look.position, ALIKE.reach * track.look.size, |at, look| {
@@ -101,7 +101,7 @@ impl Joiner {
             });
             (track, offers)
         });
-        let named: Vec<(&Track, [Offers; 2])> = named.collect();
+        let named: Vec<(&OpenTrack, [Offers; 2])> = named.collect();
         for (track, offers) in &named {
             // Which of two that nobody can tell apart goes on does not matter where they are one to the eye.
             let is_in_doubt = track.is_in_doubt;
@@ -111,7 +111,7 @@ impl Joiner {
                     let are_close = cost(&looks[offer.point as usize], &track.look, &CLOSE) <= 1.0;
                     let together = u8::from(other.ago == 1);
                     let (track, other, cost) = (track.number, other.number, offer.cost);
-                    let pair = Pair { track, other, cost, together, are_close, has_ended: false };
+                    let pair = TrackPair { track, other, cost, together, are_close, has_ended: false };
                     (are_close || !is_in_doubt).then_some(pair)
                 }));
             }
@@ -125,9 +125,9 @@ impl Joiner {
     }
 }
 
-impl Lives {
+impl JoinedTracks {
     /// Drops pairs that differ, and marks those of tracks that have ended.
-    fn watch(&mut self, tracks: &[Track]) {
+    fn watch(&mut self, tracks: &[OpenTrack]) {
         let find = |number: u32| tracks.binary_search_by_key(&number, |track| track.number).ok().map(|at| &tracks[at]);
         let rule = self.rule;
         let mut within = Vec::new();
@@ -168,7 +168,7 @@ impl Lives {
     fn settle(&mut self) {
         loop {
             let firsts = self.pairs.chunk_by(|a, b| a.track == b.track).map(|of_track| of_track[0]);
-            let mut ended: Vec<Pair> = firsts.filter(|first| first.has_ended).collect();
+            let mut ended: Vec<TrackPair> = firsts.filter(|first| first.has_ended).collect();
             if ended.is_empty() {
                 return;
             }
@@ -209,7 +209,7 @@ impl Lives {
 }
 
 /// What it costs that both are one, opacities aside: too much where one is more than √2 times as large as the other.
-fn cost(a: &Look, b: &Look, rule: &Round) -> f32 {
+fn cost(a: &ComparedAppearance, b: &ComparedAppearance, rule: &Round) -> f32 {
     if (a.ln_size - b.ln_size).abs() > MOST_LARGER {
         return f32::INFINITY;
     }

@@ -4,11 +4,11 @@ use std::mem::size_of;
 
 use rayon::prelude::*;
 
-use super::grid::Grid;
+use super::grid::CellGrid;
 use super::links::Links;
-use super::look::Look;
-use super::track::{NAMED, NONE, Offer, ROUNDS, Track};
-use super::trust::Trust;
+use super::look::ComparedAppearance;
+use super::track::{NAMED, NONE, Offer, OpenTrack, ROUNDS};
+use super::trust::LinkConfidence;
 use crate::model::Gaussians;
 
 /// Frames that a track may be missing from before it ends.
@@ -22,13 +22,13 @@ const FEWEST: usize = 16;
 #[derive(Default)]
 pub struct Linker {
     /// Those that may go on, by their numbers.
-    tracks: Vec<Track>,
+    tracks: Vec<OpenTrack>,
     born: u32,
 }
 
 /// What became of a frame.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Linked {
+pub struct FrameLinks {
     /// The track of every Gaussian.
     pub tracks: Vec<u32>,
     /// How many go on by repeating to the bit.
@@ -43,10 +43,10 @@ pub struct Linked {
 
 impl Linker {
     /// Bytes for each Gaussian of the frame that is linked, beside the frame.
-    pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<Look>() + 9 * size_of::<u32>();
+    pub const BYTES_PER_GAUSSIAN: usize = 3 * size_of::<ComparedAppearance>() + 9 * size_of::<u32>();
     /// Bytes for each track that may go on, in a list that grows by being copied to twice its length.
     pub const BYTES_PER_TRACK: usize =
-        2 * size_of::<Track>() + 2 * size_of::<u32>() + NAMED * size_of::<Offer>() + size_of::<f32>();
+        2 * size_of::<OpenTrack>() + 2 * size_of::<u32>() + NAMED * size_of::<Offer>() + size_of::<f32>();
 
     /// How many tracks may go on.
     pub fn may_go_on(&self) -> usize {
@@ -54,7 +54,7 @@ impl Linker {
     }
 
     /// Those that may go on, by their numbers.
-    pub(super) fn living(&self) -> &[Track] {
+    pub(super) fn living(&self) -> &[OpenTrack] {
         &self.tracks
     }
 
@@ -64,12 +64,12 @@ impl Linker {
     }
 
     /// Links the next frame. The same for any number of threads.
-    pub fn link(&mut self, state: &Gaussians) -> Linked {
-        let looks = Look::of_all(state);
+    pub fn link(&mut self, state: &Gaussians) -> FrameLinks {
+        let looks = ComparedAppearance::of_all(state);
         let mut links = Links { of_track: vec![NONE; self.tracks.len()], of_point: vec![NONE; looks.len()] };
         links.take_repeats(&self.tracks, &looks);
         let repeated = links.count();
-        let mut trust = Trust::new(self.tracks.len());
+        let mut trust = LinkConfidence::new(self.tracks.len());
         for round in &ROUNDS {
             let named = links.take(&self.tracks, &looks, round);
             trust.weigh(&links, &named, (&self.tracks, &looks), round);
@@ -84,11 +84,11 @@ impl Linker {
         let doubtful = if is_cut { Vec::new() } else { trust.give_up(&mut links) };
         let linked = links.count();
         let tracks = self.go_on(&links, &looks, &doubtful);
-        Linked { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
+        FrameLinks { tracks, repeated: if is_cut { 0 } else { repeated }, linked, doubtful: doubtful.len(), is_cut }
     }
 
     /// Moves the tracks on by a frame; gives that of every Gaussian. Of those `in_doubt` tracks begin.
-    fn go_on(&mut self, links: &Links, looks: &[Look], in_doubt: &[u32]) -> Vec<u32> {
+    fn go_on(&mut self, links: &Links, looks: &[ComparedAppearance], in_doubt: &[u32]) -> Vec<u32> {
         let mut of_points = vec![NONE; looks.len()];
         let born = self.born;
         for track in self.succeeded(links, looks) {
@@ -105,7 +105,7 @@ impl Linker {
         self.tracks.retain(|track| track.ago <= GAP + 1);
         for (point, of_point) in of_points.iter_mut().enumerate().filter(|(_, track)| **track == NONE) {
             *of_point = self.born;
-            self.tracks.push(Track::begin(self.born, looks[point]));
+            self.tracks.push(OpenTrack::begin(self.born, looks[point]));
             self.born += 1;
         }
         let first = self.tracks.partition_point(|track| track.number < born);
@@ -116,14 +116,14 @@ impl Linker {
     }
 
     /// Those that are missed for the first time while another is where they are expected and looks like them.
-    fn succeeded(&self, links: &Links, looks: &[Look]) -> Vec<u32> {
+    fn succeeded(&self, links: &Links, looks: &[ComparedAppearance]) -> Vec<u32> {
         let is_missed = |&i: &u32| links.of_track[i as usize] == NONE && self.tracks[i as usize].ago == 1;
         let missed: Vec<u32> = (0..links.of_track.len() as u32).filter(is_missed).collect();
         if missed.is_empty() || looks.is_empty() {
             return Vec::new();
         }
         let (reach, strictness) = BESIDE;
-        let grid = Grid::new(looks, &Vec::from_iter(0..looks.len() as u32), reach);
+        let grid = CellGrid::new(looks, &Vec::from_iter(0..looks.len() as u32), reach);
         let is_succeeded = |i: &u32| {
             let track = &self.tracks[*i as usize];
             let look = track.look.at(track.expected());

@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::grid::Grid;
-use super::look::Look;
-use super::track::{NONE, Offers, Round, Track};
+use super::grid::CellGrid;
+use super::look::ComparedAppearance;
+use super::track::{NONE, Offers, OpenTrack, Round};
 
 /// Most times that all tracks are asked whether they would exchange.
 const EXCHANGES: usize = 4;
@@ -37,9 +37,9 @@ impl Links {
     }
 
     /// Links what is repeated to the bit, in order.
-    pub(super) fn take_repeats(&mut self, tracks: &[Track], looks: &[Look]) {
+    pub(super) fn take_repeats(&mut self, tracks: &[OpenTrack], looks: &[ComparedAppearance]) {
         let buckets = (2 * looks.len()).next_power_of_two();
-        let bucket = |look: &Look| look.bits as usize & (buckets - 1);
+        let bucket = |look: &ComparedAppearance| look.bits as usize & (buckets - 1);
         let mut starts = vec![0u32; buckets + 1];
         looks.iter().for_each(|look| starts[bucket(look) + 1] += 1);
         (0..buckets).for_each(|at| starts[at + 1] += starts[at]);
@@ -67,8 +67,13 @@ impl Links {
     }
 
     /// Links what a round does, of what is left; gives what each track may have gone on as.
-    pub(super) fn take(&mut self, tracks: &[Track], looks: &[Look], round: &Round) -> Vec<(u32, Offers)> {
-        let takes_part = |track: &Track| track.ago == 1 || (round.missing && !track.is_succeeded);
+    pub(super) fn take(
+        &mut self,
+        tracks: &[OpenTrack],
+        looks: &[ComparedAppearance],
+        round: &Round,
+    ) -> Vec<(u32, Offers)> {
+        let takes_part = |track: &OpenTrack| track.ago == 1 || (round.missing && !track.is_succeeded);
         let free =
             |links: &[u32]| -> Vec<u32> { (0..links.len() as u32).filter(|&i| links[i as usize] == NONE).collect() };
         let (points, mut left) = (free(&self.of_point), free(&self.of_track));
@@ -76,7 +81,7 @@ impl Links {
         if points.is_empty() || left.is_empty() {
             return Vec::new();
         }
-        let grid = Grid::new(looks, &points, round.reach);
+        let grid = CellGrid::new(looks, &points, round.reach);
         let offers = |&track: &u32| (track, tracks[track as usize].offers(&grid, round));
         let named: Vec<(u32, Offers)> = left.par_iter().with_min_len(1024).map(offers).collect();
         self.settle(&named);

@@ -17,7 +17,7 @@ const TWIN_STRICTNESS: f32 = 4.0;
 
 /// What is compared of a Gaussian at a frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Look {
+pub(super) struct ComparedAppearance {
     /// Scene units.
     pub(super) position: [f32; 3],
     /// Root mean square of the scales, scene units, and its natural log.
@@ -32,13 +32,13 @@ pub(super) struct Look {
     pub(super) bits: u64,
 }
 
-impl Look {
+impl ComparedAppearance {
     /// Those of all Gaussians of a frame.
-    pub(super) fn of_all(state: &Gaussians) -> Vec<Look> {
-        (0..state.len()).into_par_iter().with_min_len(4096).map(|i| Look::of(state, i)).collect()
+    pub(super) fn of_all(state: &Gaussians) -> Vec<ComparedAppearance> {
+        (0..state.len()).into_par_iter().with_min_len(4096).map(|i| ComparedAppearance::of(state, i)).collect()
     }
 
-    fn of(state: &Gaussians, i: usize) -> Look {
+    fn of(state: &Gaussians, i: usize) -> ComparedAppearance {
         let row = |column: &Column| column.row::<3>(i);
         let (position, rotation, log_scale) = (row(&state.position), state.rotation.row::<4>(i), row(&state.log_scale));
         let (logit, dc) = (state.opacity_logit.row::<1>(i), row(&state.sh));
@@ -48,7 +48,7 @@ impl Look {
         let variance = log_scale.map(|log| (2.0 * log.clamp(-MOST_LOG_SCALE, MOST_LOG_SCALE)).exp());
         let trace: f32 = variance.iter().sum();
         let size = (trace / 3.0).sqrt();
-        Look {
+        ComparedAppearance {
             position,
             size,
             ln_size: size.ln(),
@@ -60,8 +60,8 @@ impl Look {
     }
 
     /// The same elsewhere.
-    pub(super) fn at(self, position: [f32; 3]) -> Look {
-        Look { position, ..self }
+    pub(super) fn at(self, position: [f32; 3]) -> ComparedAppearance {
+        ComparedAppearance { position, ..self }
     }
 
     /// What tells those of a crowded cell apart.
@@ -70,19 +70,19 @@ impl Look {
     }
 
     /// A of the [module](super), symmetric.
-    pub(super) fn unlike(&self, other: &Look) -> f32 {
+    pub(super) fn unlike(&self, other: &ComparedAppearance) -> f32 {
         let opacity = (self.opacity - other.opacity) / OPACITY_UNIT;
         self.unlike_but_opacity(other) + opacity * opacity
     }
 
     /// Whether both are one to the eye, but for their opacity: in the same place by what the first round calls it.
-    pub(super) fn is_twin(&self, other: &Look) -> bool {
+    pub(super) fn is_twin(&self, other: &ComparedAppearance) -> bool {
         self.apart(other, TWIN_REACH, TWIN_STRICTNESS) <= 1.0
     }
 
     /// |x_b − x_a|² / (r·min(s_a, s_b))² + q·A of the [module](super), opacities aside, with r the `reach` and q the
     /// `strictness`; more than 1 where that is too much, whatever it is.
-    pub(super) fn apart(&self, other: &Look, reach: f32, strictness: f32) -> f32 {
+    pub(super) fn apart(&self, other: &ComparedAppearance, reach: f32, strictness: f32) -> f32 {
         let unit = reach * self.size.min(other.size);
         let apart = squared(&self.position, &other.position) / (unit * unit);
         // Most of those in the cells of a grid are too far away.
@@ -90,7 +90,7 @@ impl Look {
     }
 
     /// A without opacities.
-    fn unlike_but_opacity(&self, other: &Look) -> f32 {
+    fn unlike_but_opacity(&self, other: &ComparedAppearance) -> f32 {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
             + squared(&self.shape, &other.shape) / (SHAPE_UNIT * SHAPE_UNIT)

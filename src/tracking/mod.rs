@@ -29,7 +29,7 @@
 //!    where one fades out while the other fades in they are one.
 //!    By strangers: ¼·k·C^{3/2}, at most ½, for a cost C where tracks name k Gaussians too many in the mean of the round: of
 //!    strangers that lie evenly so many cost as little. The least likely links are given up, and begin new tracks, until of
-//!    those left no more than one in two hundred is expected to be wrong ([`Linked::doubtful`]).
+//!    those left no more than one in two hundred is expected to be wrong ([`FrameLinks::doubtful`]).
 //! 5. Where less than a quarter goes on, of at least 16, everything has moved at once: a cut, at which all tracks end.
 //! 6. Lives that are one ([`Joiner`]). A track that begins where another is, or would be, that was not succeeded names the
 //!    four that cost least by |x_b − x_a|² / (r·min(s_a, s_b))² + q·A without opacities, at most 1, with r = 4 and q = 1/16
@@ -55,9 +55,9 @@ mod look;
 mod track;
 mod trust;
 
-pub use identity::{Identity, identity};
+pub use identity::{OrderDifference, identity};
 pub use join::{Joiner, blend};
-pub use linker::{GAP, Linked, Linker};
+pub use linker::{FrameLinks, GAP, Linker};
 
 #[cfg(test)]
 mod tests;

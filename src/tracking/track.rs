@@ -1,7 +1,7 @@
 //! A track that may go on, and what it may go on as.
 
-use super::grid::Grid;
-use super::look::Look;
+use super::grid::CellGrid;
+use super::look::ComparedAppearance;
 
 /// Gaussians that a track may go on as.
 pub(super) const NAMED: usize = 4;
@@ -26,13 +26,13 @@ pub(super) struct Round {
 
 /// A track that may go on.
 #[derive(Clone, Copy)]
-pub(super) struct Track {
+pub(super) struct OpenTrack {
     pub(super) number: u32,
     /// Frames since it was seen: 1 for one of the frame before.
     pub(super) ago: u32,
     /// Scene units per frame; none before its first step.
     pub(super) velocity: Option<[f32; 3]>,
-    pub(super) look: Look,
+    pub(super) look: ComparedAppearance,
     /// Whether it has begun as nobody could tell which track goes on as it.
     pub(super) is_in_doubt: bool,
     /// Whether another was where it was expected when it was missed first: only as what it was to the bit it goes on.
@@ -46,10 +46,10 @@ pub(super) struct Offer {
     pub(super) point: u32,
 }
 
-impl Track {
+impl OpenTrack {
     /// One that begins.
-    pub(super) fn begin(number: u32, look: Look) -> Track {
-        Track { number, ago: 1, velocity: None, look, is_in_doubt: false, is_succeeded: false }
+    pub(super) fn begin(number: u32, look: ComparedAppearance) -> OpenTrack {
+        OpenTrack { number, ago: 1, velocity: None, look, is_in_doubt: false, is_succeeded: false }
     }
 
     /// Where it is expected.
@@ -65,11 +65,11 @@ impl Track {
     }
 
     /// What going on as `look` costs; more than 1 where that is too much, whatever it is.
-    pub(super) fn cost(&self, look: &Look, round: &Round) -> f32 {
+    pub(super) fn cost(&self, look: &ComparedAppearance, round: &Round) -> f32 {
         self.cost_at(look, self.expected(), round.reach * self.unit(), round.strictness)
     }
 
-    fn cost_at(&self, look: &Look, expected: [f32; 3], unit: f32, strictness: f32) -> f32 {
+    fn cost_at(&self, look: &ComparedAppearance, expected: [f32; 3], unit: f32, strictness: f32) -> f32 {
         let distance: f32 = (0..3).map(|c| (look.position[c] - expected[c]).powi(2)).sum();
         let apart = distance / (unit * unit);
         // Most of those in its cells are too far away.
@@ -82,7 +82,7 @@ impl Track {
         std::array::from_fn(|c| self.look.position[c] + (self.ago - 1) as f32 * velocity[c])
     }
 
-    pub(super) fn see(&mut self, look: Look) {
+    pub(super) fn see(&mut self, look: ComparedAppearance) {
         let step: [f32; 3] = std::array::from_fn(|c| (look.position[c] - self.look.position[c]) / self.ago as f32);
         self.velocity = Some(match self.velocity {
             None => step,
@@ -92,7 +92,7 @@ impl Track {
     }
 
     /// The Gaussians it may go on as.
-    pub(super) fn offers(&self, grid: &Grid, round: &Round) -> Offers {
+    pub(super) fn offers(&self, grid: &CellGrid, round: &Round) -> Offers {
         let mut offers = Offers::default();
         let (expected, unit) = (self.expected(), round.reach * self.unit());
         grid.near(&self.look, expected, unit, |point, look| {

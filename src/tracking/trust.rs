@@ -1,8 +1,8 @@
 //! How likely links are wrong, and which of them are given up.
 
 use super::links::Links;
-use super::look::Look;
-use super::track::{NONE, Offers, Round, Track};
+use super::look::ComparedAppearance;
+use super::track::{NONE, Offers, OpenTrack, Round};
 
 /// Part of a frame's links that may be expected to be wrong.
 pub(super) const MOST_WRONG: f64 = 0.005;
@@ -12,7 +12,7 @@ const SAME: f32 = 1e-6;
 const AWAY: f32 = 0.25;
 
 /// What is expected of the links of a frame.
-pub(super) struct Trust {
+pub(super) struct LinkConfidence {
     /// Links expected to be wrong.
     wrong: f64,
     /// Those that are likely enough to be, with that chance.
@@ -21,9 +21,9 @@ pub(super) struct Trust {
     ratios: Vec<f32>,
 }
 
-impl Trust {
-    pub(super) fn new(tracks: usize) -> Trust {
-        Trust { wrong: 0.0, doubted: Vec::new(), ratios: vec![0.0; tracks] }
+impl LinkConfidence {
+    pub(super) fn new(tracks: usize) -> LinkConfidence {
+        LinkConfidence { wrong: 0.0, doubted: Vec::new(), ratios: vec![0.0; tracks] }
     }
 
     /// Takes in what a round has linked, of those that it had `named` Gaussians for.
@@ -31,7 +31,7 @@ impl Trust {
         &mut self,
         links: &Links,
         named: &[(u32, Offers)],
-        (tracks, looks): (&[Track], &[Look]),
+        (tracks, looks): (&[OpenTrack], &[ComparedAppearance]),
         round: &Round,
     ) {
         let cost = |track: u32, point: u32| tracks[track as usize].cost(&looks[point as usize], round).min(1.0);

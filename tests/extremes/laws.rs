@@ -15,7 +15,7 @@ use splatsieve::outputs::container::write_container;
 use splatsieve::passes::HeldFrames;
 use splatsieve::pipeline::score_scene;
 use splatsieve::pruning::score::UserOverrides;
-use splatsieve::recipe::{Motion, Recipe};
+use splatsieve::recipe::{MotionParams, Recipe};
 use splatsieve::scene::Scene;
 
 use super::scene::by_formula;
@@ -35,7 +35,7 @@ struct Found {
 }
 
 impl World {
-    fn found(&self, motion: Motion) -> Found {
+    fn found(&self, motion: MotionParams) -> Found {
         let mut recipe: Recipe = by_formula("default");
         recipe.scan.motion = motion;
         // Of any unit of length there is as much room for motion as the paper gives it.
@@ -138,8 +138,8 @@ fn world() -> impl Strategy<Value = World> {
     })
 }
 
-fn motion() -> impl Strategy<Value = Motion> {
-    prop_oneof![Just(Motion::Runs), Just(Motion::Literal)]
+fn motion() -> impl Strategy<Value = MotionParams> {
+    prop_oneof![Just(MotionParams::Runs), Just(MotionParams::Literal)]
 }
 
 /// Whether `found` is `expected` within `relative` of itself or `absolute`.
@@ -233,7 +233,7 @@ proptest! {
         for camera in &mut larger.cameras {
             (camera.translation, camera.near) = (camera.translation * by, camera.near * by);
         }
-        let (expected, found) = (world.found(Motion::Runs), larger.found(Motion::Runs));
+        let (expected, found) = (world.found(MotionParams::Runs), larger.found(MotionParams::Runs));
         near("C", &found.rows.c, &expected.rows.c, 4e-6, 1e-9)?;
         near("E", &found.rows.e, &expected.rows.e, 0.0, 4e-6)?;
         prop_assert_eq!(found.rows.vis, expected.rows.vis);
@@ -289,7 +289,7 @@ proptest! {
         let mut other = world.clone();
         let span = (world.times[world.times.len() - 1] - world.times[0]).max(1.0);
         other.times.iter_mut().for_each(|time| *time = 10f64.powf(unit) * (*time + start * span));
-        let (expected, found) = (world.found(Motion::Runs), other.found(Motion::Runs));
+        let (expected, found) = (world.found(MotionParams::Runs), other.found(MotionParams::Runs));
         near("D", &found.rows.d, &expected.rows.d, 1e-9, 0.0)?;
         near("kappa", &found.rows.kappa, &expected.rows.kappa, 1e-8, 1e-12 * expected.rows.d.iter().fold(0.0, |a: f64, b| a.max(*b)))?;
         prop_assert_eq!((found.rows.v, found.rows.life), (expected.rows.v, expected.rows.life));

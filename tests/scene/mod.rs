@@ -285,12 +285,12 @@ pub(crate) fn arrays(path: &Path) -> BTreeMap<String, Vec<f64>> {
 /// A preset that scores by projected coverage and leaves nothing to renders: what the formulas decide alone.
 pub(crate) fn by_formula(preset: &str) -> splatsieve::recipe::Recipe {
     use splatsieve::model::Columns;
-    use splatsieve::recipe::{Coverage, Groups, Precision, Recipe, StaticTerm, WhichBands};
+    use splatsieve::recipe::{AttributeGroups, Coverage, Precision, Recipe, StaticTerm, WhichBands};
     let mut recipe = Recipe::preset(preset).unwrap();
     recipe.scan.coverage = Coverage::Projected;
     recipe.score.static_term = StaticTerm::Mean;
     recipe.select.choose_by_views = false;
-    recipe.refine.refine = Groups(Columns::empty());
+    recipe.refine.refine = AttributeGroups(Columns::empty());
     recipe.field.field = Precision::Exact;
     recipe.bands.bands = WhichBands::All;
     recipe

@@ -12,7 +12,7 @@ use super::camera::Camera;
 pub struct Schedule {
     /// Distinct cameras.
     pub cameras: Vec<Camera>,
-    runs: Vec<Run>,
+    runs: Vec<FrameRun>,
     /// (View number, camera index) pairs of run after run.
     views: Vec<(u32, u32)>,
     frames: usize,
@@ -20,7 +20,7 @@ pub struct Schedule {
 
 /// Frames one after the other that have the same pictures; they end where the next run begins.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct Run {
+struct FrameRun {
     /// Its first frame.
     frame: usize,
     /// Its first pair.
@@ -55,7 +55,7 @@ impl Schedule {
     pub fn push(&mut self, count: usize, views: &[(u32, u32)]) {
         let goes_on = self.runs.last().is_some_and(|last| &self.views[last.view..] == views);
         if count > 0 && !goes_on {
-            self.runs.push(Run { frame: self.frames, view: self.views.len() });
+            self.runs.push(FrameRun { frame: self.frames, view: self.views.len() });
             self.views.extend_from_slice(views);
         }
         self.frames += count;
@@ -63,7 +63,7 @@ impl Schedule {
 
     /// Bytes of `runs` runs of at most `views` pictures a frame, twice over, as vectors grow.
     pub const fn bytes(runs: u64, views: u64) -> u64 {
-        2 * runs * (size_of::<Run>() as u64 + views * size_of::<(u32, u32)>() as u64)
+        2 * runs * (size_of::<FrameRun>() as u64 + views * size_of::<(u32, u32)>() as u64)
     }
 
     /// T, the number of frames.
@@ -152,7 +152,7 @@ mod tests {
                 schedule.push(1, &of_frame);
             }
             let held =
-                schedule.runs.capacity() * size_of::<Run>() + schedule.views.capacity() * size_of::<(u32, u32)>();
+                schedule.runs.capacity() * size_of::<FrameRun>() + schedule.views.capacity() * size_of::<(u32, u32)>();
             // A vector begins with room for four.
             let counted = Schedule::bytes(frames.max(4).into(), views.into());
             assert!(held as u64 <= counted, "{frames} frames of {views}: {held} bytes, counted {counted}");

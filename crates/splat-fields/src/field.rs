@@ -12,8 +12,8 @@ use splat_core::error::{Error, Result};
 use splat_core::{Column, Columns, Gaussians};
 
 use super::deltas::Deltas;
-use super::linear::{LANES, Lanes, Linear};
-use super::planes::{Lines, Planes, PreparedPlanes};
+use super::linear::{CacheLine, LANES, Linear};
+use super::planes::{Planes, PreparedPlanes, TimeLines};
 use super::tensors::{Lookup, Tensors};
 use super::voxel::VoxelMask;
 
@@ -82,9 +82,9 @@ enum PreparedInput {
 /// Reusable activations of one reader.
 #[derive(Debug, Clone, Default)]
 pub struct Scratch {
-    features: Vec<Lanes>,
-    trunk: [Vec<Lanes>; 2],
-    hidden: Vec<Lanes>,
+    features: Vec<CacheLine>,
+    trunk: [Vec<CacheLine>; 2],
+    hidden: Vec<CacheLine>,
 }
 
 /// Name of a column's head in the state dict and its flag in `cfg_args`.
@@ -240,7 +240,14 @@ impl Field {
     /// [`Field::evaluate`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn evaluate_fma(&self, prepared: &Prepared, time: f32, lines: &[Lines], scratch: &mut Scratch, out: &mut Deltas) {
+    fn evaluate_fma(
+        &self,
+        prepared: &Prepared,
+        time: f32,
+        lines: &[TimeLines],
+        scratch: &mut Scratch,
+        out: &mut Deltas,
+    ) {
         self.evaluate::<true>(prepared, time, lines, scratch, out);
     }
 
@@ -250,7 +257,7 @@ impl Field {
         &self,
         prepared: &Prepared,
         time: f32,
-        lines: &[Lines],
+        lines: &[TimeLines],
         scratch: &mut Scratch,
         out: &mut Deltas,
     ) {
@@ -290,9 +297,9 @@ impl Field {
 
 /// What the trunk reads where it reads `[x, y, z, t]`; `places` are by axis.
 #[inline(always)]
-pub(super) fn place_features(places: [&[f32]; 3], time: f32, features: &mut Vec<Lanes>) {
+pub(super) fn place_features(places: [&[f32]; 3], time: f32, features: &mut Vec<CacheLine>) {
     features.clear();
-    features.resize(4, Lanes([time; LANES]));
+    features.resize(4, CacheLine([time; LANES]));
     for (out, place) in features.iter_mut().zip(places) {
         out.0[..place.len()].copy_from_slice(place);
     }
@@ -302,9 +309,9 @@ pub(super) fn place_features(places: [&[f32]; 3], time: f32, features: &mut Vec<
 #[inline(always)]
 fn run_trunk<'a, const FMA: bool>(
     layers: &[Linear],
-    input: &[Lanes],
-    [last, spare]: &'a mut [Vec<Lanes>; 2],
-) -> &'a [Lanes] {
+    input: &[CacheLine],
+    [last, spare]: &'a mut [Vec<CacheLine>; 2],
+) -> &'a [CacheLine] {
     for (i, layer) in layers.iter().enumerate() {
         std::mem::swap(last, spare);
         layer.activate::<FMA>(if i == 0 { input } else { spare }, last);
@@ -313,9 +320,9 @@ fn run_trunk<'a, const FMA: bool>(
 }
 
 /// `[f, sin(p·f), cos(p·f)]` of features f.
-pub(super) fn add_frequencies(features: &mut Vec<Lanes>, p: f32) {
+pub(super) fn add_frequencies(features: &mut Vec<CacheLine>, p: f32) {
     let plain = features.clone();
     for of in [f32::sin, f32::cos] {
-        features.extend(plain.iter().map(|f| Lanes(f.0.map(|f| of(p * f)))));
+        features.extend(plain.iter().map(|f| CacheLine(f.0.map(|f| of(p * f)))));
     }
 }

@@ -8,22 +8,22 @@
 
 use super::deltas::{Deltas, finite};
 use super::field::{Field, Head, Mask, Scratch, add_frequencies, place_features};
-use super::linear::{LANES, Lanes, Linear};
+use super::linear::{CacheLine, LANES, Linear};
 use splat_core::error::{Error, Result};
 use splat_core::{Column, Columns, Gaussians, Jacobian};
 
 /// Derivatives and activations of one group of Gaussians.
 #[derive(Default)]
-struct Group {
-    features: Vec<Lanes>,
+struct JacobianGroup {
+    features: Vec<CacheLine>,
     /// Derivatives of the planes' features by position, by axis.
-    slopes: [Vec<Lanes>; 3],
+    slopes: [Vec<CacheLine>; 3],
     /// Of every layer, as ReLU left them.
-    trunk: Vec<Vec<Lanes>>,
-    hidden: Vec<Lanes>,
+    trunk: Vec<Vec<CacheLine>>,
+    hidden: Vec<CacheLine>,
     /// By what the last step reads.
-    by: Vec<Lanes>,
-    spare: Vec<Lanes>,
+    by: Vec<CacheLine>,
+    spare: Vec<CacheLine>,
 }
 
 impl Field {
@@ -85,7 +85,7 @@ impl Field {
     #[inline(always)]
     fn of_groups<const FMA: bool>(&self, head: &Head, position: &Column, time: f32, out: &mut Column) {
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));
-        let mut group = Group::default();
+        let mut group = JacobianGroup::default();
         for start in (0..position.len()).step_by(LANES) {
             let rows = start..position.len().min(start + LANES);
             let places = [0, 1, 2].map(|axis| &position.plane(axis)[rows.clone()]);
@@ -100,8 +100,8 @@ impl Field {
 
             for component in 0..3 {
                 group.by.clear();
-                group.by.resize(head.output.padded_outputs(), Lanes([0.0; LANES]));
-                group.by[component] = Lanes([1.0; LANES]);
+                group.by.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
+                group.by[component] = CacheLine([1.0; LANES]);
                 group.backward::<FMA>(self, head);
                 if self.planes.is_some() && self.config.grid_pe > 1 {
                     pull_frequencies(&group.features, self.config.grid_pe as f32, &mut group.by);
@@ -120,7 +120,7 @@ impl Field {
     }
 }
 
-impl Group {
+impl JacobianGroup {
     /// Activations from features.
     #[inline(always)]
     fn forward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
@@ -135,8 +135,8 @@ impl Group {
 
     /// From derivatives by the planes' features to those by one axis.
     #[inline(always)]
-    fn along(&self, axis: usize) -> Lanes {
-        let mut sums = Lanes([0.0; LANES]);
+    fn along(&self, axis: usize) -> CacheLine {
+        let mut sums = CacheLine([0.0; LANES]);
         for (by, slope) in self.by.iter().zip(&self.slopes[axis]) {
             for lane in 0..LANES {
                 sums.0[lane] += by.0[lane] * slope.0[lane];
@@ -148,8 +148,8 @@ impl Group {
     /// From derivatives by the head's outputs to those by features.
     #[inline(always)]
     fn backward<const FMA: bool>(&mut self, field: &Field, head: &Head) {
-        let Group { trunk, hidden, by, spare, .. } = self;
-        let mut step = |layer: &Linear, kept: Option<&[Lanes]>| {
+        let JacobianGroup { trunk, hidden, by, spare, .. } = self;
+        let mut step = |layer: &Linear, kept: Option<&[CacheLine]>| {
             layer.pull::<FMA>(by, kept, spare);
             std::mem::swap(by, spare);
         };
@@ -162,7 +162,7 @@ impl Group {
 }
 
 /// From derivatives by `[f, sin(p·f), cos(p·f)]`, which are `features`, to those by f, in the first third of `by`.
-fn pull_frequencies(features: &[Lanes], p: f32, by: &mut [Lanes]) {
+fn pull_frequencies(features: &[CacheLine], p: f32, by: &mut [CacheLine]) {
     let n = features.len() / 3;
     for c in 0..n {
         for lane in 0..LANES {

@@ -21,6 +21,6 @@ mod voxel;
 
 pub use deltas::Deltas;
 pub use field::{Field, FieldConfig, Prepared, Scratch};
-pub use network::{Encoded, Motion, Network};
+pub use network::{Encoded, Network, PredictedMotion};
 pub use planes::{Box3, Tap, rows_before_zero, tap};
 pub use tensors::{Tensor, Tensors};

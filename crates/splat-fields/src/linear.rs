@@ -14,7 +14,7 @@ pub(super) const LANES: usize = 16;
 /// One value of each of them: a line of the cache, as a register that spans two is loaded at half the speed.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
-pub(super) struct Lanes(pub(super) [f32; LANES]);
+pub(super) struct CacheLine(pub(super) [f32; LANES]);
 
 /// Outputs whose sums are made together.
 const PANEL: usize = 4;
@@ -68,8 +68,8 @@ impl Linear {
     /// ReLU(y) of `input` `[inputs, LANES]` into `out` `[outputs, LANES]`. NaN stays NaN, as it would not through
     /// `f32::max`.
     #[inline(always)]
-    pub(super) fn activate<const FMA: bool>(&self, input: &[Lanes], out: &mut Vec<Lanes>) {
-        out.resize(self.padded_outputs(), Lanes([0.0; LANES]));
+    pub(super) fn activate<const FMA: bool>(&self, input: &[CacheLine], out: &mut Vec<CacheLine>) {
+        out.resize(self.padded_outputs(), CacheLine([0.0; LANES]));
         let panels = self.weight.chunks_exact(self.inputs).zip(&self.bias);
         for (out, (weight, bias)) in out.chunks_exact_mut(PANEL).zip(panels) {
             let sums = sums::<FMA>(input, weight, bias);
@@ -84,10 +84,15 @@ impl Linear {
     /// Derivatives by the inputs into `out`, given those by the outputs, both in whole panels that are 0 beyond the
     /// last; 0 where `kept`, the inputs as ReLU left them, is not positive.
     #[inline(always)]
-    pub(super) fn pull<const FMA: bool>(&self, by_output: &[Lanes], kept: Option<&[Lanes]>, out: &mut Vec<Lanes>) {
-        out.resize(self.inputs.next_multiple_of(PANEL), Lanes([0.0; LANES]));
+    pub(super) fn pull<const FMA: bool>(
+        &self,
+        by_output: &[CacheLine],
+        kept: Option<&[CacheLine]>,
+        out: &mut Vec<CacheLine>,
+    ) {
+        out.resize(self.inputs.next_multiple_of(PANEL), CacheLine([0.0; LANES]));
         for (first, out) in (0..self.inputs).step_by(PANEL).zip(out.chunks_exact_mut(PANEL)) {
-            let mut sums = [Lanes([0.0; LANES]); PANEL];
+            let mut sums = [CacheLine([0.0; LANES]); PANEL];
             for (weight, by) in self.weight.chunks_exact(self.inputs).zip(by_output.chunks_exact(PANEL)) {
                 for (sum, weight) in sums.iter_mut().zip(&weight[first..]) {
                     for (&w, by) in weight.iter().zip(by) {
@@ -110,7 +115,7 @@ impl Linear {
     #[inline(always)]
     pub(super) fn write<const FMA: bool>(
         &self,
-        input: &[Lanes],
+        input: &[CacheLine],
         lanes: usize,
         planes: &mut [f32],
         len: usize,
@@ -131,8 +136,8 @@ impl Linear {
 /// does not depend on those beside it. Fused multiply-adds only where the processor has them: elsewhere each would be a
 /// call.
 #[inline(always)]
-fn sums<const FMA: bool>(input: &[Lanes], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [Lanes; PANEL] {
-    let mut sums = bias.map(|b| Lanes([b; LANES]));
+fn sums<const FMA: bool>(input: &[CacheLine], weight: &[[f32; PANEL]], bias: &[f32; PANEL]) -> [CacheLine; PANEL] {
+    let mut sums = bias.map(|b| CacheLine([b; LANES]));
     for (x, weight) in input.iter().zip(weight) {
         for (sums, &w) in sums.iter_mut().zip(weight) {
             for (sum, &x) in sums.0.iter_mut().zip(&x.0) {

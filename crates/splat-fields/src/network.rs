@@ -2,14 +2,14 @@
 //!
 //! h = [e(x), e(t)] with e(v) = [v, sin(2⁰v), cos(2⁰v), sin(2¹v), cos(2¹v), …], every block all components, ten octaves of
 //! x; with a time network e(t) is its output. Layers are linear, then ReLU; some read [e(x), e(t), h] instead of h. Heads
-//! are linear in the last h. Data in: tensors of a state dict, canonical positions, a time. Data out: [`Motion`].
+//! are linear in the last h. Data in: tensors of a state dict, canonical positions, a time. Data out: [`PredictedMotion`].
 //! Memory: the tensors twice, [`Network::BYTES_PER_GAUSSIAN`] per encoded Gaussian, and about 64 kB of activations per call.
 //! Sources: Yang et al., "Deformable 3D Gaussians for High-Fidelity Monocular Dynamic Scene Reconstruction", 2024; Huang et
 //! al., "SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes", 2024; and their public code.
 
 use std::path::Path;
 
-use super::linear::{LANES, Lanes, Linear};
+use super::linear::{CacheLine, LANES, Linear};
 use super::tensors::{Lookup, Tensors};
 use splat_core::error::{Error, Result};
 use splat_core::{Column, Columns};
@@ -26,19 +26,19 @@ pub struct Network {
     octaves: usize,
     /// Two layers between time's sines and what the others read.
     time: Option<[Linear; 2]>,
-    layers: Vec<Layer>,
-    heads: Vec<Head>,
+    layers: Vec<NetworkLayer>,
+    heads: Vec<NetworkHead>,
 }
 
 #[derive(Debug, Clone)]
-struct Layer {
+struct NetworkLayer {
     linear: Linear,
     /// Whether it reads the encodings before what the layer before it gives.
     joins: bool,
 }
 
 #[derive(Debug, Clone)]
-struct Head {
+struct NetworkHead {
     column: Columns,
     /// Of its first output in the column.
     plane: usize,
@@ -50,12 +50,12 @@ struct Head {
 pub struct Encoded {
     rows: usize,
     /// Groups of [`LANES`] Gaussians, zero beyond the last: [`PLACE`] values each.
-    values: Vec<Lanes>,
+    values: Vec<CacheLine>,
 }
 
 /// What heads say of a block of Gaussians; of no rows where there is no head, or where nobody asked.
 #[derive(Debug, Clone, Default)]
-pub struct Motion {
+pub struct PredictedMotion {
     /// `[3]` what is added to positions, scene units; of a network of screws `[6]`, w and then v.
     pub warp: Column,
     /// `[4]` what is added to quaternions, wxyz.
@@ -70,14 +70,14 @@ pub struct Motion {
 
 /// Activations of one group.
 #[derive(Default)]
-struct Scratch {
+struct NetworkScratch {
     /// Encodings, and behind them what a layer that joins reads.
-    input: Vec<Lanes>,
-    last: Vec<Lanes>,
-    spare: Vec<Lanes>,
+    input: Vec<CacheLine>,
+    last: Vec<CacheLine>,
+    spare: Vec<CacheLine>,
 }
 
-impl Motion {
+impl PredictedMotion {
     fn column_mut(&mut self, which: Columns) -> &mut Column {
         match which {
             Columns::POSITION => &mut self.warp,
@@ -140,7 +140,7 @@ impl Network {
             return Err(lookup.mismatch(&name("timenet.2.weight"), expected, last.outputs.to_string()));
         }
 
-        let mut layers: Vec<Layer> = Vec::new();
+        let mut layers: Vec<NetworkLayer> = Vec::new();
         let mut width = 0;
         while has(&format!("linear.{}", layers.len())) {
             let of = format!("linear.{}", layers.len());
@@ -148,13 +148,13 @@ impl Network {
             let reads = if layers.is_empty() || joins { width + inputs } else { width };
             let linear = load(&of, reads, None, "the layer before it, with or without the encodings")?;
             width = linear.outputs;
-            layers.push(Layer { linear, joins });
+            layers.push(NetworkLayer { linear, joins });
         }
 
         let mut heads = Vec::new();
         let mut add = |column: Columns, plane: usize, of: &str, outputs: usize, why: &str| -> Result<()> {
             let output = load(of, width, Some(outputs), why)?;
-            heads.push(Head { column, plane, output });
+            heads.push(NetworkHead { column, plane, output });
             Ok(())
         };
         if has("branch_w") {
@@ -179,7 +179,7 @@ impl Network {
         self.heads.iter().map(|head| head.column).collect()
     }
 
-    /// Whether positions move by screws: [`Motion::warp`] is then w and v.
+    /// Whether positions move by screws: [`PredictedMotion::warp`] is then w and v.
     pub fn has_screws(&self) -> bool {
         self.heads.iter().any(|head| head.plane > 0)
     }
@@ -196,7 +196,7 @@ impl Network {
     /// doubles an error of 1e-16, which is 1e-13 at the last.
     pub fn encode(&self, position: &Column) -> Encoded {
         let rows = position.len();
-        let mut values = vec![Lanes([0.0; LANES]); rows.div_ceil(LANES) * PLACE];
+        let mut values = vec![CacheLine([0.0; LANES]); rows.div_ceil(LANES) * PLACE];
         for (axis, row) in (0..3).flat_map(|axis| (0..rows).map(move |row| (axis, row))) {
             let (group, lane) = (row / LANES, row % LANES);
             let out = &mut values[group * PLACE..][..PLACE];
@@ -212,7 +212,7 @@ impl Network {
     ///
     /// # Errors
     /// A time that is not finite.
-    pub fn motion(&self, encoded: &Encoded, time: f64, want: Columns, out: &mut Motion) -> Result<()> {
+    pub fn motion(&self, encoded: &Encoded, time: f64, want: Columns, out: &mut PredictedMotion) -> Result<()> {
         let time = finite(time)?;
         for head in self.heads.iter().filter(|head| want.contains(head.column)) {
             let column = out.column_mut(head.column);
@@ -232,7 +232,7 @@ impl Network {
         Ok(())
     }
 
-    /// How [`Motion::warp`] at `time` changes with canonical `position` `[N, 3]`: output o along axis a in plane 3·o + a.
+    /// How [`PredictedMotion::warp`] at `time` changes with canonical `position` `[N, 3]`: output o along axis a in plane 3·o + a.
     ///
     /// # Errors
     /// A time that is not finite.
@@ -254,7 +254,7 @@ impl Network {
     /// [`Network::evaluate`] compiled for AVX2 and FMA.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma")]
-    fn evaluate_fma(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut Motion) {
+    fn evaluate_fma(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut PredictedMotion) {
         self.evaluate::<true>(encoded, time, want, out);
     }
 
@@ -267,10 +267,10 @@ impl Network {
 
     /// Fills the columns of `out`; inlined, with all it calls, into each instruction set's copy.
     #[inline(always)]
-    fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut Motion) {
-        let (of_time, mut scratch) = (self.of_time::<FMA>(time), Scratch::default());
+    fn evaluate<const FMA: bool>(&self, encoded: &Encoded, time: f32, want: Columns, out: &mut PredictedMotion) {
+        let (of_time, mut scratch) = (self.of_time::<FMA>(time), NetworkScratch::default());
         for (group, place) in encoded.values.chunks_exact(PLACE).enumerate() {
-            let Scratch { input, last, spare } = &mut scratch;
+            let NetworkScratch { input, last, spare } = &mut scratch;
             input.clear();
             input.extend_from_slice(place);
             input.extend_from_slice(&of_time);
@@ -293,13 +293,14 @@ impl Network {
 
     /// What the layers read of a time.
     #[inline(always)]
-    fn of_time<const FMA: bool>(&self, time: f32) -> Vec<Lanes> {
-        let mut now: Vec<Lanes> = sines(time, self.octaves).into_iter().map(|value| Lanes([value; LANES])).collect();
+    fn of_time<const FMA: bool>(&self, time: f32) -> Vec<CacheLine> {
+        let mut now: Vec<CacheLine> =
+            sines(time, self.octaves).into_iter().map(|value| CacheLine([value; LANES])).collect();
         if let Some([first, last]) = &self.time {
             let (mut hidden, mut planes) = (Vec::new(), vec![0.0; last.outputs]);
             first.activate::<FMA>(&now, &mut hidden);
             last.write::<FMA>(&hidden, 1, &mut planes, 1, 0);
-            now = planes.into_iter().map(|value| Lanes([value; LANES])).collect();
+            now = planes.into_iter().map(|value| CacheLine([value; LANES])).collect();
         }
         now
     }
@@ -309,7 +310,7 @@ impl Network {
     fn differentiate<const FMA: bool>(&self, encoded: &Encoded, time: f32, out: &mut Column) {
         let of_time = self.of_time::<FMA>(time);
         let encodings = PLACE + of_time.len();
-        let mut kept: Vec<Vec<Lanes>> = vec![Vec::new(); self.layers.len()];
+        let mut kept: Vec<Vec<CacheLine>> = vec![Vec::new(); self.layers.len()];
         let (mut input, mut by, mut spare, mut of_place) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for (group, place) in encoded.values.chunks_exact(PLACE).enumerate() {
             input.clear();
@@ -329,10 +330,10 @@ impl Network {
             let heads = self.heads.iter().filter(|head| head.column == Columns::POSITION);
             for (head, component) in heads.flat_map(|head| (0..head.output.outputs).map(move |o| (head, o))) {
                 by.clear();
-                by.resize(head.output.padded_outputs(), Lanes([0.0; LANES]));
-                by[component] = Lanes([1.0; LANES]);
+                by.resize(head.output.padded_outputs(), CacheLine([0.0; LANES]));
+                by[component] = CacheLine([1.0; LANES]);
                 of_place.clear();
-                of_place.resize(PLACE, Lanes([0.0; LANES]));
+                of_place.resize(PLACE, CacheLine([0.0; LANES]));
                 head.output.pull::<FMA>(&by, kept.last().map(Vec::as_slice), &mut spare);
                 std::mem::swap(&mut by, &mut spare);
                 for (k, layer) in self.layers.iter().enumerate().rev() {
@@ -345,7 +346,7 @@ impl Network {
                     }
                     if let Some(before) = before.filter(|_| layer.joins) {
                         by.drain(..encodings);
-                        by.resize(before.len(), Lanes([0.0; LANES]));
+                        by.resize(before.len(), CacheLine([0.0; LANES]));
                         by.iter_mut().zip(before).for_each(|(by, kept)| keep_positive(by, kept));
                     }
                 }
@@ -380,20 +381,20 @@ fn sines(value: f32, octaves: usize) -> Vec<f32> {
 }
 
 #[inline(always)]
-fn add(of: &[Lanes], to: &mut [Lanes]) {
+fn add(of: &[CacheLine], to: &mut [CacheLine]) {
     for (to, of) in to.iter_mut().zip(of) {
         to.0.iter_mut().zip(&of.0).for_each(|(to, of)| *to += of);
     }
 }
 
 #[inline(always)]
-fn keep_positive(by: &mut Lanes, kept: &Lanes) {
+fn keep_positive(by: &mut CacheLine, kept: &CacheLine) {
     by.0.iter_mut().zip(&kept.0).for_each(|(by, &kept)| *by = if kept > 0.0 { *by } else { 0.0 });
 }
 
 /// From derivatives by encoded values, which are `place`, to those along one axis.
 #[inline(always)]
-fn along(axis: usize, place: &[Lanes], by: &[Lanes]) -> Lanes {
+fn along(axis: usize, place: &[CacheLine], by: &[CacheLine]) -> CacheLine {
     let mut sum = by[axis];
     for k in 0..OCTAVES {
         let (sine, cosine) = (3 * (2 * k + 1) + axis, 3 * (2 * k + 2) + axis);

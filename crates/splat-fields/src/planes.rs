@@ -11,7 +11,7 @@
 use splat_core::Column;
 use splat_core::error::Result;
 
-use super::linear::{LANES, Lanes};
+use super::linear::{CacheLine, LANES};
 use super::tensors::Lookup;
 
 const X: usize = 0;
@@ -26,7 +26,7 @@ const TEMPORAL: [usize; 3] = [2, 4, 5];
 
 /// A plane over axes (a, b), `[size_b, size_a, channels]`: one sample is contiguous.
 #[derive(Debug, Clone)]
-pub(super) struct Plane {
+pub(super) struct FeaturePlane {
     pub(super) size_a: usize,
     pub(super) size_b: usize,
     texels: Vec<f32>,
@@ -35,12 +35,12 @@ pub(super) struct Plane {
 #[derive(Debug, Clone)]
 pub(super) struct Level {
     pub(super) channels: usize,
-    pub(super) spatial: [Plane; 3],
-    pub(super) temporal: [Plane; 3],
+    pub(super) spatial: [FeaturePlane; 3],
+    pub(super) temporal: [FeaturePlane; 3],
 }
 
 /// The time planes of a level at one time, by axis: `[size_a, channels]` each.
-pub(super) type Lines = [Vec<f32>; 3];
+pub(super) type TimeLines = [Vec<f32>; 3];
 
 /// The box that planes cover.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -94,7 +94,7 @@ pub(super) struct PreparedPlanes {
     taps: Vec<Tap>,
 }
 
-impl Plane {
+impl FeaturePlane {
     fn load(lookup: Lookup<'_>, name: &str, channels: Option<usize>) -> Result<(Self, usize)> {
         let tensor = lookup.get_shaped(name, &[Some(1), channels, None, None], "1, channels, size_b, size_a")?;
         let [channels, size_b, size_a] = [tensor.shape[1], tensor.shape[2], tensor.shape[3]];
@@ -105,7 +105,7 @@ impl Plane {
                 texel[c] = value;
             }
         }
-        Ok((Plane { size_a, size_b, texels }, channels))
+        Ok((FeaturePlane { size_a, size_b, texels }, channels))
     }
 
     pub(super) fn texel(&self, a: u32, b: u32, channels: usize) -> &[f32] {
@@ -169,8 +169,8 @@ impl Planes {
         let mut levels = Vec::new();
         while levels.is_empty() || lookup.has(&name(levels.len(), 0)) {
             let level = levels.len();
-            let (xy, channels) = Plane::load(lookup, &name(level, SPATIAL[0].0), None)?;
-            let load = |plane| Plane::load(lookup, &name(level, plane), Some(channels)).map(|(plane, _)| plane);
+            let (xy, channels) = FeaturePlane::load(lookup, &name(level, SPATIAL[0].0), None)?;
+            let load = |plane| FeaturePlane::load(lookup, &name(level, plane), Some(channels)).map(|(plane, _)| plane);
             levels.push(Level {
                 channels,
                 spatial: [xy, load(SPATIAL[1].0)?, load(SPATIAL[2].0)?],
@@ -220,8 +220,8 @@ impl Planes {
     }
 
     /// The time planes of every level interpolated at `time`.
-    pub(super) fn lines(&self, time: f32) -> Vec<Lines> {
-        let line = |level: &Level, plane: &Plane| {
+    pub(super) fn lines(&self, time: f32) -> Vec<TimeLines> {
+        let line = |level: &Level, plane: &FeaturePlane| {
             let Tap { low, high, fraction } = tap(time, plane.size_b);
             let row =
                 |b: u32| &plane.texels[b as usize * plane.size_a * level.channels..][..plane.size_a * level.channels];
@@ -236,14 +236,14 @@ impl Planes {
     pub(super) fn features(
         &self,
         prepared: &PreparedPlanes,
-        lines: &[Lines],
+        lines: &[TimeLines],
         start: usize,
         lanes: usize,
-        out: &mut Vec<Lanes>,
+        out: &mut Vec<CacheLine>,
     ) {
         let width = self.width();
         out.clear();
-        out.resize(width, Lanes([0.0; LANES]));
+        out.resize(width, CacheLine([0.0; LANES]));
         let product = &prepared.product[start * width..][..lanes * width];
         let taps = &prepared.taps[start * 3 * self.levels.len()..];
         let rows = product.chunks_exact(width).zip(taps.chunks_exact(3 * self.levels.len()));

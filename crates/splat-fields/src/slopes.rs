@@ -4,8 +4,8 @@
 //! as much for each axis. A feature is a product of six samples, so each derivative is a sample's times the other five.
 //! What lies outside the box along an axis is clipped and does not change with it. Memory: the stack.
 
-use super::linear::{LANES, Lanes};
-use super::planes::{Lines, Plane, Planes, SPATIAL, tap, texels};
+use super::linear::{CacheLine, LANES};
+use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, tap, texels};
 
 /// Texels per unit of normalised coordinate `u` on `size` of them; 0 where [`tap`] clips it.
 fn texels_per_unit(u: f32, size: usize) -> f32 {
@@ -39,7 +39,7 @@ struct Patch<'a> {
 
 impl<'a> Patch<'a> {
     #[inline(always)]
-    fn new(plane: &'a Plane, [a, b]: [f32; 2], channels: usize) -> Self {
+    fn new(plane: &'a FeaturePlane, [a, b]: [f32; 2], channels: usize) -> Self {
         let (tap_a, tap_b) = (tap(a, plane.size_a), tap(b, plane.size_b));
         let corner = |a, b| plane.texel(a, b, channels);
         let at_low = [corner(tap_a.low, tap_b.low), corner(tap_a.high, tap_b.low)];
@@ -96,13 +96,13 @@ impl Planes {
     pub(super) fn sloped(
         &self,
         [x, y, z]: [&[f32]; 3],
-        lines: &[Lines],
-        features: &mut Vec<Lanes>,
-        slopes: &mut [Vec<Lanes>; 3],
+        lines: &[TimeLines],
+        features: &mut Vec<CacheLine>,
+        slopes: &mut [Vec<CacheLine>; 3],
     ) {
         let width = self.width();
         for out in slopes.iter_mut().chain([&mut *features]) {
-            out.resize(width, Lanes([0.0; LANES]));
+            out.resize(width, CacheLine([0.0; LANES]));
         }
         for (lane, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
             let u = self.space.normalised([x, y, z]);

@@ -1,7 +1,7 @@
 //! Front-to-back blending of one tile, groups of eight pixels at a time.
 //!
 //! Data in: the tile's splats, nearest first. Data out: each pixel's transmittance, and whatever an
-//! [`Ink`] makes of the weights alpha · transmittance. Memory: a tile's pixels and the rows of [`AHEAD`] splats, in the
+//! [`BlendSink`] makes of the weights alpha · transmittance. Memory: a tile's pixels and the rows of [`AHEAD`] splats, in the
 //! first-level cache. `benches/render.rs` measures how far it is from what the arithmetic alone would take.
 
 use super::convention::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
@@ -16,21 +16,21 @@ pub(super) const GROUPS: usize = SIDE * SIDE / LANES;
 const EVEN: u32 = 0x5555_5555;
 
 /// One f32 per sampled pixel of a tile.
-pub(super) type Plane = Aligned<[[f32; LANES]; GROUPS]>;
+pub(super) type TilePlane = Aligned<[[f32; LANES]; GROUPS]>;
 
 /// One f32 per row or column of a tile.
-type Line = Aligned<[[f32; LANES]; SIDE / LANES]>;
+type TileLine = Aligned<[[f32; LANES]; SIDE / LANES]>;
 
 /// The pixels of a tile that are sampled: every `stride`-th of the picture each way.
 ///
 /// Samples are packed towards the tile's corner, so that a stride leaves fewer groups, not emptier ones.
-pub(super) struct Lattice {
+pub(super) struct SampledPixels {
     /// Corner of the tile, pixels.
     x0: f64,
     y0: f64,
     /// Offsets of the sampled columns and rows from the corner, pixels.
-    xs: Line,
-    ys: Line,
+    xs: TileLine,
+    ys: TileLine,
     /// First and last sampled offset of either half of `xs`.
     spans: [[f32; 2]; SIDE / LANES],
     /// Number of sampled columns and rows.
@@ -38,7 +38,7 @@ pub(super) struct Lattice {
     down: usize,
 }
 
-impl Lattice {
+impl SampledPixels {
     /// The lattice of tile (`tile[0]`, `tile[1]`) in a picture of `size` = (width, height).
     pub(super) fn new(tile: [u32; 2], size: [u32; 2], stride: u32) -> Self {
         let (xs, across) = samples(tile[0] * TILE, size[0], stride);
@@ -48,7 +48,7 @@ impl Lattice {
             [xs[half][0], xs.as_flattened()[last]]
         });
         let corner = [f64::from(tile[0] * TILE), f64::from(tile[1] * TILE)];
-        Lattice { x0: corner[0], y0: corner[1], xs, ys, spans, across, down }
+        SampledPixels { x0: corner[0], y0: corner[1], xs, ys, spans, across, down }
     }
 
     /// Bits of the groups that hold a sampled pixel.
@@ -58,7 +58,7 @@ impl Lattice {
     }
 
     /// Transmittance before any splat: 1, negative (ended) where no pixel is sampled.
-    fn clear(&self) -> Plane {
+    fn clear(&self) -> TilePlane {
         let sampled = |group: usize, lane| group / SIDE * LANES + lane < self.across && group % SIDE < self.down;
         let of = |group| std::array::from_fn(|lane| if sampled(group, lane) { 1.0 } else { -1.0 });
         Aligned(std::array::from_fn(of))
@@ -66,8 +66,8 @@ impl Lattice {
 }
 
 /// Offsets from `start` of the samples among the tile's pixels, and how many there are.
-fn samples(start: u32, size: u32, stride: u32) -> (Line, usize) {
-    let mut offsets = Line::default();
+fn samples(start: u32, size: u32, stride: u32) -> (TileLine, usize) {
+    let mut offsets = TileLine::default();
     let mut count = 0;
     for offset in 0..TILE.min(size - start) {
         if (start + offset) % stride == stride / 2 {
@@ -80,7 +80,7 @@ fn samples(start: u32, size: u32, stride: u32) -> (Line, usize) {
 
 /// One splat in one vector of pixels.
 #[derive(Clone, Copy)]
-pub(super) struct Stroke<V: Lanes> {
+pub(super) struct Fragment<V: Lanes> {
     /// Cut at 0.99.
     pub(super) alpha: V,
     /// Mask of the pixels where it is blended.
@@ -96,14 +96,14 @@ pub(super) struct Stroke<V: Lanes> {
 }
 
 /// What becomes of the weights alpha · transmittance.
-pub(super) trait Ink {
+pub(super) trait BlendSink {
     /// What it holds of one splat while that is drawn.
     type Drop<V: Lanes>: Copy;
     /// The next splat.
     fn begin<V: Lanes>(&self, splat: &Splat) -> Self::Drop<V>;
     /// What it does to `group` and, of a vector of more than one, those after it.
-    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, stroke: Stroke<V>) -> Self::Drop<V>;
-    /// Whether all even groups are to come before the odd ones, with [`Ink::turn`] after either.
+    fn add<V: Lanes>(&mut self, drop: Self::Drop<V>, group: usize, stroke: Fragment<V>) -> Self::Drop<V>;
+    /// Whether all even groups are to come before the odd ones, with [`BlendSink::turn`] after either.
     const TURNS: bool = false;
     /// What [`Lanes`] of one group do between the even and the odd ones, and once more in the end.
     #[inline(always)]
@@ -116,17 +116,17 @@ pub(super) trait Ink {
 
 /// Accumulates colour: three planes.
 pub(super) struct Colour {
-    pub(super) planes: [Plane; 3],
+    pub(super) planes: [TilePlane; 3],
 }
 
-impl Ink for Colour {
+impl BlendSink for Colour {
     type Drop<V: Lanes> = [V; 3];
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> [V; 3] {
         [V::splat(splat.colour[0]), V::splat(splat.colour[1]), V::splat(splat.colour[2])]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, Stroke { weight, .. }: Stroke<V>) -> [V; 3] {
+    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, Fragment { weight, .. }: Fragment<V>) -> [V; 3] {
         for (plane, colour) in self.planes.iter_mut().zip(colour) {
             V::load(plane, group).add(colour.mul(weight)).store(plane, group);
         }
@@ -150,7 +150,7 @@ pub(super) struct Weights<'a> {
     pub(super) pairs: &'a mut [Weight],
 }
 
-impl Ink for Weights<'_> {
+impl BlendSink for Weights<'_> {
     /// Sum and largest.
     type Drop<V: Lanes> = (V::Sums, V);
     #[inline(always)]
@@ -158,7 +158,7 @@ impl Ink for Weights<'_> {
         (V::Sums::zero(), V::splat(0.0))
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, (sum, max): (V::Sums, V), _: usize, stroke: Stroke<V>) -> (V::Sums, V) {
+    fn add<V: Lanes>(&mut self, (sum, max): (V::Sums, V), _: usize, stroke: Fragment<V>) -> (V::Sums, V) {
         (stroke.weight.add_to(sum), max.max(stroke.weight))
     }
     #[inline(always)]
@@ -212,13 +212,24 @@ impl Blend {
 
     /// Blends the splats `pairs` front to back over the lattice; gives the transmittance left, its sign
     /// set where the pixel ended early.
-    pub(super) fn tile(self, splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
+    pub(super) fn tile(
+        self,
+        splats: &[Splat],
+        pairs: &[u32],
+        lattice: &SampledPixels,
+        ink: &mut impl BlendSink,
+    ) -> TilePlane {
         match self {
             Blend::Portable => blend::<Portable, _>(splats, pairs, lattice, ink),
             #[cfg(target_arch = "x86_64")]
             Blend::Avx2 => {
                 #[target_feature(enable = "avx2")]
-                fn blend_avx2(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
+                fn blend_avx2(
+                    splats: &[Splat],
+                    pairs: &[u32],
+                    lattice: &SampledPixels,
+                    ink: &mut impl BlendSink,
+                ) -> TilePlane {
                     blend::<super::lanes::Avx2, _>(splats, pairs, lattice, ink)
                 }
                 // SAFETY: `Blend::Avx2` is made by `all` alone, after AVX2 was detected.
@@ -227,7 +238,12 @@ impl Blend {
             #[cfg(target_arch = "x86_64")]
             Blend::Avx512 => {
                 #[target_feature(enable = "avx2,avx512f,avx512dq,avx512vl")]
-                fn blend_avx512(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut impl Ink) -> Plane {
+                fn blend_avx512(
+                    splats: &[Splat],
+                    pairs: &[u32],
+                    lattice: &SampledPixels,
+                    ink: &mut impl BlendSink,
+                ) -> TilePlane {
                     blend::<super::lanes::Avx512, _>(splats, pairs, lattice, ink)
                 }
                 // SAFETY: `Blend::Avx512` is made by `all` alone, after these were detected.
@@ -250,13 +266,13 @@ struct Crossing {
     groups: u32,
     /// Centre, pixels below the tile's corner.
     v: f32,
-    middles: Line,
-    levels: Line,
+    middles: TileLine,
+    levels: TileLine,
 }
 
 impl Crossing {
     #[inline(always)]
-    fn new<V: Lanes>(splat: &Splat, pair: usize, lattice: &Lattice) -> Self {
+    fn new<V: Lanes>(splat: &Splat, pair: usize, lattice: &SampledPixels) -> Self {
         // Relative to the tile's corner, f32 keeps a millionth of a pixel wherever the tile lies.
         let (u, v) = ((splat.u - lattice.x0) as f32, (splat.v - lattice.y0) as f32);
         let mut crossing = Crossing { pair, v, ..Crossing::default() };
@@ -280,14 +296,14 @@ impl Crossing {
 }
 
 #[inline(always)]
-fn blend<V: Lanes, I: Ink>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, ink: &mut I) -> Plane {
+fn blend<V: Lanes, I: BlendSink>(splats: &[Splat], pairs: &[u32], lattice: &SampledPixels, ink: &mut I) -> TilePlane {
     let xs = lattice.xs.each_ref().map(V::repeat);
     // Of groups, those that share a vector; a vector is named by its first.
     let vectors =
         |groups: u32| (0..V::GROUPS).fold(0, |all, k| all | groups >> k) & (u32::MAX / ((1 << V::GROUPS) - 1));
     let mut transmittance = lattice.clear();
     let mut live = vectors(lattice.groups());
-    let mut alphas = Plane::default();
+    let mut alphas = TilePlane::default();
     let mut crossings = [Crossing::default(); AHEAD];
     for (chunk, ahead) in pairs.chunks(AHEAD).enumerate() {
         for &index in pairs.get((chunk + 1) * AHEAD..).unwrap_or_default().iter().take(AHEAD) {
@@ -333,7 +349,7 @@ fn blend<V: Lanes, I: Ink>(splats: &[Splat], pairs: &[u32], lattice: &Lattice, i
                     ended |= u32::from(left.all_negative()) << group;
                     let across = xs[group / SIDE].sub(V::spread(&crossing.middles, row));
                     let down = V::spread(&lattice.ys, row).sub(V::splat(crossing.v));
-                    drop = ink.add::<V>(drop, group, Stroke { alpha, blended, weight, left, across, down });
+                    drop = ink.add::<V>(drop, group, Fragment { alpha, blended, weight, left, across, down });
                 }
                 drop = ink.turn::<V>(drop);
             }

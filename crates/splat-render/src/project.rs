@@ -26,7 +26,7 @@ const LEAST_LOGIT: f32 = -6.0;
 const REACH_SLACK: f64 = 1e-3;
 
 /// What of a camera the projection needs.
-pub(super) struct View {
+pub(super) struct CameraTerms {
     /// Rows of the rotation from world to camera.
     pub(super) rotation: [[f64; 3]; 3],
     translation: [f64; 3],
@@ -42,10 +42,10 @@ pub(super) struct View {
     near: f64,
 }
 
-impl View {
+impl CameraTerms {
     pub(super) fn new(camera: &Camera) -> Self {
         let rows = camera.rotation.transpose();
-        View {
+        CameraTerms {
             rotation: [rows.x_axis.to_array(), rows.y_axis.to_array(), rows.z_axis.to_array()],
             translation: camera.translation.to_array(),
             focal: [camera.fx, camera.fy],
@@ -119,12 +119,18 @@ impl Splats {
 /// Appends the visible Gaussians of `ids` to `out`; with `coloured`, their colours too (else black).
 ///
 /// A Gaussian with a value that is not finite is not visible.
-pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, coloured: bool, out: &mut Splats) {
     #[cfg(target_arch = "x86_64")]
     {
         /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
         #[target_feature(enable = "avx2")]
-        fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+        fn project_avx2(
+            gaussians: &Gaussians,
+            ids: Range<usize>,
+            view: &CameraTerms,
+            coloured: bool,
+            out: &mut Splats,
+        ) {
             project_blocks(gaussians, ids, view, coloured, out);
         }
         if is_x86_feature_detected!("avx2") {
@@ -136,11 +142,11 @@ pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &View, col
 }
 
 #[inline(always)]
-fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloured: bool, out: &mut Splats) {
+fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, coloured: bool, out: &mut Splats) {
     // Room for all at once: growing would copy, and room that is never written takes no memory.
     out.splats.reserve_exact(ids.len());
     out.rects.reserve_exact(ids.len());
-    let mut footprints = Footprints::default();
+    let mut footprints = ProjectedSplats::default();
     let mut colours: Colours = [[0.0; BLOCK]; 3];
     for start in ids.clone().step_by(BLOCK) {
         let block = start..(start + BLOCK).min(ids.end);
@@ -167,7 +173,7 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &View, coloure
 }
 
 /// Projected quantities of one block.
-struct Footprints {
+struct ProjectedSplats {
     depth: [f64; BLOCK],
     order: [f32; BLOCK],
     u: [f64; BLOCK],
@@ -184,10 +190,10 @@ struct Footprints {
     opacity: [f64; BLOCK],
 }
 
-impl Default for Footprints {
+impl Default for ProjectedSplats {
     fn default() -> Self {
         let zero = [0.0; BLOCK];
-        Footprints {
+        ProjectedSplats {
             depth: zero,
             order: [0.0; BLOCK],
             u: zero,
@@ -203,10 +209,10 @@ impl Default for Footprints {
     }
 }
 
-impl Footprints {
+impl ProjectedSplats {
     /// Projects every Gaussian of the block, visible or not: without branches the loop runs in vectors.
     #[inline(always)]
-    fn fill(&mut self, gaussians: &Gaussians, block: Range<usize>, view: &View) {
+    fn fill(&mut self, gaussians: &Gaussians, block: Range<usize>, view: &CameraTerms) {
         let n = block.len().min(BLOCK);
         let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[block.clone()][..n]);
         let rotation: [&[f32]; 4] = std::array::from_fn(|c| &gaussians.rotation.plane(c)[block.clone()][..n]);
@@ -218,7 +224,7 @@ impl Footprints {
             let p: [f64; 3] = [position[0][i].into(), position[1][i].into(), position[2][i].into()];
             let q: [f64; 4] =
                 [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()];
-            let shape = Shape::new(p, q, [log_scale[0][i], log_scale[1][i], log_scale[2][i]], view);
+            let shape = ProjectedShape::new(p, q, [log_scale[0][i], log_scale[1][i], log_scale[2][i]], view);
             let Covariance { xx, xy, yy, det } = shape.covariance();
             // m² − det of the dilated covariance, written as a sum of squares.
             let spread = 0.25 * (xx - yy) * (xx - yy) + xy * xy;
@@ -239,7 +245,7 @@ impl Footprints {
 
     /// The footprint of Gaussian `i` of the block, or none when it cannot change any pixel.
     #[inline(always)]
-    fn splat(&self, i: usize, id: u32, view: &View) -> Option<(Splat, TileRect)> {
+    fn splat(&self, i: usize, id: u32, view: &CameraTerms) -> Option<(Splat, TileRect)> {
         let (depth, u, v, opacity) = (self.depth[i], self.u[i], self.v[i], self.opacity[i]);
         let finite = depth.is_finite() && u.is_finite() && v.is_finite() && self.narrow[i].is_finite();
         if !(depth > view.near && finite && opacity >= f64::from(MIN_ALPHA)) {
@@ -270,7 +276,7 @@ impl Footprints {
 }
 
 /// How a camera sees the axes of one Gaussian.
-pub(super) struct Shape {
+pub(super) struct ProjectedShape {
     /// View depth, scene units.
     pub(super) depth: f64,
     /// x / depth and y / depth in camera axes.
@@ -292,10 +298,10 @@ pub(super) struct Covariance {
     pub(super) det: f64,
 }
 
-impl Shape {
+impl ProjectedShape {
     /// Of a Gaussian at `p` with wxyz quaternion `q`.
     #[inline(always)]
-    pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &View) -> Self {
+    pub(super) fn new(p: [f64; 3], q: [f64; 4], log_scale: [f32; 3], view: &CameraTerms) -> Self {
         let [r0, r1, r2] = view.rotation;
         let [t0, t1, t2] = view.translation;
         let z = dot(r2, p) + t2;
@@ -315,7 +321,7 @@ impl Shape {
             [dot(to_u, axes[0]) * s[0], dot(to_u, axes[1]) * s[1], dot(to_u, axes[2]) * s[2]],
             [dot(to_v, axes[0]) * s[0], dot(to_v, axes[1]) * s[1], dot(to_v, axes[2]) * s[2]],
         ];
-        Shape { depth: z, slopes, to: [to_u, to_v], axes, scale: s, spread }
+        ProjectedShape { depth: z, slopes, to: [to_u, to_v], axes, scale: s, spread }
     }
 
     #[inline(always)]

@@ -7,7 +7,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::blend::{Ink, Plane, Stroke};
+use super::blend::{BlendSink, Fragment, TilePlane};
 use super::lanes::{Lanes, Sums};
 use super::project::Splat;
 
@@ -82,13 +82,13 @@ impl RemovalError {
 /// Sums squared changes over the pixels of a tile.
 pub(super) struct Removal<'a> {
     /// Colours of the pixels; of what is drawn so far, each takes its part away.
-    pub(super) rest: [Plane; 3],
+    pub(super) rest: [TilePlane; 3],
     pub(super) contrast_floor: f32,
     /// One per pair of the tile.
     pub(super) pairs: &'a mut [f32],
 }
 
-impl Ink for Removal<'_> {
+impl BlendSink for Removal<'_> {
     /// Colour and sum.
     type Drop<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
@@ -100,9 +100,9 @@ impl Ink for Removal<'_> {
         &mut self,
         (colour, sum): ([V; 3], V::Sums),
         group: usize,
-        stroke: Stroke<V>,
+        stroke: Fragment<V>,
     ) -> ([V; 3], V::Sums) {
-        let Stroke { weight, left, .. } = stroke;
+        let Fragment { weight, left, .. } = stroke;
         // What lies behind shows with transmittance `left`, and `weight` more without this splat.
         let gain = weight.div(left);
         let floor = weight.mul(V::splat(self.contrast_floor));

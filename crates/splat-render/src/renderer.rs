@@ -5,13 +5,13 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::backward::sums::Taken;
+use super::backward::sums::ImageGradientSums;
 use super::bin::{Bins, STRIP_PAIRS};
-use super::blend::{Blend, Colour, Lattice, Plane, Weight, Weights};
+use super::blend::{Blend, Colour, SampledPixels, TilePlane, Weight, Weights};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
 use super::lanes::LANES;
-use super::project::{Splat, Splats, TileRect, View, project};
+use super::project::{CameraTerms, Splat, Splats, TileRect, project};
 use super::removal::{Removal, RemovalError};
 use splat_core::{Camera, Gaussians};
 
@@ -81,7 +81,7 @@ pub struct Renderer {
     pub(super) splats: Splats,
     pub(super) bins: Bins,
     weights: Vec<Weight>,
-    pub(super) taken: Taken,
+    pub(super) taken: ImageGradientSums,
     /// Pairs of splats and tiles that lie ready at a time.
     pub(super) strip_pairs: usize,
 }
@@ -110,20 +110,20 @@ impl Renderer {
             splats: Splats::default(),
             bins: Bins::default(),
             weights: Vec::new(),
-            taken: Taken::default(),
+            taken: ImageGradientSums::default(),
             strip_pairs: STRIP_PAIRS,
         }
     }
 
     /// As the function [`render`].
     pub fn render(&mut self, gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> Image {
-        let view = View::new(camera);
+        let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
         self.picture(&view, background)
     }
 
     /// The picture of what is prepared.
-    pub(super) fn picture(&mut self, view: &View, background: [f32; 3]) -> Image {
+    pub(super) fn picture(&mut self, view: &CameraTerms, background: [f32; 3]) -> Image {
         let [width, height] = view.size;
         let row_len = width as usize * 3;
         let mut data = vec![0.0; row_len * height as usize];
@@ -134,7 +134,7 @@ impl Renderer {
             let first = bins.rows(strip.clone()).next().map_or(0, |(y, _)| y);
             let paint_row = |((y, tiles), rows): ((usize, Range<usize>), &mut [f32])| {
                 for x in tiles {
-                    let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
+                    let lattice = SampledPixels::new([x as u32, y as u32], view.size, 1);
                     let pairs = bins.pairs_of(y, x..x + 1);
                     let planes = paint(blend, splats, pairs, &lattice, background);
                     for (v, row) in rows.chunks_exact_mut(row_len).enumerate() {
@@ -171,12 +171,12 @@ impl Renderer {
         seen: &mut Contribution,
     ) {
         assert_eq!(seen.len(), gaussians.len(), "contribution of another model");
-        let view = View::new(camera);
+        let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, false);
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             fill_pairs(bins, strip.clone(), self.parallel, &mut self.weights, |tile, pairs, weights| {
-                let lattice = Lattice::new(tile, view.size, stride.get());
+                let lattice = SampledPixels::new(tile, view.size, stride.get());
                 blend.tile(splats, pairs, &lattice, &mut Weights { pairs: weights });
             });
             for (&splat, weight) in bins.pairs(strip).iter().zip(&self.weights) {
@@ -199,14 +199,14 @@ impl Renderer {
         errors: &mut RemovalError,
     ) {
         assert_eq!(errors.len(), gaussians.len(), "errors of another model");
-        let view = View::new(camera);
+        let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
         let mut sums = Vec::new();
         while let Some(strip) = self.bins.next_strip(&self.splats, self.strip_pairs) {
             let (bins, splats) = (&self.bins, &self.splats.splats);
             for (y, x) in bins.rows(strip).flat_map(|(y, tiles)| tiles.map(move |x| (y, x))) {
                 let pairs = bins.pairs_of(y, x..x + 1);
-                let lattice = Lattice::new([x as u32, y as u32], view.size, 1);
+                let lattice = SampledPixels::new([x as u32, y as u32], view.size, 1);
                 let rest = paint(self.blend, splats, pairs, &lattice, background);
                 sums.clear();
                 sums.resize(pairs.len(), 0.0);
@@ -220,7 +220,7 @@ impl Renderer {
     }
 
     /// Projects and sorts.
-    pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &View, coloured: bool) {
+    pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, coloured: bool) {
         let count = gaussians.len();
         self.splats.clear();
         if self.parallel {
@@ -274,8 +274,14 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
 }
 
 /// The colours of one tile's sampled pixels.
-fn paint(blend: Blend, splats: &[Splat], pairs: &[u32], lattice: &Lattice, background: [f32; 3]) -> [Plane; 3] {
-    let mut colour = Colour { planes: [Plane::default(); 3] };
+fn paint(
+    blend: Blend,
+    splats: &[Splat],
+    pairs: &[u32],
+    lattice: &SampledPixels,
+    background: [f32; 3],
+) -> [TilePlane; 3] {
+    let mut colour = Colour { planes: [TilePlane::default(); 3] };
     let left = blend.tile(splats, pairs, lattice, &mut colour);
     for (plane, background) in colour.planes.iter_mut().zip(background) {
         for (pixel, left) in plane.as_flattened_mut().iter_mut().zip(left.as_flattened()) {
@@ -344,7 +350,7 @@ mod tests {
         let whole = made(Renderer::new());
         let (scene, camera) = scene();
         let mut renderer = Renderer::new();
-        renderer.prepare(&scene, &View::new(&camera), true);
+        renderer.prepare(&scene, &CameraTerms::new(&camera), true);
         let tiles = renderer.bins.next_strip(&renderer.splats, usize::MAX).unwrap();
         let pairs = renderer.bins.pairs(0..7 * 5).len();
         assert_eq!(tiles, 0..7 * 5);

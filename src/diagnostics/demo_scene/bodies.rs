@@ -10,7 +10,7 @@ use crate::model::SH_C0;
 
 /// A kind of thing in the demo scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Body {
+pub enum DemoBody {
     /// Floor and three walls with a chequered texture. Still; inside a tile all of one colour, so
     /// neighbours can merge.
     Wall,
@@ -37,55 +37,55 @@ pub enum Body {
     Wire,
 }
 
-impl Body {
+impl DemoBody {
     /// Every body, in the order of their Gaussians.
-    pub const ALL: [Body; 9] = [
-        Body::Wall,
-        Body::Double,
-        Body::Buried,
-        Body::Dust,
-        Body::Egg,
-        Body::Cloth,
-        Body::Fading,
-        Body::Spark,
-        Body::Wire,
+    pub const ALL: [DemoBody; 9] = [
+        DemoBody::Wall,
+        DemoBody::Double,
+        DemoBody::Buried,
+        DemoBody::Dust,
+        DemoBody::Egg,
+        DemoBody::Cloth,
+        DemoBody::Fading,
+        DemoBody::Spark,
+        DemoBody::Wire,
     ];
 
     /// Its name, for tables.
     pub const fn name(self) -> &'static str {
         match self {
-            Body::Wall => "wall",
-            Body::Double => "double",
-            Body::Buried => "buried",
-            Body::Dust => "dust",
-            Body::Egg => "egg",
-            Body::Cloth => "cloth",
-            Body::Fading => "fading",
-            Body::Spark => "spark",
-            Body::Wire => "wire",
+            DemoBody::Wall => "wall",
+            DemoBody::Double => "double",
+            DemoBody::Buried => "buried",
+            DemoBody::Dust => "dust",
+            DemoBody::Egg => "egg",
+            DemoBody::Cloth => "cloth",
+            DemoBody::Fading => "fading",
+            DemoBody::Spark => "spark",
+            DemoBody::Wire => "wire",
         }
     }
 
     /// Parts of a thousand Gaussians.
     const fn share(self) -> usize {
         match self {
-            Body::Wall => 400,
-            Body::Double => 150,
-            Body::Egg => 100,
-            Body::Buried | Body::Dust | Body::Cloth => 80,
-            Body::Fading | Body::Wire => 40,
-            Body::Spark => 30,
+            DemoBody::Wall => 400,
+            DemoBody::Double => 150,
+            DemoBody::Egg => 100,
+            DemoBody::Buried | DemoBody::Dust | DemoBody::Cloth => 80,
+            DemoBody::Fading | DemoBody::Wire => 40,
+            DemoBody::Spark => 30,
         }
     }
 }
 
 /// A Gaussian's constants and its law of motion.
 #[derive(Debug, Clone)]
-pub(super) struct Part {
+pub(super) struct DemoGaussian {
     position: DVec3,
     rotation: DQuat,
     opacity_logit: f64,
-    motion: Motion,
+    motion: DemoMotion,
     pub(super) log_scale: [f32; 3],
     pub(super) sh: [f32; 12],
 }
@@ -99,7 +99,7 @@ pub(super) struct Moved {
 
 /// How a Gaussian moves; times run from 0 to 1.
 #[derive(Debug, Clone)]
-enum Motion {
+enum DemoMotion {
     Still,
     /// `position` and `rotation` are those in the egg's own frame.
     Egg,
@@ -134,26 +134,26 @@ const BRIGHT: f64 = 3.0;
 const HALF_LIFE: f64 = 1.0 / 16.0;
 const GRAVITY: f64 = 12.0;
 
-impl Part {
+impl DemoGaussian {
     /// The Gaussian at `time`.
     pub(super) fn at(&self, time: f64) -> Moved {
-        let Part { mut position, mut rotation, mut opacity_logit, .. } = *self;
+        let DemoGaussian { mut position, mut rotation, mut opacity_logit, .. } = *self;
         match self.motion {
-            Motion::Still => {}
-            Motion::Egg => {
+            DemoMotion::Still => {}
+            DemoMotion::Egg => {
                 let (sin, cos) = (0.75 * TAU * time).sin_cos();
                 let spin = DQuat::from_axis_angle(DVec3::new(1.0, 1.0, 3.0).normalize(), TAU * time);
                 position = DVec3::new(0.6 * cos, 0.2 + 0.4 * sin, 0.7) + spin * position;
                 rotation = spin * rotation;
             }
-            Motion::Wave { along } => {
+            DemoMotion::Wave { along } => {
                 let (sin, cos) = (TAU * (WAVES * along - PASSES * time)).sin_cos();
                 position.y += SWING * along * sin;
                 let slope = SWING * (sin + along * TAU * WAVES * cos) / CLOTH_WIDTH;
                 rotation = DQuat::from_rotation_z(slope.atan()) * rotation;
             }
-            Motion::Fade { rate } => opacity_logit += rate * time,
-            Motion::Spark { peak, half_life, velocity } => {
+            DemoMotion::Fade { rate } => opacity_logit += rate * time,
+            DemoMotion::Spark { peak, half_life, velocity } => {
                 let away = (time - peak) / half_life;
                 opacity_logit = BRIGHT + (GONE - BRIGHT) * (away * away).min(1.5);
                 let flown = (time - (peak - half_life)).clamp(0.0, 2.0 * half_life);
@@ -166,51 +166,51 @@ impl Part {
 
 /// Which Gaussian belongs to which body.
 #[derive(Debug, Clone)]
-pub(super) struct Layout {
+pub(super) struct BodyLayout {
     /// Where each body starts, and where the last ends.
-    starts: [usize; Body::ALL.len() + 1],
+    starts: [usize; DemoBody::ALL.len() + 1],
 }
 
-impl Layout {
-    pub(super) fn new(count: usize) -> Layout {
-        let mut starts = [0; Body::ALL.len() + 1];
+impl BodyLayout {
+    pub(super) fn new(count: usize) -> BodyLayout {
+        let mut starts = [0; DemoBody::ALL.len() + 1];
         let mut share = 0;
-        for (start, body) in starts[1..].iter_mut().zip(Body::ALL) {
+        for (start, body) in starts[1..].iter_mut().zip(DemoBody::ALL) {
             share += body.share();
             *start = (count as u128 * share as u128 / 1000) as usize;
         }
-        Layout { starts }
+        BodyLayout { starts }
     }
 
-    pub(super) fn members(&self, body: Body) -> Range<usize> {
+    pub(super) fn members(&self, body: DemoBody) -> Range<usize> {
         let at = body as usize;
         self.starts[at]..self.starts[at + 1]
     }
 
     /// Gaussian `id`, less than the count.
-    pub(super) fn part(&self, id: usize) -> Part {
-        let body = Body::ALL[self.starts.partition_point(|&start| start <= id) - 1];
+    pub(super) fn part(&self, id: usize) -> DemoGaussian {
+        let body = DemoBody::ALL[self.starts.partition_point(|&start| start <= id) - 1];
         let members = self.members(body);
-        let dice = Dice(id as u64);
+        let dice = GaussianRandom(id as u64);
         let (k, n) = (id - members.start, members.len());
         match body {
-            Body::Wall => wall(k, n, dice),
-            Body::Double => self.double(k, n, dice),
-            Body::Buried => buried(dice),
-            Body::Dust => dust(dice),
-            Body::Egg => egg(k, n, dice),
-            Body::Cloth => cloth(k, n, dice),
-            Body::Fading => fading(dice),
-            Body::Spark => spark(dice),
-            Body::Wire => wire(k, n, dice),
+            DemoBody::Wall => wall(k, n, dice),
+            DemoBody::Double => self.double(k, n, dice),
+            DemoBody::Buried => buried(dice),
+            DemoBody::Dust => dust(dice),
+            DemoBody::Egg => egg(k, n, dice),
+            DemoBody::Cloth => cloth(k, n, dice),
+            DemoBody::Fading => fading(dice),
+            DemoBody::Spark => spark(dice),
+            DemoBody::Wire => wire(k, n, dice),
         }
     }
 
-    fn double(&self, k: usize, n: usize, dice: Dice) -> Part {
-        let walls = self.members(Body::Wall);
+    fn double(&self, k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
+        let walls = self.members(DemoBody::Wall);
         // A scene of two Gaussians has a double and no wall.
         let original = (k as u128 * walls.len() as u128 / n as u128) as usize;
-        let mut part = wall(original, walls.len().max(1), Dice((walls.start + original) as u64));
+        let mut part = wall(original, walls.len().max(1), GaussianRandom((walls.start + original) as u64));
         let size = f64::from(part.log_scale[0]).exp();
         part.position += part.rotation * DVec3::new(dice.signed(0), dice.signed(1), 0.0) * (0.1 * size);
         part.log_scale = part.log_scale.map(|x| x - 0.1);
@@ -221,9 +221,9 @@ impl Layout {
 
 /// Numbers that belong to one Gaussian: hashed from its id, so that no order of drawing matters.
 #[derive(Clone, Copy)]
-struct Dice(u64);
+struct GaussianRandom(u64);
 
-impl Dice {
+impl GaussianRandom {
     /// Number `channel`, from 0 to 1.
     fn unit(self, channel: u64) -> f64 {
         const BITS: u32 = f64::MANTISSA_DIGITS;
@@ -241,17 +241,17 @@ impl Dice {
     }
 }
 
-/// Channels of [`Dice`] that several bodies use: the bodies' own start at 0.
+/// Channels of [`GaussianRandom`] that several bodies use: the bodies' own start at 0.
 const TINT: u64 = 100;
 const SHEEN: u64 = 200;
 
-fn still(position: DVec3, rotation: DQuat, scale: [f64; 3], opacity_logit: f64, sh: [f32; 12]) -> Part {
+fn still(position: DVec3, rotation: DQuat, scale: [f64; 3], opacity_logit: f64, sh: [f32; 12]) -> DemoGaussian {
     let log_scale = scale.map(|s| s.ln() as f32);
-    Part { position, rotation, opacity_logit, motion: Motion::Still, log_scale, sh }
+    DemoGaussian { position, rotation, opacity_logit, motion: DemoMotion::Still, log_scale, sh }
 }
 
 /// Coefficients for a colour in [0, 1], with a tint of its own and a slight change with direction.
-fn color(rgb: [f64; 3], dice: Dice) -> [f32; 12] {
+fn color(rgb: [f64; 3], dice: GaussianRandom) -> [f32; 12] {
     std::array::from_fn(|at| match at {
         0..3 => ((rgb[at] + 0.02 * dice.signed(TINT) - 0.5) / SH_C0) as f32,
         _ => (0.04 * dice.signed(SHEEN + at as u64)) as f32,
@@ -271,7 +271,7 @@ fn facing_y() -> DQuat {
     DQuat::from_rotation_x(FRAC_PI_2)
 }
 
-fn wall(k: usize, n: usize, dice: Dice) -> Part {
+fn wall(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     /// Height of the walls and width of the room.
     const HIGH: f64 = 2.5;
     const WIDE: f64 = 4.0;
@@ -306,19 +306,19 @@ fn wall(k: usize, n: usize, dice: Dice) -> Part {
     )
 }
 
-fn buried(dice: Dice) -> Part {
+fn buried(dice: GaussianRandom) -> DemoGaussian {
     let position = DVec3::new(1.8 * dice.signed(0), dice.between(1, 2.3, 2.8), dice.between(2, 0.2, 2.2));
     let size = dice.between(3, 0.03, 0.06);
     still(position, facing_y(), [size, size, 0.5 * size], 3.0, color([0.9, 0.1, 0.9], dice))
 }
 
-fn dust(dice: Dice) -> Part {
+fn dust(dice: GaussianRandom) -> DemoGaussian {
     let position = DVec3::new(1.9 * dice.signed(0), 1.9 * dice.signed(1), dice.between(2, 0.1, 2.4));
     let size = dice.between(3, 0.002, 0.004);
     still(position, DQuat::IDENTITY, [size; 3], dice.between(4, -4.0, -1.0), color([0.7; 3], dice))
 }
 
-fn egg(k: usize, n: usize, dice: Dice) -> Part {
+fn egg(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     let axes = DVec3::new(0.3, 0.3, 0.42);
     let DVec2 { x: turn, y: height } = spread(k);
     let z = 2.0 * height - 1.0;
@@ -328,36 +328,37 @@ fn egg(k: usize, n: usize, dice: Dice) -> Part {
     let band = if (4.0 * turn).floor() % 2.0 == 0.0 { [0.95, 0.75, 0.2] } else { [0.2, 0.35, 0.8] };
     let rotation = DQuat::from_rotation_arc(DVec3::Z, (ball / axes).normalize());
     let scale = [size, size, 0.2 * size];
-    Part { motion: Motion::Egg, ..still(ball * axes, rotation, scale, 4.0, color(band, dice)) }
+    DemoGaussian { motion: DemoMotion::Egg, ..still(ball * axes, rotation, scale, 4.0, color(band, dice)) }
 }
 
-fn cloth(k: usize, n: usize, dice: Dice) -> Part {
+fn cloth(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     const HIGH: f64 = 1.1;
     let DVec2 { x: along, y: up } = spread(k);
     let position = DVec3::new(-1.6 + CLOTH_WIDTH * along, 1.0, 0.7 + HIGH * up);
     let size = 0.7 * (CLOTH_WIDTH * HIGH / n as f64).sqrt();
     let stripe = if (6.0 * up).floor() % 2.0 == 0.0 { [0.85, 0.85, 0.8] } else { [0.75, 0.15, 0.15] };
     let scale = [size, size, 0.1 * size];
-    Part { motion: Motion::Wave { along }, ..still(position, facing_y(), scale, 4.0, color(stripe, dice)) }
+    DemoGaussian { motion: DemoMotion::Wave { along }, ..still(position, facing_y(), scale, 4.0, color(stripe, dice)) }
 }
 
-fn fading(dice: Dice) -> Part {
+fn fading(dice: GaussianRandom) -> DemoGaussian {
     let position = DVec3::new(1.1, 0.8, 1.0) + 0.4 * DVec3::new(dice.signed(0), dice.signed(1), dice.signed(2));
     let size = dice.between(3, 0.03, 0.06);
     let (start, end) = if dice.unit(4) < 0.5 { (BRIGHT, GONE) } else { (GONE, BRIGHT) };
     let cloud = still(position, DQuat::IDENTITY, [size; 3], start, color([0.8, 0.8, 0.9], dice));
-    Part { motion: Motion::Fade { rate: end - start }, ..cloud }
+    DemoGaussian { motion: DemoMotion::Fade { rate: end - start }, ..cloud }
 }
 
-fn spark(dice: Dice) -> Part {
+fn spark(dice: GaussianRandom) -> DemoGaussian {
     let position = DVec3::new(0.9, -0.5, 0.1);
     let velocity = DVec3::new(2.0 * dice.signed(0), 2.0 * dice.signed(1), dice.between(2, 3.0, 5.0));
     // The peak lies where the whole life fits into the sequence.
-    let motion = Motion::Spark { peak: dice.between(3, HALF_LIFE, 1.0 - HALF_LIFE), half_life: HALF_LIFE, velocity };
-    Part { motion, ..still(position, DQuat::IDENTITY, [0.02; 3], BRIGHT, color([1.0, 0.8, 0.3], dice)) }
+    let motion =
+        DemoMotion::Spark { peak: dice.between(3, HALF_LIFE, 1.0 - HALF_LIFE), half_life: HALF_LIFE, velocity };
+    DemoGaussian { motion, ..still(position, DQuat::IDENTITY, [0.02; 3], BRIGHT, color([1.0, 0.8, 0.3], dice)) }
 }
 
-fn wire(k: usize, n: usize, dice: Dice) -> Part {
+fn wire(k: usize, n: usize, dice: GaussianRandom) -> DemoGaussian {
     const WIRES: usize = 4;
     const SPAN: f64 = 3.8;
     let (which, at) = (k % WIRES, k / WIRES);

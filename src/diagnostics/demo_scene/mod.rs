@@ -1,6 +1,6 @@
 //! A small dynamic scene made from nothing: for trying the program without files, and for tests.
 //!
-//! It holds what trained scenes hold and this program is about, each in a [`Body`] whose motion is
+//! It holds what trained scenes hold and this program is about, each in a [`DemoBody`] whose motion is
 //! known in closed form: a room with needless Gaussians in it, things that move rigidly and not,
 //! things that fade and flash, thin things. Every value is a function of the Gaussian's number, the
 //! scene's size and the time, so nothing is stored and any block can be read on its own.
@@ -19,9 +19,9 @@ use glam::DVec3;
 use crate::error::{Error, Result};
 use crate::model::{Camera, Columns, Gaussians, Rig, SequenceInfo, Shot, Split};
 use crate::source::{BlockReader, FrameSource, Ids};
-use bodies::{Layout, Part};
+use bodies::{BodyLayout, DemoGaussian};
 
-pub use bodies::Body;
+pub use bodies::DemoBody;
 
 /// Degree of the scene's spherical harmonics: view-dependent enough to exercise the code, small
 /// enough to keep the scene so.
@@ -47,7 +47,7 @@ const HELD_OUT: u32 = 2;
 /// ```
 #[derive(Debug, Clone)]
 pub struct Scene {
-    layout: Layout,
+    layout: BodyLayout,
     info: SequenceInfo,
 }
 
@@ -66,12 +66,12 @@ impl Scene {
             sh_degree: SH_DEGREE,
             varying: Columns::POSITION | Columns::ROTATION | Columns::OPACITY,
         };
-        Scene { layout: Layout::new(count), info }
+        Scene { layout: BodyLayout::new(count), info }
     }
 
     /// The Gaussians of a body, which are consecutive; bodies follow one another in the order of
-    /// [`Body::ALL`].
-    pub fn members(&self, body: Body) -> Range<usize> {
+    /// [`DemoBody::ALL`].
+    pub fn members(&self, body: DemoBody) -> Range<usize> {
         self.layout.members(body)
     }
 
@@ -114,7 +114,7 @@ impl FrameSource for Scene {
 
 struct Reader<'a> {
     times: &'a [f64],
-    parts: Vec<Part>,
+    parts: Vec<DemoGaussian>,
 }
 
 impl BlockReader for Reader<'_> {

@@ -12,7 +12,7 @@ fn frame(scene: &Scene, ids: Ids<'_>, frame: usize) -> Gaussians {
 }
 
 /// A body at every frame.
-fn film(scene: &Scene, body: Body) -> Vec<Gaussians> {
+fn film(scene: &Scene, body: DemoBody) -> Vec<Gaussians> {
     let members = scene.members(body);
     (0..scene.info().times.len()).map(|t| frame(scene, Ids::Range(members.clone()), t)).collect()
 }
@@ -67,7 +67,7 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
         let scene = Scene::new(count, frames);
         assert_eq!((scene.info().count, scene.info().times.len()), (count, frames));
         assert!(scene.info().times.is_sorted_by(|a, b| a < b));
-        assert_eq!(Body::ALL.iter().map(|&body| scene.members(body).len()).sum::<usize>(), count);
+        assert_eq!(DemoBody::ALL.iter().map(|&body| scene.members(body).len()).sum::<usize>(), count);
         for t in 0..frames {
             let state = frame(&scene, Ids::Range(0..count), t);
             for column in Columns::all().iter() {
@@ -84,22 +84,23 @@ fn scene_of_any_size_is_finite_with_unit_rotations() {
 #[test]
 fn still_bodies_do_not_change_by_a_bit_and_constant_columns_never_do() {
     let scene = usual();
-    for body in Body::ALL {
+    for body in DemoBody::ALL {
         let film = film(&scene, body);
-        let still = matches!(body, Body::Wall | Body::Double | Body::Buried | Body::Dust | Body::Wire);
+        let still =
+            matches!(body, DemoBody::Wall | DemoBody::Double | DemoBody::Buried | DemoBody::Dust | DemoBody::Wire);
         for column in Columns::all().iter() {
             let constant = film.iter().all(|state| bits(state.column(column)) == bits(film[0].column(column)));
             let must = still || !scene.info().varying.contains(column);
             assert!(constant || !must, "{body:?} {}", column.name());
         }
         let moves = film.iter().any(|state| state.position != film[0].position);
-        assert_eq!(moves, matches!(body, Body::Egg | Body::Cloth | Body::Spark), "{body:?}");
+        assert_eq!(moves, matches!(body, DemoBody::Egg | DemoBody::Cloth | DemoBody::Spark), "{body:?}");
     }
 }
 
 #[test]
 fn egg_moves_as_one_body() {
-    let film = film(&usual(), Body::Egg);
+    let film = film(&usual(), DemoBody::Egg);
     let n = film[0].len();
     let quaternion = |state: &Gaussians, i: usize| {
         let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
@@ -122,7 +123,7 @@ fn egg_moves_as_one_body() {
 
 #[test]
 fn cloth_is_held_at_one_edge_and_bends_at_the_other() {
-    let film = film(&usual(), Body::Cloth);
+    let film = film(&usual(), DemoBody::Cloth);
     let n = film[0].len();
     let sway = |i: usize| {
         let y = || film.iter().map(|state| f64::from(state.position.plane(1)[i]));
@@ -155,7 +156,7 @@ fn cloth_is_held_at_one_edge_and_bends_at_the_other() {
 
 #[test]
 fn fading_cloud_is_monotone_and_crosses_the_threshold_of_life() {
-    let film = film(&usual(), Body::Fading);
+    let film = film(&usual(), DemoBody::Fading);
     let mut both = [0, 0];
     for i in 0..film[0].len() {
         let series: Vec<f64> = film.iter().map(|state| opacity(state, i)).collect();
@@ -170,7 +171,7 @@ fn fading_cloud_is_monotone_and_crosses_the_threshold_of_life() {
 
 #[test]
 fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
-    let film = film(&usual(), Body::Spark);
+    let film = film(&usual(), DemoBody::Spark);
     let mut first = Vec::new();
     for i in 0..film[0].len() {
         let life: Vec<usize> = (0..film.len()).filter(|&t| opacity(&film[t], i) >= ALPHA_MIN).collect();
@@ -190,8 +191,8 @@ fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
 #[test]
 fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_colour() {
     let scene = usual();
-    let walls = frame(&scene, Ids::Range(scene.members(Body::Wall)), 0);
-    let doubles = frame(&scene, Ids::Range(scene.members(Body::Double)), 0);
+    let walls = frame(&scene, Ids::Range(scene.members(DemoBody::Wall)), 0);
+    let doubles = frame(&scene, Ids::Range(scene.members(DemoBody::Double)), 0);
     for i in 0..doubles.len() {
         let at = point(&doubles.position, i);
         let apart = |j: usize| (point(&walls.position, j) - at).length();
@@ -205,8 +206,8 @@ fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_colour() {
 #[test]
 fn wires_are_needles_and_dust_is_tiny() {
     let scene = usual();
-    let wires = frame(&scene, Ids::Range(scene.members(Body::Wire)), 0);
-    let dust = frame(&scene, Ids::Range(scene.members(Body::Dust)), 0);
+    let wires = frame(&scene, Ids::Range(scene.members(DemoBody::Wire)), 0);
+    let dust = frame(&scene, Ids::Range(scene.members(DemoBody::Dust)), 0);
     for i in 0..wires.len() {
         let [long, a, b] = wires.log_scale.row::<3>(i);
         assert!(((long - a).exp() - 25.0).abs() < 1e-3 && a == b);
@@ -220,7 +221,7 @@ fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
     let rig = scene.rig();
     assert_eq!((rig.cameras.len(), rig.schedule(&scene.info().times, None).unwrap().pairs()), (6, 6 * 48));
     assert_eq!(rig.schedule(&scene.info().times, Some(Split::Test)).unwrap().pairs(), 48);
-    for body in [Body::Egg, Body::Cloth, Body::Fading] {
+    for body in [DemoBody::Egg, DemoBody::Cloth, DemoBody::Fading] {
         let state = frame(&scene, Ids::Range(scene.members(body)), 24);
         for camera in &rig.cameras {
             for i in 0..state.len() {
@@ -230,7 +231,7 @@ fn every_camera_sees_the_moving_things_and_none_a_buried_one_before_the_wall() {
             }
         }
     }
-    let buried = frame(&scene, Ids::Range(scene.members(Body::Buried)), 0);
+    let buried = frame(&scene, Ids::Range(scene.members(DemoBody::Buried)), 0);
     for camera in &rig.cameras {
         for i in 0..buried.len() {
             let (eye, at) = (camera.center(), point(&buried.position, i));
@@ -265,5 +266,5 @@ fn what_the_scene_does_not_have_is_refused() {
 
 #[test]
 fn open_block_takes_the_memory_it_declares() {
-    assert!(size_of::<Part>() <= 192, "{}", size_of::<Part>());
+    assert!(size_of::<DemoGaussian>() <= 192, "{}", size_of::<DemoGaussian>());
 }

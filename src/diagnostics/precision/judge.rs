@@ -24,7 +24,7 @@ pub(super) struct Judge {
 
 /// How close something comes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Closeness {
+pub(super) struct JudgedQuality {
     /// Root mean square error over all pixels, channels and pictures, of colours from 0 to 1.
     pub(super) error: f64,
     /// Mean PSNR, dB.
@@ -59,21 +59,21 @@ impl Judge {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub(super) fn closeness(&self, scene: &Scene, kept: &[u32]) -> Result<Closeness> {
+    pub(super) fn closeness(&self, scene: &Scene, kept: &[u32]) -> Result<JudgedQuality> {
         let subject = Subject { source: scene.source(), ids: Some(Ids::List(kept)), columns: Columns::all() };
         let mut originals = self.originals.iter();
         let mut found = Vec::with_capacity(self.originals.len());
         made(scene, subject, &self.pictures, |image| found.extend(originals.next().map(|of| psnr(&image, of))))?;
-        Ok(Closeness::of(&found))
+        Ok(JudgedQuality::of(&found))
     }
 }
 
-impl Closeness {
+impl JudgedQuality {
     /// Of the PSNR of pictures of one size.
-    pub(super) fn of(psnr: &[f64]) -> Closeness {
+    pub(super) fn of(psnr: &[f64]) -> JudgedQuality {
         let count = psnr.len().max(1) as f64;
         let mean_square = psnr.iter().map(|psnr| 10f64.powf(-psnr / 10.0)).sum::<f64>() / count;
-        Closeness { error: mean_square.sqrt(), psnr: psnr.iter().sum::<f64>() / count }
+        JudgedQuality { error: mean_square.sqrt(), psnr: psnr.iter().sum::<f64>() / count }
     }
 }
 
@@ -95,8 +95,8 @@ mod tests {
     #[test]
     fn errors_of_pictures_add_up_in_squares_and_decibels_are_their_mean() {
         // A tenth and a hundredth of the range.
-        let Closeness { error, psnr } = Closeness::of(&[20.0, 40.0]);
+        let JudgedQuality { error, psnr } = JudgedQuality::of(&[20.0, 40.0]);
         assert!((error - (0.5f64 * (0.01 + 0.0001)).sqrt()).abs() < 1e-15, "{error}");
-        assert_eq!((psnr, Closeness::of(&[f64::INFINITY]).error), (30.0, 0.0));
+        assert_eq!((psnr, JudgedQuality::of(&[f64::INFINITY]).error), (30.0, 0.0));
     }
 }

@@ -18,16 +18,16 @@ use std::path::{Path, PathBuf};
 
 use super::whole_run::{result_name, trained};
 use crate::TOOL;
-use crate::budget::{Budget, Tell, Workload};
+use crate::budget::{Budget, Verbosity, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::cost::Repeats;
-use crate::evaluation::precision::{Knob, Precision};
+use crate::evaluation::precision::{PrecisionDiagram, PrecisionKnob};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::names::name_of;
 use crate::journal::Journal;
 use crate::model::{Rows, Schedule};
 use crate::outputs::kind::check_folder_name;
-use crate::pipeline::stages::measure::{Measure, Outlook, Stages};
+use crate::pipeline::stages::measure::{InputMeta, Measure, Stages};
 use crate::pipeline::{Job, Request, Target};
 use crate::progress::Progress;
 use crate::pruning::score::UserOverrides;
@@ -162,7 +162,7 @@ impl Bench<'_> {
 ///
 /// # Errors
 /// Whatever is wrong with input, cameras, recipe, options or output. Nothing is left behind then.
-pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
+pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
     if options.input.is_stream() {
         return Err(Error::usage("precision reads its input many times: pack the stream first, then give the .gseq"));
     }
@@ -188,7 +188,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
         target: Some(options.target),
         ..Request::new(input.clone(), options.output.join(name), options.recipe.clone())
     };
-    let job = Job::within(&request, Outlook::of(&scene), &scene.workload())?;
+    let job = Job::within(&request, InputMeta::of(&scene), &scene.workload())?;
     scene.keep_to(input.memory, |work, limits| {
         let mut needs = job.needs(work, limits);
         for need in &mut needs {
@@ -201,7 +201,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
     let work = scene.workload();
     let beside = work.count() as u64 * (HELD + work.input.per_gaussian) + work.input.fixed + Judge::bytes(work.pixels);
     let left = input.memory.bytes.map(|bytes| bytes.saturating_sub(beside));
-    let input = InputOptions { memory: Budget { bytes: left, tell: Tell::Nothing }, ..input };
+    let input = InputOptions { memory: Budget { bytes: left, tell: Verbosity::Nothing }, ..input };
     let mut notes = scene.notes.clone();
     scene.schedule = thin(std::mem::take(&mut scene.schedule), options.max_frames);
     let looked_at = scene.schedule.iter().filter(|views| !views.is_empty()).count();
@@ -233,7 +233,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
         name,
         progress: Progress::counting("precision", "settings"),
     };
-    let mut found = Precision {
+    let mut found = PrecisionDiagram {
         tool: TOOL.to_owned(),
         path: name_of(&scene.path),
         digest: scene.input.digest()?,
@@ -273,7 +273,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<Precision> {
 
 impl Bench<'_> {
     /// All settings of a knob; none where the scene has nothing to turn it on.
-    fn turn(&self, knob: Turned) -> Result<Option<Knob>> {
+    fn turn(&self, knob: Turned) -> Result<Option<PrecisionKnob>> {
         match knob {
             Turned::Look => self.look(),
             Turned::Rounds => self.rounds(),
@@ -314,7 +314,7 @@ fn thinned_bytes(work: &Workload, most: usize) -> u64 {
 mod tests {
     use super::*;
     use crate::model::{Columns, SequenceInfo};
-    use crate::models::Residence;
+    use crate::models::MemoryProfile;
 
     #[test]
     fn thinned_schedules_keep_frames_evenly_and_all_of_their_pictures() {
@@ -335,7 +335,7 @@ mod tests {
     #[test]
     fn what_thinning_makes_is_counted_and_what_stays_as_it_is_takes_nothing() {
         let info = SequenceInfo { count: 1, times: vec![0.0; 1000], sh_degree: 0, varying: Columns::empty() };
-        let work = Workload { views: 3, ..Workload::new(&info, Residence::of_tiles(1)) };
+        let work = Workload { views: 3, ..Workload::new(&info, MemoryProfile::of_tiles(1)) };
         assert_eq!((thinned_bytes(&work, 1000), thinned_bytes(&work, 5000)), (0, 0));
         // Two runs of 16 bytes, and a pair of 8 for every view.
         assert!(thinned_bytes(&work, 60) >= 60 * (2 * 16 + 3 * 8));

@@ -7,18 +7,19 @@ use super::Bench;
 use crate::error::Result;
 use crate::evaluation::cost::Cost;
 use crate::evaluation::precision::{
-    ADDED, Curve, KEPT, Knob, Mark, PERCENTILES, PICTURES, STAYING, Source, added, apart, relative_l2,
+    ADDED, KEPT, PERCENTILES, PICTURES, PrecisionCurve, PrecisionKnob, PrecisionSetting, STAYING, Source, added, apart,
+    relative_l2,
 };
 use crate::journal::Journal;
 use crate::pipeline::stages::measure::Measure;
-use crate::pruning::contribution::Seen;
+use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::rounds::Rounds;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::pruning::visible::Visible;
 use crate::pruning::{Overrides, select};
 use crate::recipe::{self, Recipe};
 use crate::statistics::score::sketch::MOST_BITS;
-use crate::statistics::score::{Graded, Looks, Scores, score_by};
+use crate::statistics::score::{Graded, PercentilePasses, Scores, score_by};
 
 /// Pictures of a look or a round: numbers that are tried, as far as there are so many.
 const PICTURES_TRIED: [usize; 9] = [6, 12, 25, 50, 100, 200, 400, 800, 1600];
@@ -32,7 +33,7 @@ const FRACTIONS: [f64; 7] = [0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95];
 const BITS: [u32; 8] = [1, 2, 3, 5, 7, 9, 11, MOST_BITS];
 
 /// A ranking, and what it took.
-struct Tried {
+struct TriedRanking {
     value: f64,
     step: f64,
     cost: Cost,
@@ -42,7 +43,7 @@ struct Tried {
 }
 
 /// A way to look: a recipe, and where on a curve it stands.
-struct Way {
+struct RankingVariant {
     value: f64,
     step: f64,
     recipe: Recipe,
@@ -50,15 +51,15 @@ struct Way {
 
 impl Bench<'_> {
     /// The first look: how many pictures, and every how many-th pixel, view and frame. None where nothing is looked at.
-    pub(super) fn look(&self) -> Result<Option<Knob>> {
+    pub(super) fn look(&self) -> Result<Option<PrecisionKnob>> {
         let all = self.scene.schedule.pairs();
-        let way = |value: f64, step: f64, change: &dyn Fn(&mut recipe::Scan)| {
+        let way = |value: f64, step: f64, change: &dyn Fn(&mut recipe::ScanParams)| {
             let mut recipe = self.recipe.clone();
             let one = NonZeroU32::MIN;
             let scan = &mut recipe.scan;
             (scan.look_pictures, scan.pixel_stride, scan.view_stride, scan.frame_stride) = (0, one, one, one);
             change(scan);
-            Way { value, step, recipe }
+            RankingVariant { value, step, recipe }
         };
         let (finest, cost) = self.seen_at_cost(&way(1.0, 1.0, &|_| ()).recipe)?;
         let Some(finest) = finest else { return Ok(None) };
@@ -70,7 +71,7 @@ impl Bench<'_> {
         let mut curves = vec![self.looks("look_pictures", counts, (last, &finest, &cost), Some(own as f64))?];
         let seen = self.scene.schedule.iter().filter(|views| !views.is_empty()).count();
         let views = self.scene.schedule.most_views();
-        type Set = fn(&mut recipe::Scan, NonZeroU32);
+        type Set = fn(&mut recipe::ScanParams, NonZeroU32);
         let strides: [(&str, usize, Set); 3] = [
             ("pixel_stride", usize::MAX, |scan, stride| scan.pixel_stride = stride),
             ("view_stride", views, |scan, stride| scan.view_stride = stride),
@@ -83,7 +84,7 @@ impl Bench<'_> {
             let ways = strides.map(|n| way(value(n), value(n), &|scan| set(scan, n))).collect();
             curves.push(self.looks(name, ways, ((1.0, 1.0), &finest, &cost), None)?);
         }
-        Ok(Some(Knob {
+        Ok(Some(PrecisionKnob {
             name: "look".to_owned(),
             about: "The first look: contributions C and W of every Gaussian from some of the pictures, and which Gaussians \
                     the scores of these keep, before any round."
@@ -94,14 +95,14 @@ impl Bench<'_> {
     }
 
     /// What the look of `recipe` sees, if it looks.
-    fn seen(&self, recipe: &Recipe) -> Result<Option<Seen>> {
+    fn seen(&self, recipe: &Recipe) -> Result<Option<VisibleContribution>> {
         let measure = Measure::new(recipe, self.scene.has_cameras, UserOverrides::default());
         let look = |visible: &Visible| visible.run(self.scene, &self.scanned.rows.life, &mut Journal::default());
         measure.visible.as_ref().map(look).transpose()
     }
 
     /// The same, and what that takes.
-    fn seen_at_cost(&self, recipe: &Recipe) -> Result<(Option<Seen>, Cost)> {
+    fn seen_at_cost(&self, recipe: &Recipe) -> Result<(Option<VisibleContribution>, Cost)> {
         self.repeats.measure(|| self.seen(recipe), || Ok(()))
     }
 
@@ -109,21 +110,23 @@ impl Bench<'_> {
     fn looks(
         &self,
         name: &str,
-        ways: Vec<Way>,
-        ((value, step), finest, cost): ((f64, f64), &Seen, &Cost),
+        ways: Vec<RankingVariant>,
+        ((value, step), finest, cost): ((f64, f64), &VisibleContribution, &Cost),
         own: Option<f64>,
-    ) -> Result<Curve> {
+    ) -> Result<PrecisionCurve> {
         let best = self.scored(Some(finest.clone()))?;
-        let of = |value: f64, step: f64, seen: Seen, cost: Cost| -> Result<Tried> {
-            let l2 = |of: fn(&Seen) -> &Vec<f64>| relative_l2(of(&seen).iter().copied(), of(finest).iter().copied());
+        let of = |value: f64, step: f64, seen: VisibleContribution, cost: Cost| -> Result<TriedRanking> {
+            let l2 = |of: fn(&VisibleContribution) -> &Vec<f64>| {
+                relative_l2(of(&seen).iter().copied(), of(finest).iter().copied())
+            };
             let [c, w] = [l2(|seen| &seen.coverage), l2(|seen| &seen.peak)];
             let scored = self.scored(Some(seen))?;
             let staying = off(scored.selection.counts.kept, best.selection.counts.kept);
             let errors = [("C", c), ("W", w), (STAYING, staying)].map(|(of, error)| (of.to_owned(), error)).into();
-            Ok(Tried { value, step, cost, errors, kept: scored.ranked().take(self.kept) })
+            Ok(TriedRanking { value, step, cost, errors, kept: scored.ranked().take(self.kept) })
         };
         let mut tried = Vec::with_capacity(ways.len() + 1);
-        for Way { value, step, recipe } in ways {
+        for RankingVariant { value, step, recipe } in ways {
             if let (Some(seen), cost) = self.seen_at_cost(&recipe)? {
                 tried.push(of(value, step, seen, cost)?);
             }
@@ -133,13 +136,13 @@ impl Bench<'_> {
     }
 
     /// Scores by what was scanned and `seen`.
-    fn scored(&self, seen: Option<Seen>) -> Result<Scored> {
+    fn scored(&self, seen: Option<VisibleContribution>) -> Result<Scored> {
         let measure = Measure::new(self.recipe, self.scene.has_cameras, UserOverrides::default());
         measure.score.run(self.scene, self.scanned.clone(), seen, &mut Journal::default())
     }
 
     /// Rounds of more and of fewer pictures, and of larger and of smaller cuts. None where nothing is looked at.
-    pub(super) fn rounds(&self) -> Result<Option<Knob>> {
+    pub(super) fn rounds(&self) -> Result<Option<PrecisionKnob>> {
         let Some(seen) = self.seen(self.recipe)? else { return Ok(None) };
         let scored = self.scored(Some(seen))?;
         let own = &self.recipe.select;
@@ -163,7 +166,7 @@ impl Bench<'_> {
             self.curve("round_pictures", "the most pictures", by_pictures, own.0, &[])?,
             self.curve("round_fraction", "the smallest cuts", by_fraction, own.1, &[])?,
         ];
-        Ok(Some(Knob {
+        Ok(Some(PrecisionKnob {
             name: "rounds".to_owned(),
             about:
                 "Rounds that rank anew by what pictures would lose: pictures of each, and the part that each leaves."
@@ -174,7 +177,7 @@ impl Bench<'_> {
     }
 
     /// What rounds of `select` keep.
-    fn ranked(&self, scored: &Scored, select: &recipe::Select, value: f64, step: f64) -> Result<Tried> {
+    fn ranked(&self, scored: &Scored, select: &recipe::Select, value: f64, step: f64) -> Result<TriedRanking> {
         let rounds = Rounds::of(select, None);
         let rank = || {
             let order = match &rounds {
@@ -184,28 +187,28 @@ impl Bench<'_> {
             Ok(order.take(self.kept))
         };
         let (kept, cost) = self.repeats.measure(rank, || Ok(()))?;
-        Ok(Tried { value, step, cost, errors: BTreeMap::new(), kept })
+        Ok(TriedRanking { value, step, cost, errors: BTreeMap::new(), kept })
     }
 
     /// Percentiles from one look at the values, by more and fewer bits, beside exact ones.
-    pub(super) fn percentiles(&self) -> Result<Knob> {
+    pub(super) fn percentiles(&self) -> Result<PrecisionKnob> {
         let scored = self.scored(self.seen(self.recipe)?)?;
         let rows = scored.rows()?;
         let frames = self.scene.source().info().times.len();
-        let by = |looks: Looks| -> Result<(Scores, Cost)> {
+        let by = |looks: PercentilePasses| -> Result<(Scores, Cost)> {
             self.repeats.measure(|| Ok(score_by(looks, &rows, frames, &self.recipe.score)), || Ok(()))
         };
-        let (exact, cost) = by(Looks::Two)?;
+        let (exact, cost) = by(PercentilePasses::Two)?;
         let staying = scored.selection.counts.kept;
-        let of = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<Tried> {
+        let of = |value: f64, step: f64, scores: &Scores, cost: Cost| -> Result<TriedRanking> {
             let selection = select(scores, &self.recipe.select, &Overrides::default())?;
             let errors = [(PERCENTILES, worst(scores, &exact)), (STAYING, off(selection.counts.kept, staying))];
             let errors = errors.map(|(of, error)| (of.to_owned(), error)).into();
-            Ok(Tried { value, step, cost, errors, kept: selection.ranking.take(self.kept) })
+            Ok(TriedRanking { value, step, cost, errors, kept: selection.ranking.take(self.kept) })
         };
         let mut tried = Vec::with_capacity(BITS.len() + 1);
         for bits in BITS {
-            let (scores, cost) = by(Looks::One(bits))?;
+            let (scores, cost) = by(PercentilePasses::One(bits))?;
             tried.push(of(f64::from(bits), 0.5f64.powi(bits as i32), &scores, cost)?);
         }
         let own = f64::from(MOST_BITS + 1);
@@ -213,7 +216,7 @@ impl Bench<'_> {
         let against = "exact percentiles from two looks, as every run has them (the last mark)";
         // Half a bucket at most, and buckets halve with every bit.
         let curve = self.curve("mantissa bits", against, tried, Some(own), &[(PERCENTILES, 1.0)])?;
-        Ok(Knob {
+        Ok(PrecisionKnob {
             name: "percentiles".to_owned(),
             about: "Percentiles from one look at the values: mantissa bits of the histogram's keys.".to_owned(),
             source: Source::Discretisation,
@@ -226,25 +229,25 @@ impl Bench<'_> {
         &self,
         name: &str,
         against: &str,
-        tried: Vec<Tried>,
+        tried: Vec<TriedRanking>,
         own: Option<f64>,
         expected: &[(&str, f64)],
-    ) -> Result<Curve> {
+    ) -> Result<PrecisionCurve> {
         let mut marks = Vec::with_capacity(tried.len());
         let Some(finest) = tried.last().map(|last| last.kept.clone()) else {
-            return Ok(Curve::new(name, against, marks, None, expected));
+            return Ok(PrecisionCurve::new(name, against, marks, None, expected));
         };
         let best = self.judge.closeness(self.scene, &finest)?;
-        for Tried { value, step, cost, mut errors, kept } in tried {
+        for TriedRanking { value, step, cost, mut errors, kept } in tried {
             let found = if kept == finest { best } else { self.judge.closeness(self.scene, &kept)? };
             errors.extend(
                 [(KEPT, apart(&kept, &finest)), (PICTURES, found.error), (ADDED, added(found.error, best.error))]
                     .map(|(of, error)| (of.to_owned(), error)),
             );
-            marks.push(Mark { value, step, cost, errors, psnr: Some(found.psnr) });
+            marks.push(PrecisionSetting { value, step, cost, errors, psnr: Some(found.psnr) });
             self.advance();
         }
-        Ok(Curve::new(name, against, marks, own, expected))
+        Ok(PrecisionCurve::new(name, against, marks, own, expected))
     }
 }
 

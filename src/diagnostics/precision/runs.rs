@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::Bench;
-use super::judge::Closeness;
+use super::judge::JudgedQuality;
 use crate::budget::{Budget, Plan};
 use crate::diagnostics::whole_run::{WholeRun, trained};
 use crate::error::{Error, Result};
 use crate::evaluation::cost::Cost;
-use crate::evaluation::method::Means;
-use crate::evaluation::precision::{BYTES, Curve, Knob, Mark, PICTURES, Source};
-use crate::pipeline::stages::measure::{Outlook, Stages};
+use crate::evaluation::method::MethodKind;
+use crate::evaluation::precision::{BYTES, PICTURES, PrecisionCurve, PrecisionKnob, PrecisionSetting, Source};
+use crate::pipeline::stages::measure::{InputMeta, Stages};
 use crate::pipeline::{Job, Only, Request, Target};
 use crate::recipe::{MergePass, Recipe};
 use crate::scene::{InputOptions, open_input};
@@ -35,7 +35,7 @@ const WHOLE: &str = "the whole model's pictures: every held-out view of up to 12
 
 impl Bench<'_> {
     /// Merging after pruning, to one count.
-    pub(super) fn merging(&self) -> Result<Knob> {
+    pub(super) fn merging(&self) -> Result<PrecisionKnob> {
         let plain = self.recipe.unrefined();
         let pass = plain.merge.passes.first().copied();
         let pass = pass.unwrap_or(MergePass { epsilon: 0.005, d0: 1.0, rho: 0.95, tau_m: 0.9 });
@@ -57,7 +57,7 @@ impl Bench<'_> {
             let some: Vec<MergePass> = own.iter().copied().cycle().take(passes).collect();
             by_passes.push(self.ran(&merging(some), passes as f64, passes as f64)?);
         }
-        Ok(Knob {
+        Ok(PrecisionKnob {
             name: "merging".to_owned(),
             about:
                 "Merging to one count, whatever pictures say of it, without refining: radius ε of one pass (0: pruning \
@@ -65,14 +65,14 @@ impl Bench<'_> {
                     .to_owned(),
             source: Source::Model,
             curves: vec![
-                Curve::new("merge radius", WHOLE, by_radius, Some(pass.epsilon), &[]),
-                Curve::new("merge passes", WHOLE, by_passes, Some(plain.merge.passes.len() as f64), &[]),
+                PrecisionCurve::new("merge radius", WHOLE, by_radius, Some(pass.epsilon), &[]),
+                PrecisionCurve::new("merge passes", WHOLE, by_passes, Some(plain.merge.passes.len() as f64), &[]),
             ],
         })
     }
 
     /// Refining at one count. None of a recipe that refines nothing.
-    pub(super) fn refining(&self) -> Result<Option<Knob>> {
+    pub(super) fn refining(&self) -> Result<Option<PrecisionKnob>> {
         let own = &self.recipe.refine;
         if own.refine.0.is_empty() || own.refine_steps == 0 {
             return Ok(None);
@@ -91,19 +91,19 @@ impl Bench<'_> {
             recipe.refine.refine_pictures = pictures;
             by_pictures.push(self.ran(&recipe, pictures as f64, 1.0 / pictures as f64)?);
         }
-        Ok(Some(Knob {
+        Ok(Some(PrecisionKnob {
             name: "refining".to_owned(),
             about: "Refining to one count: steps (0: pruning alone), and the pictures that they go through.".to_owned(),
             source: Source::Model,
             curves: vec![
-                Curve::new("refine_steps", WHOLE, by_steps, Some(own.refine_steps.into()), &[]),
-                Curve::new("refine_pictures", WHOLE, by_pictures, Some(own.refine_pictures as f64), &[]),
+                PrecisionCurve::new("refine_steps", WHOLE, by_steps, Some(own.refine_steps.into()), &[]),
+                PrecisionCurve::new("refine_pictures", WHOLE, by_pictures, Some(own.refine_pictures as f64), &[]),
             ],
         }))
     }
 
     /// Threads and memory, which must not change a byte.
-    pub(super) fn machine(&self) -> Result<Knob> {
+    pub(super) fn machine(&self) -> Result<PrecisionKnob> {
         let recipe = self.recipe.unrefined();
         let mut expected = None;
         let mut by_threads = Vec::new();
@@ -121,7 +121,7 @@ impl Bench<'_> {
             target: Some(self.target()),
             ..Request::new(trained(self.input), self.scratch.join(self.name), recipe.clone())
         };
-        let job = Job::new(&request, Outlook::of(self.scene))?;
+        let job = Job::new(&request, InputMeta::of(self.scene))?;
         let least = Plan::closest(self.work, 1, |work, limits| job.needs(work, limits)).peak();
         let mut by_memory = Vec::new();
         for part in BUDGETS {
@@ -131,14 +131,14 @@ impl Bench<'_> {
             by_memory.push(self.same(&recipe, &input, mebibytes, &mut expected)?);
         }
         let against = "the bytes of the first of these runs";
-        Ok(Knob {
+        Ok(PrecisionKnob {
             name: "machine".to_owned(),
             about: "Threads, and MiB of memory from the least that works on: the result is the same, byte for byte."
                 .to_owned(),
             source: Source::Rounding,
             curves: vec![
-                Curve::new("threads", against, by_threads, Some(most as f64), &[]),
-                Curve::new("memory, MiB", against, by_memory, None, &[]),
+                PrecisionCurve::new("threads", against, by_threads, Some(most as f64), &[]),
+                PrecisionCurve::new("memory, MiB", against, by_memory, None, &[]),
             ],
         })
     }
@@ -148,21 +148,33 @@ impl Bench<'_> {
     }
 
     /// A whole run by `recipe`.
-    fn ran(&self, recipe: &Recipe, value: f64, step: f64) -> Result<Mark> {
+    fn ran(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compared(result))?;
         let psnr: Vec<f64> = evaluation.pictures.iter().map(|picture| picture.loss.psnr).collect();
-        let Closeness { error, psnr } = Closeness::of(&psnr);
-        Ok(Mark { value, step, cost, errors: BTreeMap::from([(PICTURES.to_owned(), error)]), psnr: Some(psnr) })
+        let JudgedQuality { error, psnr } = JudgedQuality::of(&psnr);
+        Ok(PrecisionSetting {
+            value,
+            step,
+            cost,
+            errors: BTreeMap::from([(PICTURES.to_owned(), error)]),
+            psnr: Some(psnr),
+        })
     }
 
     /// The same, and whether its bytes are `expected`: those of the first.
-    fn same(&self, recipe: &Recipe, input: &InputOptions, value: f64, expected: &mut Option<String>) -> Result<Mark> {
+    fn same(
+        &self,
+        recipe: &Recipe,
+        input: &InputOptions,
+        value: f64,
+        expected: &mut Option<String>,
+    ) -> Result<PrecisionSetting> {
         let (digest, cost) = self.run(recipe, input, |_, result| {
             open_input(&InputOptions { path: result.to_owned(), ..self.input.clone() })?.input.digest()
         })?;
         let differs = *expected.get_or_insert(digest.clone()) != digest;
         let errors = BTreeMap::from([(BYTES.to_owned(), f64::from(u8::from(differs)))]);
-        Ok(Mark { value, step: value, cost, errors, psnr: None })
+        Ok(PrecisionSetting { value, step: value, cost, errors, psnr: None })
     }
 
     fn run<T>(
@@ -179,7 +191,7 @@ impl Bench<'_> {
             max_frames: Some(FRAMES_COMPARED),
             background: None,
         };
-        let means = Means::Recipe(Box::new(recipe.clone()), Only::Both);
+        let means = MethodKind::Recipe(Box::new(recipe.clone()), Only::Both);
         let ran = run.run(&means, Some(self.target()), |result| look(&run, result))?;
         self.advance();
         Ok(ran)

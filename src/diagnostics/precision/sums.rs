@@ -10,11 +10,11 @@ use num_traits::Float;
 
 use super::Bench;
 use crate::error::Result;
-use crate::evaluation::precision::{Curve, Knob, Mark, Source, relative_l2};
+use crate::evaluation::precision::{PrecisionCurve, PrecisionKnob, PrecisionSetting, Source, relative_l2};
 use crate::model::{Columns, Flags, Gaussians, Schedule, opacity};
-use crate::passes::Frames;
-use crate::recipe::{self, Motion, Recipe};
-use crate::source::{BlockReader, Ids, Wanted};
+use crate::passes::FrameReaders;
+use crate::recipe::{self, MotionParams, Recipe};
+use crate::source::{BlockReader, Ids, ReadPlan};
 use crate::statistics::{BlockScan, NEEDED, ScanPlan};
 
 /// Gaussians whose sums are looked at, evenly among all.
@@ -83,11 +83,11 @@ fn narrow<T: Float>(value: f64) -> T {
 }
 
 /// D, κ and V of every Gaussian.
-type Statistics = [Vec<f64>; 3];
+type SummedStatistics = [Vec<f64>; 3];
 
 impl Bench<'_> {
     /// Sums over longer and longer sequences.
-    pub(super) fn sums(&self) -> Result<Option<Knob>> {
+    pub(super) fn sums(&self) -> Result<Option<PrecisionKnob>> {
         let source = self.scene.source();
         let info = source.info();
         let frames = info.times.len();
@@ -101,7 +101,7 @@ impl Bench<'_> {
         let ids: Vec<u32> = (0..count).map(|k| ids[k * ids.len() / count]).collect();
         let shown: Vec<usize> = (0..frames).step_by(every).collect();
         let columns = Columns::POSITION | Columns::OPACITY;
-        let mut reader = Frames::open(source, Ids::List(&ids), NEEDED, &Wanted::of(shown.iter().copied()))?;
+        let mut reader = FrameReaders::open(source, Ids::List(&ids), NEEDED, &ReadPlan::of(shown.iter().copied()))?;
         let mut states = Vec::with_capacity(shown.len());
         for frame in shown {
             let mut state = Gaussians::zeros(0, 0);
@@ -110,17 +110,17 @@ impl Bench<'_> {
         }
         let decoded: Vec<Decoded> = states.iter().map(Decoded::of).collect();
         let mut curves = Vec::new();
-        type Way = (&'static str, fn(&[Decoded], usize) -> Statistics);
+        type Way = (&'static str, fn(&[Decoded], usize) -> SummedStatistics);
         let ways: [Way; 2] =
             [("f32", summed::<f32, Plain<f32>>), ("f32, compensated", summed::<f32, Compensated<f32>>)];
         let expected = PLAYED.map(|played| summed::<f64, Compensated<f64>>(&decoded, played));
         for (name, sum) in ways {
             let marks = self.played(&expected, |played| Ok(sum(&decoded, played)))?;
-            curves.push(Curve::new(name, AGAINST, marks, None, &[]));
+            curves.push(PrecisionCurve::new(name, AGAINST, marks, None, &[]));
         }
         let marks = self.played(&expected, |played| scanned(&states, played, columns))?;
-        curves.push(Curve::new("f64, as the scan has them", AGAINST, marks, None, &[]));
-        Ok(Some(Knob {
+        curves.push(PrecisionCurve::new("f64, as the scan has them", AGAINST, marks, None, &[]));
+        Ok(Some(PrecisionKnob {
             name: "sums".to_owned(),
             about: format!(
                 "Running sums over frames: D, κ and V of {count} Gaussians whose frames are played to and fro. Marks are \
@@ -132,8 +132,12 @@ impl Bench<'_> {
     }
 
     /// A mark for every number of frames.
-    fn played(&self, expected: &[Statistics], sums: impl Fn(usize) -> Result<Statistics>) -> Result<Vec<Mark>> {
-        let mark = |(played, expected): (usize, &Statistics)| {
+    fn played(
+        &self,
+        expected: &[SummedStatistics],
+        sums: impl Fn(usize) -> Result<SummedStatistics>,
+    ) -> Result<Vec<PrecisionSetting>> {
+        let mark = |(played, expected): (usize, &SummedStatistics)| {
             let (found, cost) = self.repeats.measure(|| sums(played), || Ok(()))?;
             let errors = ["D", "kappa", "V"].into_iter().zip(found.iter().zip(expected));
             let errors: BTreeMap<String, f64> = errors
@@ -142,7 +146,7 @@ impl Bench<'_> {
                 })
                 .collect();
             self.advance();
-            Ok(Mark { value: played as f64, step: played as f64, cost, errors, psnr: None })
+            Ok(PrecisionSetting { value: played as f64, step: played as f64, cost, errors, psnr: None })
         };
         PLAYED.into_iter().zip(expected).map(mark).collect()
     }
@@ -171,7 +175,7 @@ impl Decoded {
 }
 
 /// D, κ and V over `played` frames of Gaussians that live throughout, in numbers T summed by S.
-fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> Statistics {
+fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> SummedStatistics {
     let count = states.first().map_or(0, |state| state.opacity.len());
     let length2 = |v: [T; 3]| v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
     let difference = |a: [T; 3], b: [T; 3]| -> [T; 3] { std::array::from_fn(|axis| a[axis] - b[axis]) };
@@ -206,11 +210,11 @@ fn summed<T: Float, S: Sum<T>>(states: &[Decoded], played: usize) -> Statistics 
 }
 
 /// The same by the scan itself, of Gaussians that all count as living.
-fn scanned(states: &[Gaussians], played: usize, changed: Columns) -> Result<Statistics> {
+fn scanned(states: &[Gaussians], played: usize, changed: Columns) -> Result<SummedStatistics> {
     let times: Vec<f64> = (0..played).map(|k| k as f64).collect();
     let mut schedule = Schedule::default();
     schedule.push(played, &[]);
-    let scan = recipe::Scan { alpha_min: 0.0, motion: Motion::Runs, ..Recipe::preset("default")?.scan };
+    let scan = recipe::ScanParams { alpha_min: 0.0, motion: MotionParams::Runs, ..Recipe::preset("default")?.scan };
     let plan = ScanPlan::new(&scan, &times, &schedule)?;
     let mut block = BlockScan::new(states.first().map_or(0, Gaussians::len), 0, &plan);
     for k in 0..played {

@@ -29,11 +29,11 @@ impl Case {
         name: &'static str,
         what: &'static str,
         bound: f64,
-        measure: impl FnOnce() -> Result<Worst>,
+        measure: impl FnOnce() -> Result<LargestError>,
     ) -> Case {
         // A build so broken that it panics has other cases to show.
         let (error, failure) = match catch_unwind(AssertUnwindSafe(measure)) {
-            Ok(Ok(Worst(error))) => (error, None),
+            Ok(Ok(LargestError(error))) => (error, None),
             Ok(Err(error)) => (f64::INFINITY, Some(error.to_string())),
             Err(_) => (f64::INFINITY, Some("a panic".to_owned())),
         };
@@ -43,15 +43,15 @@ impl Case {
 
 /// The largest error so far; NaN, which is within no bound, of nothing looked at.
 #[derive(Debug)]
-pub(super) struct Worst(pub(super) f64);
+pub(super) struct LargestError(pub(super) f64);
 
-impl Default for Worst {
-    fn default() -> Worst {
-        Worst(f64::NAN)
+impl Default for LargestError {
+    fn default() -> LargestError {
+        LargestError(f64::NAN)
     }
 }
 
-impl Worst {
+impl LargestError {
     /// An error, which is infinite where it is no number.
     pub(super) fn add(&mut self, error: f64) {
         self.0 = if error.is_nan() { f64::INFINITY } else { self.0.max(error) };

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use crate::deform::oracle::{Oracle, Parameters};
 use crate::deform::synthetic::{Noise, plain, tensors};
 use crate::deform::{Deltas, Field, FieldConfig, Scratch};
@@ -11,7 +11,7 @@ use crate::model::{Columns, Gaussians};
 /// Against the definition, in parts of 1 and the value; some 60 roundings of f32.
 pub(super) fn states() -> Case {
     Case::new("deformation field", "states: planes, layers in f64", 5e-6, || {
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         let raw = cloud(40);
         for (config, depth) in [
             (plain(), 1),
@@ -48,7 +48,7 @@ pub(super) fn derivative() -> Case {
         let oracle = Oracle { tensors: &tensors, config: &config };
         let raw = cloud(40);
         let found = field.jacobian(&raw, time, Columns::POSITION)?;
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.same(&found.column(Columns::POSITION).width(), &9);
         for i in 0..raw.len() {
             for by in 0..3 {

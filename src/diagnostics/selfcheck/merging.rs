@@ -2,24 +2,24 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use super::made::clouds::{Random, scene};
 use crate::error::{Error, Result};
-use crate::merging::moments::{Ellipsoid, Part, align_axes, moments};
+use crate::merging::moments::{Ellipsoid, WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::{Importance, merge_state, weights};
 use crate::merging::{Survivors, run};
 use crate::model::{Columns, Gaussians};
-use crate::recipe::{Merge, Placement, ProxyOpacity, Recipe};
+use crate::recipe::{MergeParams, Placement, ProxyOpacity, Recipe};
 
 /// Against Σ formed in f64, in parts of its largest entry; a dozen parts lose some 1e-15.
 pub(super) fn mixture() -> Case {
     Case::new("mixture", "mean, covariance: Σ formed in f64", 1e-13, || {
         let mut random = Random(1);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for count in [1, 2, 3, 12] {
             let mut within = |low, high| f64::from(random.within(low, high));
-            let parts: Vec<Part> = (1..=count)
-                .map(|k| Part {
+            let parts: Vec<WeightedGaussian> = (1..=count)
+                .map(|k| WeightedGaussian {
                     weight: 2.0 * f64::from(k) / f64::from(count * (count + 1)),
                     position: DVec3::new(within(-1.0, 1.0), within(-1.0, 1.0), within(-1.0, 1.0)),
                     rotation: DQuat::from_xyzw(within(-1.0, 1.0), within(-1.0, 1.0), within(-1.0, 1.0), 0.3)
@@ -37,10 +37,10 @@ pub(super) fn mixture() -> Case {
 /// the smallest.
 pub(super) fn needle() -> Case {
     Case::new("needle and its twin", "scales of 1 : 1e12: themselves", 1e-12, || {
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         let rotation = DQuat::from_xyzw(0.3, -0.5, 0.2, 0.7).normalize();
         for scales in [DVec3::new(1e6, 1.0, 1e-6), DVec3::new(1e-6, 1e6, 1e-6), DVec3::new(1e-6, 3e-6, 1e6)] {
-            let part = Part { weight: 0.5, position: DVec3::new(1.0, 2.0, 3.0), rotation, scales };
+            let part = WeightedGaussian { weight: 0.5, position: DVec3::new(1.0, 2.0, 3.0), rotation, scales };
             let found = align_axes(&moments(&[part, part], None), rotation);
             (0..3).for_each(|axis| worst.relative(found.scales[axis], scales[axis]));
         }
@@ -59,11 +59,11 @@ pub(super) fn proxy() -> Case {
         let rows = [0, 1, 2, 3, 4];
         let importance = Importance { ids: &rows, coverage: &coverage, visibility: &visibility };
         let members: Vec<(u32, f64)> = rows.into_iter().zip(weights(&rows, &importance, &states)).collect();
-        let recipe = Merge { placement: Placement::Mean, ..recipe(ProxyOpacity::Union)? };
+        let recipe = MergeParams { placement: Placement::Mean, ..recipe(ProxyOpacity::Union)? };
         let found = merge_state(&members, &states, 2, &recipe, Columns::all());
 
-        let mut worst = Worst::default();
-        let parts: Vec<Part> = (0..5).map(|i| part(&states, i, seen[i] / total)).collect();
+        let mut worst = LargestError::default();
+        let parts: Vec<WeightedGaussian> = (0..5).map(|i| part(&states, i, seen[i] / total)).collect();
         let [w, x, y, z] = found.rotation;
         let rotation = DQuat::from_xyzw(x, y, z, w);
         let scales = DVec3::from(found.log_scale).exp();
@@ -91,7 +91,7 @@ pub(super) fn duplicates() -> Case {
         let rows: Vec<u32> = (0..9).collect();
         let importance = Importance { ids: &rows, coverage: &[1.0; 9], visibility: &[1.0; 9] };
         let survivors = Survivors { states: &states, rows: &rows, importance, classes: &[Some(0); 9], extent: 1.0 };
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for (rule, expected) in [
             (ProxyOpacity::Sum, 8.0 * opacity),
             (ProxyOpacity::Area, 8.0 * opacity),
@@ -114,14 +114,14 @@ pub(super) fn duplicates() -> Case {
     })
 }
 
-fn recipe(opacity: ProxyOpacity) -> Result<Merge> {
-    Ok(Merge { opacity, ..Recipe::preset("default")?.merge })
+fn recipe(opacity: ProxyOpacity) -> Result<MergeParams> {
+    Ok(MergeParams { opacity, ..Recipe::preset("default")?.merge })
 }
 
 /// Gaussian `i` as it is stored.
-fn part(states: &Gaussians, i: usize, weight: f64) -> Part {
+fn part(states: &Gaussians, i: usize, weight: f64) -> WeightedGaussian {
     let [w, x, y, z] = states.rotation.row::<4>(i).map(f64::from);
-    Part {
+    WeightedGaussian {
         weight,
         position: DVec3::from(states.position.row::<3>(i).map(f64::from)),
         rotation: DQuat::from_xyzw(x, y, z, w).normalize(),
@@ -130,14 +130,15 @@ fn part(states: &Gaussians, i: usize, weight: f64) -> Part {
 }
 
 /// Mean and covariance by the textbook, forming Σ; both in parts of what Σ has as its largest entry.
-fn keeps_moments(found: &Ellipsoid, parts: &[Part], worst: &mut Worst) {
+fn keeps_moments(found: &Ellipsoid, parts: &[WeightedGaussian], worst: &mut LargestError) {
     let covariance = |rotation: DQuat, scales: DVec3| {
         let axes = DMat3::from_quat(rotation);
         axes * DMat3::from_diagonal(scales * scales) * axes.transpose()
     };
     let outer = |v: DVec3| DMat3::from_cols(v * v.x, v * v.y, v * v.z);
     let mean: DVec3 = parts.iter().map(|part| part.weight * part.position).sum();
-    let spread = |part: &Part| (covariance(part.rotation, part.scales) + outer(part.position - mean)) * part.weight;
+    let spread =
+        |part: &WeightedGaussian| (covariance(part.rotation, part.scales) + outer(part.position - mean)) * part.weight;
     let expected = parts.iter().map(spread).fold(DMat3::ZERO, |sum, part| sum + part).to_cols_array();
     let largest = expected.iter().fold(0.0f64, |most, x| most.max(x.abs()));
     (0..3).for_each(|axis| worst.near(found.mean[axis], mean[axis], largest.sqrt()));

@@ -1,6 +1,6 @@
 //! The numbers of this very program on this very machine, against closed forms and slow oracles.
 //!
-//! In: nothing; what cases look at is made up, the same on every run. Out: a [`Report`], one line a case. Memory: a few
+//! In: nothing; what cases look at is made up, the same on every run. Out: a [`SelfcheckReport`], one line a case. Memory: a few
 //! sequences of at most 3000 Gaussians; on disk, one of them at a time, in a temporary folder that is gone afterwards.
 //!
 //! A case runs the code that `compress` runs. What it expects shares none of it: a formula, integers, or the definition
@@ -60,7 +60,7 @@ const CASES: [fn() -> Case; 28] = [
 
 /// What all cases found.
 #[derive(Debug, Serialize)]
-pub struct Report {
+pub struct SelfcheckReport {
     /// Program and version.
     pub tool: &'static str,
     /// Whether every case passes.
@@ -72,15 +72,15 @@ pub struct Report {
 }
 
 /// Runs every case.
-pub fn run() -> Report {
+pub fn run() -> SelfcheckReport {
     let start = Instant::now();
     let cases: Vec<Case> = CASES.iter().map(|case| case()).collect();
-    Report::of(cases, start.elapsed().as_secs_f64())
+    SelfcheckReport::of(cases, start.elapsed().as_secs_f64())
 }
 
-impl Report {
-    fn of(cases: Vec<Case>, seconds: f64) -> Report {
-        Report { tool: TOOL, pass: cases.iter().all(|case| case.pass), seconds, cases }
+impl SelfcheckReport {
+    fn of(cases: Vec<Case>, seconds: f64) -> SelfcheckReport {
+        SelfcheckReport { tool: TOOL, pass: cases.iter().all(|case| case.pass), seconds, cases }
     }
 
     /// A table for a person.
@@ -119,7 +119,7 @@ fn short(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::case::Worst;
+    use super::case::LargestError;
     use super::*;
 
     #[test]
@@ -140,15 +140,18 @@ mod tests {
     fn a_case_fails_beyond_its_bound_without_a_number_and_with_an_error() {
         let case = |error| Case::new("made up", "nothing", 1e-9, || Ok(error));
         let nan = || {
-            let mut worst = Worst::default();
+            let mut worst = LargestError::default();
             worst.near(f64::NAN, 0.0, 1.0);
             worst.near(0.0, 0.0, 1.0);
             worst
         };
         let refused = Case::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
-        let idle = Case::new("idle", "nothing", 1e-9, || Ok(Worst::default()));
+        let idle = Case::new("idle", "nothing", 1e-9, || Ok(LargestError::default()));
         let panics = Case::new("panics", "nothing", 1e-9, || panic!("as it should"));
-        let report = Report::of(vec![case(Worst(1e-9)), case(Worst(1.1e-9)), case(nan()), refused, panics, idle], 0.5);
+        let report = SelfcheckReport::of(
+            vec![case(LargestError(1e-9)), case(LargestError(1.1e-9)), case(nan()), refused, panics, idle],
+            0.5,
+        );
         let passes: Vec<bool> = report.cases.iter().map(|case| case.pass).collect();
         assert_eq!((passes, report.pass), (vec![true, false, false, false, false, false], false));
         let text = report.text();

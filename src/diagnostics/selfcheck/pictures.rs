@@ -5,7 +5,7 @@ use std::num::NonZeroU32;
 
 use glam::DVec3;
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use super::made::clouds::{Random, camera, plain_camera, scene, single};
 use super::oracle::picture::{blended, decided, picture};
 use crate::metrics::{psnr, ssim};
@@ -22,7 +22,7 @@ pub(super) fn one_gaussian() -> Case {
         let image = render(&single(depth as f32, scale as f32, opacity as f32), &plain_camera(size), [0.25; 3]);
         let variance = (50.0 * scale / depth).powi(2) + 0.3;
         let middle = f64::from(size) / 2.0 - 0.5;
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for (at, pixel) in image.data.chunks_exact(3).enumerate() {
             let [x, y] = [at % size as usize, at / size as usize].map(|k| k as f64 - middle);
             let alpha = opacity * (-0.5 * (x * x + y * y) / variance).exp();
@@ -43,7 +43,7 @@ pub(super) fn many_gaussians() -> Case {
         let expected = picture(&scene, &camera, BACKGROUND, 1);
         let got = render(&scene, &camera, BACKGROUND);
         let sure = expected.doubtful.iter().filter(|&&doubtful| !doubtful).count();
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.same(&(20 * sure > 19 * expected.doubtful.len()), &true);
         for (at, rgb) in expected.rgb.iter().enumerate().filter(|&(at, _)| !expected.doubtful[at]) {
             (0..3).for_each(|c| worst.near(got.data[3 * at + c].into(), rgb[c], 1.0));
@@ -59,7 +59,7 @@ pub(super) fn weights() -> Case {
         let expected = picture(&scene, &camera, BACKGROUND, 1);
         let mut seen = Contribution::new(scene.len());
         Renderer::new().contribution(&scene, &camera, NonZeroU32::MIN, &mut seen);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for i in 0..scene.len() {
             worst.near(seen.pixels(i), expected.sum[i], 1.0 + expected.sum[i]);
             worst.near(seen.max[i].into(), expected.max[i], 1.0);
@@ -76,7 +76,7 @@ pub(super) fn removal() -> Case {
         Renderer::new().removal_error(&scene, &camera, BACKGROUND, &mut found);
         let all = blended(&scene, &camera);
         let whole = decided(&scene, &camera, BACKGROUND, &all);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for i in 0..scene.len() {
             let others: Vec<Vec<usize>> =
                 all.iter().map(|ids| ids.iter().copied().filter(|&id| id != i).collect()).collect();
@@ -92,7 +92,7 @@ pub(super) fn removal() -> Case {
 /// Against K·P(cos θ)·cos mφ by recurrence; a colour of 1 is off by some 1e-7 in f32.
 pub(super) fn harmonics() -> Case {
     Case::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for toward in [DVec3::new(0.3, -0.5, 0.8), DVec3::new(-0.7, 0.2, -0.4), DVec3::new(0.1, 0.9, 0.05)] {
             let toward = toward.normalize();
             let camera = Camera::look_at(DVec3::ZERO, toward, 1.0, (8, 8));
@@ -139,7 +139,7 @@ pub(super) fn gradients() -> Case {
             let squares = pixels.as_flattened().iter().enumerate().map(|(at, &x)| off(at, x).powi(2));
             0.5 * squares.sum::<f64>()
         };
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for column in Columns::all().iter() {
             let got = found.column(column).planes();
             let mut largest: Vec<usize> = (0..got.len()).collect();
@@ -170,7 +170,7 @@ pub(super) fn comparison() -> Case {
         };
         let ((a, levels), (b, others)) = (image(512), image(512));
         let squares: i64 = levels.iter().zip(&others).map(|(a, b)| (a - b).pow(2)).sum();
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.near(psnr(&a, &b), -10.0 * (squares as f64 / 65536.0 / levels.len() as f64).log10(), 1.0);
         let ((a, _), (b, _)) = (image(16), image(16));
         worst.near(ssim(&a, &b), plain_ssim(&a, &b), 1.0);

@@ -1,6 +1,6 @@
 //! Percentiles, by which values are normalised and scenes measured.
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use super::made::clouds::Random;
 use crate::model::Column;
 use crate::model::RobustBox;
@@ -9,7 +9,7 @@ use crate::statistics::score::FloatSketch;
 /// Against the sorted values: the value at the rank, to the bit.
 pub(super) fn percentiles() -> Case {
     Case::new("percentiles", "nearest ranks: the sorted values", 0.0, || {
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for count in [1, 2, 50, 99, 100, 101, 1000, 20_011] {
             let values = values(count);
             let sketch = FloatSketch::of(values.iter().copied());
@@ -25,7 +25,7 @@ pub(super) fn percentiles() -> Case {
 /// As [`percentiles`].
 pub(super) fn robust_box() -> Case {
     Case::new("extent of a scene", "P1, P50, P99: the sorted values", 0.0, || {
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for count in [1, 100, 1003] {
             let axes = [7, 8, 9].map(|seed| (0..count).map(|i| values(count)[(i * seed) % count] as f32).collect());
             let axes: [Vec<f32>; 3] = axes;

@@ -4,27 +4,27 @@ use std::f64::consts::PI;
 
 use glam::{DMat3, DVec3};
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use super::made::clouds::{Random, camera};
-use super::oracle::statistics::{Row, row};
+use super::oracle::statistics::{OracleRow, row};
 use crate::error::Result;
 use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
-use crate::recipe::{Motion, Recipe, Scan};
+use crate::recipe::{MotionParams, Recipe, ScanParams};
 use crate::statistics::{BlockScan, ScanPlan};
 
-const BOTH: [Motion; 2] = [Motion::Literal, Motion::Runs];
+const BOTH: [MotionParams; 2] = [MotionParams::Literal, MotionParams::Runs];
 
 /// Against the definition, with lives of many gaps; sums of 40 terms in f64 lose some 1e-15, and variances a few digits
 /// more.
 pub(super) fn motion() -> Case {
     Case::new("motion and life", "D, κ, V, life: definition, f64", 1e-13, || {
         let frames = wanderers(500, 40);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for motion in BOTH {
             let (schedule, recipe) = (unseen(frames.len()), recipe(motion)?);
             let got = scan(&frames, &schedule, &recipe)?;
             for i in 0..got.len() {
-                let Row { d, kappa, v, life, .. } = row(i, &frames, &schedule, &recipe);
+                let OracleRow { d, kappa, v, life, .. } = row(i, &frames, &schedule, &recipe);
                 worst.relative(got.d[i], d);
                 worst.relative(got.kappa[i], kappa);
                 worst.relative(got.v[i], v);
@@ -59,11 +59,11 @@ pub(super) fn uneven_frames() -> Case {
                 frame
             })
             .collect();
-        let got = scan_at(&times, &frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let got = scan_at(&times, &frames, &unseen(frames.len()), &recipe(MotionParams::Runs)?)?;
         let steps = times.len() - 1;
         let mean_step = times[steps] / steps as f64;
         let squares: f64 = times.windows(2).map(|pair| (mean_step * (pair[0] + pair[1])).powi(2)).sum();
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.relative(got.d[0], (squares / steps as f64).sqrt());
         worst.relative(got.kappa[0], 2.0 * mean_step * mean_step);
         Ok(worst)
@@ -73,7 +73,7 @@ pub(super) fn uneven_frames() -> Case {
 /// Nothing, one and two life frames have exact answers.
 pub(super) fn short_lives() -> Case {
     Case::new("short lives", "D, κ, V of 0 to 3 life frames: exact", 0.0, || {
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for motion in BOTH {
             // Whether it lives in each frame; steps of 3 and turns of 6 that count, for the paper and in runs.
             for (life, steps, turns) in [
@@ -91,8 +91,8 @@ pub(super) fn short_lives() -> Case {
                 let got = scan(&frames, &unseen(frames.len()), &recipe(motion)?)?;
                 let alive = life.iter().sum::<u32>();
                 let (k, divisor) = match motion {
-                    Motion::Literal => (0, alive),
-                    Motion::Runs => (1, steps[1]),
+                    MotionParams::Literal => (0, alive),
+                    MotionParams::Runs => (1, steps[1]),
                 };
                 worst.same(&got.life[0], &alive);
                 worst.same(&got.d[0], &(f64::from(9 * steps[k]) / f64::from(divisor.max(1))).sqrt());
@@ -120,11 +120,11 @@ pub(super) fn steady_opacity() -> Case {
                 frame
             })
             .collect();
-        let got = scan(&frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let got = scan(&frames, &unseen(frames.len()), &recipe(MotionParams::Runs)?)?;
         let count = logits.len() as f64;
         let mean = logits.iter().map(|&x| opacity(x)).sum::<f64>() / count;
         let variance = logits.iter().map(|&x| (opacity(x) - mean).powi(2)).sum::<f64>() / count;
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.relative(got.v[0], variance);
         worst.same(&got.v[1], &0.0);
         Ok(worst)
@@ -138,11 +138,11 @@ pub(super) fn projected_area() -> Case {
         let cameras = vec![camera(320, 256), camera(40, 300)];
         let mut schedule = Schedule::new(cameras);
         schedule.push(frames.len(), &[(0, 0), (1, 1)]);
-        let recipe = recipe(Motion::Runs)?;
+        let recipe = recipe(MotionParams::Runs)?;
         let got = scan(&frames, &schedule, &recipe)?;
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for i in 0..got.len() {
-            let Row { c, vis, .. } = row(i, &frames, &schedule, &recipe);
+            let OracleRow { c, vis, .. } = row(i, &frames, &schedule, &recipe);
             worst.near(got.c[i], c, c.max(1.0));
             worst.same(&got.vis[i], &vis);
         }
@@ -169,7 +169,7 @@ pub(super) fn needle_on_screen() -> Case {
         };
         let mut schedule = Schedule::new(vec![camera]);
         schedule.push(1, &[(0, 0)]);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         for (turn, length) in [(0.1f32, 1e2f64), (0.4, 1e3), (0.9, 1e4), (1.3, 1e5)] {
             let mut frame = resting(1);
             let depth = 2.0f32;
@@ -177,7 +177,7 @@ pub(super) fn needle_on_screen() -> Case {
             frame.rotation.set_row(0, [1.0, 0.0, 0.0, turn]);
             let logs = [length, 1e-8, 1e-8].map(|px| (px * f64::from(depth) / focal).ln() as f32);
             frame.log_scale.set_row(0, logs);
-            let got = scan(&[frame], &schedule, &recipe(Motion::Runs)?)?;
+            let got = scan(&[frame], &schedule, &recipe(MotionParams::Runs)?)?;
             let variance = |k: usize| (f64::from(logs[k]).exp() * focal / f64::from(depth)).powi(2);
             let (a, b) = (variance(0), variance(1));
             let (sine, cosine) = (2.0 * f64::from(turn).atan()).sin_cos();
@@ -192,8 +192,8 @@ pub(super) fn needle_on_screen() -> Case {
 }
 
 /// One Gaussian that walks along x by whole numbers of `unit` from `from`, for every (from, unit).
-fn walks(sizes: &[(f32, f32)]) -> Result<Worst> {
-    let mut worst = Worst::default();
+fn walks(sizes: &[(f32, f32)]) -> Result<LargestError> {
+    let mut worst = LargestError::default();
     for &(from, unit) in sizes {
         let mut random = Random(9);
         let mut place = 0i64;
@@ -213,7 +213,7 @@ fn walks(sizes: &[(f32, f32)]) -> Result<Worst> {
                 frame
             })
             .collect();
-        let got = scan(&frames, &unseen(frames.len()), &recipe(Motion::Runs)?)?;
+        let got = scan(&frames, &unseen(frames.len()), &recipe(MotionParams::Runs)?)?;
         let steps: Vec<i64> = places.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let squares: i64 = steps.iter().map(|step| step * step).sum();
         let turns: i64 = steps.windows(2).map(|pair| (pair[1] - pair[0]).abs()).sum();
@@ -256,8 +256,8 @@ fn wanderers(count: usize, frames: usize) -> Vec<Gaussians> {
     (0..frames).map(&mut frame).collect()
 }
 
-fn recipe(motion: Motion) -> Result<Scan> {
-    Ok(Scan { motion, ..Recipe::preset("default")?.scan })
+fn recipe(motion: MotionParams) -> Result<ScanParams> {
+    Ok(ScanParams { motion, ..Recipe::preset("default")?.scan })
 }
 
 fn unseen(frames: usize) -> Schedule {
@@ -267,13 +267,13 @@ fn unseen(frames: usize) -> Schedule {
 }
 
 /// The rows of evenly spaced frames.
-fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
+fn scan(frames: &[Gaussians], schedule: &Schedule, recipe: &ScanParams) -> Result<Rows> {
     let times: Vec<f64> = (0..frames.len()).map(|t| t as f64).collect();
     scan_at(&times, frames, schedule, recipe)
 }
 
 /// The rows of frames at `times`, told where opacities stay, as sources do.
-fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &Scan) -> Result<Rows> {
+fn scan_at(times: &[f64], frames: &[Gaussians], schedule: &Schedule, recipe: &ScanParams) -> Result<Rows> {
     let plan = ScanPlan::new(recipe, times, schedule)?;
     let mut block = BlockScan::new(frames.first().map_or(0, Gaussians::len), 0, &plan);
     for (t, (frame, views)) in frames.iter().zip(schedule.iter()).enumerate() {

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use gseq::Compression;
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use super::made::clouds::{Random, scene};
 use crate::archive::{
     ATTRIBUTES, Content, Encoded, FieldSteps, Role, Steps, TensorSteps, attribute, decode, encode, round_cloud, step,
@@ -24,8 +24,8 @@ use crate::source::{BlockReader, FrameSource, Ids};
 /// Every bit, NaN and −0 among them, and of a column whose last frame is its first.
 pub(super) fn container() -> Case {
     Case::new("container", "values of 70 frames: the same bits", 0.0, || {
-        let mut worst = Worst::default();
-        let made = Frames::new();
+        let mut worst = LargestError::default();
+        let made = MemoryFrames::new();
         for compression in [Compression::Raw, Compression::Zstd(1)] {
             through_container(&made, compression, |got, expected, _| worst.same(&got.to_bits(), &expected.to_bits()))?;
         }
@@ -36,8 +36,8 @@ pub(super) fn container() -> Case {
 /// In parts of the bound that was asked for.
 pub(super) fn bounded_container() -> Case {
     Case::new("container in bounds", "values: within 1 bound of theirs", 1.0, || {
-        let mut worst = Worst::default();
-        let mut made = Frames::new();
+        let mut worst = LargestError::default();
+        let mut made = MemoryFrames::new();
         for column in made.frames.iter_mut().flat_map(|frame| frame.columns_mut(Columns::all())) {
             column.planes_mut().iter_mut().filter(|x| !x.is_finite()).for_each(|x| *x = 0.0);
         }
@@ -59,7 +59,7 @@ pub(super) fn archive_grid() -> Case {
         let Encoded { bytes, order, .. } = encode(&content, &steps)?;
         let (back, _) = decode(&bytes, Path::new("made up"), ReadLimit::NONE)?;
         let expected = content.cloud.pick(&order);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         let half = |k: i32, value: f32| 0.5 * step(k) + f64::from(value.abs()) * f64::from(f32::EPSILON);
         for (k, &step) in steps.cloud.iter().enumerate().take(used_attributes(&content)) {
             for (got, expected) in attribute(&back.cloud, k).zip(attribute(&expected, k)) {
@@ -84,7 +84,7 @@ pub(super) fn archive_codes() -> Case {
         let mut expected = content.cloud.pick(&order);
         let attributes: Vec<usize> = (0..used_attributes(&content)).collect();
         round_cloud(&mut expected, &steps.cloud, &attributes);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.same(&back.cloud, &expected);
         worst.same(&back.files, &content.files);
         worst.same(&back.tensors.get("a.exact"), &content.tensors.get("a.exact"));
@@ -123,7 +123,7 @@ fn used_attributes(content: &Content) -> usize {
 
 /// Hands every value that comes back of `made`, and what it was, to `compare`.
 fn through_container(
-    made: &Frames,
+    made: &MemoryFrames,
     packing: impl Into<Packing>,
     mut compare: impl FnMut(f32, f32, Columns),
 ) -> Result<()> {
@@ -146,15 +146,15 @@ fn through_container(
 }
 
 /// Frames in memory.
-struct Frames {
+struct MemoryFrames {
     info: SequenceInfo,
     frames: Vec<Gaussians>,
 }
 
-impl Frames {
+impl MemoryFrames {
     /// 1100 Gaussians, more than a block, at 70 frames, more than two: positions wander, opacities jump, rotations are
     /// at their first value again in the last frame of a block, scales and colours stay.
-    fn new() -> Frames {
+    fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);
         let mut now = scene(15, count, 1);
@@ -175,26 +175,26 @@ impl Frames {
         let frames = (0..times).map(&mut frame).collect();
         let varying = Columns::POSITION | Columns::ROTATION | Columns::OPACITY;
         let times = (0..times).map(|t| t as f64).collect();
-        Frames { info: SequenceInfo { count, times, sh_degree: 1, varying }, frames }
+        MemoryFrames { info: SequenceInfo { count, times, sh_degree: 1, varying }, frames }
     }
 }
 
-impl FrameSource for Frames {
+impl FrameSource for MemoryFrames {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
-        Ok(Box::new(Rows { frames: &self.frames, rows: ids.iter().map(|id| id as u32).collect() }))
+        Ok(Box::new(StoredRows { frames: &self.frames, rows: ids.iter().map(|id| id as u32).collect() }))
     }
 }
 
-struct Rows<'a> {
+struct StoredRows<'a> {
     frames: &'a [Gaussians],
     rows: Vec<u32>,
 }
 
-impl BlockReader for Rows<'_> {
+impl BlockReader for StoredRows<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
             *out.column_mut(column) = self.frames[frame].column(column).pick(&self.rows);

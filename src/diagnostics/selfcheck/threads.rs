@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use super::case::{Case, Worst};
+use super::case::{Case, LargestError};
 use super::made::clouds::{camera, scene};
 use crate::budget::Budget;
 use crate::diagnostics::demo;
@@ -18,7 +18,7 @@ use crate::render::{Image, Renderer};
 pub(super) fn same_bytes() -> Case {
     Case::new("1 and 2 threads", "demo compressed, gradients: same bits", 0.0, || {
         let (one, two) = (made_on(1)?, made_on(2)?);
-        let mut worst = Worst::default();
+        let mut worst = LargestError::default();
         worst.same(&two, &one);
         Ok(worst)
     })

@@ -21,7 +21,7 @@ const MAX_FOCAL_PX: f64 = 1e9;
 
 /// A picture as a file lists it.
 #[derive(Debug, Clone)]
-pub(super) struct Picture {
+pub(super) struct ListedImage {
     /// The camera that took it.
     pub(super) camera: Camera,
     /// Its time stamp; none when it stands for every frame.
@@ -42,7 +42,7 @@ pub(super) struct Picture {
 #[derive(Debug)]
 pub(super) struct Assembly {
     rig: Rig,
-    gauge: Gauge,
+    gauge: MemoryCounter,
     /// Indices of `rig.cameras` by their values.
     known: HashTable<u32>,
     hasher: DefaultHashBuilder,
@@ -60,7 +60,7 @@ impl Assembly {
     pub(super) fn new(memory: ReadLimit) -> Assembly {
         Assembly {
             rig: Rig { cameras: Vec::new(), shots: Vec::new(), background: None, origin: String::new() },
-            gauge: Gauge { limit: memory, used: 0 },
+            gauge: MemoryCounter { limit: memory, used: 0 },
             known: HashTable::new(),
             hasher: DefaultHashBuilder::default(),
             untimed: HashSet::new(),
@@ -72,7 +72,7 @@ impl Assembly {
     }
 
     /// Counts the memory of what is kept beside the rig while it is made.
-    pub(super) fn gauge(&mut self) -> &mut Gauge {
+    pub(super) fn gauge(&mut self) -> &mut MemoryCounter {
         &mut self.gauge
     }
 
@@ -102,7 +102,7 @@ impl Assembly {
     ///
     /// # Panics
     /// If no file was begun.
-    pub(super) fn add(&mut self, picture: Picture) -> Result<()> {
+    pub(super) fn add(&mut self, picture: ListedImage) -> Result<()> {
         let path = &self.files.last().expect("a file was begun").0;
         let frame = self.taken;
         let wrong = |expected: String, found: String| Error::input(path, place(Some(frame)), expected, found);
@@ -204,12 +204,12 @@ impl Assembly {
 
 /// Counts the memory that is kept while cameras are read.
 #[derive(Debug)]
-pub(super) struct Gauge {
+pub(super) struct MemoryCounter {
     limit: ReadLimit,
     used: u64,
 }
 
-impl Gauge {
+impl MemoryCounter {
     /// Counts `bytes` that are about to be kept of the file at `path`; `what` names what they are for.
     ///
     /// # Errors

@@ -21,8 +21,8 @@
 use std::path::Path;
 
 use super::CameraOptions;
-use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
-use super::fields::{Fields, place};
+use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
+use super::fields::{CameraFields, place};
 use super::pictures::each_picture;
 use super::times::{self, Times};
 use crate::error::Result;
@@ -38,7 +38,7 @@ const CAMERA: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation"
 
 /// Reads this project's own file, of which `outline` is what lies around the pictures.
 pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
-    let shared = Fields::of(file, None, outline)?;
+    let shared = CameraFields::of(file, None, outline)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
@@ -46,13 +46,13 @@ pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) 
     let mut assembly = Assembly::new(memory);
     assembly.begin(file, shared.list("frames")?)?;
     each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(per_picture(file, Fields::of(file, Some(index), frame)?)?)
+        assembly.add(per_picture(file, CameraFields::of(file, Some(index), frame)?)?)
     })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
     assembly.finish(background, shown_name(file))
 }
 
-fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
+fn per_picture(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let (rotation, translation) = own.pose("w2c")?;
     let split = match own.optional_text("split")? {
         None | Some("train") => Split::Train,
@@ -71,7 +71,7 @@ fn per_picture(file: &Path, own: Fields<'_>) -> Result<Picture> {
         translation,
         near: Camera::NEAR,
     };
-    Ok(Picture {
+    Ok(ListedImage {
         camera,
         time: own.optional_number("time")?,
         split,
@@ -103,16 +103,16 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     }
     each_picture(file, None, &CAMERA, |index, camera| {
         let time = times.get(index).copied().flatten();
-        assembly.add(Picture { time, ..per_camera(file, Fields::of(file, Some(index), camera)?)? })
+        assembly.add(ListedImage { time, ..per_camera(file, CameraFields::of(file, Some(index), camera)?)? })
     })?;
     assembly.finish(None, origin)
 }
 
-fn per_camera(file: &Path, own: Fields<'_>) -> Result<Picture> {
+fn per_camera(file: &Path, own: CameraFields<'_>) -> Result<ListedImage> {
     let size @ (width, height) = (own.side("width")?, own.side("height")?);
     let intrinsics = [own.number("fx")?, own.number("fy")?, 0.5 * f64::from(width), 0.5 * f64::from(height)];
     let name = own.optional_text("img_name")?;
-    Ok(Picture {
+    Ok(ListedImage {
         camera: from_camera_to_world(size, intrinsics, own.matrix3("rotation")?, own.vector("position")?.into()),
         time: None,
         split: Split::Train,

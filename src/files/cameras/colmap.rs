@@ -14,12 +14,12 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DQuat, DVec3};
 use hashbrown::HashMap;
 
-use super::assemble::{Assembly, Gauge, Picture};
+use super::assemble::{Assembly, ListedImage, MemoryCounter};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX, Times, frames, times};
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
 use crate::files::open::open_file;
-use crate::files::text::Lines;
+use crate::files::text::TextLines;
 use crate::model::{Camera, Rig, Split};
 
 /// Longest name of a picture.
@@ -29,7 +29,7 @@ const POINT: u64 = 24;
 /// Bytes of a camera in its table, and of a picture in its list beside its name, while they grow by being copied to twice
 /// their size.
 const LENS_BYTES: u64 = 4 * size_of::<(u32, Lens)>() as u64;
-const IMAGE_BYTES: u64 = 3 * size_of::<Image>() as u64 + 160;
+const IMAGE_BYTES: u64 = 3 * size_of::<ColmapImage>() as u64 + 160;
 /// Furthest that the length of a quaternion may be from 1.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
@@ -56,7 +56,7 @@ struct Lens {
     intrinsics: [f64; 4],
 }
 
-struct Image {
+struct ColmapImage {
     quaternion: [f64; 4],
     translation: [f64; 3],
     camera: u32,
@@ -79,7 +79,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     // A reconstruction lists its pictures in the order in which it found them.
     listed.sort_by(|a, b| natord::compare(&a.name, &b.name).then_with(|| a.name.cmp(&b.name)));
     let pictures_in = pictures_folder(&folder);
-    let picture = |image: &Image| -> Result<Picture> {
+    let picture = |image: &ColmapImage| -> Result<ListedImage> {
         let wrong = |expected: String, found: String| {
             Error::input(&images, format!("picture {}", quoted(&image.name)), expected, found)
         };
@@ -92,7 +92,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
             return Err(wrong("a quaternion of length 1".into(), format!("{w} {x} {y} {z}")));
         }
         let (size, [fx, fy, cx, cy]) = scaled(*lens, options.size);
-        Ok(Picture {
+        Ok(ListedImage {
             camera: Camera {
                 width: size.0,
                 height: size.1,
@@ -129,7 +129,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
     let (given, said) = times::give(&images, &names, &options.times, assembly.gauge())?;
     assembly.begin(&images, listed.len())?;
     for (index, image) in listed.iter().enumerate() {
-        assembly.add(Picture { time: given.get(index).copied().flatten(), ..picture(image)? })?;
+        assembly.add(ListedImage { time: given.get(index).copied().flatten(), ..picture(image)? })?;
     }
     let origin = shown_name(&folder);
     let origin = if said.is_empty() { origin } else { format!("{origin} ({said})") };
@@ -203,9 +203,9 @@ fn lens(
     Ok(Lens { size: (w, h), intrinsics })
 }
 
-fn parse_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
+fn parse_cameras(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut lenses = HashMap::new();
-    let mut lines = Lines::open(path)?;
+    let mut lines = TextLines::open(path)?;
     while let Some((number, line)) = lines.next_line()? {
         let (at, line) = (number - 1, line.trim());
         if line.is_empty() || line.starts_with('#') {
@@ -226,9 +226,9 @@ fn parse_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
     Ok(lenses)
 }
 
-fn parse_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
+fn parse_images(path: &Path, gauge: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut images = Vec::new();
-    let mut lines = Lines::open(path)?;
+    let mut lines = TextLines::open(path)?;
     while let Some((number, line)) = lines.next_line()? {
         let (at, line) = (number - 1, line.trim());
         if line.is_empty() || line.starts_with('#') {
@@ -253,7 +253,7 @@ fn parse_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
         let [w, x, y, z, tx, ty, tz] = values;
         gauge.take(path, &format!("line {number}"), "the pictures", IMAGE_BYTES + 2 * rest.len() as u64)?;
         let name = rest.into();
-        images.push(Image { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
+        images.push(ColmapImage { quaternion: [w, x, y, z], translation: [tx, ty, tz], camera, name });
         // The points that it sees, on a line that may be empty.
         lines.skip_line()?;
     }
@@ -330,7 +330,7 @@ impl<'a> Binary<'a> {
     }
 }
 
-fn read_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
+fn read_cameras(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<u32, Lens>> {
     let mut file = Binary::open(path)?;
     let mut lenses = HashMap::new();
     for _ in 0..file.u64("a number of cameras")? {
@@ -349,7 +349,7 @@ fn read_cameras(path: &Path, gauge: &mut Gauge) -> Result<HashMap<u32, Lens>> {
     Ok(lenses)
 }
 
-fn read_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
+fn read_images(path: &Path, gauge: &mut MemoryCounter) -> Result<Vec<ColmapImage>> {
     let mut file = Binary::open(path)?;
     let mut images = Vec::new();
     for _ in 0..file.u64("a number of images")? {
@@ -359,7 +359,7 @@ fn read_images(path: &Path, gauge: &mut Gauge) -> Result<Vec<Image>> {
         gauge.take(path, &format!("byte {}", file.at), "the pictures", IMAGE_BYTES + 2 * name.len() as u64)?;
         let points = file.u64("a number of points")?;
         file.skip(points.checked_mul(POINT), "the points of a picture")?;
-        images.push(Image { quaternion, translation, camera, name: name.into() });
+        images.push(ColmapImage { quaternion, translation, camera, name: name.into() });
     }
     Ok(images)
 }

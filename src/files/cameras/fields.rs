@@ -13,18 +13,18 @@ pub(super) const POSE: &str = "3 or 4 rows of 4 finite numbers";
 
 /// One JSON object of a camera file: a picture's, or the file's own.
 #[derive(Clone, Copy)]
-pub(super) struct Fields<'a> {
+pub(super) struct CameraFields<'a> {
     path: &'a Path,
     /// Index of the picture in the file; none for the file's own keys.
     frame: Option<usize>,
     map: &'a Object,
 }
 
-impl<'a> Fields<'a> {
+impl<'a> CameraFields<'a> {
     /// The keys of `value`, which must be an object.
     pub(super) fn of(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
         match value {
-            Small::Object(map) => Ok(Fields { path, frame, map }),
+            Small::Object(map) => Ok(CameraFields { path, frame, map }),
             other => Err(Error::input(path, place(frame), "an object", other.describe())),
         }
     }

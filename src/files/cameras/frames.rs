@@ -7,7 +7,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::assemble::Picture;
+use super::assemble::ListedImage;
 use crate::model::Split;
 
 const PREFIX: &str = "colmap_";
@@ -39,10 +39,10 @@ pub(super) fn count(root: &Path, first: u32) -> usize {
 
 /// `pictures`, all of frame `first` in `root`, at each of `frames` frames; the first of them is held out.
 pub(super) fn repeated<'a>(
-    pictures: &'a [Picture],
+    pictures: &'a [ListedImage],
     (root, first): &'a (PathBuf, u32),
     frames: usize,
-) -> impl Iterator<Item = Picture> + 'a {
+) -> impl Iterator<Item = ListedImage> + 'a {
     let at = move |frame: usize| {
         let folder = root.with_file_name(format!("{PREFIX}{}", u64::from(*first) + frame as u64));
         pictures.iter().enumerate().map(move |(k, picture)| {
@@ -53,7 +53,7 @@ pub(super) fn repeated<'a>(
             });
             let time = (frames > 1).then(|| frame as f64 / frames as f64);
             let split = if k == 0 { Split::Test } else { picture.split };
-            Picture { time, view: Some(k as u32), split, image, ..picture.clone() }
+            ListedImage { time, view: Some(k as u32), split, image, ..picture.clone() }
         })
     };
     (0..frames).flat_map(at)

@@ -13,7 +13,7 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 use npyz::{NpyFile, Order, TypeChar};
 
-use super::assemble::{Assembly, Gauge, Picture, check, from_camera_to_world};
+use super::assemble::{Assembly, ListedImage, MemoryCounter, check, from_camera_to_world};
 use super::{CameraOptions, MAX_PICTURES, MAX_SIDE_PX};
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
@@ -51,8 +51,8 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
 }
 
 /// One picture per frame and camera, frame after frame.
-fn pictures(cameras: &[Camera], frames: usize) -> impl Iterator<Item = Picture> {
-    let picture = move |frame: usize, view: usize| Picture {
+fn pictures(cameras: &[Camera], frames: usize) -> impl Iterator<Item = ListedImage> {
+    let picture = move |frame: usize, view: usize| ListedImage {
         camera: cameras[view].clone(),
         time: Some(frame as f64 / frames as f64),
         split: if view == 0 { Split::Test } else { Split::Train },
@@ -83,7 +83,7 @@ fn camera(file: &Path, index: usize, row: &[f64; WIDTH], options: &CameraOptions
 }
 
 /// The rows of the array in `file`, checked to be `[V, 17]` floats that are all there.
-fn read_rows(file: &Path, gauge: &mut Gauge) -> Result<Vec<[f64; WIDTH]>> {
+fn read_rows(file: &Path, gauge: &mut MemoryCounter) -> Result<Vec<[f64; WIDTH]>> {
     let unreadable = |found: String| Error::input(file, "header", "a NumPy array", found);
     let mut opened = open_file(file)?;
     let bytes = opened.metadata().map_err(Error::io("read the size of", file))?.len();

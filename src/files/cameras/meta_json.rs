@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::assemble::{Assembly, Picture};
-use super::fields::{Fields, POSE, place};
+use super::assemble::{Assembly, ListedImage};
+use super::fields::{CameraFields, POSE, place};
 use super::pictures::outline;
 use crate::error::ShowPath;
 use crate::error::{Error, Result};
-use crate::files::json::lists::{Ask, At, each_element};
+use crate::files::json::lists::{Ask, JsonPlace, each_element};
 use crate::files::json::small::Small;
 use crate::files::names::shown_name;
 use crate::limits::ReadLimit;
@@ -53,14 +53,14 @@ pub(super) fn load(file: &Path, with_others: bool, memory: ReadLimit) -> Result<
 
 /// The values under one key, by frame and camera.
 #[derive(Debug)]
-struct Table<T> {
+struct KeyedValues<T> {
     values: Vec<Option<T>>,
     /// End of each frame's values.
     ends: Vec<usize>,
 }
 
-impl<T> Table<T> {
-    const EMPTY: Table<T> = Table { values: Vec::new(), ends: Vec::new() };
+impl<T> KeyedValues<T> {
+    const EMPTY: KeyedValues<T> = KeyedValues { values: Vec::new(), ends: Vec::new() };
 
     /// Memory of one more value, as lists grow by being copied to twice their length.
     const BYTES: u64 = 3 * size_of::<Option<T>>() as u64;
@@ -82,15 +82,15 @@ impl<T> Table<T> {
 /// The values of a file.
 #[derive(Debug)]
 struct Tables {
-    intrinsics: Table<[f64; 4]>,
-    poses: Table<(DMat3, DVec3)>,
-    images: Table<Box<str>>,
-    views: Table<u32>,
+    intrinsics: KeyedValues<[f64; 4]>,
+    poses: KeyedValues<(DMat3, DVec3)>,
+    images: KeyedValues<Box<str>>,
+    views: KeyedValues<u32>,
 }
 
 impl Tables {
     /// Takes the value of the key number `key` at `frame`.
-    fn take(&mut self, own: Fields<'_>, key: usize) -> Result<()> {
+    fn take(&mut self, own: CameraFields<'_>, key: usize) -> Result<()> {
         match key {
             0 => {
                 let k = own.matrix3("k")?;
@@ -117,16 +117,24 @@ impl Tables {
 /// Adds the pictures of a file; returns how many frames it has.
 fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
-    let shared = Fields::of(file, None, &outline)?;
+    let shared = CameraFields::of(file, None, &outline)?;
     let (width, height) = (shared.side("w")?, shared.side("h")?);
     let frames = shared.list("k")?;
-    let mut tables =
-        Tables { intrinsics: Table::EMPTY, poses: Table::EMPTY, images: Table::EMPTY, views: Table::EMPTY };
-    let bytes =
-        [Table::<[f64; 4]>::BYTES, Table::<(DMat3, DVec3)>::BYTES, Table::<Box<str>>::BYTES + 32, Table::<u32>::BYTES];
+    let mut tables = Tables {
+        intrinsics: KeyedValues::EMPTY,
+        poses: KeyedValues::EMPTY,
+        images: KeyedValues::EMPTY,
+        views: KeyedValues::EMPTY,
+    };
+    let bytes = [
+        KeyedValues::<[f64; 4]>::BYTES,
+        KeyedValues::<(DMat3, DVec3)>::BYTES,
+        KeyedValues::<Box<str>>::BYTES + 32,
+        KeyedValues::<u32>::BYTES,
+    ];
     let (mut used, mut next) = (0, [0; KEYS.len()]);
     let ask = Ask { keys: &KEYS, nested: true, wanted: &[] };
-    each_element(file, ask, |At { key, index, inner }, value| {
+    each_element(file, ask, |JsonPlace { key, index, inner }, value| {
         let name = KEYS[key];
         if index != next[key] {
             return Err(Error::input(file, format!("key \"{name}\""), "this key once", "twice"));
@@ -137,7 +145,7 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
         used += taken;
         if inner.is_some() {
             let entry = Small::of_entry(name, value);
-            return tables.take(Fields::of(file, Some(index), &entry)?, key);
+            return tables.take(CameraFields::of(file, Some(index), &entry)?, key);
         }
         next[key] += 1;
         match value {
@@ -162,7 +170,7 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
             let [fx, fy, cx, cy] = *intrinsics.get(frame, camera).expect("a matrix for every camera");
             let &(rotation, translation) = poses.get(frame, camera).ok_or_else(nothing)?;
             let image = images.get(frame, camera).map(|name| PathBuf::from("ims").join(&**name));
-            assembly.add(Picture {
+            assembly.add(ListedImage {
                 camera: Camera { width, height, fx, fy, cx, cy, rotation, translation, near: Camera::NEAR },
                 time: Some(frame as f64 / frames.saturating_sub(1).max(1) as f64),
                 split,

@@ -12,12 +12,12 @@ use std::path::Path;
 use hashbrown::{HashMap, HashSet};
 
 use super::CameraOptions;
-use super::assemble::{Assembly, Gauge, Picture, from_camera_to_world};
-use super::fields::Fields;
+use super::assemble::{Assembly, ListedImage, MemoryCounter, from_camera_to_world};
+use super::fields::CameraFields;
 use super::pictures::whole;
 use crate::error::{Error, Result, quoted};
 use crate::files::image::measure;
-use crate::files::json::lists::{Ask, At, each_element, each_entry};
+use crate::files::json::lists::{Ask, JsonPlace, each_element, each_entry};
 use crate::files::json::small::Small;
 use crate::files::names::shown_name;
 use crate::model::{Rig, Split};
@@ -47,7 +47,7 @@ pub(super) fn load(file: &Path, options: &CameraOptions) -> Result<Rig> {
         let picture = picture(folder, id, options)?;
         for split in splits {
             let time = f64::from(warp) / latest;
-            assembly.add(Picture { time: Some(time), split, ..picture.clone() })?;
+            assembly.add(ListedImage { time: Some(time), split, ..picture.clone() })?;
         }
     }
     assembly.finish(None, shown_name(folder))
@@ -59,16 +59,16 @@ const LISTS: [&str; 3] = ["ids", "val_ids", "train_ids"];
 const NAME_BYTES: u64 = 200;
 
 /// Reads the names of `file`. Those for training may be left out where none are held out.
-fn names(file: &Path, gauge: &mut Gauge) -> Result<[Vec<Box<str>>; 3]> {
+fn names(file: &Path, gauge: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
     let outline = whole(file, &LISTS)?;
-    let of = Fields::of(file, None, &outline)?;
+    let of = CameraFields::of(file, None, &outline)?;
     let held_out = of.list(LISTS[1])?;
     of.list(LISTS[0])?;
     if held_out > 0 {
         of.list(LISTS[2])?;
     }
     let mut names = [const { Vec::new() }; 3];
-    each_element(file, Ask { keys: &LISTS, nested: false, wanted: &[] }, |At { key, index, .. }, name| {
+    each_element(file, Ask { keys: &LISTS, nested: false, wanted: &[] }, |JsonPlace { key, index, .. }, name| {
         if index != names[key].len() {
             return Err(Error::input(file, format!("key \"{}\"", LISTS[key]), "this key once", "twice"));
         }
@@ -84,7 +84,7 @@ fn names(file: &Path, gauge: &mut Gauge) -> Result<[Vec<Box<str>>; 3]> {
 }
 
 /// Reads the `warp_id` of each picture.
-fn warps(file: &Path, ids: &[Box<str>], gauge: &mut Gauge) -> Result<Vec<u32>> {
+fn warps(file: &Path, ids: &[Box<str>], gauge: &mut MemoryCounter) -> Result<Vec<u32>> {
     gauge.take(file, "", "the times of its pictures", 64 * ids.len() as u64)?;
     // A name may be there twice.
     let mut places: HashMap<&str, u32> = HashMap::with_capacity(ids.len());
@@ -97,7 +97,7 @@ fn warps(file: &Path, ids: &[Box<str>], gauge: &mut Gauge) -> Result<Vec<u32>> {
     }
     each_entry(file, &["warp_id"], |id, own| {
         if let Some(&place) = places.get(id) {
-            let own = Fields::of(file, None, &own)?;
+            let own = CameraFields::of(file, None, &own)?;
             found[place as usize] =
                 Some(own.optional_index("warp_id")?.ok_or_else(|| own.wrong("warp_id", "a number"))?);
         }
@@ -131,10 +131,10 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
     ids.iter().map(|id| split(id)).collect()
 }
 
-fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<Picture> {
+fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
     let file = folder.join("camera").join(format!("{id}.json"));
     let document = whole(&file, &CAMERA)?;
-    let own = Fields::of(&file, None, &document)?;
+    let own = CameraFields::of(&file, None, &document)?;
     let [width, height] = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));
     let size = options.size.or_else(|| measure(&image)).unwrap_or(((width / 2).max(1), (height / 2).max(1)));
@@ -142,7 +142,7 @@ fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<Picture> 
     let (x, y) = (f64::from(size.0) / f64::from(width), f64::from(size.1) / f64::from(height));
     let intrinsics = [focal * x, focal * y, 0.5 * f64::from(size.0), 0.5 * f64::from(size.1)];
     let orientation = own.matrix3("orientation")?;
-    Ok(Picture {
+    Ok(ListedImage {
         camera: from_camera_to_world(size, intrinsics, orientation.transpose(), own.vector("position")?.into()),
         time: None,
         split: Split::Train,

@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 
 use hashbrown::HashMap;
 
-use super::assemble::Gauge;
+use super::assemble::MemoryCounter;
 use crate::error::{Error, Result, ShowPath, quoted};
 use crate::files::names::shown_name;
-use crate::files::text::Lines;
+use crate::files::text::TextLines;
 
 /// Bytes of an entry of a table beside its name, while the table grows by being copied to twice its size.
 const TABLE_ENTRY: u64 = 3 * 40 + 32;
@@ -60,7 +60,7 @@ pub(super) fn give(
     file: &Path,
     names: &[Box<str>],
     times: &Times,
-    gauge: &mut Gauge,
+    gauge: &mut MemoryCounter,
 ) -> Result<(Vec<Option<f64>>, String)> {
     gauge.take(file, "", "the times of its pictures", 40 * names.len() as u64)?;
     let none = || Ok((Vec::new(), String::new()));
@@ -128,9 +128,9 @@ fn keys(name: &str) -> impl Iterator<Item = &str> {
     [name, file, stem(file)].into_iter()
 }
 
-fn read_table(path: &Path, gauge: &mut Gauge) -> Result<HashMap<String, f64>> {
+fn read_table(path: &Path, gauge: &mut MemoryCounter) -> Result<HashMap<String, f64>> {
     let mut known = HashMap::new();
-    let mut lines = Lines::open(path)?;
+    let mut lines = TextLines::open(path)?;
     while let Some((number, line)) = lines.next_line()? {
         let (at, line) = (number - 1, line.trim());
         if line.is_empty() || line.starts_with('#') {

@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
 
-use super::assemble::{Assembly, Picture, from_camera_to_world, view_in_name};
-use super::fields::Fields;
+use super::assemble::{Assembly, ListedImage, from_camera_to_world, view_in_name};
+use super::fields::CameraFields;
 use super::pictures::{each_picture, outline};
 use super::{CameraOptions, Clock};
 use crate::error::{Result, ShowPath};
@@ -90,21 +90,27 @@ fn latest_in(file: &Path) -> Result<f64> {
 /// Adds the pictures of `file`.
 fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
-    let shared = Fields::of(file, None, &outline)?;
+    let shared = CameraFields::of(file, None, &outline)?;
     assembly.begin(file, shared.list("frames")?)?;
     let split = split_of(file);
     each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(picture(file, shared, Fields::of(file, Some(index), frame)?, split, options)?)
+        assembly.add(picture(file, shared, CameraFields::of(file, Some(index), frame)?, split, options)?)
     })
 }
 
-fn picture(file: &Path, shared: Fields<'_>, own: Fields<'_>, split: Split, options: &CameraOptions) -> Result<Picture> {
+fn picture(
+    file: &Path,
+    shared: CameraFields<'_>,
+    own: CameraFields<'_>,
+    split: Split,
+    options: &CameraOptions,
+) -> Result<ListedImage> {
     let name = own.optional_text("file_path")?;
     let image = name.map(|name| resolve(file, name));
     let size = size(shared, own, image.as_deref(), options)?;
     let intrinsics = intrinsics(shared, own, size)?;
     let (rotation, center) = own.pose("transform_matrix")?;
-    Ok(Picture {
+    Ok(ListedImage {
         camera: from_camera_to_world(size, intrinsics, rotation * FLIP, center),
         time: own.optional_number("time")?,
         split,
@@ -114,7 +120,12 @@ fn picture(file: &Path, shared: Fields<'_>, own: Fields<'_>, split: Split, optio
 }
 
 /// Picture size in pixels: the file's, else the picture's own, else the option's.
-fn size(shared: Fields<'_>, own: Fields<'_>, image: Option<&Path>, options: &CameraOptions) -> Result<(u32, u32)> {
+fn size(
+    shared: CameraFields<'_>,
+    own: CameraFields<'_>,
+    image: Option<&Path>,
+    options: &CameraOptions,
+) -> Result<(u32, u32)> {
     let side =
         |key| own.optional_side(key).and_then(|side| side.map_or_else(|| shared.optional_side(key), |s| Ok(Some(s))));
     if let (Some(width), Some(height)) = (side("w")?, side("h")?) {
@@ -129,9 +140,9 @@ fn size(shared: Fields<'_>, own: Fields<'_>, image: Option<&Path>, options: &Cam
 }
 
 /// fx, fy, cx, cy in pixels.
-fn intrinsics(shared: Fields<'_>, own: Fields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
+fn intrinsics(shared: CameraFields<'_>, own: CameraFields<'_>, (width, height): (u32, u32)) -> Result<[f64; 4]> {
     let (width, height) = (f64::from(width), f64::from(height));
-    let focal = |fields: Fields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
+    let focal = |fields: CameraFields<'_>, pixels: &str, angle: &str, side: f64| -> Result<Option<f64>> {
         if let Some(focal) = fields.optional_number(pixels)? {
             return Ok(Some(focal));
         }

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 
 use super::made::{Made, MadeTensor, named, tensor, zip};
 use super::*;
-use crate::files::checkpoint::write::{Rows, write_like};
+use crate::files::checkpoint::write::{GaussianRows, write_like};
 
 struct Place(tempfile::TempDir);
 
@@ -24,7 +24,7 @@ impl Place {
         self.0.path().join("left.pt")
     }
 
-    fn left(&self, from: &Checkpoint, kept: &[u32], rows: &[Rows]) -> Result<Checkpoint> {
+    fn left(&self, from: &Checkpoint, kept: &[u32], rows: &[GaussianRows]) -> Result<Checkpoint> {
         let path = self.path();
         write_like(from, kept, rows, &path)?;
         Checkpoint::open(&path, ReadLimit::NONE)
@@ -59,7 +59,7 @@ fn model() -> Made {
     ])
 }
 
-fn find(checkpoint: &Checkpoint, part: usize, name: &str) -> Tensor {
+fn find(checkpoint: &Checkpoint, part: usize, name: &str) -> TensorView {
     let pickle = checkpoint.pickle();
     let parts = pickle.elements(pickle.root()).unwrap();
     checkpoint.tensor(pickle.item(parts[part], name).unwrap()).unwrap()
@@ -112,7 +112,7 @@ fn every_type_of_numbers_becomes_f32() {
 fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
     let place = Place::new();
     let checkpoint = place.open(&model().file()).unwrap();
-    let of = |part, name, changed: &[u32], values: &[f32]| Rows {
+    let of = |part, name, changed: &[u32], values: &[f32]| GaussianRows {
         tensor: find(&checkpoint, part, name),
         changed: changed.to_vec(),
         values: values.to_vec(),
@@ -174,7 +174,7 @@ fn rows_that_stay_keep_their_values_and_everything_else_its_bytes() {
 fn all_rows_are_the_same_values_again() {
     let place = Place::new();
     let checkpoint = place.open(&model().file()).unwrap();
-    let rows = [(0, "means"), (0, "turned"), (1, "mask")].map(|(part, name)| Rows {
+    let rows = [(0, "means"), (0, "turned"), (1, "mask")].map(|(part, name)| GaussianRows {
         tensor: find(&checkpoint, part, name),
         changed: Vec::new(),
         values: Vec::new(),
@@ -184,7 +184,7 @@ fn all_rows_are_the_same_values_again() {
         let mut files = Vec::new();
         checkpoint
             .files(|name, what, bytes| {
-                files.push((name.to_owned(), what != File::Pickle, bytes));
+                files.push((name.to_owned(), what != CheckpointFile::Pickle, bytes));
                 Ok(())
             })
             .unwrap();
@@ -215,7 +215,7 @@ fn a_shape_that_two_tensors_share_is_refused_where_one_has_to_change() {
     pickle.splice(found[0] + shape.len()..found[0] + shape.len(), [b'q', 9]);
     let checkpoint = place.open(&zip(&files)).unwrap();
     let id = |k: usize| checkpoint.pickle().elements(checkpoint.pickle().root()).unwrap()[k];
-    let of = |k| Rows { tensor: checkpoint.tensor(id(k)).unwrap(), changed: Vec::new(), values: Vec::new() };
+    let of = |k| GaussianRows { tensor: checkpoint.tensor(id(k)).unwrap(), changed: Vec::new(), values: Vec::new() };
     let error = place.left(&checkpoint, &[0], &[of(0)]).unwrap_err().to_string();
     assert!(error.contains("several share") && error.contains("clone()"), "{error}");
     // Both: they agree.
@@ -268,7 +268,7 @@ fn a_file_cut_anywhere_is_refused_and_a_flipped_bit_is_never_unnoticed() {
         assert!(error.contains("a.pt"), "{error}");
     }
     let expected = values(&place.open(&whole).unwrap(), 0, "means");
-    let root = |checkpoint: &Checkpoint| -> Option<Tensor> {
+    let root = |checkpoint: &Checkpoint| -> Option<TensorView> {
         let pickle = checkpoint.pickle();
         checkpoint.tensor(pickle.item(*pickle.elements(pickle.root())?.first()?, "means")?)
     };
@@ -296,7 +296,7 @@ proptest! {
                     _ = checkpoint.floats(&tensor, "t");
                 }
                 if !tensor.shape.is_empty() {
-                    _ = place.left(&checkpoint, &[], &[Rows { tensor, changed: Vec::new(), values: Vec::new() }]);
+                    _ = place.left(&checkpoint, &[], &[GaussianRows { tensor, changed: Vec::new(), values: Vec::new() }]);
                 }
             }
         };

@@ -16,7 +16,7 @@ use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use crate::error::{Error, Result};
 use crate::files::checkpoint;
-use crate::files::checkpoint::{Checkpoint, NodeId, Pickle, Tensor};
+use crate::files::checkpoint::{Checkpoint, NodeId, Pickle, TensorView};
 use crate::files::zip_output::ZipOutput;
 
 /// Where the bytes of a file begin is a multiple of so many, as PyTorch has it.
@@ -24,9 +24,9 @@ const ALIGNMENT: u16 = 64;
 
 /// A tensor whose first axis counts Gaussians, and what becomes of it.
 #[derive(Debug)]
-pub(crate) struct Rows {
+pub(crate) struct GaussianRows {
     /// The tensor.
-    pub(crate) tensor: Tensor,
+    pub(crate) tensor: TensorView,
     /// Rows of the result with other values than the row they come from, increasing.
     pub(crate) changed: Vec<u32>,
     /// Their values, `[changed, elements of a row]`, the last index fastest; empty: zeros.
@@ -34,10 +34,10 @@ pub(crate) struct Rows {
 }
 
 /// How a storage is made up anew.
-struct Part<'a> {
-    tensor: &'a Tensor,
+struct StoragePart<'a> {
+    tensor: &'a TensorView,
     /// None: all of its elements stay.
-    rows: Option<&'a Rows>,
+    rows: Option<&'a GaussianRows>,
     shape: Vec<usize>,
     stride: Vec<usize>,
     offset: usize,
@@ -48,24 +48,24 @@ struct Part<'a> {
 ///
 /// # Errors
 /// A tensor whose values are not all there; tensors that share what has to differ between them; a failed write.
-pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Rows], path: &Path) -> Result<()> {
-    let by_node: BTreeMap<NodeId, &Rows> =
+pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[GaussianRows], path: &Path) -> Result<()> {
+    let by_node: BTreeMap<NodeId, &GaussianRows> =
         rows.iter().filter(|rows| !rows.tensor.shape.is_empty()).map(|rows| (rows.tensor.id, rows)).collect();
     let touched: BTreeSet<&str> = rows.iter().map(|rows| rows.tensor.storage.as_str()).collect();
-    let all: Vec<Tensor> = checkpoint.tensors().collect();
+    let all: Vec<TensorView> = checkpoint.tensors().collect();
     let mut numbers = BTreeMap::new();
-    let mut parts: BTreeMap<&str, Vec<Part<'_>>> = BTreeMap::new();
+    let mut parts: BTreeMap<&str, Vec<StoragePart<'_>>> = BTreeMap::new();
     for tensor in all.iter().filter(|tensor| touched.contains(tensor.storage.as_str())) {
         checkpoint
             .check(tensor)
             .map_err(|found| checkpoint.wrong(&format!("data/{}", tensor.storage), "values for all elements", found))?;
         let rows = by_node.get(&tensor.id).copied();
         let of_storage = parts.entry(&tensor.storage).or_default();
-        if of_storage.first().is_some_and(|first: &Part<'_>| first.tensor.kind != tensor.kind) {
+        if of_storage.first().is_some_and(|first: &StoragePart<'_>| first.tensor.kind != tensor.kind) {
             return Err(checkpoint.wrong(&format!("data/{}", tensor.storage), "values of one type", "of several"));
         }
         let offset = of_storage.last().map_or(0, |last| last.offset + last.len);
-        let part = Part::new(tensor, rows, kept.len(), offset);
+        let part = StoragePart::new(tensor, rows, kept.len(), offset);
         of_storage.push(part);
     }
     let mut expected: BTreeMap<NodeId, (Vec<usize>, Vec<usize>, usize)> = BTreeMap::new();
@@ -93,12 +93,12 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Rows], p
         ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path).map_err(Error::io("create", path))?)));
     checkpoint.files(|name, what, bytes| {
         let bytes = match what {
-            checkpoint::File::Pickle => {
+            checkpoint::CheckpointFile::Pickle => {
                 let written = checkpoint.pickle().with_numbers(&bytes, &numbers);
                 confirm(checkpoint, &written, &all, &expected)?;
                 written
             }
-            checkpoint::File::Storage(key) => match parts.get(key) {
+            checkpoint::CheckpointFile::Storage(key) => match parts.get(key) {
                 Some(parts) => {
                     let mut out = Vec::with_capacity(bytes.len());
                     parts.iter().for_each(|part| part.write(&bytes, kept, &mut out));
@@ -106,7 +106,7 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Rows], p
                 }
                 None => bytes,
             },
-            checkpoint::File::Other => bytes,
+            checkpoint::CheckpointFile::Other => bytes,
         };
         let options = FileOptions::default()
             .compression_method(CompressionMethod::Stored)
@@ -118,8 +118,8 @@ pub(crate) fn write_like(checkpoint: &Checkpoint, kept: &[u32], rows: &[Rows], p
     archive.finish().map_err(Into::into).and_then(ZipOutput::close).map_err(failed)
 }
 
-impl<'a> Part<'a> {
-    fn new(tensor: &'a Tensor, rows: Option<&'a Rows>, kept: usize, offset: usize) -> Part<'a> {
+impl<'a> StoragePart<'a> {
+    fn new(tensor: &'a TensorView, rows: Option<&'a GaussianRows>, kept: usize, offset: usize) -> StoragePart<'a> {
         let mut shape = tensor.shape.clone();
         if let (Some(_), Some(first)) = (rows, shape.first_mut()) {
             *first = kept;
@@ -129,8 +129,12 @@ impl<'a> Part<'a> {
         // Rows one after the other, and in each of them every place once: it stays so. Everything else keeps the order of its
         // axes, without the gaps.
         let is_dense = stride.first() == Some(&row) && {
-            let of_row =
-                Tensor { offset: 0, shape: tensor.shape[1..].to_vec(), stride: stride[1..].to_vec(), ..tensor.clone() };
+            let of_row = TensorView {
+                offset: 0,
+                shape: tensor.shape[1..].to_vec(),
+                stride: stride[1..].to_vec(),
+                ..tensor.clone()
+            };
             let mut seen = vec![false; row];
             of_row.each(|at| {
                 if let Some(seen) = seen.get_mut(at) {
@@ -148,7 +152,7 @@ impl<'a> Part<'a> {
             });
         }
         let len = shape.iter().product();
-        Part { tensor, rows, shape, stride, offset, len }
+        StoragePart { tensor, rows, shape, stride, offset, len }
     }
 
     /// Adds its bytes, taken from those of the storage as it was.
@@ -156,7 +160,8 @@ impl<'a> Part<'a> {
         let (bytes, start) = (self.tensor.kind.bytes(), out.len());
         out.resize(start + self.len * bytes, 0);
         let out = &mut out[start..];
-        let to = Tensor { offset: 0, shape: self.shape.clone(), stride: self.stride.clone(), ..self.tensor.clone() };
+        let to =
+            TensorView { offset: 0, shape: self.shape.clone(), stride: self.stride.clone(), ..self.tensor.clone() };
         let Some(rows) = self.rows else {
             let mut places = Vec::with_capacity(self.len);
             to.each(|at| places.push(at));
@@ -169,9 +174,9 @@ impl<'a> Part<'a> {
             return;
         };
         // Places of the elements of a row, counted from its first one.
-        let of_row = |tensor: &Tensor| {
+        let of_row = |tensor: &TensorView| {
             let mut places = Vec::new();
-            let row = Tensor {
+            let row = TensorView {
                 offset: 0,
                 shape: tensor.shape[1..].to_vec(),
                 stride: tensor.stride[1..].to_vec(),
@@ -203,7 +208,7 @@ impl<'a> Part<'a> {
 fn confirm(
     checkpoint: &Checkpoint,
     written: &[u8],
-    all: &[Tensor],
+    all: &[TensorView],
     expected: &BTreeMap<NodeId, (Vec<usize>, Vec<usize>, usize)>,
 ) -> Result<()> {
     let wrong = || {

@@ -9,14 +9,14 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 
 use crate::error::Result;
 
-type Slot = OnceLock<Box<[f32]>>;
+type TileSlot = OnceLock<Box<[f32]>>;
 
 /// Locks that tiles share while they are decoded: more than there are threads, so that hardly two wait for one another.
 const TURNS: usize = 256;
 
 /// The tiles held, each with a place of its own, so that nobody who reads one waits for another.
 pub(super) struct HeldTiles {
-    slots: Vec<Slot>,
+    slots: Vec<TileSlot>,
     /// Held by whoever decodes the tile of a slot, by its number modulo theirs.
     turns: Vec<Mutex<()>>,
     /// Bytes allowed.
@@ -29,11 +29,11 @@ pub(super) struct HeldTiles {
 
 impl HeldTiles {
     /// Memory of a tile's place.
-    pub(super) const BYTES_PER_SLOT: u64 = size_of::<Slot>() as u64;
+    pub(super) const BYTES_PER_SLOT: u64 = size_of::<TileSlot>() as u64;
 
     /// Room for no tile yet.
     pub(super) fn new(slots: usize) -> HeldTiles {
-        let slots = (0..slots).map(|_| Slot::new()).collect();
+        let slots = (0..slots).map(|_| TileSlot::new()).collect();
         let turns = (0..TURNS).map(|_| Mutex::default()).collect();
         HeldTiles { slots, turns, capacity: AtomicU64::new(0), left: AtomicU64::new(0), full: AtomicBool::new(false) }
     }

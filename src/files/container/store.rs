@@ -20,7 +20,7 @@ pub struct Container {
     /// Place of each column in the container, in the order of [`Columns::all`].
     pub(super) places: Vec<(Columns, u32)>,
     /// One for each thread at most, shared by all readers.
-    pub(super) scratch: Mutex<Vec<Scratch>>,
+    pub(super) scratch: Mutex<Vec<TileScratch>>,
     /// Made when the first tile may be held.
     pub(super) held: OnceLock<HeldTiles>,
     pub(super) states: Count,
@@ -28,17 +28,17 @@ pub struct Container {
 
 /// What decoding a tile takes besides what is kept of it.
 #[derive(Default)]
-pub(super) struct Scratch {
+pub(super) struct TileScratch {
     pub(super) buffer: TileBuffer,
     pub(super) frames: TileFrames,
     /// One frame of the tile.
     pub(super) plane: Vec<f32>,
 }
 
-/// A [`Scratch`] on loan.
+/// A [`TileScratch`] on loan.
 pub(super) struct Lent<'a> {
-    from: &'a Mutex<Vec<Scratch>>,
-    scratch: Scratch,
+    from: &'a Mutex<Vec<TileScratch>>,
+    scratch: TileScratch,
 }
 
 impl Container {
@@ -171,7 +171,7 @@ impl Container {
                 Ok(frames * width * (range.end - range.start) as usize)
             },
             |values| {
-                let Scratch { buffer, frames, .. } = &mut *self.scratch();
+                let TileScratch { buffer, frames, .. } = &mut *self.scratch();
                 let mut touched = Touched::default();
                 self.reader.load(at, buffer, frames, Some(&mut touched))?;
                 self.reader.read_frames(frames, values)?;
@@ -207,14 +207,14 @@ impl Container {
 }
 
 impl Deref for Lent<'_> {
-    type Target = Scratch;
-    fn deref(&self) -> &Scratch {
+    type Target = TileScratch;
+    fn deref(&self) -> &TileScratch {
         &self.scratch
     }
 }
 
 impl DerefMut for Lent<'_> {
-    fn deref_mut(&mut self) -> &mut Scratch {
+    fn deref_mut(&mut self) -> &mut TileScratch {
         &mut self.scratch
     }
 }

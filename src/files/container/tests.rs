@@ -3,12 +3,12 @@ use std::collections::BTreeMap;
 use gseq::{Compression, TileId};
 use rayon::prelude::*;
 
-use super::tiles::Kept;
+use super::tiles::KeptColumn;
 use super::*;
 use crate::model::Gaussians;
 use crate::model::hash_id;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK, write_container};
-use crate::source::Wanted;
+use crate::source::ReadPlan;
 
 const COUNT: usize = 2 * GAUSSIAN_BLOCK + 77;
 const FRAMES: usize = 2 * FRAME_BLOCK + 5;
@@ -100,7 +100,7 @@ fn frames_read_the_same_whatever_a_reader_holds_and_in_whatever_order() {
         for ids in blocks(&scattered) {
             for held in [1, 3, FRAME_BLOCK, usize::MAX] {
                 let mut reader = container.open(ids.clone()).unwrap();
-                reader.expect(&Wanted::every().holding(held));
+                reader.expect(&ReadPlan::every().holding(held));
                 for k in 0..3 * FRAMES / 2 {
                     let frame = if k < FRAMES { k } else { hash_id(k as u64) as usize % FRAMES };
                     let want = if k % 7 == 0 { Columns::all() } else { made.info().varying };
@@ -123,14 +123,14 @@ fn a_reader_keeps_no_more_than_it_may_and_nothing_that_is_read_once() {
     for ids in blocks(&scattered) {
         for held in [1, 3, FRAME_BLOCK] {
             let mut reader = TileReader::new(&container, &ids);
-            reader.expect(&Wanted::every().holding(held));
+            reader.expect(&ReadPlan::every().holding(held));
             let mut state = Gaussians::zeros(0, 1);
             for frame in 0..FRAMES {
                 reader.read(frame, Columns::all(), &mut state).unwrap();
-                let values = |kept: &Kept| match kept {
-                    Kept::Nothing => 0,
-                    Kept::Tile(_, frames) => frames.memory() / 4,
-                    Kept::Values(kept) => kept.values.capacity(),
+                let values = |kept: &KeptColumn| match kept {
+                    KeptColumn::Nothing => 0,
+                    KeptColumn::Tile(_, frames) => frames.memory() / 4,
+                    KeptColumn::Values(kept) => kept.values.capacity(),
                 };
                 let kept: usize = reader.kept.iter().map(values).sum();
                 let frames = match held {
@@ -202,7 +202,7 @@ fn of_wanted_frames_those_of_a_frame_block_take_its_tiles_once_unless_memory_for
             for (held, times) in [(usize::MAX, 3), (5, 3), (2, 6)] {
                 let (_folder, container) = made.pack(compression);
                 let mut reader = container.open(ids.clone()).unwrap();
-                reader.expect(&Wanted::of(wanted).holding(held));
+                reader.expect(&ReadPlan::of(wanted).holding(held));
                 let mut got = Gaussians::zeros(0, 1);
                 for frame in wanted {
                     reader.read(frame, Columns::POSITION, &mut got).unwrap();
@@ -229,7 +229,7 @@ fn tiles_that_are_held_are_read_once_by_whomever_and_hold_the_same_values() {
             let (_folder, container) = made.pack(compression);
             container.hold_decoded(capacity);
             for ids in blocks(&scattered) {
-                for wanted in [Wanted::every(), Wanted::every().holding(1), Wanted::of([7, 8, 40])] {
+                for wanted in [ReadPlan::every(), ReadPlan::every().holding(1), ReadPlan::of([7, 8, 40])] {
                     let mut reader = container.open(ids.clone()).unwrap();
                     reader.expect(&wanted);
                     for frame in [0, 7, 8, 40, FRAMES - 1, 7] {

@@ -4,16 +4,16 @@ use std::ops::Range;
 
 use gseq::{Encoding, TileFrames, TileId, Touched};
 
-use super::store::{Container, Scratch};
+use super::store::{Container, TileScratch};
 use crate::error::{Error, Result, ShowPath};
 use crate::model::{Columns, Gaussians};
-use crate::source::{BlockReader, Ids, Wanted};
+use crate::source::{BlockReader, Ids, ReadPlan};
 
 /// Bytes of the map that a reader touches, at most, before it releases what it no longer needs.
 const TOUCHED: u64 = 1 << 20;
 
 /// Gaussians that lie side by side in a tile and in the block read.
-struct Run {
+struct TileRun {
     gaussian_block: u32,
     from: usize,
     to: usize,
@@ -21,16 +21,16 @@ struct Run {
 }
 
 /// What a reader keeps of a column.
-pub(super) enum Kept {
+pub(super) enum KeptColumn {
     Nothing,
     /// The one tile that a reader of just its Gaussians needs in a frame block: decompressed, or raw in the file.
     Tile(u32, TileFrames),
-    Values(Values),
+    Values(FrameValues),
 }
 
 /// Values at some frames of a frame block.
 #[derive(Default)]
-pub(super) struct Values {
+pub(super) struct FrameValues {
     block: Range<usize>,
     /// Increasing; none if one frame stands for all of the block.
     frames: Vec<usize>,
@@ -38,7 +38,7 @@ pub(super) struct Values {
     pub(super) values: Vec<f32>,
 }
 
-impl Values {
+impl FrameValues {
     /// Which of the frames kept stands for `frame`.
     fn place(&self, frame: usize) -> Option<usize> {
         match self.frames[..] {
@@ -51,20 +51,20 @@ impl Values {
 /// Reads some Gaussians of a container.
 ///
 /// Memory per Gaussian: 4 bytes × width × frames held for each column that varies, `frames held` being those wanted of a
-/// frame block or what [`Wanted::holding`] allows; 8 × width more where that is a whole block. Of raw tiles that are read
+/// frame block or what [`ReadPlan::holding`] allows; 8 × width more where that is a whole block. Of raw tiles that are read
 /// whole as much, in the map, if a whole block may be held, else nothing. Nothing if just one frame is held, nothing of
 /// columns that do not vary, nothing of tiles that the container holds.
 pub(super) struct TileReader<'a> {
     source: &'a Container,
     len: usize,
-    runs: Vec<Run>,
+    runs: Vec<TileRun>,
     /// Whether the Gaussians are those of one tile, in its order.
     pub(super) whole: bool,
-    wanted: Wanted,
+    wanted: ReadPlan,
     /// The last frame block for which the system was told of what comes next.
     told: Option<u32>,
     /// By place in [`Container::places`].
-    pub(super) kept: Vec<Kept>,
+    pub(super) kept: Vec<KeptColumn>,
     /// The frame block that `staying` belongs to.
     entered: u32,
     /// Raw tiles in use, to be released when another frame block is entered.
@@ -76,18 +76,18 @@ pub(super) struct TileReader<'a> {
 impl<'a> TileReader<'a> {
     pub(super) fn new(source: &'a Container, ids: &Ids<'_>) -> TileReader<'a> {
         let block = source.reader.layout().gaussian_block as usize;
-        let mut runs: Vec<Run> = Vec::new();
+        let mut runs: Vec<TileRun> = Vec::new();
         for (to, id) in ids.iter().enumerate() {
             let (tile, from) = ((id / block) as u32, id % block);
             match runs.last_mut() {
                 Some(run) if run.gaussian_block == tile && run.from + run.len == from => run.len += 1,
-                _ => runs.push(Run { gaussian_block: tile, from, to, len: 1 }),
+                _ => runs.push(TileRun { gaussian_block: tile, from, to, len: 1 }),
             }
         }
         // Each tile is decoded once, in whatever order the Gaussians were asked for.
         runs.sort_by_key(|run| run.gaussian_block);
         let whole = match runs[..] {
-            [Run { gaussian_block, from: 0, len, .. }] => {
+            [TileRun { gaussian_block, from: 0, len, .. }] => {
                 let range = source.reader.layout().gaussian_range(gaussian_block);
                 len as u64 == range.end - range.start
             }
@@ -98,9 +98,9 @@ impl<'a> TileReader<'a> {
             len: ids.len(),
             runs,
             whole,
-            wanted: Wanted::every(),
+            wanted: ReadPlan::every(),
             told: None,
-            kept: source.places.iter().map(|_| Kept::Nothing).collect(),
+            kept: source.places.iter().map(|_| KeptColumn::Nothing).collect(),
             entered: 0,
             staying: Touched::default(),
             passing: Touched::default(),
@@ -117,15 +117,15 @@ impl<'a> TileReader<'a> {
             return self.decode(index, &[frame], out);
         }
         match &mut self.kept[index] {
-            Kept::Tile(_, tile) => {
+            KeptColumn::Tile(_, tile) => {
                 let within = frame % self.source.reader.layout().frame_block as usize;
                 self.source.reader.read_frame(tile, within, out)?;
             }
-            Kept::Values(kept) => {
+            KeptColumn::Values(kept) => {
                 let at = kept.place(frame).unwrap_or_default() * out.len();
                 out.copy_from_slice(&kept.values[at..][..out.len()]);
             }
-            Kept::Nothing => (),
+            KeptColumn::Nothing => (),
         }
         Ok(())
     }
@@ -138,8 +138,8 @@ impl<'a> TileReader<'a> {
             return Ok(false);
         }
         match &self.kept[index] {
-            Kept::Tile(of, _) if *of == frame_block => return Ok(true),
-            Kept::Values(values) if values.place(frame).is_some() => return Ok(true),
+            KeptColumn::Tile(of, _) if *of == frame_block => return Ok(true),
+            KeptColumn::Values(values) if values.place(frame).is_some() => return Ok(true),
             _ => (),
         }
         let (column, place) = self.source.places[index];
@@ -159,8 +159,8 @@ impl<'a> TileReader<'a> {
             let all = self.wanted.held() >= block.len();
             // Decompressed, a tile is as large as all of its frames.
             if raw || all && 2 * frames.len() > block.len() {
-                let mut tile = match std::mem::replace(&mut self.kept[index], Kept::Nothing) {
-                    Kept::Tile(_, tile) => tile,
+                let mut tile = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
+                    KeptColumn::Tile(_, tile) => tile,
                     _ => TileFrames::default(),
                 };
                 // Releasing a raw tile frame by frame costs more than copying from the file does.
@@ -170,16 +170,16 @@ impl<'a> TileReader<'a> {
                     (false, _) => Some(&mut self.passing),
                 };
                 reader.load(at, &mut self.source.scratch().buffer, &mut tile, touched)?;
-                self.kept[index] = Kept::Tile(frame_block, tile);
+                self.kept[index] = KeptColumn::Tile(frame_block, tile);
                 return Ok(true);
             }
         }
         if self.wanted.held() == 1 {
             return Ok(false);
         }
-        let mut kept = match std::mem::replace(&mut self.kept[index], Kept::Nothing) {
-            Kept::Values(kept) => kept,
-            _ => Values::default(),
+        let mut kept = match std::mem::replace(&mut self.kept[index], KeptColumn::Nothing) {
+            KeptColumn::Values(kept) => kept,
+            _ => FrameValues::default(),
         };
         frames.truncate(self.wanted.held());
         let constant = self.is_constant(place, frame_block)?;
@@ -191,7 +191,7 @@ impl<'a> TileReader<'a> {
         if constant {
             frames.clear();
         }
-        self.kept[index] = Kept::Values(Values { block, frames, values: kept.values });
+        self.kept[index] = KeptColumn::Values(FrameValues { block, frames, values: kept.values });
         Ok(true)
     }
 
@@ -232,7 +232,7 @@ impl<'a> TileReader<'a> {
         // One frame of many is rather copied from the file than mapped and released.
         let in_place = frames.len() > 1 || !source.info.varying.contains(column);
         let mut lent = source.scratch();
-        let Scratch { buffer, frames: tile, plane: room } = &mut *lent;
+        let TileScratch { buffer, frames: tile, plane: room } = &mut *lent;
         for runs in self.runs.chunk_by(|a, b| a.gaussian_block == b.gaussian_block) {
             let gaussian_block = runs[0].gaussian_block;
             let range = layout.gaussian_range(gaussian_block);
@@ -271,8 +271,8 @@ impl<'a> TileReader<'a> {
         let frame_block = self.frame_block(frame);
         if frame_block != self.entered {
             for kept in &mut self.kept {
-                if matches!(kept, Kept::Tile(_, tile) if tile.is_in_place()) {
-                    *kept = Kept::Nothing;
+                if matches!(kept, KeptColumn::Tile(_, tile) if tile.is_in_place()) {
+                    *kept = KeptColumn::Nothing;
                 }
             }
             self.source.reader.release(&mut self.staying);
@@ -329,9 +329,9 @@ impl BlockReader for TileReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.wanted = wanted.clone();
-        self.kept.fill_with(|| Kept::Nothing);
+        self.kept.fill_with(|| KeptColumn::Nothing);
         self.source.reader.release(&mut self.staying);
     }
 

@@ -23,7 +23,7 @@ pub struct StreamHeader {
 
 /// What stands before the columns of a frame, or ends the stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Mark {
+pub(crate) enum FrameMark {
     /// A frame's number, time stamp and bytes.
     Frame { index: u32, time: f64, bytes: u64 },
     /// Number of frames.
@@ -104,13 +104,13 @@ impl StreamHeader {
     }
 }
 
-impl Mark {
+impl FrameMark {
     pub(crate) const BYTES: usize = 24;
 
     pub(crate) fn to_bytes(self) -> [u8; Self::BYTES] {
         let (mark, index, time, length) = match self {
-            Mark::Frame { index, time, bytes } => (FRAME, index, time, bytes),
-            Mark::End(frames) => (END, frames, 0.0, 0),
+            FrameMark::Frame { index, time, bytes } => (FRAME, index, time, bytes),
+            FrameMark::End(frames) => (END, frames, 0.0, 0),
         };
         let mut bytes = [0; Self::BYTES];
         bytes[..4].copy_from_slice(&mark);
@@ -143,7 +143,7 @@ impl Mark {
                 if bytes[8..].iter().any(|&byte| byte != 0) {
                     return illegal(8, "a reserved field of 0".into(), "another value".into(), "");
                 }
-                Ok(Mark::End(frames))
+                Ok(FrameMark::End(frames))
             }
             FRAME => {
                 let time = f64::from_bits(u64_at(bytes, 8));
@@ -169,7 +169,7 @@ impl Mark {
                 } else if length != header.frame_bytes() {
                     return illegal(16, expected_length(header), found_length(header, length), SAME_IN_EVERY_FRAME);
                 }
-                Ok(Mark::Frame { index, time, bytes: length })
+                Ok(FrameMark::Frame { index, time, bytes: length })
             }
             _ => illegal(0, format!("frame {frames} or the end mark"), quoted(&shown(&bytes[..4])), FOREIGN),
         }

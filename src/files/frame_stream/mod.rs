@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians};
 pub use framing::StreamHeader;
-pub(crate) use framing::{Illegal, Mark};
+pub(crate) use framing::{FrameMark, Illegal};
 
 /// Least bytes to make room for at a time.
 const PIECE_BYTES: u64 = 1 << 20;
@@ -98,13 +98,13 @@ impl<R: Read> FrameStream<R> {
             return Ok(None);
         }
         let (start, frame) = (self.bytes.received, self.frames);
-        let mut mark = [0; Mark::BYTES];
+        let mut mark = [0; FrameMark::BYTES];
         if self.bytes.fill(&mut mark)? < mark.len() {
             return Err(self.bytes.ended(&format!("frame {frame} or the end mark"), Some(frame)));
         }
-        let mark = Mark::from_bytes(&mark, &self.header, frame, self.last_time)
+        let mark = FrameMark::from_bytes(&mark, &self.header, frame, self.last_time)
             .map_err(|illegal| self.bytes.error(start, Some(frame), illegal))?;
-        let Mark::Frame { time, bytes, .. } = mark else {
+        let FrameMark::Frame { time, bytes, .. } = mark else {
             self.ended = true;
             return self.expect_nothing().map(|()| None);
         };

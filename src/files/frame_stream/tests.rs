@@ -18,8 +18,8 @@ fn written() -> (Scene, Vec<u8>, Vec<usize>) {
         stream.frame(time, state).unwrap();
     }
     stream.finish().unwrap();
-    let frame = Mark::BYTES + header.frame_bytes() as usize;
-    let first = bytes.len() - Mark::BYTES - T * frame;
+    let frame = FrameMark::BYTES + header.frame_bytes() as usize;
+    let first = bytes.len() - FrameMark::BYTES - T * frame;
     (scene, bytes, (0..=T).map(|t| first + t * frame).collect())
 }
 
@@ -133,7 +133,7 @@ fn with(frame: usize, offset: usize, field: &[u8]) -> Vec<u8> {
 #[test]
 fn every_illegal_field_is_named_with_its_frame_and_byte() {
     let (_, bytes, starts) = written();
-    let frame = starts[1] - starts[0] - Mark::BYTES;
+    let frame = starts[1] - starts[0] - FrameMark::BYTES;
     let header = |offset: usize, field: &[u8]| {
         let mut changed = bytes.clone();
         changed[offset..][..field.len()].copy_from_slice(field);

@@ -6,14 +6,14 @@ use std::path::Path;
 
 use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 
-use super::small::{Keep, Key, MAX_ELEMENTS, Small};
+use super::small::{Keep, MAX_ELEMENTS, ShortKey, Small};
 use super::{Stopped, read, read_from};
 use crate::error::Result;
 use crate::files::open::open_file;
 
 /// Place of a value in a document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct At {
+pub(crate) struct JsonPlace {
     /// Index of the key among those asked for; 0 for a document that is a list itself.
     pub(crate) key: usize,
     /// Index in the list. Index 0 comes again where a key is repeated: the last list counts.
@@ -38,7 +38,7 @@ pub(crate) struct Ask<'a> {
 ///
 /// # Errors
 /// Those of `each` and of [`read`].
-pub(crate) fn each_element(path: &Path, ask: Ask<'_>, each: impl FnMut(At, Small) -> Result<()>) -> Result<()> {
+pub(crate) fn each_element(path: &Path, ask: Ask<'_>, each: impl FnMut(JsonPlace, Small) -> Result<()>) -> Result<()> {
     each_in(open_file(path)?, path, ask, each)
 }
 
@@ -50,7 +50,7 @@ pub(crate) fn each_in(
     file: impl Read,
     path: &Path,
     ask: Ask<'_>,
-    mut each: impl FnMut(At, Small) -> Result<()>,
+    mut each: impl FnMut(JsonPlace, Small) -> Result<()>,
 ) -> Result<()> {
     let stopped = Stopped::default();
     let mut lists = Lists { ask, each: &mut each, stopped: &stopped };
@@ -69,7 +69,7 @@ pub(crate) fn each_entry(path: &Path, wanted: &[&str], mut each: impl FnMut(&str
 
 struct Lists<'a> {
     ask: Ask<'a>,
-    each: &'a mut dyn FnMut(At, Small) -> Result<()>,
+    each: &'a mut dyn FnMut(JsonPlace, Small) -> Result<()>,
     stopped: &'a Stopped,
 }
 
@@ -134,7 +134,7 @@ impl<'de> Visitor<'de> for Document<'_, '_> {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
-        while let Some(name) = map.next_key_seed(Key)? {
+        while let Some(name) = map.next_key_seed(ShortKey)? {
             match self.0.ask.keys.iter().position(|key| *key == name) {
                 Some(key) => map.next_value_seed(List { lists: self.0, key })?,
                 None => drop(map.next_value::<IgnoredAny>()?),
@@ -158,7 +158,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> std::result::Result<(), A::Error> {
         let Lists { ask, stopped, .. } = *self.lists;
         for index in 0.. {
-            let at = At { key: self.key, index, inner: None };
+            let at = JsonPlace { key: self.key, index, inner: None };
             let value = match ask.nested {
                 true => list.next_element_seed(Within { lists: self.lists, at })?,
                 false => list.next_element_seed(Keep { wanted: ask.wanted, elements: MAX_ELEMENTS })?,
@@ -177,7 +177,7 @@ impl<'de> Visitor<'de> for List<'_, '_> {
 /// An element of a list that should be a list itself. Its value is what it is, without its elements.
 struct Within<'a, 'b> {
     lists: &'a mut Lists<'b>,
-    at: At,
+    at: JsonPlace,
 }
 
 impl<'de> DeserializeSeed<'de> for Within<'_, '_> {
@@ -224,7 +224,7 @@ impl<'de> Visitor<'de> for Within<'_, '_> {
         for inner in 0.. {
             let keep = Keep { wanted: ask.wanted, elements: MAX_ELEMENTS };
             let Some(value) = list.next_element_seed(keep)? else { break };
-            let at = At { inner: Some(inner), ..self.at };
+            let at = JsonPlace { inner: Some(inner), ..self.at };
             (self.lists.each)(at, value).map_err(|error| stopped.by::<A::Error>(error))?;
         }
         Ok(Small::List(Vec::new(), 0))
@@ -252,7 +252,7 @@ impl<'de> Visitor<'de> for Entries<'_> {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<(), A::Error> {
-        while let Some(key) = map.next_key_seed(Key)? {
+        while let Some(key) = map.next_key_seed(ShortKey)? {
             let value = map.next_value_seed(Keep { wanted: self.wanted, elements: MAX_ELEMENTS })?;
             (self.each)(&key, value).map_err(|error| self.stopped.by::<A::Error>(error))?;
         }
@@ -274,7 +274,7 @@ mod tests {
     fn elements(text: &str, keys: &[&str], nested: bool) -> Vec<(usize, usize, Option<usize>, String)> {
         let mut found = Vec::new();
         let ask = Ask { keys, nested, wanted: &[] };
-        each_element(file(text).path(), ask, |At { key, index, inner }, value| {
+        each_element(file(text).path(), ask, |JsonPlace { key, index, inner }, value| {
             found.push((key, index, inner, value.describe()));
             Ok(())
         })

@@ -226,7 +226,7 @@ impl<'de> Visitor<'de> for Inner<'_> {
 
     fn visit_map<A: MapAccess<'de>>(mut self, mut map: A) -> Result<Small, A::Error> {
         let mut object = Object::default();
-        while let Some(key) = map.next_key_seed(Key)? {
+        while let Some(key) = map.next_key_seed(ShortKey)? {
             let is_wanted = self.keep.wanted.contains(&&*key);
             let is_known = object.get(&key).is_some();
             if !is_wanted && !is_known {
@@ -249,9 +249,9 @@ impl<'de> Visitor<'de> for Inner<'_> {
 
 /// Reads a key, of which the first bytes are kept.
 #[derive(Debug)]
-pub(crate) struct Key;
+pub(crate) struct ShortKey;
 
-impl<'de> DeserializeSeed<'de> for Key {
+impl<'de> DeserializeSeed<'de> for ShortKey {
     type Value = String;
 
     fn deserialize<D: Deserializer<'de>>(self, from: D) -> Result<String, D::Error> {
@@ -259,7 +259,7 @@ impl<'de> DeserializeSeed<'de> for Key {
     }
 }
 
-impl Visitor<'_> for Key {
+impl Visitor<'_> for ShortKey {
     type Value = String;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -12,7 +12,7 @@ use zip::write::FileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use crate::error::{Error, Result};
-use crate::files::npz::{Entry, Npz};
+use crate::files::npz::{Npz, NpzArray};
 use crate::files::zip_output::ZipOutput;
 
 /// Bytes from which an entry of an archive needs wide lengths.
@@ -20,7 +20,7 @@ const LARGE: usize = 1 << 32;
 
 /// What becomes of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Axis {
+pub(crate) enum ArrayRows {
     /// It stays as it is.
     None,
     /// Its axis 0 counts Gaussians.
@@ -38,7 +38,7 @@ pub(crate) enum Axis {
 pub(crate) fn write_like(
     template: &Npz,
     kept: &[u32],
-    axis: impl Fn(&Entry) -> Axis,
+    axis: impl Fn(&NpzArray) -> ArrayRows,
     mut change: impl FnMut(&str, usize, &mut [f32]) -> Result<Vec<u32>>,
     path: &Path,
 ) -> Result<()> {
@@ -49,9 +49,9 @@ pub(crate) fn write_like(
         let axis = axis(entry);
         let mut shape = entry.shape.clone();
         match axis {
-            Axis::None => (),
-            Axis::First => shape[0] = kept.len(),
-            Axis::Second => shape[1] = kept.len(),
+            ArrayRows::None => (),
+            ArrayRows::First => shape[0] = kept.len(),
+            ArrayRows::Second => shape[1] = kept.len(),
         }
         let method = if entry.is_compressed { CompressionMethod::Deflated } else { CompressionMethod::Stored };
         let options = FileOptions::default()
@@ -60,7 +60,7 @@ pub(crate) fn write_like(
             .large_file(entry.len().saturating_mul(8) >= LARGE);
         archive.start_file(format!("{}.npy", entry.name), options).map_err(|error| failed(error.into()))?;
         template.read(entry, |values| {
-            if axis == Axis::None {
+            if axis == ArrayRows::None {
                 archive.write_all(&header(&entry.descr, entry.is_fortran, &shape)).map_err(failed)?;
                 std::io::copy(values, &mut archive).map_err(|error| template.damaged(entry, &error))?;
                 return Ok(());
@@ -70,7 +70,7 @@ pub(crate) fn write_like(
             };
             archive.write_all(&header(&entry.descr, false, &shape)).map_err(failed)?;
             let (frames, rows) = match axis {
-                Axis::Second => (entry.shape[0], &entry.shape[1..]),
+                ArrayRows::Second => (entry.shape[0], &entry.shape[1..]),
                 _ => (1, &entry.shape[..]),
             };
             let width: usize = rows[1..].iter().product();

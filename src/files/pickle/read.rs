@@ -47,7 +47,7 @@ impl Meter {
 }
 
 /// The machine that builds nodes by the instructions of a pickle.
-pub(super) struct Reader<'a> {
+pub(super) struct PickleMachine<'a> {
     bytes: &'a [u8],
     at: usize,
     instructions: u32,
@@ -62,9 +62,9 @@ pub(super) struct Reader<'a> {
     memo: HashMap<u32, NodeId>,
 }
 
-impl<'a> Reader<'a> {
-    pub(super) fn new(bytes: &'a [u8], memory: u64) -> Reader<'a> {
-        Reader {
+impl<'a> PickleMachine<'a> {
+    pub(super) fn new(bytes: &'a [u8], memory: u64) -> PickleMachine<'a> {
+        PickleMachine {
             bytes,
             at: 0,
             instructions: 0,

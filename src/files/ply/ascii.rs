@@ -8,7 +8,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::header::{Element, Header, Property, Scalar};
+use super::header::{Element, PlyHeader, Property, Scalar};
 use crate::error::{Error, Result, quoted};
 
 /// Bytes of a line of text, beside [`LINE_BYTES_PER_NUMBER`] for each number of its row.
@@ -43,7 +43,7 @@ impl TextStore {
     /// # Errors
     /// Too few rows, a row with too few or too many numbers, a word that is not a number of its type, a line far longer
     /// than its numbers take; each names the line. A scratch file that cannot be written.
-    pub(super) fn convert(&self, path: &Path, header: &Header, mut text: File) -> Result<TextRows> {
+    pub(super) fn convert(&self, path: &Path, header: &PlyHeader, mut text: File) -> Result<TextRows> {
         let failed = |action| Error::io(action, path);
         let whole = text.metadata().map_err(failed("read the size of"))?.len();
         check_counts(path, header, whole.saturating_sub(header.text.len() as u64))?;
@@ -57,7 +57,7 @@ impl TextStore {
         };
         let start = (&*file).seek(SeekFrom::End(0)).map_err(scratch("write a scratch file in"))?;
         let mut out = BufWriter::with_capacity(1 << 18, &*file);
-        let mut lines = Lines { path, text: BufReader::new(text), number: header.lines, line: Vec::new() };
+        let mut lines = AsciiLines { path, text: BufReader::new(text), number: header.lines, line: Vec::new() };
         let mut row_bytes = Vec::new();
         for element in header.elements.iter().filter(|element| !element.properties.is_empty()) {
             for row in 0..element.count {
@@ -75,7 +75,7 @@ impl TextStore {
 }
 
 /// Confirms that `available` bytes of text can hold the announced rows: a number takes a digit and a separator.
-fn check_counts(path: &Path, header: &Header, available: u64) -> Result<()> {
+fn check_counts(path: &Path, header: &PlyHeader, available: u64) -> Result<()> {
     for element in &header.elements {
         let least = element.count.checked_mul(2 * element.properties.len() as u64);
         if least.is_none_or(|least| least > available + 1) {
@@ -88,7 +88,7 @@ fn check_counts(path: &Path, header: &Header, available: u64) -> Result<()> {
 }
 
 /// Lines of a text body.
-struct Lines<'a> {
+struct AsciiLines<'a> {
     path: &'a Path,
     text: BufReader<File>,
     /// Number of the line read last, counted from 1.
@@ -96,7 +96,7 @@ struct Lines<'a> {
     line: Vec<u8>,
 }
 
-impl Lines<'_> {
+impl AsciiLines<'_> {
     /// Reads row `row` of `element` from the next line that is not blank, and appends its numbers to `out`.
     fn read_row(&mut self, element: &Element, row: u64, out: &mut Vec<u8>) -> Result<()> {
         let numbers = element.properties.len();

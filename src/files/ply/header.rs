@@ -1,6 +1,6 @@
 //! The header of a PLY file: encoding, elements, properties, comments.
 //!
-//! In: the bytes of a file. Out: [`Header`]. Source: G. Turk, "The PLY Polygon File Format", 1994.
+//! In: the bytes of a file. Out: [`PlyHeader`]. Source: G. Turk, "The PLY Polygon File Format", 1994.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ const MOST_BYTES: usize = 1 << 20;
 
 /// How the body stores numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Encoding {
+pub enum PlyEncoding {
     /// Text, one row per line.
     Ascii,
     /// Little-endian binary.
@@ -100,8 +100,8 @@ pub(crate) struct Element {
 
 /// A parsed header. All elements have rows of fixed size.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Header {
-    pub(crate) encoding: Encoding,
+pub(crate) struct PlyHeader {
+    pub(crate) encoding: PlyEncoding,
     pub(crate) elements: Vec<Element>,
     /// Texts of the `comment` lines, in order.
     pub(crate) comments: Vec<String>,
@@ -111,13 +111,13 @@ pub(crate) struct Header {
     pub(crate) lines: usize,
 }
 
-impl Header {
+impl PlyHeader {
     /// Parses the header at the start of `bytes`, the content of `path`. Lines may end in LF or CRLF.
     ///
     /// # Errors
     /// Not a PLY; a header without `end_header`, or of more than 1 MiB; a line, type or count that is none; a list property
     /// (its rows have no fixed size); a name used twice. Each names the line.
-    pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<Header> {
+    pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<PlyHeader> {
         let (length, bytes) = (bytes.len(), &bytes[..bytes.len().min(MOST_BYTES)]);
         let first = bytes.split(|&b| b == b'\n').next().unwrap_or_default();
         if first.trim_ascii_end() != b"ply" {
@@ -149,9 +149,9 @@ impl Header {
                 }
                 ["format", name, "1.0"] => {
                     encoding = Some(match name {
-                        "ascii" => Encoding::Ascii,
-                        "binary_little_endian" => Encoding::LittleEndian,
-                        "binary_big_endian" => Encoding::BigEndian,
+                        "ascii" => PlyEncoding::Ascii,
+                        "binary_little_endian" => PlyEncoding::LittleEndian,
+                        "binary_big_endian" => PlyEncoding::BigEndian,
                         _ => {
                             let expected = "ascii, binary_little_endian or binary_big_endian";
                             return Err(Error::input(path, place(), expected, quoted(name)));
@@ -195,7 +195,13 @@ impl Header {
                     let Some(encoding) = encoding else {
                         return Err(Error::input(path, place(), "a format line before it", "none"));
                     };
-                    return Ok(Header { encoding, elements, comments, text: bytes[..end].to_vec(), lines: index + 1 });
+                    return Ok(PlyHeader {
+                        encoding,
+                        elements,
+                        comments,
+                        text: bytes[..end].to_vec(),
+                        lines: index + 1,
+                    });
                 }
                 _ => {
                     let expected = "a format, comment, element, property or end_header line";
@@ -222,7 +228,7 @@ impl Header {
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
             let line_end: &[u8] = if line.ends_with(b"\r\n") { b"\r\n" } else { b"\n" };
             let changed = match words[..] {
-                ["format", ..] if self.encoding == Encoding::Ascii => {
+                ["format", ..] if self.encoding == PlyEncoding::Ascii => {
                     Some("format binary_little_endian 1.0".to_owned())
                 }
                 ["element", element, ..] => {

@@ -1,6 +1,6 @@
 //! Where a PLY row holds each plane of a Gaussian.
 //!
-//! In: the properties of element `vertex`. Out: [`Layout`].
+//! In: the properties of element `vertex`. Out: [`PlyLayout`].
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ pub const THIN_LOG_SCALE: f32 = -6.907_755_4;
 
 /// The source of one plane.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Plane {
+pub(crate) enum PlaneSource {
     /// A property of the row.
     Property(Property),
     /// The missing third scale of a surfel: min(scale_0, scale_1) + [`THIN_LOG_SCALE`].
@@ -24,29 +24,29 @@ pub(crate) enum Plane {
 
 /// The planes of every column, in the order of [`Gaussians`](crate::model::Gaussians).
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Layout {
+pub(crate) struct PlyLayout {
     pub(crate) sh_degree: usize,
-    planes: [Vec<Plane>; 5],
+    planes: [Vec<PlaneSource>; 5],
 }
 
-impl Layout {
+impl PlyLayout {
     /// Finds the planes among the properties of `vertex`; any others are ignored.
     ///
     /// # Errors
     /// A missing property, or a number of `f_rest` that belongs to no degree.
-    pub(crate) fn of(path: &Path, vertex: &Element) -> Result<Layout> {
+    pub(crate) fn of(path: &Path, vertex: &Element) -> Result<PlyLayout> {
         let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
         let need = |name: &str| match find(name) {
-            Some(property) => Ok(Plane::Property(property.clone())),
+            Some(property) => Ok(PlaneSource::Property(property.clone())),
             None => Err(missing(path, vertex, name)),
         };
-        let need_all = |names: &[&str]| names.iter().map(|name| need(name)).collect::<Result<Vec<Plane>>>();
+        let need_all = |names: &[&str]| names.iter().map(|name| need(name)).collect::<Result<Vec<PlaneSource>>>();
 
         let position = need_all(&["x", "y", "z"])?;
         let mut sh = need_all(&["f_dc_0", "f_dc_1", "f_dc_2"])?;
         let opacity = need_all(&["opacity"])?;
         let mut log_scale = need_all(&["scale_0", "scale_1"])?;
-        log_scale.push(find("scale_2").map_or(Plane::Thin, |property| Plane::Property(property.clone())));
+        log_scale.push(find("scale_2").map_or(PlaneSource::Thin, |property| PlaneSource::Property(property.clone())));
         let rotation = need_all(&["rot_0", "rot_1", "rot_2", "rot_3"])?;
 
         let rest = vertex.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
@@ -61,11 +61,11 @@ impl Layout {
                 sh.push(need(&format!("f_rest_{}", channel * per_channel + coefficient))?);
             }
         }
-        Ok(Layout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
+        Ok(PlyLayout { sh_degree, planes: [position, rotation, log_scale, opacity, sh] })
     }
 
     /// The planes of a single column.
-    pub(crate) fn planes(&self, column: Columns) -> &[Plane] {
+    pub(crate) fn planes(&self, column: Columns) -> &[PlaneSource] {
         let index = Columns::all().iter().take_while(|&one| one != column).count();
         &self.planes[index]
     }

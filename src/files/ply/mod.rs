@@ -21,10 +21,10 @@ use std::path::{Path, PathBuf};
 
 pub(crate) use ascii::{TextRows, TextStore};
 use header::Element;
-pub(crate) use header::Header;
-pub use header::{Encoding, Property, Scalar};
+pub(crate) use header::PlyHeader;
+pub use header::{PlyEncoding, Property, Scalar};
 pub use layout::THIN_LOG_SCALE;
-pub(crate) use layout::{Layout, Plane, name_without_bands};
+pub(crate) use layout::{PlaneSource, PlyLayout, name_without_bands};
 
 use super::map::FileMap;
 use super::open::open_file;
@@ -59,9 +59,9 @@ impl Default for PlyOptions {
 /// # Errors
 /// Those of [`Ply::open_with`] that the header alone shows.
 pub fn check_header(bytes: &[u8], path: &Path) -> Result<u64> {
-    let header = Header::parse(path, bytes)?;
+    let header = PlyHeader::parse(path, bytes)?;
     let vertex = vertex_of(&header, path)?;
-    Layout::of(path, vertex)?;
+    PlyLayout::of(path, vertex)?;
     Ok(vertex.count)
 }
 
@@ -69,11 +69,11 @@ pub fn check_header(bytes: &[u8], path: &Path) -> Result<u64> {
 #[derive(Debug)]
 pub struct Ply {
     path: PathBuf,
-    header: Header,
-    layout: Layout,
+    header: PlyHeader,
+    layout: PlyLayout,
     stride: usize,
     properties: Vec<Property>,
-    body: Body,
+    body: PlyBody,
     /// Where the rows of `vertex` lie in the body.
     rows: Range<usize>,
     count: usize,
@@ -82,7 +82,7 @@ pub struct Ply {
 
 /// The tables of a file after its header.
 #[derive(Debug)]
-struct Body {
+struct PlyBody {
     /// The whole file, or the converted rows of a text file.
     map: FileMap,
     /// Where the tables start in the map.
@@ -91,7 +91,7 @@ struct Body {
     text: Option<(u64, TextRows)>,
 }
 
-impl Body {
+impl PlyBody {
     fn bytes(&self) -> &[u8] {
         &self.map[self.start..]
     }
@@ -135,22 +135,22 @@ impl Ply {
     fn with_text_rows(
         path: &Path,
         memory: ReadLimit,
-        convert: impl FnOnce(&Header) -> Result<TextRows>,
+        convert: impl FnOnce(&PlyHeader) -> Result<TextRows>,
     ) -> Result<Ply> {
         let map = FileMap::open(path)?;
-        let header = Header::parse(path, &map)?;
+        let header = PlyHeader::parse(path, &map)?;
         let vertex = vertex_of(&header, path)?;
         let (stride, properties) = (vertex.stride, vertex.properties.clone());
-        let layout = Layout::of(path, vertex)?;
+        let layout = PlyLayout::of(path, vertex)?;
         let count = u32::try_from(vertex.count)
             .map_err(|_| Error::input(path, "element vertex", "at most 4294967295 rows", vertex.count.to_string()))?;
         let body = match header.encoding {
-            Encoding::Ascii => {
+            PlyEncoding::Ascii => {
                 let (length, rows) = (map.len() as u64, convert(&header)?);
                 let map = FileMap::from_scratch(&rows.file, rows.range.clone(), path)?;
-                Body { map, start: 0, text: Some((length, rows)) }
+                PlyBody { map, start: 0, text: Some((length, rows)) }
             }
-            Encoding::LittleEndian | Encoding::BigEndian => Body { map, start: header.text.len(), text: None },
+            PlyEncoding::LittleEndian | PlyEncoding::BigEndian => PlyBody { map, start: header.text.len(), text: None },
         };
         let rows = vertex_rows(path, &header, body.bytes().len())?;
         let count = count as usize;
@@ -220,7 +220,7 @@ impl Ply {
             }
         }
         let rows = &self.body.bytes()[self.rows.clone()];
-        let big_endian = self.header.encoding == Encoding::BigEndian;
+        let big_endian = self.header.encoding == PlyEncoding::BigEndian;
         let mut starts = Vec::with_capacity(BLOCK_ROWS);
         let mut ids_left = ids.iter();
         // Rows with thousands of properties: few of them, so that few of their pages are resident.
@@ -231,14 +231,14 @@ impl Ply {
             self.touch(&starts);
             for column in want.iter() {
                 for (c, plane) in self.layout.planes(column).iter().enumerate() {
-                    if let Plane::Property(property) = plane {
+                    if let PlaneSource::Property(property) = plane {
                         let out = &mut out.column_mut(column).plane_mut(c)[first..first + starts.len()];
                         read_plane(rows, &starts, property, big_endian, out);
                     }
                 }
             }
         }
-        if want.contains(Columns::LOG_SCALE) && self.layout.planes(Columns::LOG_SCALE).contains(&Plane::Thin) {
+        if want.contains(Columns::LOG_SCALE) && self.layout.planes(Columns::LOG_SCALE).contains(&PlaneSource::Thin) {
             for i in 0..ids.len() {
                 let [a, b, _] = out.log_scale.row::<3>(i);
                 out.log_scale.set_row(i, [a, b, a.min(b) + THIN_LOG_SCALE]);
@@ -256,7 +256,7 @@ impl Ply {
         let Some(property) = self.properties.iter().find(|property| property.name == name) else { return Ok(None) };
         let mut values = vec![0.0; self.count];
         let rows = &self.body.bytes()[self.rows.clone()];
-        let big_endian = self.header.encoding == Encoding::BigEndian;
+        let big_endian = self.header.encoding == PlyEncoding::BigEndian;
         for (block, values) in values.chunks_mut(BLOCK_ROWS).enumerate() {
             let starts: Vec<usize> = (0..values.len()).map(|i| (block * BLOCK_ROWS + i) * self.stride).collect();
             self.touch(&starts);
@@ -274,12 +274,12 @@ impl Ply {
     }
 
     /// The header, for writers.
-    pub(crate) fn header(&self) -> &Header {
+    pub(crate) fn header(&self) -> &PlyHeader {
         &self.header
     }
 
     /// Where a row holds what, for writers.
-    pub(crate) fn layout(&self) -> &Layout {
+    pub(crate) fn layout(&self) -> &PlyLayout {
         &self.layout
     }
 
@@ -326,7 +326,7 @@ impl Ply {
 }
 
 /// The element that holds the Gaussians.
-fn vertex_of<'a>(header: &'a Header, path: &Path) -> Result<&'a Element> {
+fn vertex_of<'a>(header: &'a PlyHeader, path: &Path) -> Result<&'a Element> {
     header.vertex().ok_or_else(|| Error::input(path, "header", "an element \"vertex\"", "none"))
 }
 
@@ -351,7 +351,7 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
 }
 
 /// Where the rows of `vertex` lie in a binary body of `available` bytes.
-fn vertex_rows(path: &Path, header: &Header, available: usize) -> Result<Range<usize>> {
+fn vertex_rows(path: &Path, header: &PlyHeader, available: usize) -> Result<Range<usize>> {
     let mut end = 0u64;
     let mut rows = 0..0;
     for element in &header.elements {

@@ -9,9 +9,11 @@ use std::ops::Range;
 use std::path::Path;
 
 use crate::error::{Error, Result, ShowPath};
-use crate::files::ply::{Encoding, Header, Layout, Plane, Ply, Property, Scalar, name_without_bands, read_plane};
+use crate::files::ply::{
+    PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_without_bands, read_plane,
+};
 use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
-use crate::reduction::{Change, Reduction};
+use crate::reduction::{CompressedModel, ParamDelta};
 
 /// One row of a smaller PLY.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -23,7 +25,7 @@ pub struct OutRow {
 }
 
 /// The rows of what `reduction` leaves.
-pub fn out_rows(reduction: &Reduction) -> Vec<OutRow> {
+pub fn out_rows(reduction: &CompressedModel) -> Vec<OutRow> {
     let mut rows: Vec<OutRow> = reduction.kept.iter().map(|&source| OutRow { source, proxy: None }).collect();
     for (proxy, cluster) in reduction.clusters.iter().enumerate() {
         rows[cluster.output as usize].proxy = Some(proxy as u32);
@@ -48,13 +50,13 @@ pub fn write_like(
     template: &Ply,
     rows: &[OutRow],
     proxies: &Gaussians,
-    change: &Change,
+    change: &ParamDelta,
     sh_degree: usize,
     path: &Path,
 ) -> Result<()> {
     check_rows(template, rows, proxies, change)?;
     let name = |name: &str| name_without_bands(name, template.sh_degree(), sh_degree);
-    let big_endian = template.header().encoding == Encoding::BigEndian;
+    let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     let sources: Vec<u32> = rows.iter().map(|row| row.source).collect();
     write_rows_like(template, &sources, name, path, |place, bytes| {
         if let Some(proxy) = rows[place].proxy {
@@ -169,7 +171,7 @@ pub(crate) fn bytes_beside(template: &Ply) -> usize {
 /// A header that is of no such rows; a failed write.
 pub(crate) fn write_rows(
     from: &Path,
-    header: &Header,
+    header: &PlyHeader,
     [lead, tail]: [&[u8]; 2],
     beside: &[u8],
     cloud: &Gaussians,
@@ -179,13 +181,13 @@ pub(crate) fn write_rows(
     let Some(vertex) = header.vertex().filter(|vertex| vertex.count == cloud.len() as u64) else {
         return Err(mismatch(format!("{} rows", cloud.len())));
     };
-    let layout = Layout::of(from, vertex)?;
+    let layout = PlyLayout::of(from, vertex)?;
     let ranges = ranges_beside(&vertex.properties, &layout);
     let width: usize = ranges.iter().map(|range| range.len()).sum();
     if layout.planes(Columns::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {
         return Err(mismatch("the properties of the rows".to_owned()));
     }
-    let big_endian = header.encoding == Encoding::BigEndian;
+    let big_endian = header.encoding == PlyEncoding::BigEndian;
     create(path, |out| {
         out.write_all(&header.text)?;
         out.write_all(lead)?;
@@ -205,12 +207,12 @@ pub(crate) fn write_rows(
 }
 
 /// Where a row holds what is no attribute of a Gaussian.
-fn ranges_beside(properties: &[Property], layout: &Layout) -> Vec<Range<usize>> {
+fn ranges_beside(properties: &[Property], layout: &PlyLayout) -> Vec<Range<usize>> {
     let mut used: Vec<usize> = Vec::new();
     for column in Columns::all().iter() {
         used.extend(layout.planes(column).iter().filter_map(|plane| match plane {
-            Plane::Property(property) => Some(property.offset),
-            Plane::Thin => None,
+            PlaneSource::Property(property) => Some(property.offset),
+            PlaneSource::Thin => None,
         }));
     }
     let beside = properties.iter().filter(|property| !used.contains(&property.offset));
@@ -223,7 +225,7 @@ fn create(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> R
     fill(&mut out).and_then(|()| out.flush()).map_err(Error::io("write", path))
 }
 
-fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change) -> Result<()> {
+fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Result<()> {
     for column in change.columns().iter() {
         let changes = change.0.column(column).len();
         if changes != rows.len() {
@@ -245,10 +247,10 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Cha
 }
 
 /// Replaces the attributes in the bytes of a row by those of a proxy.
-fn replace(row: &mut [u8], layout: &Layout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
+fn replace(row: &mut [u8], layout: &PlyLayout, big_endian: bool, proxies: &Gaussians, proxy: usize) {
     for column in Columns::all().iter() {
         for (c, plane) in layout.planes(column).iter().enumerate() {
-            if let Plane::Property(property) = plane {
+            if let PlaneSource::Property(property) = plane {
                 put(row, property, big_endian, proxies.column(column).plane(c)[proxy]);
             }
         }
@@ -256,13 +258,13 @@ fn replace(row: &mut [u8], layout: &Layout, big_endian: bool, proxies: &Gaussian
 }
 
 /// Adds the change of the Gaussian at `place` of the output to the bytes of its row.
-fn add(row: &mut [u8], template: &Ply, change: &Change, place: usize) {
-    let big_endian = template.header().encoding == Encoding::BigEndian;
+fn add(row: &mut [u8], template: &Ply, change: &ParamDelta, place: usize) {
+    let big_endian = template.header().encoding == PlyEncoding::BigEndian;
     for column in change.columns().iter() {
         let by = change.0.column(column);
         for (c, plane) in template.layout().planes(column).iter().enumerate().take(by.width()) {
             let by = by.plane(c)[place];
-            if let (Plane::Property(property), true) = (plane, by != 0.0) {
+            if let (PlaneSource::Property(property), true) = (plane, by != 0.0) {
                 put(row, property, big_endian, value(row, property, big_endian) + by);
             }
         }

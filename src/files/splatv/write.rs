@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use crate::error::{Error, Result};
 use crate::files::accuracy::{Accuracy, Drawn};
 use crate::files::cameras::virtual_rig;
-use crate::files::splatv::{MAGIC, ROW_BYTES, Row, TEXELS, WORDS};
+use crate::files::splatv::{MAGIC, ROW_BYTES, SplatvGaussian, TEXELS, WORDS};
 use crate::model::RobustBox;
 use crate::model::{Camera, Column};
 
@@ -24,7 +24,7 @@ const SEEN_WIDTHS: f64 = 2.36;
 const TEXELS_EACH: usize = 4;
 
 /// The words that a viewer reads of `row`. What no half holds becomes the largest that it does; NaN becomes 0.
-pub fn words(row: &Row) -> [u32; WORDS] {
+pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let half = |value: f32| {
         let most = f16::MAX.to_f32();
         let held = if value.is_nan() { 0.0 } else { value.clamp(-most, most) };
@@ -33,7 +33,8 @@ pub fn words(row: &Row) -> [u32; WORDS] {
     let pair = |low: f32, high: f32| half(low) | half(high) << 16;
     // `as` truncates, saturates and turns NaN into 0.
     let byte = |value: f64| u32::from((255.0 * value) as u8);
-    let Row { position, motion: m, rotation: q, omega: o, scale: s, rgb: [r, g, b], opacity, centre, width } = *row;
+    let SplatvGaussian { position, motion: m, rotation: q, omega: o, scale: s, rgb: [r, g, b], opacity, centre, width } =
+        *row;
     let [x, y, z] = position.map(f32::to_bits);
     let colour = byte(r) | byte(g) << 8 | byte(b) << 16 | byte(opacity) << 24;
     [
@@ -58,9 +59,9 @@ pub fn words(row: &Row) -> [u32; WORDS] {
 
 /// Measures what a viewer reads of `row` against `row` itself, as Gaussian `id`. Rounding of its path counts as far from its
 /// center as it is seen.
-pub fn measure(row: &Row, id: usize, to: &mut Accuracy) {
-    let held = Row::of_words(&words(row));
-    let drawn = |of: &Row| Drawn {
+pub fn measure(row: &SplatvGaussian, id: usize, to: &mut Accuracy) {
+    let held = SplatvGaussian::of_words(&words(row));
+    let drawn = |of: &SplatvGaussian| Drawn {
         position: of.position.map(f64::from),
         scale: of.scale.map(f64::from),
         opacity: of.opacity,
@@ -126,10 +127,10 @@ mod tests {
     use crate::files::splatv::Splatv;
 
     /// A row of values that halves and bytes hold.
-    fn row(seed: u16) -> Row {
+    fn row(seed: u16) -> SplatvGaussian {
         let value = |k: u16| f16::from_bits(0x3000 + (seed.wrapping_mul(31).wrapping_add(k * 977)) % 0x1000).to_f32();
         let byte = |k: u16| f64::from((seed.wrapping_mul(7).wrapping_add(k)) % 255 + 1) / 255.0 + 1e-4;
-        Row {
+        SplatvGaussian {
             position: [value(0), -3.75 - f32::from(seed), 1e-3],
             motion: std::array::from_fn(|k| -value(k as u16)),
             rotation: std::array::from_fn(|k| value(20 + k as u16)),
@@ -147,7 +148,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("some.splatv");
         for count in [1, 1024, 1025] {
-            let rows: Vec<Row> = (0..count).map(row).collect();
+            let rows: Vec<SplatvGaussian> = (0..count).map(row).collect();
             write(&path, rows.len(), rows.iter().map(words), &json!([{"id": 0}])).unwrap();
             let read = Splatv::open(&path).unwrap();
             assert_eq!((read.count(), read.cameras()[0]["id"].as_u64()), (count as usize, Some(0)));
@@ -157,24 +158,27 @@ mod tests {
                     && bytes < 65536 * u64::from(count.div_ceil(1024)) + 512
             );
             for (i, expected) in rows.iter().enumerate() {
-                let found = Row::of_words(&read.words(i));
+                let found = SplatvGaussian::of_words(&read.words(i));
                 let close = |a: f64, b: f64| (a - b).abs() <= 1.0 / 255.0;
                 assert!(
                     found.rgb.iter().zip(expected.rgb).all(|(&a, b)| close(a, b))
                         && close(found.opacity, expected.opacity)
                 );
-                assert_eq!(Row { rgb: expected.rgb, opacity: expected.opacity, ..found }, *expected);
-                assert_eq!(words(&Row { rgb: expected.rgb, opacity: expected.opacity, ..found }), read.words(i));
+                assert_eq!(SplatvGaussian { rgb: expected.rgb, opacity: expected.opacity, ..found }, *expected);
+                assert_eq!(
+                    words(&SplatvGaussian { rgb: expected.rgb, opacity: expected.opacity, ..found }),
+                    read.words(i)
+                );
             }
         }
     }
 
     #[test]
     fn what_no_half_holds_is_the_largest_that_it_does() {
-        let wild = Row { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
-        let found = Row::of_words(&words(&wild));
+        let wild = SplatvGaussian { motion: [1e9, -1e9, f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], width: 1e6, ..row(1) };
+        let found = SplatvGaussian::of_words(&words(&wild));
         assert_eq!((&found.motion[..3], found.width), (&[65504.0, -65504.0, 0.0][..], 65504.0));
-        assert_eq!(words(&Row { rgb: [-1.0, 2.0, 0.5], ..row(1) })[7] & 0xffffff, 0x7f_ff_00);
+        assert_eq!(words(&SplatvGaussian { rgb: [-1.0, 2.0, 0.5], ..row(1) })[7] & 0xffffff, 0x7f_ff_00);
     }
 
     #[test]

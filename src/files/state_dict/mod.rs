@@ -8,9 +8,9 @@ use std::path::Path;
 
 use crate::deform::{Tensor, Tensors};
 use crate::error::{Error, Result, quoted};
-use crate::files::checkpoint::{Checkpoint, MAX_DEPTH, Node, NodeId, Tensor as StoredTensor};
+use crate::files::checkpoint::{Checkpoint, MAX_DEPTH, Node, NodeId, TensorView};
 use crate::limits::ReadLimit;
-pub(crate) use write::{Stored, Values, write_state_dict};
+pub(crate) use write::{StoredTensor, TensorValues, write_state_dict};
 
 /// A view may repeat its storage (stride 0), so a small file can declare any number of values. No
 /// trained state dict stores less than a quarter of what it means.
@@ -31,10 +31,10 @@ const TENSOR_BYTES: u64 = 512;
 pub(crate) fn read_state_dict(path: &Path, memory: ReadLimit) -> Result<Tensors> {
     let file_bytes = fs::metadata(path).map_err(Error::io("open", path))?.len();
     let dict = StateDict::open(path, memory)?;
-    let bytes = |tensor: &StoredTensor, width: usize| {
+    let bytes = |tensor: &TensorView, width: usize| {
         tensor.len().map_or(u64::MAX, |len| (len as u64).saturating_mul(width as u64))
     };
-    let sum = |width: fn(&StoredTensor) -> usize| {
+    let sum = |width: fn(&TensorView) -> usize| {
         dict.tensors.values().fold(0u64, |sum, tensor| sum.saturating_add(bytes(tensor, width(tensor))))
     };
     let declared = sum(|tensor| tensor.kind.bytes());
@@ -88,7 +88,7 @@ pub(crate) fn is_pair(path: &Path, memory: ReadLimit) -> bool {
 /// The tensors of a checkpoint, by name. Names of nested dicts, lists and tuples are joined by dots.
 struct StateDict {
     checkpoint: Checkpoint,
-    tensors: BTreeMap<String, StoredTensor>,
+    tensors: BTreeMap<String, TensorView>,
 }
 
 impl StateDict {
@@ -101,7 +101,8 @@ impl StateDict {
                 .hint("save the model again with torch.save(model.state_dict(), path)"));
         }
         // What is shared is visited once for each of its names, which a pickle can make any number of.
-        let mut walk = Walk { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
+        let mut walk =
+            TensorSearch { checkpoint: &checkpoint, left: 4 * nodes + 1000, name_bytes: 0, found: BTreeMap::new() };
         walk.visit(root, &mut String::new(), 0)?;
         let tensors = walk.found;
         Ok(StateDict { checkpoint, tensors })
@@ -109,15 +110,15 @@ impl StateDict {
 }
 
 /// The search for tensors in a tree.
-struct Walk<'a> {
+struct TensorSearch<'a> {
     checkpoint: &'a Checkpoint,
     /// Number of nodes that may still be visited.
     left: usize,
     name_bytes: u64,
-    found: BTreeMap<String, StoredTensor>,
+    found: BTreeMap<String, TensorView>,
 }
 
-impl Walk<'_> {
+impl TensorSearch<'_> {
     /// Adds the tensors at and below `id`, which is called `name`.
     fn visit(&mut self, id: NodeId, name: &mut String, depth: u8) -> Result<()> {
         let (checkpoint, pickle) = (self.checkpoint, self.checkpoint.pickle());

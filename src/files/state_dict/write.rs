@@ -23,11 +23,11 @@ const ALIGNMENT: u16 = 64;
 /// A tensor as a file stores it: element `i` of its `shape` is value `offset + Σ i·stride` of its storage. Strides may
 /// be 0 and elements may share values.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Stored {
+pub(crate) struct StoredTensor {
     /// Its dotted name.
     pub(crate) name: String,
     /// Its values.
-    pub(crate) values: Values,
+    pub(crate) values: TensorValues,
     /// Place of its first element.
     pub(crate) offset: usize,
     /// Extents, outermost first; empty for a scalar.
@@ -38,55 +38,55 @@ pub(crate) struct Stored {
 
 /// The values of a tensor.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Values {
+pub(crate) enum TensorValues {
     /// IEEE 754 binary32.
     F32(Vec<f32>),
     /// IEEE 754 binary16.
     F16(Vec<f16>),
 }
 
-impl Values {
+impl TensorValues {
     /// How many there are.
     pub(crate) fn len(&self) -> usize {
         match self {
-            Values::F32(values) => values.len(),
-            Values::F16(values) => values.len(),
+            TensorValues::F32(values) => values.len(),
+            TensorValues::F16(values) => values.len(),
         }
     }
 
     /// Bytes of each.
     pub(crate) fn width(&self) -> usize {
         match self {
-            Values::F32(_) => size_of::<f32>(),
-            Values::F16(_) => size_of::<f16>(),
+            TensorValues::F32(_) => size_of::<f32>(),
+            TensorValues::F16(_) => size_of::<f16>(),
         }
     }
 
     /// Name of the storage in the pickle.
     fn class(&self) -> &'static str {
         match self {
-            Values::F32(_) => "FloatStorage",
-            Values::F16(_) => "HalfStorage",
+            TensorValues::F32(_) => "FloatStorage",
+            TensorValues::F16(_) => "HalfStorage",
         }
     }
 
     /// In this machine's order of bytes.
     fn bytes(&self) -> &[u8] {
         match self {
-            Values::F32(values) => bytemuck::cast_slice(values),
-            Values::F16(values) => bytemuck::cast_slice(values.reinterpret_cast()),
+            TensorValues::F32(values) => bytemuck::cast_slice(values),
+            TensorValues::F16(values) => bytemuck::cast_slice(values.reinterpret_cast()),
         }
     }
 }
 
-impl Stored {
+impl StoredTensor {
     /// `values` one after the other, the last extent fastest.
-    pub(crate) fn dense(name: String, shape: Vec<usize>, values: Values) -> Stored {
+    pub(crate) fn dense(name: String, shape: Vec<usize>, values: TensorValues) -> StoredTensor {
         let mut stride = vec![1; shape.len()];
         for axis in (1..shape.len()).rev() {
             stride[axis - 1] = stride[axis] * shape[axis].max(1);
         }
-        Stored { name, values, offset: 0, shape, stride }
+        StoredTensor { name, values, offset: 0, shape, stride }
     }
 }
 
@@ -94,7 +94,7 @@ impl Stored {
 ///
 /// # Errors
 /// A failed write.
-pub(crate) fn write_state_dict(path: &Path, tensors: &[Stored]) -> Result<()> {
+pub(crate) fn write_state_dict(path: &Path, tensors: &[StoredTensor]) -> Result<()> {
     let write = || {
         let mut archive = ZipWriter::new(ZipOutput::new(BufWriter::new(File::create(path)?)));
         // The pickle first, and all in one folder: by its name readers know the others.
@@ -119,7 +119,7 @@ fn add(archive: &mut ZipWriter<ZipOutput<BufWriter<File>>>, name: &str, bytes: &
 }
 
 /// The pickle, of protocol 2, of an ordered dictionary of the tensors by name. Value storages are called by number.
-fn pickle(tensors: &[Stored]) -> Vec<u8> {
+fn pickle(tensors: &[StoredTensor]) -> Vec<u8> {
     const DICTIONARY: &[u8] = b"ccollections\nOrderedDict\n)R";
     let mut out = [b"\x80\x02", DICTIONARY, b"("].concat();
     for (key, tensor) in tensors.iter().enumerate() {
@@ -180,16 +180,16 @@ mod tests {
     use super::*;
 
     /// The element at `index`, by the definition.
-    fn element(tensor: &Stored, index: &[usize]) -> f32 {
+    fn element(tensor: &StoredTensor, index: &[usize]) -> f32 {
         let at = tensor.offset + index.iter().zip(&tensor.stride).map(|(i, stride)| i * stride).sum::<usize>();
         match &tensor.values {
-            Values::F32(values) => values[at],
-            Values::F16(values) => values[at].to_f32(),
+            TensorValues::F32(values) => values[at],
+            TensorValues::F16(values) => values[at].to_f32(),
         }
     }
 
     /// Every element, the last index fastest.
-    fn elements(tensor: &Stored) -> Vec<f32> {
+    fn elements(tensor: &StoredTensor) -> Vec<f32> {
         let mut indices = vec![Vec::new()];
         for &extent in &tensor.shape {
             indices = indices.into_iter().flat_map(|at| (0..extent).map(move |i| [&at[..], &[i]].concat())).collect();
@@ -198,7 +198,7 @@ mod tests {
     }
 
     /// Of any shape and strides over a storage with some values before and behind.
-    fn tensor() -> impl Strategy<Value = Stored> {
+    fn tensor() -> impl Strategy<Value = StoredTensor> {
         let extents = proptest::collection::vec((1..5usize, 0..7usize), 0..4);
         (extents, 0..4usize, 0..3usize, any::<bool>(), any::<u64>()).prop_map(
             |(extents, offset, spare, narrow, seed)| {
@@ -207,10 +207,10 @@ mod tests {
                 let bits =
                     (0..offset + last + 1 + spare).map(|i| (seed ^ i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
                 let values = match narrow {
-                    true => Values::F16(bits.map(|bits| f16::from_bits((bits >> 48) as u16)).collect()),
-                    false => Values::F32(bits.map(|bits| f32::from_bits((bits >> 32) as u32)).collect()),
+                    true => TensorValues::F16(bits.map(|bits| f16::from_bits((bits >> 48) as u16)).collect()),
+                    false => TensorValues::F32(bits.map(|bits| f32::from_bits((bits >> 32) as u32)).collect()),
                 };
-                Stored { name: String::new(), values, offset, shape, stride }
+                StoredTensor { name: String::new(), values, offset, shape, stride }
             },
         )
     }
@@ -262,9 +262,10 @@ mod tests {
     fn entries_are_named_ordered_and_aligned_as_pytorch_has_them() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.pth");
-        let of = |name: &str, values| Stored::dense(name.to_owned(), vec![3], values);
+        let of = |name: &str, values| StoredTensor::dense(name.to_owned(), vec![3], values);
         let half = [1.0, -2.0, 0.25].map(f16::from_f32).to_vec();
-        write_state_dict(&path, &[of("a", Values::F32(vec![1.0, 2.0, 3.0])), of("b", Values::F16(half))]).unwrap();
+        write_state_dict(&path, &[of("a", TensorValues::F32(vec![1.0, 2.0, 3.0])), of("b", TensorValues::F16(half))])
+            .unwrap();
         let found = entries(&fs::read(&path).unwrap());
         let names: Vec<&str> = found.iter().map(|entry| entry.0.as_str()).collect();
         let expected = ["data.pkl", "byteorder", "data/0", "data/1", "version"].map(|name| format!("archive/{name}"));
@@ -276,8 +277,9 @@ mod tests {
 
     #[test]
     fn a_pickle_is_these_bytes() {
-        let values = Values::F16(vec![f16::ZERO; 300]);
-        let tensor = Stored { name: "w".to_owned(), values, offset: 7, shape: vec![2, 70_000], stride: vec![0, 0] };
+        let values = TensorValues::F16(vec![f16::ZERO; 300]);
+        let tensor =
+            StoredTensor { name: "w".to_owned(), values, offset: 7, shape: vec![2, 70_000], stride: vec![0, 0] };
         let expected = [
             &b"\x80\x02ccollections\nOrderedDict\n)R("[..],
             b"X\x01\0\0\0wctorch._utils\n_rebuild_tensor_v2\n(",

@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::archive::Content;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{beside, bytes_beside, write_rows};
-use crate::files::ply::{Header, Ply, name_without_bands};
+use crate::files::ply::{Ply, PlyHeader, name_without_bands};
 
 /// Names of what an archive holds of a PLY beside its rows.
 pub(crate) const HEADER: &str = "ply.header";
@@ -49,6 +49,6 @@ pub(super) fn write_cloud(content: &Content, path: &Path, to: &Path) -> Result<(
         let missing = || Error::input(path, "blobs", format!("a part named {name}"), "none");
         content.files.get(name).ok_or_else(missing)
     };
-    let header = Header::parse(path, part(HEADER)?)?;
+    let header = PlyHeader::parse(path, part(HEADER)?)?;
     write_rows(path, &header, [part(LEAD)?, part(TAIL)?], &content.beside, &content.cloud, to)
 }

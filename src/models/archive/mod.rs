@@ -12,32 +12,32 @@ use xxhash_rust::xxh3::xxh3_128;
 
 use files::{CFG_ARGS, ITERATION, write_cloud};
 
-use super::family::{ColumnInfo, Entry, Family, OpenOptions, Residence, Timing};
+use super::family::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::size::Size;
 use super::{four_d_gaussians, ply_sequence};
-use crate::archive::{self, Content, Parts};
+use crate::archive::{self, ArchiveSize, Content};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::open::open_file;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// An archive.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a .gsz",
     recognises: |found| found.is_file_of(&archive::MAGIC, "gsz"),
-    open: |path, options| Ok(Box::new(Archive::open(path, options)?)),
+    open: |path, options| Ok(Box::new(OpenArchive::open(path, options)?)),
 };
 
 /// Reads an archive; gives also how many of its bytes are for what.
 ///
 /// # Errors
 /// Whatever is wrong with it; more than `memory` takes.
-pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, Parts)> {
+pub fn read_archive(path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
     archive::decode(&load(path, memory)?, path, memory)
 }
 
@@ -80,16 +80,16 @@ pub fn is_folder(content: &Content) -> bool {
 }
 
 /// An open archive.
-struct Archive {
+struct OpenArchive {
     /// What it holds, as files in `scratch`.
-    inner: Box<dyn Family>,
+    inner: Box<dyn InputModel>,
     scratch: ScratchFolder,
     digest: String,
     size: Size,
 }
 
-impl Archive {
-    fn open(path: &Path, options: &OpenOptions) -> Result<Archive> {
+impl OpenArchive {
+    fn open(path: &Path, options: &OpenOptions) -> Result<OpenArchive> {
         options.refuse_for(path)?;
         let bytes = load(path, options.memory)?;
         let (content, parts) = archive::decode(&bytes, path, options.memory)?;
@@ -97,7 +97,7 @@ impl Archive {
         drop(bytes);
         let folder = options.scratch.clone().unwrap_or_else(std::env::temp_dir);
         let scratch = ScratchFolder::new(&folder)?;
-        let inner: Box<dyn Family> = if is_folder(&content) {
+        let inner: Box<dyn InputModel> = if is_folder(&content) {
             unpack(&content, path, scratch.path())?;
             drop(content);
             (four_d_gaussians::ENTRY.open)(scratch.path(), options)?
@@ -107,11 +107,11 @@ impl Archive {
             drop(content);
             (ply_sequence::FILE.open)(&file, options)?
         };
-        Ok(Archive { inner, scratch, digest, size: parts.into() })
+        Ok(OpenArchive { inner, scratch, digest, size: parts.into() })
     }
 }
 
-impl Family for Archive {
+impl InputModel for OpenArchive {
     fn kind(&self) -> &'static str {
         "gsz archive"
     }
@@ -140,7 +140,7 @@ impl Family for Archive {
         self.inner.stored_bytes()
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         self.inner.residence()
     }
 
@@ -148,9 +148,9 @@ impl Family for Archive {
         self.inner.timing()
     }
 
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
-        let Archive { inner, scratch, digest, size } = *self;
-        Ok(Box::new(Archive { inner: inner.with_times(times)?, scratch, digest, size }))
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
+        let OpenArchive { inner, scratch, digest, size } = *self;
+        Ok(Box::new(OpenArchive { inner: inner.with_times(times)?, scratch, digest, size }))
     }
 
     fn data_folder(&self) -> Option<&str> {
@@ -177,15 +177,21 @@ impl Family for Archive {
         self.inner.check_output(kind, path)
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         self.inner.solve(clusters, reference, rule)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         self.inner.reduced(reduction)
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         self.inner.write(reduction, kind, path, limits)
     }
 
@@ -197,7 +203,7 @@ impl Family for Archive {
         self.inner.needs_all_bands()
     }
 
-    fn content(&self, reduction: &Reduction) -> Result<Content> {
+    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         self.inner.content(reduction)
     }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::Result;
 use crate::files::python_literal::{Argument, Literal, parse_call};
-use crate::models::four_d_gaussians::cfg_args::{Key, NAME, read};
+use crate::models::four_d_gaussians::cfg_args::{ConfigKey, NAME, read};
 
 /// The keys of a `cfg_args`.
 #[derive(Debug)]
@@ -30,8 +30,8 @@ impl Arguments {
     }
 
     /// The last value of `name`; none stands for a missing key too.
-    pub(in crate::models) fn get(&self, name: &'static str) -> Key<'_> {
+    pub(in crate::models) fn get(&self, name: &'static str) -> ConfigKey<'_> {
         let found = self.keys.iter().rev().find(|key| key.name == name);
-        Key { name, value: found.map_or(&Literal::None, |key| &key.value), path: &self.path }
+        ConfigKey { name, value: found.map_or(&Literal::None, |key| &key.value), path: &self.path }
     }
 }

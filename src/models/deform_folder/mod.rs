@@ -18,30 +18,30 @@ pub(super) use arguments::Arguments;
 use paths::Paths;
 pub(super) use paths::{has_network, names_of_network};
 
-use super::family::{Family, OpenOptions, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, OpenOptions, Timing};
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
-use super::law::{Law, Model, solve};
+use super::law::{MotionModel, MotionModelFrames, solve};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::ply::write::{out_rows, write_like};
-use crate::files::ply::{Encoding, Ply, read_plane};
+use crate::files::ply::{Ply, PlyEncoding, read_plane};
 use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// Smallest scale that has a logarithm here.
 pub(super) const LEAST_SCALE: f64 = 1e-7;
 
 /// A law by which what a network says becomes states.
-pub(super) trait Deforming: Law {
+pub(super) trait Deforming: MotionModel {
     /// What the family is called.
     const KIND: &'static str;
     /// Whether a rotation is made unit before what the network says is added to it.
@@ -74,7 +74,7 @@ pub(super) struct Parts<'a> {
 /// An open model folder.
 pub(super) struct Folder<L> {
     paths: Paths,
-    model: Model<L>,
+    model: MotionModelFrames<L>,
     source_path: Option<String>,
     white_background: bool,
     tensor_bytes: u64,
@@ -90,7 +90,7 @@ impl<L: Deforming + 'static> Folder<L> {
         root: &Path,
         options: &OpenOptions,
         make: impl FnOnce(&Parts<'_>) -> Result<(L, Vec<String>)>,
-    ) -> Result<Box<dyn Family>> {
+    ) -> Result<Box<dyn InputModel>> {
         let paths = Paths::locate(root, options.iteration)?;
         let arguments = Arguments::read(&paths.cfg_args)?;
         let tensors = paths.tensors(options.memory)?;
@@ -102,7 +102,7 @@ impl<L: Deforming + 'static> Folder<L> {
         let values = tensors.values().map(|tensor| tensor.data.len()).sum::<usize>();
         let source_path = arguments.get("source_path").string()?;
         let white_background = arguments.get("white_background").bool(false)?;
-        let model = Model::new(law, raw, ply.sh_degree());
+        let model = MotionModelFrames::new(law, raw, ply.sh_degree());
         Ok(Box::new(Folder { paths, model, source_path, white_background, tensor_bytes: 4 * values as u64, notes }))
     }
 
@@ -112,7 +112,7 @@ impl<L: Deforming + 'static> Folder<L> {
     }
 
     /// Writes what is left as a folder at `path`.
-    fn write_folder(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+    fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let to = Paths::of(path, self.paths.iteration);
         for file in [&to.point_cloud, &to.network] {
             let folder = file.parent().unwrap_or(path);
@@ -149,7 +149,7 @@ fn raw(ply: &Ply) -> Result<Raw> {
     let find = |k: usize| ply.properties().iter().find(|property| property.name == format!("fea_{k}"));
     let features: Vec<_> = (0..).map_while(find).collect();
     let mut own = Column::zeros(features.len(), count);
-    let big_endian = ply.header().encoding == Encoding::BigEndian;
+    let big_endian = ply.header().encoding == PlyEncoding::BigEndian;
     for (k, property) in features.into_iter().enumerate() {
         let plane = own.plane_mut(k);
         for (row, value) in plane.iter_mut().enumerate() {
@@ -179,7 +179,7 @@ fn size_of(paths: &Paths) -> Result<Size> {
     Ok(Size { cloud, field, rest: bytes_of([&*paths.cfg_args])?, ..Size::default() })
 }
 
-impl<L: Deforming + 'static> Family for Folder<L> {
+impl<L: Deforming + 'static> InputModel for Folder<L> {
     fn kind(&self) -> &'static str {
         L::KIND
     }
@@ -207,11 +207,11 @@ impl<L: Deforming + 'static> Family for Folder<L> {
         }
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         let law = self.model.law();
         let features = 4 * self.model.raw().own.width() as u64;
         let whole = state_bytes(self.model.info().sh_degree, Columns::all()) + features;
-        Residence {
+        MemoryProfile {
             per_gaussian: whole,
             // Normals and the like stand beside the values.
             opening: whole + 24,
@@ -239,7 +239,7 @@ impl<L: Deforming + 'static> Family for Folder<L> {
         Clock::Given
     }
 
-    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.model = self.model.with_times(times)?;
         Ok(self)
     }
@@ -271,15 +271,21 @@ impl<L: Deforming + 'static> Family for Folder<L> {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         solve(&self.model, clusters, reference, rule, |clusters| proxies::propose(&self.model, clusters, rule))
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(Box::new(self.model.reduced(reduction)))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         let mut notes = match kind {
             OutputKind::Model => self.write_folder(reduction, path).map(|()| Vec::new())?,
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?,

@@ -11,9 +11,9 @@ use super::{Deforming, LEAST_SCALE, heaviest};
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, Raw, logit, opacity};
-use crate::models::law::Model;
+use crate::models::law::MotionModelFrames;
 use crate::passes::gather_all;
-use crate::recipe::Merge;
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
 use crate::source::{Deformation, FrameSource};
 
@@ -30,7 +30,11 @@ const TURNS: usize = 3;
 const DAMPING: f64 = 1e-3;
 
 /// Parameters that move most like the members of each of `clusters`, a row for each.
-pub(super) fn propose<L: Deforming>(model: &Model<L>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+pub(super) fn propose<L: Deforming>(
+    model: &MotionModelFrames<L>,
+    clusters: &[Cluster],
+    rule: &MergeParams,
+) -> Result<Raw> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
     let wanted = MergedSequence::new(model, &leaders, members, rule);
@@ -96,7 +100,7 @@ fn place(state: &Gaussians, row: usize) -> DVec3 {
 
 /// For every row of `raw` the sum of its squared distances from where it is wanted.
 fn off<L: Deforming>(
-    model: &Model<L>,
+    model: &MotionModelFrames<L>,
     raw: &Raw,
     frames: &[usize],
     wanted: impl Fn(usize, usize) -> DVec3,
@@ -112,7 +116,7 @@ fn off<L: Deforming>(
 }
 
 /// One Gauss-Newton step of every place.
-fn step<L: Deforming>(model: &Model<L>, raw: &Raw, frames: &[usize], wanted: &[Gaussians]) -> Result<Raw> {
+fn step<L: Deforming>(model: &MotionModelFrames<L>, raw: &Raw, frames: &[usize], wanted: &[Gaussians]) -> Result<Raw> {
     let mut sums = vec![(DMat3::ZERO, DVec3::ZERO); raw.len()];
     let mut state = Gaussians::zeros(0, 0);
     for (&frame, wanted) in frames.iter().zip(wanted) {
@@ -142,7 +146,7 @@ fn step<L: Deforming>(model: &Model<L>, raw: &Raw, frames: &[usize], wanted: &[G
 /// network says is added that is what is wanted less that, at once; where more comes of it, as of quaternions that are not
 /// unit, it takes some turns. The best turn stays.
 fn shape<L: Deforming>(
-    model: &Model<L>,
+    model: &MotionModelFrames<L>,
     made: &mut Raw,
     leaders: &[u32],
     frames: &[usize],

@@ -7,18 +7,18 @@ use glam::{DMat3, DVec3};
 use tempfile::TempDir;
 
 use crate::deform::synthetic::Noise;
-use crate::deform::synthetic::deep::{KINDS, Kind, tensors};
-use crate::deform::{Motion, Network, Tensor, Tensors};
+use crate::deform::synthetic::deep::{DeepVariant, KINDS, tensors};
+use crate::deform::{Network, PredictedMotion, Tensor, Tensors};
 use crate::error::Result;
-use crate::files::state_dict::{Stored, Values, write_state_dict};
+use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
 use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, opacity};
 use crate::models;
-use crate::models::{Family, OpenOptions};
+use crate::models::{InputModel, OpenOptions};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::{Change, Cluster, Reduction, Reference};
+use crate::reduction::{Cluster, CompressedModel, ParamDelta, Reference};
 use crate::source::FrameSource;
 
 const COUNT: usize = 40;
@@ -35,7 +35,7 @@ struct Made {
 
 impl Made {
     /// Of Deformable-3D-Gaussians.
-    fn plain(kind: Kind) -> Made {
+    fn plain(kind: DeepVariant) -> Made {
         let stripped = |(name, tensor): (String, Tensor)| (name.replace("network.", ""), small(tensor));
         Made {
             folder: tempfile::tempdir().unwrap(),
@@ -50,7 +50,7 @@ impl Made {
     }
 
     /// Of SC-GS, with 12 nodes, 2 hyper dimensions and a mask.
-    fn sparse(kind: Kind) -> Made {
+    fn sparse(kind: DeepVariant) -> Made {
         let mut noise = Noise(23);
         let mut add = |shape: &[usize]| Tensor {
             shape: shape.to_vec(),
@@ -85,10 +85,9 @@ impl Made {
         }
         fs::write(self.path().join("cfg_args"), &self.cfg_args).unwrap();
         fs::write(self.path().join("cameras.json"), "[]").unwrap();
-        let stored = self
-            .tensors
-            .iter()
-            .map(|(name, tensor)| Stored::dense(name.clone(), tensor.shape.clone(), Values::F32(tensor.data.clone())));
+        let stored = self.tensors.iter().map(|(name, tensor)| {
+            StoredTensor::dense(name.clone(), tensor.shape.clone(), TensorValues::F32(tensor.data.clone()))
+        });
         write_state_dict(&network, &stored.collect::<Vec<_>>()).unwrap();
         let mut bytes = b"ply\nformat binary_little_endian 1.0\n".to_vec();
         bytes.extend(format!("element vertex {COUNT}\n").bytes());
@@ -99,7 +98,7 @@ impl Made {
     }
 
     /// Written and open, with frames.
-    fn open(&self) -> Box<dyn Family> {
+    fn open(&self) -> Box<dyn InputModel> {
         self.write(7);
         open(&self.path()).unwrap()
     }
@@ -141,7 +140,7 @@ fn cloud(features: usize) -> Vec<(String, Vec<f32>)> {
     names.into_iter().map(|name| (name.clone(), values(&name))).collect()
 }
 
-fn open(path: &Path) -> Result<Box<dyn Family>> {
+fn open(path: &Path) -> Result<Box<dyn InputModel>> {
     models::open(path, &OpenOptions::default())?.with_times(TIMES.to_vec())
 }
 
@@ -176,10 +175,10 @@ fn off(a: DMat3, b: DMat3) -> f64 {
 }
 
 /// What the network says of places at a time.
-fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> Motion {
+fn motion(tensors: &Tensors, prefix: &str, places: &[[f64; 3]], time: f64) -> PredictedMotion {
     let network = Network::new(tensors, prefix, Path::new("made")).unwrap();
     let planes = (0..3).flat_map(|c| places.iter().map(move |place| place[c] as f32)).collect();
-    let mut motion = Motion::default();
+    let mut motion = PredictedMotion::default();
     network.motion(&network.encode(&Column::from_planes(3, planes)), time, Columns::all(), &mut motion).unwrap();
     motion
 }
@@ -272,7 +271,7 @@ fn states_of_sc_gs_follow_the_formulas() {
 fn the_network_may_move_gaussians_of_sc_gs_without_nodes() {
     let made = Made {
         cfg_args: "Namespace(deform_type='mlp', sh_degree=1)".into(),
-        ..Made::plain(Kind { screws: false, ..KINDS[0] })
+        ..Made::plain(DeepVariant { screws: false, ..KINDS[0] })
     };
     let model = made.open();
     assert_eq!(model.kind(), "SC-GS model");
@@ -335,22 +334,22 @@ fn derivatives_are_those_of_finite_differences() {
 }
 
 /// A reduction with two proxies and changes.
-fn reduction(model: &dyn Family) -> Reduction {
+fn reduction(model: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
-    let mut reduction = Reduction::pruned(vec![1, 4, 9, 12, 30], &rule);
+    let mut reduction = CompressedModel::pruned(vec![1, 4, 9, 12, 30], &rule);
     reduction.clusters = vec![
         Cluster { output: 1, leader: 4, members: vec![(3, 0.6), (4, 0.4)] },
         Cluster { output: 3, leader: 12, members: vec![(12, 0.5), (17, 0.25), (39, 0.25)] },
     ];
     // Noise strays from everything: what is proposed is what is written here.
-    let rule = crate::recipe::Merge { max_drift: f64::INFINITY, ..rule };
+    let rule = crate::recipe::MergeParams { max_drift: f64::INFINITY, ..rule };
     let reference = Reference { frame: 0, extent: 1.0 };
     reduction.proxies = model.solve(&reduction.clusters, reference, &rule).unwrap();
     let mut by = Gaussians::zeros(5, 0);
     by.rotation = Column::default();
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(0, [0.1, 0.0, 0.2]);
-    reduction.change = Change(by);
+    reduction.change = ParamDelta(by);
     reduction
 }
 
@@ -362,7 +361,7 @@ fn what_stays_keeps_its_bytes_and_the_network_all_of_them() {
         let path = made.folder.path().join("result");
         fs::create_dir(&path).unwrap();
         let kept = vec![0u32, 2, 39];
-        model.write(&Reduction::pruned(kept.clone(), &rule), OutputKind::Model, &path, &Limits::NONE).unwrap();
+        model.write(&CompressedModel::pruned(kept.clone(), &rule), OutputKind::Model, &path, &Limits::NONE).unwrap();
         for name in ["cfg_args", "cameras.json", "deform/iteration_7/deform.pth"] {
             assert_eq!(fs::read(made.path().join(name)).unwrap(), fs::read(path.join(name)).unwrap(), "{name}");
         }
@@ -409,7 +408,7 @@ fn a_proxy_of_twins_is_one_of_them() {
         let rule = Recipe::preset("default").unwrap().merge;
         let clusters = [Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] }];
         let proxies = model.solve(&clusters, Reference { frame: 0, extent: 1.0 }, &rule).unwrap();
-        let mut reduction = Reduction::pruned(vec![0], &rule);
+        let mut reduction = CompressedModel::pruned(vec![0], &rule);
         (reduction.clusters, reduction.proxies) = (clusters.to_vec(), proxies);
         assert!(reduction.proxies.deviation.unwrap() < 1e-6, "{:?}", reduction.proxies);
         let (shown, all) = (model.reduced(&reduction).unwrap(), states(model.source()));

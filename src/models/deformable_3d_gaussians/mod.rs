@@ -11,17 +11,17 @@ mod screw;
 use glam::{DMat3, DVec3};
 
 use super::deform_folder::{Deforming, Folder, Parts, has_network};
-use super::family::Entry;
-use super::law::{Law, copy_stored};
-use crate::deform::{Encoded, Motion, Network};
+use super::family::ModelFormat;
+use super::law::{MotionModel, copy_stored};
+use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
 
 /// A model folder.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a Deformable-3D-Gaussians model folder",
     recognises: |found| found.is_folder && has_network(found.path),
-    open: |path, options| Folder::open(path, options, Deformation::new),
+    open: |path, options| Folder::open(path, options, DeformationKind::new),
 };
 
 /// Columns that follow from the covariance.
@@ -29,12 +29,12 @@ const SHAPE: Columns = Columns::ROTATION.union(Columns::LOG_SCALE);
 
 /// How the network deforms.
 #[derive(Debug)]
-struct Deformation {
+struct DeformationKind {
     network: Network,
 }
 
-impl Deformation {
-    fn new(parts: &Parts<'_>) -> Result<(Deformation, Vec<String>)> {
+impl DeformationKind {
+    fn new(parts: &Parts<'_>) -> Result<(DeformationKind, Vec<String>)> {
         if !parts.tensors.contains_key("linear.0.weight") {
             let names: Vec<&str> = parts.tensors.keys().map(String::as_str).take(6).collect();
             let found = if names.is_empty() { "none".to_owned() } else { format!("{}, …", names.join(", ")) };
@@ -54,14 +54,14 @@ impl Deformation {
                 ));
             }
         }
-        Ok((Deformation { network }, notes))
+        Ok((DeformationKind { network }, notes))
     }
 }
 
-impl Deformation {
+impl DeformationKind {
     /// What the network says of the columns `want` of a block.
-    fn motion(&self, time: f64, encoded: &Encoded, want: Columns) -> Result<Motion> {
-        let mut motion = Motion::default();
+    fn motion(&self, time: f64, encoded: &Encoded, want: Columns) -> Result<PredictedMotion> {
+        let mut motion = PredictedMotion::default();
         let shape = if (want & SHAPE).is_empty() { Columns::empty() } else { SHAPE };
         let want = want & Columns::POSITION | shape;
         if !want.is_empty() {
@@ -71,7 +71,7 @@ impl Deformation {
     }
 }
 
-impl Law for Deformation {
+impl MotionModel for DeformationKind {
     type Prepared = Encoded;
 
     fn prepare(&self, raw: &Raw) -> Encoded {
@@ -131,7 +131,7 @@ impl Law for Deformation {
             let slopes = self.network.slopes(position, time)?;
             let motion = match self.network.has_screws() {
                 true => self.motion(time, encoded, Columns::POSITION)?,
-                false => Motion::default(),
+                false => PredictedMotion::default(),
             };
             let mut out = Column::zeros(9, raw.len());
             for row in 0..raw.len() {
@@ -157,7 +157,7 @@ impl Law for Deformation {
     }
 }
 
-impl Deforming for Deformation {
+impl Deforming for DeformationKind {
     const KIND: &'static str = "Deformable-3D-Gaussians model";
     const NORMALISES: bool = true;
 

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{Entry, Family, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, ModelFormat, Timing};
 use super::size::bytes_of;
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::error::Result;
@@ -20,8 +20,8 @@ use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, SH_C0, colour};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::{FrameSource, Ids};
 use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
 use proxies::Settled;
@@ -30,7 +30,7 @@ use proxies::Settled;
 const FILE: &str = "params.npz";
 
 /// A model's file, or its folder.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a Dynamic3DGaussians params.npz",
     recognises: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
@@ -47,7 +47,7 @@ pub(super) const ENTRY: Entry = Entry {
     },
 };
 
-impl Family for Params {
+impl InputModel for Params {
     fn kind(&self) -> &'static str {
         "Dynamic3DGaussians model"
     }
@@ -66,8 +66,8 @@ impl Family for Params {
         bytes_of([&*self.path()])
     }
 
-    fn residence(&self) -> Residence {
-        Residence {
+    fn residence(&self) -> MemoryProfile {
+        MemoryProfile {
             per_gaussian: 0,
             opening: 0,
             reader: 8,
@@ -88,7 +88,7 @@ impl Family for Params {
         Timing::Numbered
     }
 
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(Params::with_times(*self, times)?))
     }
 
@@ -112,15 +112,21 @@ impl Family for Params {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], _: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], _: Reference, rule: &MergeParams) -> Result<Proxies> {
         proxies::solve(self, clusters, rule)
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(proxies::reduced(self, reduction))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_params(reduction, path.join(FILE)).map(|()| Vec::new()),
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),
@@ -130,7 +136,7 @@ impl Family for Params {
 
 impl Params {
     /// Writes what is left as the file `path`.
-    fn write_params(&self, reduction: &Reduction, path: PathBuf) -> Result<()> {
+    fn write_params(&self, reduction: &CompressedModel, path: PathBuf) -> Result<()> {
         let settled = Settled::new(self, reduction);
         let places: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
         let (mut proxies, mut state) = (settled.open(Ids::List(&places))?, Gaussians::zeros(0, 0));

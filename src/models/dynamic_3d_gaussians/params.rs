@@ -8,8 +8,8 @@
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
-use crate::files::npz::write::Axis;
-use crate::files::npz::{Entry, Floats, Npz};
+use crate::files::npz::write::ArrayRows;
+use crate::files::npz::{Floats, Npz, NpzArray};
 use crate::model::{Columns, Gaussians, SequenceInfo, harmonic};
 use crate::source::{BlockReader, Count, FrameSource, Ids, Reads};
 
@@ -122,11 +122,11 @@ impl Params {
     }
 
     /// Along which axis Gaussians are counted in an array.
-    pub(super) fn axis(entry: &Entry) -> Axis {
+    pub(super) fn axis(entry: &NpzArray) -> ArrayRows {
         match entry.name.as_str() {
-            MEANS | ROTATIONS | COLOURS => Axis::Second,
-            LOG_SCALES | OPACITIES | SEGMENTS => Axis::First,
-            _ => Axis::None,
+            MEANS | ROTATIONS | COLOURS => ArrayRows::Second,
+            LOG_SCALES | OPACITIES | SEGMENTS => ArrayRows::First,
+            _ => ArrayRows::None,
         }
     }
 }
@@ -140,7 +140,7 @@ impl FrameSource for Params {
         if let Some(id) = ids.iter().find(|&id| id >= self.info.count) {
             return Err(Error::usage(format!("Gaussian {id} was asked for, of {}", self.info.count)));
         }
-        Ok(Box::new(Block { params: self, ids: ids.iter().collect() }))
+        Ok(Box::new(TrajectoryBlock { params: self, ids: ids.iter().collect() }))
     }
 
     fn reads(&self) -> Reads {
@@ -150,12 +150,12 @@ impl FrameSource for Params {
 }
 
 /// Some Gaussians of a model.
-struct Block<'a> {
+struct TrajectoryBlock<'a> {
     params: &'a Params,
     ids: Vec<usize>,
 }
 
-impl BlockReader for Block<'_> {
+impl BlockReader for TrajectoryBlock<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let Params { info, means, rotations, colours, log_scales, opacities, states, .. } = self.params;
         if frame >= info.times.len() {

@@ -9,9 +9,9 @@ use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
 use crate::passes::{Changed, gather_all};
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction};
-use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Frames over which sizes and opacities are averaged.
 const SAMPLED_FRAMES: usize = 16;
@@ -23,7 +23,7 @@ const CONSTANT: Columns = Columns::LOG_SCALE.union(Columns::OPACITY);
 ///
 /// # Errors
 /// Frames that cannot be read.
-pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &Merge) -> Result<Proxies> {
+pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &MergeParams) -> Result<Proxies> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
     let proxies = MergedSequence::new(params, &leaders, members, merge);
@@ -48,7 +48,7 @@ pub(super) fn solve(params: &Params, clusters: &[Cluster], merge: &Merge) -> Res
 }
 
 /// The frames of what `reduction` leaves of `params`.
-pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a Reduction) -> Box<dyn FrameSource + 'a> {
+pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a CompressedModel) -> Box<dyn FrameSource + 'a> {
     Box::new(Changed::new(
         Box::new(Settled::new(params, reduction)),
         &reduction.change,
@@ -60,12 +60,12 @@ pub(super) fn reduced<'a>(params: &'a Params, reduction: &'a Reduction) -> Box<d
 /// A merged sequence whose proxies have the sizes and opacities that were solved for.
 pub(super) struct Settled<'a> {
     merged: MergedSequence<'a>,
-    reduction: &'a Reduction,
+    reduction: &'a CompressedModel,
     info: SequenceInfo,
 }
 
 impl<'a> Settled<'a> {
-    pub(super) fn new(params: &'a Params, reduction: &'a Reduction) -> Settled<'a> {
+    pub(super) fn new(params: &'a Params, reduction: &'a CompressedModel) -> Settled<'a> {
         let info = SequenceInfo { count: reduction.len(), ..params.info().clone() };
         Settled { merged: merged(params, reduction), reduction, info }
     }
@@ -95,7 +95,7 @@ impl FrameSource for Settled<'_> {
         Ok(self.reader(self.merged.open(ids.clone())?, ids))
     }
 
-    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         let opened = self.merged.open_all(wanted)?;
         Some(opened.map(|reader| self.reader(reader, Ids::Range(0..self.info.count))))
     }
@@ -126,7 +126,7 @@ impl BlockReader for SettledReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.reader.expect(wanted);
     }
 }

@@ -11,7 +11,7 @@ use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::Change;
+use crate::reduction::ParamDelta;
 
 /// Arrays of a model, by name: shape and values.
 type Arrays = Vec<(&'static str, Vec<u64>, Vec<f32>)>;
@@ -41,7 +41,7 @@ fn write(path: &Path, arrays: &Arrays, method: CompressionMethod) {
     }
 }
 
-fn open(path: &Path) -> Result<Box<dyn Family>> {
+fn open(path: &Path) -> Result<Box<dyn InputModel>> {
     models::open(path, &OpenOptions { scratch: path.parent().map(Path::to_owned), ..OpenOptions::default() })
 }
 
@@ -49,7 +49,7 @@ fn message(path: &Path) -> String {
     open(path).err().expect("it must be refused").to_string()
 }
 
-fn states(family: &dyn Family) -> Vec<Gaussians> {
+fn states(family: &dyn InputModel) -> Vec<Gaussians> {
     let source = family.source();
     (0..source.info().times.len()).map(|frame| gather_all(source, frame, Columns::all()).unwrap()).collect()
 }
@@ -92,7 +92,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
         let rule = Recipe::preset("default").unwrap().merge;
         let result = folder.path().join("result");
         let limits = Limits::NONE;
-        let written = |reduction: &Reduction| {
+        let written = |reduction: &CompressedModel| {
             _ = fs::remove_dir_all(&result);
             fs::create_dir(&result).unwrap();
             model.write(reduction, OutputKind::Model, &result, &limits).unwrap();
@@ -103,7 +103,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
             let array = npz.by_name(name).unwrap().unwrap();
             (array.shape().to_vec(), array.into_vec::<f32>().unwrap())
         };
-        written(&Reduction::pruned(vec![1, 4], &rule));
+        written(&CompressedModel::pruned(vec![1, 4], &rule));
         for (name, shape, values) in arrays() {
             let (found_shape, found) = of(name);
             let (outer, width) =
@@ -120,7 +120,7 @@ fn what_stays_keeps_its_bytes_and_everything_else_its_place() {
             assert_eq!(bits(&found), bits(&expected), "{name}");
         }
         // All of them: the bytes of every array, and the same file each time.
-        let all = Reduction::pruned((0..5).collect(), &rule);
+        let all = CompressedModel::pruned((0..5).collect(), &rule);
         assert_eq!(written(&all), written(&all));
         assert_eq!(states(&*open(&result).unwrap()), states(&*model));
     }
@@ -138,8 +138,8 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(0, [0.5, 0.0, -0.25]);
     by.sh.set_row(2, [0.1, 0.2, 0.0]);
-    let pruned = Reduction::pruned(vec![0, 3, 4], &rule);
-    let reduction = Reduction { clusters: vec![cluster], proxies, change: Change(by), ..pruned };
+    let pruned = CompressedModel::pruned(vec![0, 3, 4], &rule);
+    let reduction = CompressedModel { clusters: vec![cluster], proxies, change: ParamDelta(by), ..pruned };
     let shown = model.reduced(&reduction).unwrap();
     let result = folder.path().join("result");
     fs::create_dir(&result).unwrap();

@@ -73,10 +73,10 @@ impl ModelConfig {
         let keys = parse_call(text, NAME).map_err(|error| error.in_file(path, text))?;
         let get = |name: &'static str| {
             // Python would refuse a repeated keyword; of a hand-edited file take the last one.
-            keys.iter()
-                .rev()
-                .find(|key| key.name == name)
-                .map_or(Key { name, value: &Literal::None, path }, |found| Key { name, value: &found.value, path })
+            keys.iter().rev().find(|key| key.name == name).map_or(
+                ConfigKey { name, value: &Literal::None, path },
+                |found| ConfigKey { name, value: &found.value, path },
+            )
         };
         let planes = get("kplanes_config");
         let config = ModelConfig {
@@ -239,13 +239,13 @@ fn without_paths(expression: &str, all: bool) -> String {
 
 /// One key and its value; `None` stands for a missing key too, and takes the default.
 #[derive(Clone, Copy)]
-pub(in crate::models) struct Key<'a> {
+pub(in crate::models) struct ConfigKey<'a> {
     pub(in crate::models) name: &'static str,
     pub(in crate::models) value: &'a Literal,
     pub(in crate::models) path: &'a Path,
 }
 
-impl<'a> Key<'a> {
+impl<'a> ConfigKey<'a> {
     pub(in crate::models) fn wrong(&self, expected: &str) -> Error {
         Error::input(self.path, format!("key {}", self.name), expected, self.value.to_string())
     }
@@ -289,13 +289,15 @@ impl<'a> Key<'a> {
     fn ints(&self, default: &[i64]) -> Result<Vec<i64>> {
         match self.value {
             Literal::None => Ok(default.to_vec()),
-            Literal::Sequence(items) => items.iter().map(|value| Key { value, ..*self }.int(0)).collect::<Result<_>>(),
+            Literal::Sequence(items) => {
+                items.iter().map(|value| ConfigKey { value, ..*self }.int(0)).collect::<Result<_>>()
+            }
             _ => Err(self.wrong("a list of integers")),
         }
     }
 
     /// The value of `name` in this dictionary.
-    fn entry(&self, name: &'static str) -> Result<Key<'a>> {
+    fn entry(&self, name: &'static str) -> Result<ConfigKey<'a>> {
         let value = match self.value {
             Literal::None => &Literal::None,
             Literal::Dict(entries) => entries
@@ -304,7 +306,7 @@ impl<'a> Key<'a> {
                 .map_or(&Literal::None, |(_, value)| value),
             _ => return Err(self.wrong("a dictionary")),
         };
-        Ok(Key { name, value, path: self.path })
+        Ok(ConfigKey { name, value, path: self.path })
     }
 }
 

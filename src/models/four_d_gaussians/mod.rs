@@ -13,7 +13,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
-use super::family::{Entry, Family, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, ModelFormat, Timing};
 use super::files::copy;
 use super::law::left;
 use super::size::{Size, bytes_below, bytes_of};
@@ -23,18 +23,18 @@ use crate::deform::{Field, FieldConfig, Tensor, Tensors};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::Ply;
 use crate::files::ply::write::{out_rows, write_like};
-use crate::files::state_dict::{Stored, Values, is_floating, read_state_dict, write_state_dict};
+use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_state_dict, write_state_dict};
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::{Merge, Precision};
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::{MergeParams, Precision};
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
 /// A model folder.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 4DGaussians model folder",
     recognises: |found| {
         found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
@@ -42,7 +42,7 @@ pub(super) const ENTRY: Entry = Entry {
     open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),
 };
 
-impl Family for ModelFolder {
+impl InputModel for ModelFolder {
     fn kind(&self) -> &'static str {
         "4DGaussians model"
     }
@@ -77,9 +77,9 @@ impl Family for ModelFolder {
         }
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         let whole = state_bytes(self.info().sh_degree, Columns::all());
-        Residence {
+        MemoryProfile {
             per_gaussian: whole,
             // Normals and the like stand beside the values.
             opening: whole + 24,
@@ -104,7 +104,7 @@ impl Family for ModelFolder {
         Timing::Continuous
     }
 
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         Ok(Box::new(ModelFolder::with_times(*self, times)?))
     }
 
@@ -132,11 +132,11 @@ impl Family for ModelFolder {
         Ok(())
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         proxies::solve(self, clusters, reference, rule)
     }
 
-    fn content(&self, reduction: &Reduction) -> Result<Content> {
+    fn content(&self, reduction: &CompressedModel) -> Result<Content> {
         let paths = self.paths();
         if !self.can_round_field()? {
             return Err(Error::usage(format!(
@@ -177,7 +177,7 @@ impl Family for ModelFolder {
         Ok(Box::new(self.with_canonical(content.cloud.clone()).with_field(field)))
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         let model = self.with_canonical(left(self.stored(), reduction).gaussians);
         Ok(Box::new(match reduction.field {
             Precision::Exact => model,
@@ -193,7 +193,13 @@ impl Family for ModelFolder {
         self.field().active().contains(Columns::SH).then_some("the field's SH head adds to all of them")
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         let mut notes = Vec::new();
         let paths = self.paths();
         match kind {
@@ -240,7 +246,7 @@ impl ModelFolder {
     }
 
     /// Writes the canonical cloud of what is left with the properties and comments that the model's has.
-    fn write_cloud(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+    fn write_cloud(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let none = Gaussians::zeros(0, self.info().sh_degree);
         let proxies = reduction.proxies.raw.as_ref().map_or(&none, |raw| &raw.gaussians);
         let template = Ply::open(&self.paths().point_cloud)?;
@@ -290,8 +296,8 @@ fn role(config: FieldConfig, name: &str) -> Role {
 
 /// Writes the tensors of a field as the file that they are read from.
 pub(super) fn write_field(tensors: &Tensors, path: &Path) -> Result<()> {
-    let stored = tensors
-        .iter()
-        .map(|(name, tensor)| Stored::dense(name.clone(), tensor.shape.clone(), Values::F32(tensor.data.clone())));
+    let stored = tensors.iter().map(|(name, tensor)| {
+        StoredTensor::dense(name.clone(), tensor.shape.clone(), TensorValues::F32(tensor.data.clone()))
+    });
     write_state_dict(path, &stored.collect::<Vec<_>>())
 }

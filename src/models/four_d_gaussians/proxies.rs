@@ -7,7 +7,7 @@ use crate::error::Result;
 use crate::merging::proxy::merge_state;
 use crate::model::{Columns, Gaussians};
 use crate::passes::{BLOCK, gather};
-use crate::recipe::{Merge, Placement};
+use crate::recipe::{MergeParams, Placement};
 use crate::reduction::{Cluster, Proxies, Reference};
 use crate::source::FrameSource;
 
@@ -20,7 +20,12 @@ const SAMPLED_FRAMES: usize = 16;
 /// A proxy placed at the mean is moved by the field there, not by its members' field. One that strays
 /// further than `max_drift` from its members goes back to its leader's canonical position, its shape about
 /// the mean unchanged; so does one for which no raw parameters exist, with all of its leader's parameters.
-pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, merge: &Merge) -> Result<Proxies> {
+pub(super) fn solve(
+    model: &ModelFolder,
+    all: &[Cluster],
+    reference: Reference,
+    merge: &MergeParams,
+) -> Result<Proxies> {
     let leaders: Vec<u32> = all.iter().map(|cluster| cluster.leader).collect();
     let of_leaders = model.canonical().pick(&leaders);
     let mut raw = of_leaders.clone();
@@ -62,7 +67,12 @@ pub(super) fn solve(model: &ModelFolder, all: &[Cluster], reference: Reference, 
 }
 
 /// States of the proxies of `clusters` at the reference frame.
-fn merged_states(model: &ModelFolder, reference: Reference, clusters: &[Cluster], merge: &Merge) -> Result<Gaussians> {
+fn merged_states(
+    model: &ModelFolder,
+    reference: Reference,
+    clusters: &[Cluster],
+    merge: &MergeParams,
+) -> Result<Gaussians> {
     let mut states = Gaussians::zeros(clusters.len(), model.info().sh_degree);
     let ids: Vec<u32> = clusters.iter().flat_map(|cluster| cluster.members.iter().map(|&(id, _)| id)).collect();
     let of_members = gather(model, &ids, reference.frame, Columns::all())?;

@@ -8,7 +8,7 @@ use half::slice::HalfFloatSliceExt;
 use half::vec::HalfFloatVecExt;
 
 use crate::deform::{Tensor, Tensors, rows_before_zero};
-use crate::files::state_dict::{MAX_EXPANSION, Stored, Values};
+use crate::files::state_dict::{MAX_EXPANSION, StoredTensor, TensorValues};
 
 /// Tensors of fewer values keep theirs: biases, the ends of heads and the field's box take next to no bytes, and
 /// whatever passes through the field passes through them.
@@ -29,16 +29,16 @@ pub(super) fn rounded(mut tensors: Tensors) -> Tensors {
 
 /// `tensors` in as few bytes as that takes; of time planes only what times from 0 on read, if that is all there are
 /// (`from_zero`): elements that are never read then share the values of others.
-pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<Stored> {
-    let pack = |shares: bool| -> Vec<Stored> {
+pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<StoredTensor> {
+    let pack = |shares: bool| -> Vec<StoredTensor> {
         let pack = |(name, tensor): (&String, &Tensor)| match shares {
             true => packed(name, tensor, from_zero),
-            false => Stored::dense(name.clone(), tensor.shape.clone(), values(tensor, &tensor.data)),
+            false => StoredTensor::dense(name.clone(), tensor.shape.clone(), values(tensor, &tensor.data)),
         };
         tensors.iter().map(pack).collect()
     };
     let small = pack(true);
-    let bytes = |values: usize, of: &Stored| (values * of.values.width()) as u64;
+    let bytes = |values: usize, of: &StoredTensor| (values * of.values.width()) as u64;
     let kept: u64 = small.iter().map(|tensor| bytes(tensor.values.len(), tensor)).sum();
     let meant: u64 = small.iter().map(|tensor| bytes(tensor.shape.iter().product(), tensor)).sum();
     // What means more than a reader lets a file mean is written out.
@@ -46,13 +46,13 @@ pub(super) fn stored(tensors: &Tensors, from_zero: bool) -> Vec<Stored> {
 }
 
 /// One tensor.
-fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> Stored {
+fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> StoredTensor {
     let is_first = |value: &f32| value.to_bits() == tensor.data[0].to_bits();
     if tensor.data.len() > 1 && tensor.data.iter().all(is_first) {
-        let dense = Stored::dense(name.to_owned(), tensor.shape.clone(), values(tensor, &tensor.data[..1]));
-        return Stored { stride: vec![0; tensor.shape.len()], ..dense };
+        let dense = StoredTensor::dense(name.to_owned(), tensor.shape.clone(), values(tensor, &tensor.data[..1]));
+        return StoredTensor { stride: vec![0; tensor.shape.len()], ..dense };
     }
-    let dense = |data| Stored::dense(name.to_owned(), tensor.shape.clone(), values(tensor, data));
+    let dense = |data| StoredTensor::dense(name.to_owned(), tensor.shape.clone(), values(tensor, data));
     let unread = if from_zero { rows_before_zero(name, &tensor.shape) } else { 0 };
     let &[_, _, rows, columns] = &tensor.shape[..] else { return dense(&tensor.data) };
     if unread == 0 {
@@ -70,10 +70,10 @@ fn packed(name: &str, tensor: &Tensor, from_zero: bool) -> Stored {
 }
 
 /// `data`, some of the values of `tensor`, in the precision that these are stored in.
-fn values(tensor: &Tensor, data: &[f32]) -> Values {
+fn values(tensor: &Tensor, data: &[f32]) -> TensorValues {
     match halves(tensor) {
-        Some(_) => Values::F16(Vec::from_f32_slice(data)),
-        None => Values::F32(data.to_vec()),
+        Some(_) => TensorValues::F16(Vec::from_f32_slice(data)),
+        None => TensorValues::F32(data.to_vec()),
     }
 }
 
@@ -99,14 +99,14 @@ mod tests {
     }
 
     /// What a reader makes of it, by the definition of strides.
-    fn read(stored: &Stored) -> Tensor {
+    fn read(stored: &StoredTensor) -> Tensor {
         let mut data = vec![stored.offset];
         for (&extent, &stride) in stored.shape.iter().zip(&stored.stride) {
             data = data.into_iter().flat_map(|at| (0..extent).map(move |i| at + i * stride)).collect();
         }
         let value = |at: usize| match &stored.values {
-            Values::F32(values) => values[at],
-            Values::F16(values) => values[at].to_f32(),
+            TensorValues::F32(values) => values[at],
+            TensorValues::F16(values) => values[at].to_f32(),
         };
         Tensor { shape: stored.shape.clone(), data: data.into_iter().map(value).collect() }
     }
@@ -154,7 +154,7 @@ mod tests {
             ("one that is tiny", almost_all, true),
         ] {
             let stored = packed(what, &tensor, true);
-            assert_eq!(matches!(stored.values, Values::F16(_)), halved, "{what}");
+            assert_eq!(matches!(stored.values, TensorValues::F16(_)), halved, "{what}");
             let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<u32>>();
             if !halved {
                 assert_eq!(bits(&read(&stored).data), bits(&tensor.data), "{what}");

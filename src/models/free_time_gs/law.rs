@@ -7,11 +7,11 @@ use xxhash_rust::xxh3::Xxh3;
 
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
-use crate::models::in_checkpoint::Merging;
-use crate::models::in_checkpoint::linear::{Line, match_all};
+use crate::models::in_checkpoint::ProxyRule;
+use crate::models::in_checkpoint::linear::{LinearPath, match_all};
 use crate::models::law::window::{faded, odds, slope};
-use crate::models::law::{Law, Model, copy_stored};
-use crate::recipe::Merge;
+use crate::models::law::{MotionModel, MotionModelFrames, copy_stored};
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
 
 /// Planes of [`Raw::own`]: centre in time, logarithm of the standard deviation, velocity.
@@ -49,7 +49,7 @@ fn least() -> f64 {
     (OPACITY / (1.0 - OPACITY)).ln()
 }
 
-impl Law for FreeTime {
+impl MotionModel for FreeTime {
     type Prepared = Windows;
 
     fn prepare(&self, raw: &Raw) -> Windows {
@@ -104,19 +104,19 @@ impl Law for FreeTime {
     }
 }
 
-impl Merging for FreeTime {
-    fn proposed(model: &Model<FreeTime>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+impl ProxyRule for FreeTime {
+    fn proposed(model: &MotionModelFrames<FreeTime>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
         let raw = model.raw();
         let line = |id: u32| {
             let id = id as usize;
-            Line {
+            LinearPath {
                 position: raw.gaussians.position.row::<3>(id).map(f64::from),
                 velocity: [0, 1, 2].map(|c| f64::from(raw.own.plane(VELOCITY + c)[id])),
                 centre: raw.own.plane(TIME)[id].into(),
                 deviation: deviation(raw.own.plane(DURATION)[id]),
             }
         };
-        let fades = |line: &Line, time: f64| (-0.5 * ((time - line.centre) / line.deviation).powi(2)).exp();
+        let fades = |line: &LinearPath, time: f64| (-0.5 * ((time - line.centre) / line.deviation).powi(2)).exp();
         let mut sh = vec![Vec::new(); clusters.len()];
         let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
             // The same at every frame.

@@ -9,9 +9,9 @@ mod law;
 
 use std::path::{Path, PathBuf};
 
-use super::family::{Entry, Family, OpenOptions};
+use super::family::{InputModel, ModelFormat, OpenOptions};
 use super::in_checkpoint::still::Still;
-use super::in_checkpoint::{About, InCheckpoint, Plane, Reading, count_of, numbered};
+use super::in_checkpoint::{About, InCheckpoint, Reading, RowElement, count_of, numbered};
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
 use crate::limits::ReadLimit;
@@ -22,7 +22,7 @@ use law::{DURATION, FreeTime, OWN, TIME, VELOCITY};
 const FOLDER: &str = "ckpts";
 
 /// A checkpoint, or the folder of a result.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a gsplat checkpoint",
     recognises: |found| match found.is_folder {
         true => !checkpoints(found.path).is_empty(),
@@ -82,7 +82,7 @@ fn splats_in(path: &Path, memory: ReadLimit) -> bool {
     pickle.item(pickle.root(), "splats").is_some_and(|splats| pickle.item(splats, "means").is_some())
 }
 
-fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
+fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let checkpoint = Checkpoint::open(&about.file, options.memory)?;
     let pickle = checkpoint.pickle();
     let Some(splats) = pickle.item(pickle.root(), "splats") else {
@@ -138,11 +138,11 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
         (Columns::SH, &[bands - 1, 3], 3, 3 * (bands - 1)),
     ];
     for ((name, id), (column, row, skipped, width)) in names.iter().zip(nodes).zip(planes) {
-        reading.read(id, &place(name), row, Plane::of(column, skipped, width))?;
+        reading.read(id, &place(name), row, RowElement::of(column, skipped, width))?;
     }
     let of_own = [("times", &[1][..], TIME, 1), ("durations", &[1], DURATION, 1), ("velocities", &[3], VELOCITY, 3)];
     for (id, (name, row, first, width)) in own.into_iter().zip(of_own) {
-        reading.read(id, &place(name), row, Plane::own(first, width))?;
+        reading.read(id, &place(name), row, RowElement::own(first, width))?;
     }
     beside.into_iter().for_each(|id| reading.beside(id));
     Ok(match moves {

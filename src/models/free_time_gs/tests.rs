@@ -8,8 +8,8 @@ use crate::model::{Gaussians, opacity};
 use crate::models;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
-use crate::recipe::{Merge, Recipe};
-use crate::reduction::{Cluster, Reduction, Reference};
+use crate::recipe::{MergeParams, Recipe};
+use crate::reduction::{Cluster, CompressedModel, Reference};
 
 const COUNT: usize = 5;
 const TIMES: [f64; 4] = [0.0, 0.25, 0.5, 1.0];
@@ -73,7 +73,7 @@ impl Place {
         self.0.path().join(name)
     }
 
-    fn written(&self, model: &dyn Family, reduction: &Reduction) -> PathBuf {
+    fn written(&self, model: &dyn InputModel, reduction: &CompressedModel) -> PathBuf {
         let result = self.path("written");
         fs::create_dir(&result).unwrap();
         model.write(reduction, OutputKind::Model, &result, &Limits::NONE).unwrap();
@@ -81,15 +81,15 @@ impl Place {
     }
 }
 
-fn open(path: &Path) -> Result<Box<dyn Family>> {
+fn open(path: &Path) -> Result<Box<dyn InputModel>> {
     models::open(path, &OpenOptions::default())?.with_times(TIMES.to_vec())
 }
 
-fn states(model: &dyn Family) -> Vec<Gaussians> {
+fn states(model: &dyn InputModel) -> Vec<Gaussians> {
     (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Columns::all()).unwrap()).collect()
 }
 
-fn rule() -> Merge {
+fn rule() -> MergeParams {
     Recipe::preset("default").unwrap().merge
 }
 
@@ -132,7 +132,7 @@ fn states_are_those_of_the_formulas() {
 fn what_is_left_has_its_rows_in_splats_and_optimizers() {
     let place = Place::put(&splats());
     let model = open(&place.path("result")).unwrap();
-    let result = place.written(&*model, &Reduction::pruned(vec![0, 3], &rule()));
+    let result = place.written(&*model, &CompressedModel::pruned(vec![0, 3], &rule()));
     let left = open(&result).unwrap();
     states(&*left).iter().zip(states(&*model)).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[0, 3])));
     let [before, after] = [place.path("result"), result]
@@ -162,8 +162,8 @@ fn a_proxy_moves_as_the_mean_of_its_members() {
     let reference = Reference { frame: 2, extent: 10.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.deviation.is_some_and(|deviation| deviation < 1e-6), "{proxies:?}");
-    let pruned = Reduction::pruned(vec![0, 1], &rule());
-    let reduction = Reduction { clusters: vec![cluster], proxies, ..pruned };
+    let pruned = CompressedModel::pruned(vec![0, 1], &rule());
+    let reduction = CompressedModel { clusters: vec![cluster], proxies, ..pruned };
     let left = open(&place.written(&*model, &reduction)).unwrap();
     for (left, whole) in states(&*left).iter().zip(states(&*model)) {
         let [a, b] = [0, 2].map(|row| whole.position.row::<3>(row));
@@ -183,7 +183,7 @@ fn without_velocities_it_is_static_and_of_any_degree() {
     let model = models::open(&place.path("result"), &OpenOptions::default()).unwrap();
     assert_eq!((model.kind(), model.source().info().sh_degree), ("gsplat checkpoint", 1));
     let whole = gather_all(model.source(), 0, Columns::all()).unwrap();
-    let result = place.written(&*model, &Reduction::pruned(vec![1, 2], &rule()));
+    let result = place.written(&*model, &CompressedModel::pruned(vec![1, 2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap();
     assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), whole.pick(&[1, 2]));
 }

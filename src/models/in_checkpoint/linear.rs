@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, logit, opacity};
 use crate::passes::{BLOCK, gather_all};
-use crate::recipe::Merge;
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
 use crate::source::FrameSource;
 
@@ -22,24 +22,24 @@ const OPACITIES: [f64; 2] = [1e-3, 1.0 - 1e-4];
 
 /// A straight path with a window: x(t) = position + velocity·(t − centre), exp(−½((t − centre)/deviation)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(in crate::models) struct Line {
+pub(in crate::models) struct LinearPath {
     pub(in crate::models) position: [f64; 3],
     pub(in crate::models) velocity: [f64; 3],
     pub(in crate::models) centre: f64,
     pub(in crate::models) deviation: f64,
 }
 
-impl Line {
+impl LinearPath {
     /// What stands for `members`, each with a weight; they sum to 1.
-    pub(in crate::models) fn blended(members: &[(f64, Line)]) -> Line {
+    pub(in crate::models) fn blended(members: &[(f64, LinearPath)]) -> LinearPath {
         let lasting: f64 = members.iter().map(|(weight, line)| weight * line.deviation).sum();
-        let mean = |of: &dyn Fn(&Line) -> f64| {
+        let mean = |of: &dyn Fn(&LinearPath) -> f64| {
             members.iter().map(|(weight, line)| weight * line.deviation / lasting * of(line)).sum::<f64>()
         };
         let centre = mean(&|line| line.centre);
         let variance = mean(&|line| line.deviation.powi(2) + (line.centre - centre).powi(2));
-        let sum = |of: &dyn Fn(&Line) -> f64| members.iter().map(|(weight, line)| weight * of(line)).sum::<f64>();
-        Line {
+        let sum = |of: &dyn Fn(&LinearPath) -> f64| members.iter().map(|(weight, line)| weight * of(line)).sum::<f64>();
+        LinearPath {
             position: [0, 1, 2].map(|c| sum(&|line| line.position[c] + line.velocity[c] * (centre - line.centre))),
             velocity: [0, 1, 2].map(|c| sum(&|line| line.velocity[c])),
             centre,
@@ -51,16 +51,16 @@ impl Line {
 /// A proxy as its members are over frames.
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
-    pub(in crate::models) line: Line,
+    pub(in crate::models) line: LinearPath,
     /// Opacity at the centre of its window, as a logit, and covariance (xx xy xz yy yz zz); none where no frame shows it.
     pub(in crate::models) seen: Option<(f32, [f64; 6])>,
 }
 
 /// A proxy at a frame, as its members are there.
-pub(in crate::models) struct Seen<'a> {
+pub(in crate::models) struct ProxyAtFrame<'a> {
     /// Which proxy.
     pub(in crate::models) proxy: usize,
-    pub(in crate::models) line: &'a Line,
+    pub(in crate::models) line: &'a LinearPath,
     pub(in crate::models) time: f64,
     /// How much the frame counts.
     pub(in crate::models) weight: f64,
@@ -77,11 +77,11 @@ pub(in crate::models) struct Seen<'a> {
 pub(in crate::models) fn match_all(
     source: &dyn FrameSource,
     clusters: &[Cluster],
-    rule: &Merge,
-    line_of: impl Fn(u32) -> Line,
-    fades: impl Fn(&Line, f64) -> f64,
+    rule: &MergeParams,
+    line_of: impl Fn(u32) -> LinearPath,
+    fades: impl Fn(&LinearPath, f64) -> f64,
     wanted: Columns,
-    mut see: impl FnMut(Seen<'_>),
+    mut see: impl FnMut(ProxyAtFrame<'_>),
 ) -> Result<Vec<Matched>> {
     let times = &source.info().times;
     let sampled = times.len().min(SAMPLED_FRAMES);
@@ -93,10 +93,10 @@ pub(in crate::models) fn match_all(
         let members = chunk.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
         let merged = MergedSequence::new(source, &leaders, members, rule);
         let line = |cluster: &Cluster| {
-            Line::blended(&cluster.members.iter().map(|&(id, weight)| (weight, line_of(id))).collect::<Vec<_>>())
+            LinearPath::blended(&cluster.members.iter().map(|&(id, weight)| (weight, line_of(id))).collect::<Vec<_>>())
         };
-        let lines: Vec<Line> = chunk.iter().map(line).collect();
-        let mut sums = vec![Sums::default(); chunk.len()];
+        let lines: Vec<LinearPath> = chunk.iter().map(line).collect();
+        let mut sums = vec![FrameSums::default(); chunk.len()];
         for &frame in &frames {
             let (time, state) = (times[frame], gather_all(&merged, frame, wanted)?);
             for (row, (line, sums)) in lines.iter().zip(&mut sums).enumerate() {
@@ -104,7 +104,7 @@ pub(in crate::models) fn match_all(
                 let weight = m * alpha;
                 if weight > SEEN {
                     sums.add(m, alpha, &state, row);
-                    see(Seen { proxy: first + row, line, time, weight, state: &state, row });
+                    see(ProxyAtFrame { proxy: first + row, line, time, weight, state: &state, row });
                 }
             }
         }
@@ -115,7 +115,7 @@ pub(in crate::models) fn match_all(
 
 /// Sums over frames.
 #[derive(Debug, Clone, Default)]
-struct Sums {
+struct FrameSums {
     /// Σ m·α and Σ m².
     product: f64,
     square: f64,
@@ -123,7 +123,7 @@ struct Sums {
     covariance: [f64; 6],
 }
 
-impl Sums {
+impl FrameSums {
     fn add(&mut self, m: f64, alpha: f64, state: &Gaussians, row: usize) {
         self.product += m * alpha;
         self.square += m * m;
@@ -159,25 +159,25 @@ mod tests {
 
     #[test]
     fn a_blended_path_is_the_weighted_mean_of_its_members_at_every_time() {
-        let line = |k: f64| Line {
+        let line = |k: f64| LinearPath {
             position: [k, 1.0 - k * k, 0.3],
             velocity: [0.2 * k, -1.0 / (1.0 + k), 5.0],
             centre: 0.1 * k,
             deviation: 0.05 + 0.02 * k,
         };
         let members = [(0.5, line(1.0)), (0.2, line(2.5)), (0.3, line(-0.7))];
-        let blended = Line::blended(&members);
+        let blended = LinearPath::blended(&members);
         for k in 0..20 {
             let time = -0.5 + 0.1 * f64::from(k);
             for c in 0..3 {
-                let at = |line: &Line| line.position[c] + line.velocity[c] * (time - line.centre);
+                let at = |line: &LinearPath| line.position[c] + line.velocity[c] * (time - line.centre);
                 let mean: f64 = members.iter().map(|(weight, line)| weight * at(line)).sum();
                 assert!((at(&blended) - mean).abs() < 1e-12, "{time} {c}: {} {mean}", at(&blended));
             }
         }
         // One alone, and one beside its like, are themselves.
-        assert_eq!(Line::blended(&[(1.0, line(2.0))]), line(2.0));
-        let twice = Line::blended(&[(0.25, line(2.0)), (0.75, line(2.0))]);
+        assert_eq!(LinearPath::blended(&[(1.0, line(2.0))]), line(2.0));
+        let twice = LinearPath::blended(&[(0.25, line(2.0)), (0.75, line(2.0))]);
         assert!((twice.deviation - line(2.0).deviation).abs() < 1e-15 && (twice.centre - 0.2).abs() < 1e-15);
     }
 }

@@ -11,9 +11,9 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{Family, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, Timing};
 use super::files::copy;
-use super::law::{self, Law, Model};
+use super::law::{self, MotionModel, MotionModelFrames};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{check_output, state_bytes, write_sequence};
 use crate::error::{Error, Result};
@@ -23,21 +23,21 @@ use crate::limits::Limits;
 use crate::model::{Columns, Jacobian, Raw};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
-pub(super) use rows::{Plane, Reading, Table, count_of};
+pub(super) use rows::{Reading, RowElement, RowTensors, count_of};
 
 /// Most bytes of a file beside the checkpoint that a result has too.
 const SMALL: u64 = 1 << 20;
 
 /// A law by which several Gaussians become one.
-pub(super) trait Merging: Law {
+pub(super) trait ProxyRule: MotionModel {
     /// Raw parameters of the proxies of `clusters`, before they are held to what their members do.
     ///
     /// # Errors
     /// Frames that cannot be evaluated.
-    fn proposed(model: &Model<Self>, clusters: &[Cluster], rule: &Merge) -> Result<Raw>
+    fn proposed(model: &MotionModelFrames<Self>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw>
     where
         Self: Sized;
 
@@ -83,17 +83,17 @@ pub(super) struct About {
 
 /// A model in a checkpoint.
 #[derive(Debug)]
-pub(super) struct InCheckpoint<L: Law> {
-    table: Table,
-    model: Model<L>,
+pub(super) struct InCheckpoint<L: MotionModel> {
+    table: RowTensors,
+    model: MotionModelFrames<L>,
     about: About,
 }
 
-impl<L: Merging> InCheckpoint<L> {
+impl<L: ProxyRule> InCheckpoint<L> {
     /// What was read, whose states follow by `law`.
     pub(super) fn new(reading: Reading, law: L, about: About) -> Result<InCheckpoint<L>> {
         let sh_degree = reading.raw.gaussians.sh_degree();
-        let model = Model::new(law, reading.raw, sh_degree);
+        let model = MotionModelFrames::new(law, reading.raw, sh_degree);
         let is_still = model.law().varying().is_empty();
         let model = if is_still { model.with_times(vec![0.0])? } else { model };
         Ok(InCheckpoint { table: reading.table, model, about })
@@ -115,7 +115,7 @@ impl<L: Merging> InCheckpoint<L> {
         self.about.file.strip_prefix(root).unwrap_or(&self.about.file).to_owned()
     }
 
-    fn write_model(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+    fn write_model(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         for file in self.beside() {
             copy(&file, &path.join(file.file_name().unwrap_or_default()))?;
         }
@@ -126,7 +126,7 @@ impl<L: Merging> InCheckpoint<L> {
     }
 }
 
-impl<L: Merging + 'static> Family for InCheckpoint<L> {
+impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     fn kind(&self) -> &'static str {
         self.about.kind
     }
@@ -161,10 +161,10 @@ impl<L: Merging + 'static> Family for InCheckpoint<L> {
         }
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         let raw = self.model.raw();
         let whole = state_bytes(raw.gaussians.sh_degree(), Columns::all()) + 4 * raw.own.width() as u64;
-        Residence {
+        MemoryProfile {
             per_gaussian: whole,
             // The widest tensor, as it is stored and as f32.
             opening: 2 * whole,
@@ -195,14 +195,14 @@ impl<L: Merging + 'static> Family for InCheckpoint<L> {
         self.model.law().span()
     }
 
-    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         let InCheckpoint { table, model, about } = *self;
         let found = model.info().times.len();
         if !model.info().times.is_empty() && model.law().varying().is_empty() && times.len() != found {
             return Err(Error::usage(format!("{} times were given for {found} frames", times.len())));
         }
         let model = match model.law().at(&times) {
-            Some(law) => Model::new(law, model.raw().clone(), model.info().sh_degree),
+            Some(law) => MotionModelFrames::new(law, model.raw().clone(), model.info().sh_degree),
             None => model,
         };
         Ok(Box::new(InCheckpoint { table, model: model.with_times(times)?, about }))
@@ -235,15 +235,21 @@ impl<L: Merging + 'static> Family for InCheckpoint<L> {
         Some("the checkpoint's own loaders expect them")
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         law::solve(&self.model, clusters, reference, rule, |clusters| L::proposed(&self.model, clusters, rule))
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(Box::new(self.model.reduced(reduction)))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_model(reduction, path).map(|()| Vec::new()),
             _ => write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held),

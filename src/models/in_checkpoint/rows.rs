@@ -6,15 +6,15 @@
 use std::path::Path;
 
 use crate::error::Result;
-use crate::files::checkpoint::write::{Rows, write_like};
-use crate::files::checkpoint::{Checkpoint, NodeId, Tensor};
+use crate::files::checkpoint::write::{GaussianRows, write_like};
+use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
 use crate::model::{Column, Columns, Gaussians, Raw};
 use crate::models::trajectories::state_bytes;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 
 /// What an element of a tensor's row is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::models) enum Plane {
+pub(in crate::models) enum RowElement {
     /// A plane of a column.
     Of(Columns, usize),
     /// A plane of [`Raw::own`].
@@ -23,22 +23,22 @@ pub(in crate::models) enum Plane {
     Unread,
 }
 
-impl Plane {
+impl RowElement {
     /// All planes of a column but the first `skipped`, so many.
-    pub(in crate::models) fn of(column: Columns, skipped: usize, count: usize) -> Vec<Plane> {
-        (skipped..skipped + count).map(|c| Plane::Of(column, c)).collect()
+    pub(in crate::models) fn of(column: Columns, skipped: usize, count: usize) -> Vec<RowElement> {
+        (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 
     /// So many planes of one's own, from `first` on.
-    pub(in crate::models) fn own(first: usize, count: usize) -> Vec<Plane> {
-        (first..first + count).map(Plane::Own).collect()
+    pub(in crate::models) fn own(first: usize, count: usize) -> Vec<RowElement> {
+        (first..first + count).map(RowElement::Own).collect()
     }
 
     fn get(self, raw: &Raw) -> Option<&[f32]> {
         match self {
-            Plane::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
-            Plane::Own(c) => Some(raw.own.plane(c)),
-            Plane::Unread => None,
+            RowElement::Of(column, c) => Some(raw.gaussians.column(column).plane(c)),
+            RowElement::Own(c) => Some(raw.own.plane(c)),
+            RowElement::Unread => None,
         }
     }
 }
@@ -47,25 +47,25 @@ impl Plane {
 #[derive(Debug)]
 struct Param {
     name: String,
-    tensor: Tensor,
+    tensor: TensorView,
     /// What the elements of a row are.
-    planes: Vec<Plane>,
+    planes: Vec<RowElement>,
 }
 
 /// Which tensors of a checkpoint have a row per Gaussian.
 #[derive(Debug)]
-pub(in crate::models) struct Table {
+pub(in crate::models) struct RowTensors {
     checkpoint: Checkpoint,
     count: usize,
     params: Vec<Param>,
     /// Those that only training reads.
-    beside: Vec<Tensor>,
+    beside: Vec<TensorView>,
 }
 
 /// A checkpoint that is being read.
 #[derive(Debug)]
 pub(in crate::models) struct Reading {
-    pub(in crate::models) table: Table,
+    pub(in crate::models) table: RowTensors,
     pub(in crate::models) raw: Raw,
 }
 
@@ -83,14 +83,20 @@ impl Reading {
         let row = state_bytes(sh_degree, Columns::all()) + 4 * own as u64;
         checkpoint.allow("", &format!("its {count} Gaussians"), row.saturating_mul(count as u64))?;
         let raw = Raw { gaussians: Gaussians::zeros(count, sh_degree), own: Column::zeros(own, count) };
-        Ok(Reading { table: Table { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw })
+        Ok(Reading { table: RowTensors { checkpoint, count, params: Vec::new(), beside: Vec::new() }, raw })
     }
 
     /// Reads the tensor at `id`, called `name`, whose rows have the shape `row` and are `planes`.
     ///
     /// # Errors
     /// No tensor of floating-point numbers of that shape; values that are not there or not finite.
-    pub(in crate::models) fn read(&mut self, id: NodeId, name: &str, row: &[usize], planes: Vec<Plane>) -> Result<()> {
+    pub(in crate::models) fn read(
+        &mut self,
+        id: NodeId,
+        name: &str,
+        row: &[usize],
+        planes: Vec<RowElement>,
+    ) -> Result<()> {
         let checkpoint = &self.table.checkpoint;
         let tensor = checkpoint.float_tensor(id, name)?;
         let shape = [&[self.table.count], row].concat();
@@ -101,9 +107,9 @@ impl Reading {
         let width = planes.len();
         for (c, plane) in planes.iter().enumerate() {
             let to = match *plane {
-                Plane::Of(column, plane) => self.raw.gaussians.column_mut(column).plane_mut(plane),
-                Plane::Own(plane) => self.raw.own.plane_mut(plane),
-                Plane::Unread => continue,
+                RowElement::Of(column, plane) => self.raw.gaussians.column_mut(column).plane_mut(plane),
+                RowElement::Own(plane) => self.raw.own.plane_mut(plane),
+                RowElement::Unread => continue,
             };
             to.iter_mut().zip(values.iter().skip(c).step_by(width)).for_each(|(to, from)| *to = *from);
         }
@@ -128,13 +134,19 @@ pub(in crate::models) fn count_of(checkpoint: &Checkpoint, id: NodeId, name: &st
     rows.ok_or_else(|| checkpoint.wrong(name, "a row per Gaussian", tensor.describe()))
 }
 
-impl Table {
+impl RowTensors {
     /// Writes the rows that `reduction` leaves of the tensors to `path`: those of `left` where they differ from `before`; what
     /// training keeps of merged ones is zero.
     ///
     /// # Errors
     /// Those of the writer.
-    pub(in crate::models) fn write(&self, before: &Raw, left: &Raw, reduction: &Reduction, path: &Path) -> Result<()> {
+    pub(in crate::models) fn write(
+        &self,
+        before: &Raw,
+        left: &Raw,
+        reduction: &CompressedModel,
+        path: &Path,
+    ) -> Result<()> {
         let mut rows = Vec::new();
         for Param { name, tensor, planes } in &self.params {
             let pairs: Vec<_> = planes.iter().map(|plane| plane.get(left).zip(plane.get(before))).collect();
@@ -146,7 +158,7 @@ impl Table {
                 .filter(|&(place, &row)| differs(place as usize, row))
                 .map(|(place, _)| place)
                 .collect();
-            let unread = planes.contains(&Plane::Unread) && !changed.is_empty();
+            let unread = planes.contains(&RowElement::Unread) && !changed.is_empty();
             let stored = if unread { self.checkpoint.floats(tensor, name)? } else { Vec::new() };
             let mut values = Vec::with_capacity(changed.len() * planes.len());
             for &place in &changed {
@@ -156,12 +168,16 @@ impl Table {
                     None => stored[row + c],
                 }));
             }
-            rows.push(Rows { tensor: tensor.clone(), changed, values });
+            rows.push(GaussianRows { tensor: tensor.clone(), changed, values });
         }
         let mut merged: Vec<u32> = reduction.clusters.iter().map(|cluster| cluster.output).collect();
         merged.sort_unstable();
         let beside = self.beside.iter();
-        rows.extend(beside.map(|tensor| Rows { tensor: tensor.clone(), changed: merged.clone(), values: Vec::new() }));
+        rows.extend(beside.map(|tensor| GaussianRows {
+            tensor: tensor.clone(),
+            changed: merged.clone(),
+            values: Vec::new(),
+        }));
         write_like(&self.checkpoint, &reduction.kept, &rows, path)
     }
 }

@@ -2,20 +2,20 @@
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::Merging;
+use super::ProxyRule;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, Raw};
-use crate::models::law::{Law, Model, copy_stored};
+use crate::models::law::{MotionModel, MotionModelFrames, copy_stored};
 use crate::passes::gather_all;
-use crate::recipe::Merge;
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
 
 /// States are what is stored.
 #[derive(Debug)]
 pub(in crate::models) struct Still;
 
-impl Law for Still {
+impl MotionModel for Still {
     type Prepared = ();
 
     fn prepare(&self, _: &Raw) {}
@@ -34,8 +34,8 @@ impl Law for Still {
     }
 }
 
-impl Merging for Still {
-    fn proposed(model: &Model<Still>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+impl ProxyRule for Still {
+    fn proposed(model: &MotionModelFrames<Still>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
         let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
         let members = clusters.iter().zip(0..).map(|(cluster, place)| (place, &cluster.members[..]));
         let merged = MergedSequence::new(model, &leaders, members, rule);

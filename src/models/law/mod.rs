@@ -1,6 +1,6 @@
 //! Models whose frames follow from raw parameters by a law: polynomials of time, networks, conditional covariances.
 //!
-//! A family gives its [`Law`]; reading in blocks, changing and reducing are the same for all of them. Memory: the raw
+//! A family gives its [`MotionModel`]; reading in blocks, changing and reducing are the same for all of them. Memory: the raw
 //! parameters, and per open reader those of its Gaussians once more with what is prepared of them.
 
 mod proxies;
@@ -13,14 +13,14 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
-use crate::passes::{BLOCK, InBlocks, Parts};
-use crate::reduction::Reduction;
-use crate::source::{BlockReader, Count, Decoder, Deformation, FrameSource, Ids, Reads, Wanted};
+use crate::passes::{BLOCK, BlockSlices, InBlocks};
+use crate::reduction::CompressedModel;
+use crate::source::{BlockReader, Count, Deformation, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads};
 
 pub(super) use proxies::solve;
 
 /// How states follow from raw parameters. States are in stored encoding, as [`Gaussians`] says.
-pub(super) trait Law: Debug + Send + Sync {
+pub(super) trait MotionModel: Debug + Send + Sync {
     /// What follows from some Gaussians' raw parameters once for all times.
     type Prepared: Send + Sync;
 
@@ -67,25 +67,25 @@ pub(super) trait Shading: Sync {
 
 /// A model of a law.
 #[derive(Debug)]
-pub(super) struct Model<L> {
+pub(super) struct MotionModelFrames<L> {
     law: Arc<L>,
     raw: Arc<Raw>,
     info: SequenceInfo,
     states: Count,
 }
 
-impl<L> Clone for Model<L> {
+impl<L> Clone for MotionModelFrames<L> {
     fn clone(&self) -> Self {
         let (law, raw) = (Arc::clone(&self.law), Arc::clone(&self.raw));
-        Model { law, raw, info: self.info.clone(), states: Count::default() }
+        MotionModelFrames { law, raw, info: self.info.clone(), states: Count::default() }
     }
 }
 
-impl<L: Law> Model<L> {
+impl<L: MotionModel> MotionModelFrames<L> {
     /// A model without frames yet, whose states have harmonics of `sh_degree`.
-    pub(super) fn new(law: L, raw: Raw, sh_degree: usize) -> Model<L> {
+    pub(super) fn new(law: L, raw: Raw, sh_degree: usize) -> MotionModelFrames<L> {
         let info = SequenceInfo { count: raw.len(), times: Vec::new(), sh_degree, varying: law.varying() };
-        Model { law: Arc::new(law), raw: Arc::new(raw), info, states: Count::default() }
+        MotionModelFrames { law: Arc::new(law), raw: Arc::new(raw), info, states: Count::default() }
     }
 
     /// The law.
@@ -102,20 +102,20 @@ impl<L: Law> Model<L> {
     ///
     /// # Errors
     /// Times that are not finite or do not increase, naming the frames.
-    pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<Model<L>> {
+    pub(super) fn with_times(mut self, times: Vec<f64>) -> Result<MotionModelFrames<L>> {
         self.info = self.info.at(times)?;
         Ok(self)
     }
 
     /// The same law and frames with other Gaussians.
-    pub(super) fn with_raw(&self, raw: Raw) -> Model<L> {
+    pub(super) fn with_raw(&self, raw: Raw) -> MotionModelFrames<L> {
         let sh_degree = self.info.sh_degree.min(raw.gaussians.sh_degree());
         let info = SequenceInfo { count: raw.len(), sh_degree, ..self.info.clone() };
-        Model { law: Arc::clone(&self.law), raw: Arc::new(raw), info, states: Count::default() }
+        MotionModelFrames { law: Arc::clone(&self.law), raw: Arc::new(raw), info, states: Count::default() }
     }
 
     /// The model that `reduction` leaves.
-    pub(super) fn reduced(&self, reduction: &Reduction) -> Model<L> {
+    pub(super) fn reduced(&self, reduction: &CompressedModel) -> MotionModelFrames<L> {
         self.with_raw(left(&self.raw, reduction))
     }
 
@@ -128,7 +128,7 @@ impl<L: Law> Model<L> {
 
 /// The raw parameters of what `reduction` leaves of `raw`, with its proxies in their places, changed, and with what stays of
 /// their harmonics.
-pub(super) fn left(raw: &Raw, reduction: &Reduction) -> Raw {
+pub(super) fn left(raw: &Raw, reduction: &CompressedModel) -> Raw {
     let mut left = raw.pick(&reduction.kept);
     if let Some(proxies) = &reduction.proxies.raw {
         for (proxy, cluster) in reduction.clusters.iter().enumerate() {
@@ -148,7 +148,7 @@ pub(super) fn copy_stored(raw: &Raw, want: Columns, out: &mut Gaussians) {
     }
 }
 
-impl<L: Law> FrameSource for Model<L> {
+impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -159,12 +159,12 @@ impl<L: Law> FrameSource for Model<L> {
             return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let rows: Vec<u32> = ids.iter().map(|id| id as u32).collect();
-        let blocks = rows.chunks(BLOCK).map(|rows| Block::of(self.law(), self.raw.pick(rows))).collect();
-        Ok(Box::new(Reader { model: self, blocks, count: rows.len() }))
+        let blocks = rows.chunks(BLOCK).map(|rows| PreparedBlock::of(self.law(), self.raw.pick(rows))).collect();
+        Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
     /// Nothing is decoded together.
-    fn open_all(&self, _: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(InBlocks::new(self))))
     }
 
@@ -172,8 +172,8 @@ impl<L: Law> FrameSource for Model<L> {
         Some(self)
     }
 
-    fn decoder(&self) -> Option<&dyn Decoder> {
-        self.law.shading().is_some().then_some(self as &dyn Decoder)
+    fn decoder(&self) -> Option<&dyn FeatureDecoder> {
+        self.law.shading().is_some().then_some(self as &dyn FeatureDecoder)
     }
 
     fn reads(&self) -> Reads {
@@ -181,7 +181,7 @@ impl<L: Law> FrameSource for Model<L> {
     }
 }
 
-impl<L: Law> Decoder for Model<L> {
+impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
     fn features(&self, frame: usize, out: &mut Column) -> Result<()> {
         let time = self.time_of(frame)?;
         *out = self.law.shading().map_or(Column::default(), |shading| shading.features(time, &self.raw));
@@ -194,14 +194,14 @@ impl<L: Law> Decoder for Model<L> {
 }
 
 /// Some Gaussians, ready to be evaluated.
-struct Block<L: Law> {
+struct PreparedBlock<L: MotionModel> {
     raw: Raw,
     prepared: L::Prepared,
 }
 
-impl<L: Law> Block<L> {
-    fn of(law: &L, raw: Raw) -> Block<L> {
-        Block { prepared: law.prepare(&raw), raw }
+impl<L: MotionModel> PreparedBlock<L> {
+    fn of(law: &L, raw: Raw) -> PreparedBlock<L> {
+        PreparedBlock { prepared: law.prepare(&raw), raw }
     }
 
     fn state(&self, law: &L, time: f64, want: Columns, out: &mut Gaussians) -> Result<()> {
@@ -214,7 +214,7 @@ impl<L: Law> Block<L> {
         law.state(time, &self.raw, &self.prepared, want, out)
     }
 
-    /// [`Law::state`] compiled for AVX2.
+    /// [`MotionModel::state`] compiled for AVX2.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     fn state_avx2(&self, law: &L, time: f64, want: Columns, out: &mut Gaussians) -> Result<()> {
@@ -222,13 +222,13 @@ impl<L: Law> Block<L> {
     }
 }
 
-struct Reader<'a, L: Law> {
-    model: &'a Model<L>,
-    blocks: Vec<Block<L>>,
+struct MotionModelReader<'a, L: MotionModel> {
+    model: &'a MotionModelFrames<L>,
+    blocks: Vec<PreparedBlock<L>>,
     count: usize,
 }
 
-impl<L: Law> BlockReader for Reader<'_, L> {
+impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let (model, time) = (self.model, self.model.time_of(frame)?);
         if !want.is_empty() {
@@ -238,7 +238,7 @@ impl<L: Law> BlockReader for Reader<'_, L> {
             return block.state(model.law(), time, want, out);
         }
         let mut state = Gaussians::zeros(0, model.info.sh_degree);
-        let parts = Parts::of(out, want, self.count);
+        let parts = BlockSlices::of(out, want, self.count);
         for (block, parts) in self.blocks.iter().zip(parts) {
             block.state(model.law(), time, want, &mut state)?;
             parts.write(&state, want);
@@ -248,7 +248,7 @@ impl<L: Law> BlockReader for Reader<'_, L> {
 }
 
 /// Blocks at once.
-impl<L: Law> Deformation for Model<L> {
+impl<L: MotionModel> Deformation for MotionModelFrames<L> {
     fn stored(&self) -> &Raw {
         &self.raw
     }
@@ -260,11 +260,11 @@ impl<L: Law> Deformation for Model<L> {
     fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
-        let parts = Parts::of(out, want, ids.len());
+        let parts = BlockSlices::of(out, want, ids.len());
         ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
             || Gaussians::zeros(0, self.info.sh_degree),
             |state, (ids, parts)| {
-                Block::of(self.law(), stored.pick(ids)).state(self.law(), time, want, state)?;
+                PreparedBlock::of(self.law(), stored.pick(ids)).state(self.law(), time, want, state)?;
                 parts.write(state, want);
                 Ok::<_, Error>(())
             },
@@ -275,7 +275,7 @@ impl<L: Law> Deformation for Model<L> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {
-            let Block { raw, prepared } = Block::<L>::of(self.law(), stored.pick(ids));
+            let PreparedBlock { raw, prepared } = PreparedBlock::<L>::of(self.law(), stored.pick(ids));
             self.law.jacobian(time, &raw, &prepared, want)
         };
         let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;

@@ -1,12 +1,12 @@
 //! Proxies in a family's own parameters, held to what their members do.
 
-use super::{Law, Model};
+use super::{MotionModel, MotionModelFrames};
 use crate::error::Result;
 use crate::fit::SEEN;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Raw, opacity};
 use crate::passes::gather_all;
-use crate::recipe::Merge;
+use crate::recipe::MergeParams;
 use crate::reduction::{Cluster, Proxies, Reference};
 use crate::source::FrameSource;
 
@@ -18,11 +18,11 @@ const MOST_OPACITY: f64 = 0.1;
 ///
 /// # Errors
 /// Frames that cannot be evaluated.
-pub(in crate::models) fn solve<L: Law>(
-    model: &Model<L>,
+pub(in crate::models) fn solve<L: MotionModel>(
+    model: &MotionModelFrames<L>,
     clusters: &[Cluster],
     reference: Reference,
-    rule: &Merge,
+    rule: &MergeParams,
     propose: impl FnOnce(&[Cluster]) -> Result<Raw>,
 ) -> Result<Proxies> {
     if clusters.is_empty() {

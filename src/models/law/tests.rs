@@ -2,13 +2,13 @@ use super::*;
 use crate::model::Gaussians;
 use crate::passes::{gather, gather_all};
 use crate::recipe::Recipe;
-use crate::reduction::{Change, Cluster, Reference};
+use crate::reduction::{Cluster, ParamDelta, Reference};
 
 /// x(t) = x + v·t with velocities of a family's own, and opacities that fade by a rate of its own.
 #[derive(Debug)]
 struct Straight;
 
-impl Law for Straight {
+impl MotionModel for Straight {
     type Prepared = Vec<f32>;
 
     fn prepare(&self, raw: &Raw) -> Vec<f32> {
@@ -41,7 +41,7 @@ impl Law for Straight {
 }
 
 /// More than two blocks of Gaussians, each with values of its own.
-fn model() -> Model<Straight> {
+fn model() -> MotionModelFrames<Straight> {
     let count = 2 * BLOCK + 77;
     let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(4, count) };
     let noise = |column: &mut Column, step: f32| {
@@ -49,7 +49,7 @@ fn model() -> Model<Straight> {
     };
     raw.gaussians.columns_mut(Columns::all()).for_each(|column| noise(column, 0.618_034));
     noise(&mut raw.own, 0.754_878);
-    Model::new(Straight, raw, 0).with_times(vec![0.0, 0.5, 2.0]).unwrap()
+    MotionModelFrames::new(Straight, raw, 0).with_times(vec![0.0, 0.5, 2.0]).unwrap()
 }
 
 #[test]
@@ -73,12 +73,12 @@ fn the_same_gaussian_at_the_same_frame_has_the_same_bits_however_it_is_read() {
 #[test]
 fn what_is_left_has_its_own_values_proxies_in_their_places_and_its_changes() {
     let (model, rule) = (model(), Recipe::preset("default").unwrap().merge);
-    let mut reduction = Reduction::pruned(vec![3, 8, 11], &rule);
+    let mut reduction = CompressedModel::pruned(vec![3, 8, 11], &rule);
     reduction.clusters.push(Cluster { output: 1, leader: 8, members: vec![(8, 0.5), (9, 0.5)] });
     reduction.proxies.raw = Some(model.raw().pick(&[20]));
     let mut by = Gaussians { position: Column::zeros(3, 3), ..Gaussians::default() };
     by.position.set_row(2, [1.0, 0.0, 0.0]);
-    reduction.change = Change(by);
+    reduction.change = ParamDelta(by);
     let reduced = model.reduced(&reduction);
     let mut expected = model.raw().pick(&[3, 20, 11]);
     expected.gaussians.position.plane_mut(0)[2] += 1.0;

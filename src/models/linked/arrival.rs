@@ -11,7 +11,7 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::memory::TOGETHER_BYTES;
-use super::{Arrived, Linked};
+use super::{Arrived, LinkedFrames};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::frame_stream::FrameStream;
@@ -20,11 +20,11 @@ use crate::files::ply::write::write_inria;
 use crate::files::ply_frames::PlyFrames;
 use crate::fit::SEEN;
 use crate::model::{Columns, Gaussians, opacity};
-use crate::models::Family;
+use crate::models::InputModel;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{GAUSSIAN_BLOCK, of_block};
 use crate::progress::Progress;
-use crate::source::{FrameSource, Ids, Wanted};
+use crate::source::{FrameSource, Ids, ReadPlan};
 
 /// Files of frames that are arriving, and their times.
 struct Arriving {
@@ -56,15 +56,15 @@ impl Arriving {
         why: &str,
         joins: bool,
         options: &PlyOptions,
-    ) -> Result<Linked> {
-        let linked = Linked::open(PlyFrames::open(self.folder.path(), options)?, name, why, joins, options)?;
+    ) -> Result<LinkedFrames> {
+        let linked = LinkedFrames::open(PlyFrames::open(self.folder.path(), options)?, name, why, joins, options)?;
         let memory = self.beside + 2 * self.largest;
         let arrived = Some(Arrived { _folder: self.folder, kind, bytes, memory });
-        Ok(Linked { info: linked.info.with_times(self.times)?, arrived, ..linked })
+        Ok(LinkedFrames { info: linked.info.with_times(self.times)?, arrived, ..linked })
     }
 }
 
-impl Linked {
+impl LinkedFrames {
     /// Receives all of a stream, called `name`, and links it, and lives that are one if `joins`.
     ///
     /// # Errors
@@ -74,7 +74,7 @@ impl Linked {
         name: &Path,
         joins: bool,
         options: &PlyOptions,
-    ) -> Result<Linked> {
+    ) -> Result<LinkedFrames> {
         let mut arriving = Arriving::new(&options.scratch, 0)?;
         let mut state = Gaussians::zeros(0, stream.header().sh_degree);
         let progress = Progress::counting("receive", "frames");
@@ -95,7 +95,7 @@ impl Linked {
     ///
     /// # Errors
     /// A frame that cannot be read; a failed write.
-    pub fn anew(input: &dyn Family, kind: &'static str, joins: bool, options: &PlyOptions) -> Result<Linked> {
+    pub fn anew(input: &dyn InputModel, kind: &'static str, joins: bool, options: &PlyOptions) -> Result<LinkedFrames> {
         let (source, info) = (input.source(), input.source().info());
         let seen = count_seen(source)?;
         let state = state_bytes(info.sh_degree, Columns::all());
@@ -164,7 +164,7 @@ fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
 
 /// Those of every block that are [seen] in each of `frames`.
 fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
-    let wanted = Wanted::of(frames.clone());
+    let wanted = ReadPlan::of(frames.clone());
     let unpack = |range: Range<usize>| {
         let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, source.info().sh_degree));
         reader.expect(&wanted);

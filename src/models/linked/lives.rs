@@ -4,8 +4,8 @@ use std::ops::Range;
 use std::path::Path;
 
 use super::memory::LOOKED_AT;
-use super::steady::{Bound, Steady, Sums};
-use super::tracks::Tracks;
+use super::steady::{Bound, Steady, TrackSums};
+use super::tracks::LinkedTracks;
 use crate::error::Result;
 use crate::files::cameras::virtual_rig;
 use crate::metrics::psnr;
@@ -26,7 +26,7 @@ const BOUNDS: [Bound; 2] = [Bound { colour: 0.04, other: 0.02 }, Bound { colour:
 ///
 /// # Errors
 /// A frame that cannot be read.
-pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut Tracks) -> Result<Option<String>> {
+pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut LinkedTracks) -> Result<Option<String>> {
     let (before, median_length) = (tracks.count(), tracks.lengths()?.median());
     let mut note = None;
     for (of_tracks, count) in joiner.finish(linker) {
@@ -53,7 +53,7 @@ pub(super) fn join(joiner: Joiner, linker: &Linker, tracks: &mut Tracks) -> Resu
 ///
 /// # Errors
 /// A frame that cannot be read; a failed write to `scratch`.
-pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>> {
+pub(super) fn hold(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<String>> {
     let first = tracks.first();
     for bound in BOUNDS {
         // Tracks are numbered by their births.
@@ -64,7 +64,7 @@ pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>
             return Ok(None);
         }
         let frames: Vec<u32> = (0..tracks.frames().paths().len() as u32).collect();
-        let states = |tracks: &Tracks, frame: usize| {
+        let states = |tracks: &LinkedTracks, frame: usize| {
             tracks.states(&tracks.frames().frame(frame)?, &tracks.rows(frame, 0..tracks.count())?)
         };
         let before = looked_at(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
@@ -86,9 +86,9 @@ pub(super) fn hold(tracks: &mut Tracks, scratch: &Path) -> Result<Option<String>
 }
 
 /// Sums along the tracks of `range`, none of which is there before the frame `born`.
-fn sums(tracks: &Tracks, born: usize, range: Range<usize>) -> Result<Sums> {
+fn sums(tracks: &LinkedTracks, born: usize, range: Range<usize>) -> Result<TrackSums> {
     let sh_degree = tracks.frames().sh_degree();
-    let (mut sums, mut state) = (Sums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
+    let (mut sums, mut state) = (TrackSums::new(range.len(), sh_degree), Gaussians::zeros(0, sh_degree));
     for frame in born..tracks.frames().paths().len() {
         let rows = tracks.rows(frame, range.clone())?;
         for at in tracks.blended(&tracks.frames().frame(frame)?, &rows, &mut state)? {
@@ -99,7 +99,7 @@ fn sums(tracks: &Tracks, born: usize, range: Range<usize>) -> Result<Sums> {
 }
 
 /// PSNR of pictures of joined lives against those of lives apart, where any are blended.
-fn cost(tracks: &Tracks) -> Result<Option<f64>> {
+fn cost(tracks: &LinkedTracks) -> Result<Option<f64>> {
     let frames = tracks.lengths()?.blended;
     if frames.is_empty() {
         return Ok(None);

@@ -2,7 +2,7 @@
 
 use std::mem::size_of;
 
-use super::steady::{BATCH, Sums};
+use super::steady::{BATCH, TrackSums};
 use crate::model::Columns;
 use crate::models::trajectories::state_bytes;
 use crate::outputs::container::{FRAME_BLOCK, GAUSSIAN_BLOCK};
@@ -74,7 +74,7 @@ impl Sizes {
     /// and pictures of them. Joining lives takes the same of frames, and less for tracks.
     fn holding(&self) -> u64 {
         let threads = rayon::current_num_threads() as u64;
-        let sums = self.linked.min(BATCH as u64) * Sums::bytes(self.sh_degree);
+        let sums = self.linked.min(BATCH as u64) * TrackSums::bytes(self.sh_degree);
         let summing = threads * (sums + self.of_frame * (self.file() + self.state() + PER_ROW));
         let frames = (2 * LOOKED_AT as u64 + 1) * self.state() + self.file() + 2 * PER_ROW;
         let pictures = PICTURES + threads * STRIP_BYTES as u64;

@@ -21,8 +21,8 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::xxh3_128;
 
-use self::tracks::Tracks;
-use super::family::{Family, Residence, Timing};
+use self::tracks::LinkedTracks;
+use super::family::{InputModel, MemoryProfile, Timing};
 use super::size::bytes_of;
 use super::trajectories::write_trajectories;
 use crate::error::Result;
@@ -33,13 +33,13 @@ use crate::files::ply_frames::PlyFrames;
 use crate::limits::Limits;
 use crate::model::SequenceInfo;
 use crate::outputs::kind::OutputKind;
-use crate::reduction::Reduction;
-use crate::source::{Ahead, BlockReader, FrameSource, Ids, Reads, Wanted};
+use crate::reduction::CompressedModel;
+use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 use crate::tracking::Joiner;
 
 /// Linked frames.
-pub struct Linked {
-    tracks: Tracks,
+pub struct LinkedFrames {
+    tracks: LinkedTracks,
     /// The tracks at every frame.
     container: Container,
     /// Of the container, at times that may be others.
@@ -63,16 +63,22 @@ struct Arrived {
     memory: u64,
 }
 
-impl Linked {
+impl LinkedFrames {
     /// Links `frames`, which the notes say `why` of, and if `joins` lives that are one, along which what hardly changes is held.
     /// Messages call the frames `name`.
     ///
     /// # Errors
     /// A frame that cannot be read or has changed meanwhile; more memory than `options` allow; a failed write.
-    pub(super) fn open(frames: PlyFrames, name: &Path, why: &str, joins: bool, options: &PlyOptions) -> Result<Linked> {
+    pub(super) fn open(
+        frames: PlyFrames,
+        name: &Path,
+        why: &str,
+        joins: bool,
+        options: &PlyOptions,
+    ) -> Result<LinkedFrames> {
         let scratch = &*options.scratch;
         let mut joiner = joins.then(Joiner::default);
-        let (mut tracks, found, linker) = Tracks::link(frames, name, joiner.as_mut(), options)?;
+        let (mut tracks, found, linker) = LinkedTracks::link(frames, name, joiner.as_mut(), options)?;
         let joined = joiner.map(|joiner| lives::join(joiner, &linker, &mut tracks)).transpose()?.flatten();
         drop(linker);
         let held = if joins { lives::hold(&mut tracks, scratch)? } else { None };
@@ -83,11 +89,11 @@ impl Linked {
         let mut notes = vec![format!("frames were linked: {why}")];
         notes.extend(found.notes(&tracks)?);
         notes.extend(joined.into_iter().chain(held));
-        Ok(Linked { tracks, container, info, notes, _scratch: packed, arrived: None })
+        Ok(LinkedFrames { tracks, container, info, notes, _scratch: packed, arrived: None })
     }
 }
 
-impl FrameSource for Linked {
+impl FrameSource for LinkedFrames {
     fn info(&self) -> &SequenceInfo {
         &self.info
     }
@@ -96,7 +102,7 @@ impl FrameSource for Linked {
         self.container.open(ids)
     }
 
-    fn open_all(&self, wanted: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, wanted: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         self.container.open_all(wanted)
     }
 
@@ -104,12 +110,12 @@ impl FrameSource for Linked {
         self.container.reads()
     }
 
-    fn ahead(&self) -> Option<&dyn Ahead> {
+    fn ahead(&self) -> Option<&dyn Prefetch> {
         self.container.ahead()
     }
 }
 
-impl Family for Linked {
+impl InputModel for LinkedFrames {
     fn kind(&self) -> &'static str {
         self.arrived.as_ref().map_or("linked PLY frames", |arrived| arrived.kind)
     }
@@ -139,10 +145,10 @@ impl Family for Linked {
         true
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         let (sizes, count) = (self.tracks.sizes(), self.info.count.max(1) as u64);
         let arriving = self.arrived.as_ref().map_or(0, |arrived| arrived.memory);
-        Residence {
+        MemoryProfile {
             per_gaussian: sizes.open().div_ceil(count),
             opening: sizes.opening().max(arriving).div_ceil(count),
             file: sizes.frame_file().div_ceil(count),
@@ -151,7 +157,7 @@ impl Family for Linked {
     }
 
     fn hold_decoded(&self) {
-        Family::hold_decoded(&self.container);
+        InputModel::hold_decoded(&self.container);
     }
 
     fn timing(&self) -> Timing {
@@ -161,7 +167,7 @@ impl Family for Linked {
         }
     }
 
-    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.info = self.info.with_times(times)?;
         Ok(self)
     }
@@ -170,7 +176,13 @@ impl Family for Linked {
         self.notes.clone()
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         match kind {
             OutputKind::PlySequence => self.write_files(reduction, path).map(|()| Vec::new()),
             _ => write_trajectories(self, reduction, kind, path, limits),

@@ -13,7 +13,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use crate::cache::{Spill, Spilling};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::Result;
 use crate::model::{Columns, Gaussians};
 
@@ -41,7 +41,7 @@ pub(super) struct Steady {
 }
 
 /// What is held of some tracks.
-pub(super) struct Means {
+pub(super) struct HeldMeans {
     columns: Vec<Columns>,
     values: Gaussians,
 }
@@ -54,14 +54,14 @@ impl Steady {
     pub(super) fn of(
         count: usize,
         sh_degree: usize,
-        sums: impl Fn(Range<usize>) -> Result<Sums> + Sync,
+        sums: impl Fn(Range<usize>) -> Result<TrackSums> + Sync,
         bound: Bound,
         scratch: &Path,
     ) -> Result<Steady> {
-        let (mut columns, mut means) = (Vec::with_capacity(count), Spilling::new(scratch)?);
+        let (mut columns, mut means) = (Vec::with_capacity(count), SpillWriter::new(scratch)?);
         let batches: Vec<Range<usize>> = (0..count).step_by(BATCH).map(|at| at..count.min(at + BATCH)).collect();
         for at_once in batches.chunks(rayon::current_num_threads()) {
-            for sums in at_once.par_iter().cloned().map(&sums).collect::<Result<Vec<Sums>>>()? {
+            for sums in at_once.par_iter().cloned().map(&sums).collect::<Result<Vec<TrackSums>>>()? {
                 for track in 0..sums.len() {
                     columns.push(sums.steady(track, bound));
                     means.write(bytemuck::cast_slice(&sums.means(track)))?;
@@ -88,7 +88,7 @@ impl Steady {
     ///
     /// # Errors
     /// A failed read.
-    pub(super) fn means(&self, tracks: &[u32]) -> Result<Means> {
+    pub(super) fn means(&self, tracks: &[u32]) -> Result<HeldMeans> {
         let width = HELD.width(self.sh_degree);
         let mut values = Gaussians::zeros(tracks.len(), self.sh_degree);
         let (mut at, mut read) = (0, Vec::new());
@@ -103,11 +103,11 @@ impl Steady {
                 at += 1;
             }
         }
-        Ok(Means { columns: tracks.iter().map(|&track| self.columns[track as usize]).collect(), values })
+        Ok(HeldMeans { columns: tracks.iter().map(|&track| self.columns[track as usize]).collect(), values })
     }
 }
 
-impl Means {
+impl HeldMeans {
     /// Writes to `state` what is held, of each pair of `places` that of the first to the row of the second.
     pub(super) fn hold(&self, places: impl Iterator<Item = (usize, usize)>, state: &mut Gaussians) {
         let places: Vec<(usize, usize)> = places.filter(|&(at, _)| !self.columns[at].is_empty()).collect();
@@ -123,7 +123,7 @@ impl Means {
 }
 
 /// Sums over the frames of some tracks, of each one after the other.
-pub(super) struct Sums {
+pub(super) struct TrackSums {
     sh_width: usize,
     /// Σ 1, Σ α, Σ α².
     opacity: Vec<[f64; 3]>,
@@ -139,10 +139,10 @@ pub(super) struct Sums {
     first: Vec<[f32; 4]>,
 }
 
-impl Sums {
+impl TrackSums {
     /// Of `len` tracks that were not seen at any frame yet.
-    pub(super) fn new(len: usize, sh_degree: usize) -> Sums {
-        Sums {
+    pub(super) fn new(len: usize, sh_degree: usize) -> TrackSums {
+        TrackSums {
             sh_width: Columns::SH.width(sh_degree),
             opacity: vec![[0.0; 3]; len],
             values: vec![0.0; HELD.width(sh_degree) * len],

@@ -7,13 +7,13 @@ use std::path::Path;
 use gseq::Compression;
 
 use super::memory::Sizes;
-use super::steady::{Means, Steady};
-use crate::cache::{Spill, Spilling};
+use super::steady::{HeldMeans, Steady};
+use crate::cache::{Spill, SpillWriter};
 use crate::error::{Result, ShowPath};
 use crate::files::ply::{Ply, PlyOptions};
 use crate::files::ply_frames::PlyFrames;
 use crate::model::{Columns, Gaussians, SequenceInfo};
-use crate::outputs::container::{ContainerWriter, GAUSSIAN_BLOCK, Lives};
+use crate::outputs::container::{BlockPresence, ContainerWriter, GAUSSIAN_BLOCK};
 use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
 use crate::tracking::{Joiner, Linker, blend};
@@ -23,20 +23,20 @@ const NOT_THERE: f32 = -40.0;
 
 /// A row of a frame's file, and its track.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Row {
+pub(super) struct TrackedRow {
     pub(super) track: u32,
     pub(super) row: u32,
 }
 
 /// A frame in which a track is, and the row there.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct At {
+pub(super) struct TrackPosition {
     pub(super) frame: u32,
     row: u32,
 }
 
 /// Frames, and the track of every row of them. Where lives are joined, several rows of a frame may be of one track.
-pub(super) struct Tracks {
+pub(super) struct LinkedTracks {
     frames: PlyFrames,
     count: usize,
     /// Most tracks of `of_rows` that might go on at a frame.
@@ -46,21 +46,21 @@ pub(super) struct Tracks {
     /// What is held along tracks, if anything is.
     steady: Option<Steady>,
     /// Where each track is first.
-    births: Vec<At>,
+    births: Vec<TrackPosition>,
     /// Tracks of the rows of all frames, one after the other, and where those of each frame begin.
     of_rows: Spill,
     starts: Vec<u64>,
 }
 
 /// For how long tracks are there.
-pub(super) struct Lengths {
+pub(super) struct TrackLengths {
     /// Frames of each.
     of_tracks: Vec<u32>,
     /// Frames in which several rows are of one.
     pub(super) blended: Vec<u32>,
 }
 
-impl Lengths {
+impl TrackLengths {
     /// Frames that tracks are there, in the median.
     pub(super) fn median(mut self) -> u32 {
         let middle = self.of_tracks.len() / 2;
@@ -69,7 +69,7 @@ impl Lengths {
 }
 
 /// What linking found.
-pub(super) struct Found {
+pub(super) struct LinkingResult {
     states: u64,
     /// Frames that begin something new.
     cuts: Vec<usize>,
@@ -77,12 +77,12 @@ pub(super) struct Found {
     doubtful: usize,
 }
 
-impl Found {
+impl LinkingResult {
     /// Things a person should know, of the `tracks` that were made of it.
     ///
     /// # Errors
     /// A failed read.
-    pub(super) fn notes(&self, tracks: &Tracks) -> Result<Vec<String>> {
+    pub(super) fn notes(&self, tracks: &LinkedTracks) -> Result<Vec<String>> {
         let mut notes = vec![format!(
             "{} Gaussians of {} frames are {} tracks, of {} frames in the median",
             self.states,
@@ -107,7 +107,7 @@ impl Found {
     }
 }
 
-impl Tracks {
+impl LinkedTracks {
     /// Links `frames`, called `name` in messages, which `joiner` looks at too.
     ///
     /// # Errors
@@ -117,12 +117,12 @@ impl Tracks {
         name: &Path,
         mut joiner: Option<&mut Joiner>,
         options: &PlyOptions,
-    ) -> Result<(Tracks, Found, Linker)> {
+    ) -> Result<(LinkedTracks, LinkingResult, Linker)> {
         let scratch = &*options.scratch;
         let of_frame = frames.counts().iter().copied().max().unwrap_or(0);
         let (mut linker, mut living) = (Linker::default(), 0);
         let (mut births, mut cuts, mut doubtful) = (Vec::new(), Vec::new(), 0);
-        let (mut spilling, mut starts, mut end) = (Spilling::new(scratch)?, vec![0], 0);
+        let (mut spilling, mut starts, mut end) = (SpillWriter::new(scratch)?, vec![0], 0);
         let mut state = Gaussians::zeros(0, frames.sh_degree());
         let progress = Progress::new("link", "frames", frames.paths().len() as u64);
         for frame in 0..frames.paths().len() {
@@ -145,7 +145,7 @@ impl Tracks {
             for (row, &track) in linked.tracks.iter().enumerate() {
                 // Those that begin here are numbered in the order of their rows.
                 if track as usize == births.len() {
-                    births.push(At { frame: frame as u32, row: row as u32 });
+                    births.push(TrackPosition { frame: frame as u32, row: row as u32 });
                 }
             }
             spilling.write(bytemuck::cast_slice(&linked.tracks))?;
@@ -153,7 +153,7 @@ impl Tracks {
             starts.push(end);
             progress.advance(1);
         }
-        let tracks = Tracks {
+        let tracks = LinkedTracks {
             count: births.len(),
             living,
             frames,
@@ -163,7 +163,7 @@ impl Tracks {
             of_rows: spilling.finish()?,
             starts,
         };
-        Ok((tracks, Found { states: end, cuts, doubtful }, linker))
+        Ok((tracks, LinkingResult { states: end, cuts, doubtful }, linker))
     }
 
     /// Makes `count` tracks of what is there, of each the one that `of_tracks` says.
@@ -190,8 +190,8 @@ impl Tracks {
     ///
     /// # Errors
     /// A failed read.
-    pub(super) fn lengths(&self) -> Result<Lengths> {
-        let mut lengths = Lengths { of_tracks: vec![0; self.count], blended: Vec::new() };
+    pub(super) fn lengths(&self) -> Result<TrackLengths> {
+        let mut lengths = TrackLengths { of_tracks: vec![0; self.count], blended: Vec::new() };
         let mut last = vec![u32::MAX; self.count];
         for frame in 0..self.frames.paths().len() {
             let mut is_blended = false;
@@ -218,7 +218,7 @@ impl Tracks {
     }
 
     /// Where each track is first, in the order of frames.
-    pub(super) fn first(&self) -> Vec<At> {
+    pub(super) fn first(&self) -> Vec<TrackPosition> {
         match &self.lives {
             None => self.births.clone(),
             // Lives are numbered by their beginnings.
@@ -255,10 +255,10 @@ impl Tracks {
     }
 
     /// The rows of a frame that are of `tracks`, by their tracks.
-    pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<Row>> {
+    pub(super) fn rows(&self, frame: usize, tracks: Range<usize>) -> Result<Vec<TrackedRow>> {
         let rows = self.of_frame(frame)?.into_iter().enumerate();
-        let rows = rows.map(|(row, track)| Row { track, row: row as u32 });
-        let mut rows: Vec<Row> = rows.filter(|row| tracks.contains(&(row.track as usize))).collect();
+        let rows = rows.map(|(row, track)| TrackedRow { track, row: row as u32 });
+        let mut rows: Vec<TrackedRow> = rows.filter(|row| tracks.contains(&(row.track as usize))).collect();
         rows.sort_unstable();
         Ok(rows)
     }
@@ -268,7 +268,7 @@ impl Tracks {
     ///
     /// # Errors
     /// A failed read.
-    pub(super) fn blended(&self, file: &Ply, rows: &[Row], state: &mut Gaussians) -> Result<Vec<usize>> {
+    pub(super) fn blended(&self, file: &Ply, rows: &[TrackedRow], state: &mut Gaussians) -> Result<Vec<usize>> {
         let of_file: Vec<u32> = rows.iter().map(|row| row.row).collect();
         file.gather(&Ids::List(&of_file), Columns::all(), state)?;
         let mut firsts = Vec::with_capacity(rows.len());
@@ -288,7 +288,7 @@ impl Tracks {
     ///
     /// # Errors
     /// A failed read.
-    pub(super) fn states(&self, file: &Ply, rows: &[Row]) -> Result<Gaussians> {
+    pub(super) fn states(&self, file: &Ply, rows: &[TrackedRow]) -> Result<Gaussians> {
         let mut state = Gaussians::zeros(0, self.frames.sh_degree());
         let firsts = self.blended(file, rows, &mut state)?;
         let mut states = state.pick(&firsts.iter().map(|&first| first as u32).collect::<Vec<u32>>());
@@ -312,12 +312,14 @@ impl Tracks {
         for start in (0..times.len()).step_by(together) {
             let of_block = start..times.len().min(start + together);
             let files: Vec<Ply> = of_block.clone().map(|frame| self.frames.frame(frame)).collect::<Result<_>>()?;
-            let rows: Vec<Vec<Row>> =
+            let rows: Vec<Vec<TrackedRow>> =
                 of_block.clone().map(|frame| self.rows(frame, 0..self.count)).collect::<Result<_>>()?;
-            let mut lives: Vec<Lives> =
-                was_still.iter().map(|&still| if still { Lives::Repeating } else { Lives::Still }).collect();
+            let mut lives: Vec<BlockPresence> = was_still
+                .iter()
+                .map(|&still| if still { BlockPresence::Repeating } else { BlockPresence::Still })
+                .collect();
             for row in rows.iter().flatten() {
-                lives[row.track as usize / GAUSSIAN_BLOCK] = Lives::New;
+                lives[row.track as usize / GAUSSIAN_BLOCK] = BlockPresence::New;
             }
             let info = SequenceInfo {
                 count: self.count,
@@ -329,10 +331,10 @@ impl Tracks {
             writer.append_lives(&block, 0..of_block.len(), &times[of_block.clone()], &lives)?;
             for (frame, rows) in of_block.clone().zip(&rows) {
                 for row in rows {
-                    held[row.track as usize] = At { frame: frame as u32, row: row.row };
+                    held[row.track as usize] = TrackPosition { frame: frame as u32, row: row.row };
                 }
             }
-            was_still = lives.iter().map(|lives| *lives != Lives::New).collect();
+            was_still = lives.iter().map(|lives| *lives != BlockPresence::New).collect();
             progress.advance(of_block.len() as u64);
         }
         writer.finish()
@@ -342,14 +344,14 @@ impl Tracks {
 /// All tracks at the frames of a block.
 struct FrameBlock<'a> {
     info: SequenceInfo,
-    tracks: &'a Tracks,
+    tracks: &'a LinkedTracks,
     /// The first of the frames.
     start: usize,
     files: &'a [Ply],
     /// By track, of each of them.
-    rows: &'a [Vec<Row>],
+    rows: &'a [Vec<TrackedRow>],
     /// Where each track was last before them, or will be first.
-    held: &'a [At],
+    held: &'a [TrackPosition],
 }
 
 impl FrameSource for FrameBlock<'_> {
@@ -363,7 +365,7 @@ impl FrameSource for FrameBlock<'_> {
         let tracks: Vec<u32> = range.clone().map(|track| track as u32).collect();
         let means = self.tracks.steady.as_ref().map(|steady| steady.means(&tracks)).transpose()?;
         let [state, part] = [range.len(), 0].map(|len| Gaussians::zeros(len, self.info.sh_degree));
-        let mut reader = Reader { block: self, range, next: 0, means, state, part };
+        let mut reader = TrackReader { block: self, range, next: 0, means, state, part };
         reader.begin()?;
         Ok(Box::new(reader))
     }
@@ -372,7 +374,8 @@ impl FrameSource for FrameBlock<'_> {
 impl FrameBlock<'_> {
     /// Writes the tracks of `range` as they are held before the first of the frames.
     fn hold(&self, range: Range<usize>, state: &mut Gaussians) -> Result<()> {
-        let mut by_frame: Vec<(At, usize)> = self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
+        let mut by_frame: Vec<(TrackPosition, usize)> =
+            self.held[range].iter().enumerate().map(|(i, &at)| (at, i)).collect();
         by_frame.sort_by_key(|(at, i)| (at.frame, *i));
         let mut part = Gaussians::zeros(0, self.info.sh_degree);
         for of_frame in by_frame.chunk_by(|(a, _), (b, _)| a.frame == b.frame) {
@@ -394,18 +397,18 @@ impl FrameBlock<'_> {
 }
 
 /// Tracks that follow one another, frame by frame.
-struct Reader<'a> {
+struct TrackReader<'a> {
     block: &'a FrameBlock<'a>,
     range: Range<usize>,
     /// The frame that `state` is to become.
     next: usize,
     /// What is held of `range`.
-    means: Option<Means>,
+    means: Option<HeldMeans>,
     state: Gaussians,
     part: Gaussians,
 }
 
-impl Reader<'_> {
+impl TrackReader<'_> {
     /// Goes to what is before the first of the frames.
     fn begin(&mut self) -> Result<()> {
         self.block.hold(self.range.clone(), &mut self.state)?;
@@ -417,7 +420,7 @@ impl Reader<'_> {
     }
 }
 
-impl BlockReader for Reader<'_> {
+impl BlockReader for TrackReader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         if frame + 1 < self.next {
             self.begin()?;

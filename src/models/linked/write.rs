@@ -6,26 +6,26 @@ use std::path::Path;
 use hashbrown::HashSet;
 use rayon::prelude::*;
 
-use super::Linked;
+use super::LinkedFrames;
 use crate::error::Result;
 use crate::files::ply::write::{OutRow, out_rows, write_like};
 use crate::model::{Columns, Gaussians};
 use crate::models::trajectories::merged;
 use crate::progress::Progress;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::source::{FrameSource, Ids};
 
 /// What no row of a frame is of.
 const NONE: u32 = u32::MAX;
 
-impl Linked {
+impl LinkedFrames {
     /// Writes every frame's file into `folder`. A merged Gaussian is there where one of its members is, in the row of the
     /// first of them; of several rows of a track there is one, in the place of the first. What is held along a track is
     /// held.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    pub(super) fn write_files(&self, reduction: &Reduction, folder: &Path) -> Result<()> {
+    pub(super) fn write_files(&self, reduction: &CompressedModel, folder: &Path) -> Result<()> {
         let (frames, result) = (self.tracks.frames(), merged(self, reduction));
         let all = out_rows(reduction);
         let progress = Progress::new("emit", "frames", frames.paths().len() as u64);

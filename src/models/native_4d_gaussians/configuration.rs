@@ -11,7 +11,7 @@ use crate::models::in_checkpoint::texts_in;
 
 /// What matters of it.
 #[derive(Debug, Default)]
-pub(super) struct Configuration {
+pub(super) struct TrainingConfig {
     pub(super) source_path: Option<String>,
     pub(super) white_background: bool,
     pub(super) prefilter: f64,
@@ -19,13 +19,13 @@ pub(super) struct Configuration {
     pub(super) time_duration: Option<(f64, String)>,
 }
 
-impl Configuration {
+impl TrainingConfig {
     /// That of the model in `root`.
     ///
     /// # Errors
     /// Files that cannot be read, or not understood; such that do not agree.
-    pub(super) fn read(root: &Path) -> Result<Configuration> {
-        let mut found = Configuration { time_duration: time_duration(root)?, ..Configuration::default() };
+    pub(super) fn read(root: &Path) -> Result<TrainingConfig> {
+        let mut found = TrainingConfig { time_duration: time_duration(root)?, ..TrainingConfig::default() };
         let path = root.join("cfg_args");
         if !path.is_file() {
             return Ok(found);

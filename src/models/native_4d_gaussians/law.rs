@@ -13,7 +13,7 @@ use super::rotation::{covariance, rotation};
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
 use crate::models::law::window::{MOST, faded, odds, slope};
-use crate::models::law::{Law, copy_stored};
+use crate::models::law::{MotionModel, copy_stored};
 
 /// Planes of [`Raw::own`]: μ, the logarithm of the scale along time, the right quaternion, harmonics in time term by term.
 pub(super) const TIME: usize = 0;
@@ -101,7 +101,7 @@ impl Native {
     }
 }
 
-impl Law for Native {
+impl MotionModel for Native {
     type Prepared = Slices;
 
     fn prepare(&self, raw: &Raw) -> Slices {

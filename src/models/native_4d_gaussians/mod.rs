@@ -13,17 +13,17 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{Entry, Family, OpenOptions};
+use super::family::{InputModel, ModelFormat, OpenOptions};
 use super::in_checkpoint::still::Still;
-use super::in_checkpoint::{About, InCheckpoint, Merging, Plane, Reading, count_of, numbered};
-use super::law::Model;
+use super::in_checkpoint::{About, InCheckpoint, ProxyRule, Reading, RowElement, count_of, numbered};
+use super::law::MotionModelFrames;
 use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, Node, NodeId};
 use crate::limits::ReadLimit;
 use crate::model::{Columns, Raw, sh_coefficients};
-use crate::recipe::Merge;
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
-use configuration::Configuration;
+use configuration::TrainingConfig;
 use law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 
 /// Lengths of the tuple that a model captures: of four dimensions, and static.
@@ -31,7 +31,7 @@ const MOVING: usize = 19;
 const STATIC: usize = 12;
 
 /// A checkpoint, or the folder of a model.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 4D Gaussian Splatting checkpoint",
     recognises: |found| match found.is_folder {
         // Other families save checkpoints of their own beside their clouds.
@@ -97,7 +97,7 @@ fn choose(folder: &Path, options: &OpenOptions) -> Result<(PathBuf, Vec<String>)
     }
 }
 
-fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
+fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     let conventions = options.conventions;
     let checkpoint = Checkpoint::open(&about.file, options.memory)?;
     let pickle = checkpoint.pickle();
@@ -113,7 +113,7 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
     }
     let moves = parts.len() == MOVING;
     let root = about.root.as_deref().or(about.file.parent());
-    let config = root.map_or_else(|| Ok(Configuration::default()), Configuration::read)?;
+    let config = root.map_or_else(|| Ok(TrainingConfig::default()), TrainingConfig::read)?;
     let part = |i: usize, name: &str| (parts[i], format!("capture[{i}] ({name})"));
     let (xyz, place) = part(1, "xyz");
     let count = count_of(&checkpoint, xyz, &place)?;
@@ -169,25 +169,25 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
     }
     let own = law.as_ref().map_or(0, |law| TERMS + TERM * law.terms);
     let bands = sh_coefficients(degree);
-    let mut of_rest = Plane::of(Columns::SH, 3, 3 * (bands - 1));
-    of_rest.extend(Plane::own(TERMS, TERM * law.as_ref().map_or(0, |law| law.terms)));
-    of_rest.resize(3 * (coefficients - 1), Plane::Unread);
+    let mut of_rest = RowElement::of(Columns::SH, 3, 3 * (bands - 1));
+    of_rest.extend(RowElement::own(TERMS, TERM * law.as_ref().map_or(0, |law| law.terms)));
+    of_rest.resize(3 * (coefficients - 1), RowElement::Unread);
     let mut reading = Reading::new(checkpoint, count, degree, own)?;
     let mut read = |i: usize, name: &str, row: &[usize], planes| {
         let (id, place) = part(i, name);
         reading.read(id, &place, row, planes)
     };
-    read(1, "xyz", &[3], Plane::of(Columns::POSITION, 0, 3))?;
-    read(2, "features_dc", &[1, 3], Plane::of(Columns::SH, 0, 3))?;
+    read(1, "xyz", &[3], RowElement::of(Columns::POSITION, 0, 3))?;
+    read(2, "features_dc", &[1, 3], RowElement::of(Columns::SH, 0, 3))?;
     read(3, "features_rest", &[coefficients - 1, 3], of_rest)?;
-    read(4, "scaling", &[3], Plane::of(Columns::LOG_SCALE, 0, 3))?;
-    read(5, "rotation", &[4], Plane::of(Columns::ROTATION, 0, 4))?;
-    read(6, "opacity", &[1], Plane::of(Columns::OPACITY, 0, 1))?;
+    read(4, "scaling", &[3], RowElement::of(Columns::LOG_SCALE, 0, 3))?;
+    read(5, "rotation", &[4], RowElement::of(Columns::ROTATION, 0, 4))?;
+    read(6, "opacity", &[1], RowElement::of(Columns::OPACITY, 0, 1))?;
     if let Some(law) = &law {
-        read(13, "t", &[1], Plane::own(TIME, 1))?;
-        read(14, "scaling_t", &[1], Plane::own(SCALING_T, 1))?;
+        read(13, "t", &[1], RowElement::own(TIME, 1))?;
+        read(14, "scaling_t", &[1], RowElement::own(SCALING_T, 1))?;
         if law.turns {
-            read(15, "rotation_r", &[4], Plane::own(ROTATION_R, 4))?;
+            read(15, "rotation_r", &[4], RowElement::own(ROTATION_R, 4))?;
         }
     }
     of_training.into_iter().for_each(|id| reading.beside(id));
@@ -205,8 +205,8 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn Family>> {
     })
 }
 
-impl Merging for Native {
-    fn proposed(model: &Model<Native>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+impl ProxyRule for Native {
+    fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
         proxies::proposed(model, clusters, rule)
     }
 

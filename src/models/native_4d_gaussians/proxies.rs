@@ -8,9 +8,9 @@ use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
 use crate::error::Result;
 use crate::model::{Columns, Raw, scale_rotation};
-use crate::models::in_checkpoint::linear::{Line, match_all};
-use crate::models::law::Model;
-use crate::recipe::Merge;
+use crate::models::in_checkpoint::linear::{LinearPath, match_all};
+use crate::models::law::MotionModelFrames;
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
 
 /// Part of the frames' weight that holds waves near 0 where frames do not tell them from the constant.
@@ -20,19 +20,19 @@ const RIDGE: f64 = 1e-3;
 ///
 /// # Errors
 /// Frames that cannot be evaluated.
-pub(super) fn proposed(model: &Model<Native>, clusters: &[Cluster], rule: &Merge) -> Result<Raw> {
+pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], rule: &MergeParams) -> Result<Raw> {
     let (raw, law) = (model.raw(), model.law());
     let line = |id: u32| {
         let slice = law.slice(raw, id as usize);
-        Line {
+        LinearPath {
             position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
             velocity: slice.velocity,
             centre: raw.own.plane(TIME)[id as usize].into(),
             deviation: slice.variance.sqrt(),
         }
     };
-    let fades = |line: &Line, time: f64| law.marginal(time, line.centre, line.deviation.powi(2));
-    let mut fits = vec![Fit::default(); clusters.len()];
+    let fades = |line: &LinearPath, time: f64| law.marginal(time, line.centre, line.deviation.powi(2));
+    let mut fits = vec![ThreeFunctionFit::default(); clusters.len()];
     let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
         let [first, second] = law.waves(seen.time, seen.line.centre);
         let of = &seen.state.sh;
@@ -44,7 +44,7 @@ pub(super) fn proposed(model: &Model<Native>, clusters: &[Cluster], rule: &Merge
     for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
         let Some((opacity, covariance)) = matched.seen else { continue };
         let Raw { gaussians, own } = &mut proxies;
-        let Line { position, velocity, centre, deviation } = matched.line;
+        let LinearPath { position, velocity, centre, deviation } = matched.line;
         let variance = deviation.powi(2);
         gaussians.position.set_row(row, position.map(|x| x as f32));
         gaussians.opacity_logit.set_row(row, [opacity]);
@@ -78,12 +78,12 @@ pub(super) fn proposed(model: &Model<Native>, clusters: &[Cluster], rule: &Merge
 
 /// Sums of a least-squares fit of many values by the same three functions.
 #[derive(Debug, Clone, Default)]
-struct Fit {
+struct ThreeFunctionFit {
     normal: [[f64; 3]; 3],
     by_value: Vec<[f64; 3]>,
 }
 
-impl Fit {
+impl ThreeFunctionFit {
     fn add(&mut self, weight: f64, basis: [f64; 3], values: impl ExactSizeIterator<Item = f64>) {
         self.by_value.resize(values.len(), [0.0; 3]);
         for (i, row) in self.normal.iter_mut().enumerate() {
@@ -123,7 +123,7 @@ mod tests {
             let turn = std::f64::consts::TAU * (centre - 0.05 * f64::from(k));
             [1.0, turn.cos(), (2.0 * turn).cos()]
         };
-        let (mut whole, mut short) = (Fit::default(), Fit::default());
+        let (mut whole, mut short) = (ThreeFunctionFit::default(), ThreeFunctionFit::default());
         for k in 0..20 {
             let basis = wave(k, 0.3);
             let value = 0.7 - 0.4 * basis[1] + 0.2 * basis[2];

@@ -15,7 +15,7 @@ use crate::models::in_checkpoint::linear::covariance;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::{Change, Cluster, Reduction, Reference};
+use crate::reduction::{Cluster, CompressedModel, ParamDelta, Reference};
 
 const COUNT: usize = 6;
 const TIMES: [f64; 5] = [0.0, 0.3, 0.5, 1.1, 1.9];
@@ -92,7 +92,7 @@ impl Place {
         root
     }
 
-    fn written(&self, model: &dyn Family, reduction: &Reduction) -> PathBuf {
+    fn written(&self, model: &dyn InputModel, reduction: &CompressedModel) -> PathBuf {
         let result = self.path("result");
         _ = fs::remove_dir_all(&result);
         fs::create_dir(&result).unwrap();
@@ -101,16 +101,16 @@ impl Place {
     }
 }
 
-fn open_as(path: &Path, rot4d_unflipped: bool) -> Result<Box<dyn Family>> {
+fn open_as(path: &Path, rot4d_unflipped: bool) -> Result<Box<dyn InputModel>> {
     let conventions = Conventions { time_duration: Some(2.0), rot4d_unflipped };
     models::open(path, &OpenOptions { conventions, ..OpenOptions::default() })?.with_times(TIMES.to_vec())
 }
 
-fn open(path: &Path) -> Box<dyn Family> {
+fn open(path: &Path) -> Box<dyn InputModel> {
     open_as(path, false).unwrap()
 }
 
-fn states(model: &dyn Family) -> Vec<Gaussians> {
+fn states(model: &dyn InputModel) -> Vec<Gaussians> {
     (0..TIMES.len()).map(|frame| gather_all(model.source(), frame, Columns::all()).unwrap()).collect()
 }
 
@@ -120,7 +120,7 @@ fn floats(tensor: &MadeTensor, row: usize) -> Vec<f64> {
     values.map(|&bytes| f64::from(f32::from_le_bytes(bytes))).collect()
 }
 
-fn rule() -> crate::recipe::Merge {
+fn rule() -> crate::recipe::MergeParams {
     Recipe::preset("default").unwrap().merge
 }
 
@@ -216,7 +216,7 @@ fn what_is_left_keeps_its_bytes_in_every_tensor_with_rows() {
     let place = Place::new();
     let model = open(&place.put(capture(true)));
     let whole = states(&*model);
-    let result = place.written(&*model, &Reduction::pruned(vec![1, 4, 5], &rule()));
+    let result = place.written(&*model, &CompressedModel::pruned(vec![1, 4, 5], &rule()));
     let left = states(&*open(&result));
     left.iter().zip(&whole).for_each(|(left, whole)| assert_eq!(*left, whole.pick(&[1, 4, 5])));
     assert_eq!(fs::read(result.join("cfg_args")).unwrap(), fs::read(place.path("model/cfg_args")).unwrap());
@@ -249,12 +249,12 @@ fn merged_and_changed_ones_read_back_as_they_were_shown() {
     let reference = Reference { frame: 2, extent: 10.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule()).unwrap();
     assert!(proxies.refused.is_empty(), "{proxies:?}");
-    let pruned = Reduction::pruned(vec![0, 3, 4], &rule());
+    let pruned = CompressedModel::pruned(vec![0, 3, 4], &rule());
     let mut by = Gaussians::zeros(3, 0);
     by.position.set_row(2, [0.5, 0.0, -0.25]);
     by.sh.set_row(1, [0.1, 0.2, 0.0]);
     let by = Gaussians { rotation: Default::default(), log_scale: Default::default(), ..by };
-    let reduction = Reduction { clusters: vec![cluster], proxies, change: Change(by), ..pruned };
+    let reduction = CompressedModel { clusters: vec![cluster], proxies, change: ParamDelta(by), ..pruned };
     let shown = model.reduced(&reduction).unwrap();
     let result = place.written(&*model, &reduction);
     let whole = states(&*model);
@@ -285,7 +285,7 @@ fn a_static_capture_is_a_static_model() {
     assert_eq!(model.kind(), "3D Gaussian Splatting checkpoint");
     let state = gather_all(model.source(), 0, Columns::all()).unwrap();
     assert_eq!(f64::from(state.sh.plane(5)[2]), floats(&tensor(0, &[COUNT, 45], &noise(45 * COUNT, 3.0)), 2)[2]);
-    let result = place.written(&*model, &Reduction::pruned(vec![2], &rule()));
+    let result = place.written(&*model, &CompressedModel::pruned(vec![2], &rule()));
     let left = models::open(&result, &OpenOptions::default()).unwrap();
     assert_eq!(gather_all(left.source(), 0, Columns::all()).unwrap(), state.pick(&[2]));
 }

@@ -13,16 +13,16 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::deform_folder::{Arguments, Deforming, Folder, LEAST_SCALE, Parts, has_network, names_of_network};
-use super::family::Entry;
-use super::law::{Law, copy_stored};
-use crate::deform::{Encoded, Motion, Network};
+use super::family::ModelFormat;
+use super::law::{MotionModel, copy_stored};
+use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
 use crate::model::functions::{exp, ln};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, logit, opacity};
 use nodes::Nodes;
 
 /// A model folder, told from the other family of such by a key of its configuration or by its nodes.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "an SC-GS model folder",
     recognises: |found| {
         let typed = || {
@@ -57,11 +57,11 @@ struct Sparse {
     encoded: Encoded,
     masked: bool,
     /// Outputs at times (their f32 bits) that were asked for last, the oldest first.
-    kept: Mutex<VecDeque<(u32, Arc<Motion>)>>,
+    kept: Mutex<VecDeque<(u32, Arc<PredictedMotion>)>>,
 }
 
 /// What is known of a block of Gaussians for all times.
-enum Prepared {
+enum PreparedNodes {
     /// Their shares, K of each, times the mask.
     Shares(Vec<(u32, f64)>),
     Encoded(Encoded),
@@ -151,13 +151,13 @@ impl Sparse {
 
     /// What the network says of all nodes at `time`. The same for all blocks, so it is kept for a while; two threads that want
     /// a time at once find the same.
-    fn motion(&self, network: &Network, time: f64) -> Result<Arc<Motion>> {
+    fn motion(&self, network: &Network, time: f64) -> Result<Arc<PredictedMotion>> {
         let key = (time as f32).to_bits();
         let kept = || self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, found)) = kept().iter().find(|(of, _)| *of == key) {
             return Ok(Arc::clone(found));
         }
-        let mut motion = Motion::default();
+        let mut motion = PredictedMotion::default();
         network.motion(&self.encoded, time, Columns::all(), &mut motion)?;
         let motion = Arc::new(motion);
         let mut kept = kept();
@@ -190,18 +190,18 @@ fn blend(of: &Column, shares: &[(u32, f64)], each: usize) -> Column {
 
 impl Control {
     /// What the network says of the columns `want` of a block.
-    fn motion(&self, time: f64, prepared: &Prepared, want: Columns) -> Result<Motion> {
-        let (mut motion, want) = (Motion::default(), want & self.network.active());
+    fn motion(&self, time: f64, prepared: &PreparedNodes, want: Columns) -> Result<PredictedMotion> {
+        let (mut motion, want) = (PredictedMotion::default(), want & self.network.active());
         match (prepared, &self.nodes) {
             _ if want.is_empty() => (),
-            (Prepared::Encoded(encoded), _) => self.network.motion(encoded, time, want, &mut motion)?,
-            (Prepared::Shares(shares), Some(sparse)) => {
+            (PreparedNodes::Encoded(encoded), _) => self.network.motion(encoded, time, want, &mut motion)?,
+            (PreparedNodes::Shares(shares), Some(sparse)) => {
                 let (of_nodes, each) = (sparse.motion(&self.network, time)?, sparse.nodes.nearest());
                 let of = |column: Columns, of: &Column| match want.contains(column) {
                     true => blend(of, shares, each),
                     false => Column::default(),
                 };
-                motion = Motion {
+                motion = PredictedMotion {
                     warp: of(Columns::POSITION, &of_nodes.warp),
                     rotation: of(Columns::ROTATION, &of_nodes.rotation),
                     scaling: of(Columns::LOG_SCALE, &of_nodes.scaling),
@@ -209,17 +209,19 @@ impl Control {
                     colour: of(Columns::SH, &of_nodes.colour),
                 };
             }
-            (Prepared::Shares(_), None) => return Err(Error::usage("a block prepared by another law was given")),
+            (PreparedNodes::Shares(_), None) => return Err(Error::usage("a block prepared by another law was given")),
         }
         Ok(motion)
     }
 }
 
-impl Law for Control {
-    type Prepared = Prepared;
+impl MotionModel for Control {
+    type Prepared = PreparedNodes;
 
-    fn prepare(&self, raw: &Raw) -> Prepared {
-        let Some(sparse) = &self.nodes else { return Prepared::Encoded(self.network.encode(&raw.gaussians.position)) };
+    fn prepare(&self, raw: &Raw) -> PreparedNodes {
+        let Some(sparse) = &self.nodes else {
+            return PreparedNodes::Encoded(self.network.encode(&raw.gaussians.position));
+        };
         let (mut all, mut found) = (Vec::with_capacity(raw.len() * sparse.nodes.nearest()), Vec::new());
         for row in 0..raw.len() {
             found.clear();
@@ -227,7 +229,7 @@ impl Law for Control {
             let mask = sparse.mask(raw, row);
             all.extend(found.iter().map(|share| (share.node, mask * share.weight)));
         }
-        Prepared::Shares(all)
+        PreparedNodes::Shares(all)
     }
 
     fn varying(&self) -> Columns {
@@ -239,7 +241,7 @@ impl Law for Control {
     }
 
     #[inline(always)]
-    fn state(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(&self, time: f64, raw: &Raw, prepared: &PreparedNodes, want: Columns, out: &mut Gaussians) -> Result<()> {
         let motion = self.motion(time, prepared, want)?;
         copy_stored(raw, want, out);
         for column in want.iter() {
@@ -260,7 +262,7 @@ impl Law for Control {
         Ok(())
     }
 
-    fn jacobian(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedNodes, want: Columns) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         let motion = self.motion(time, prepared, want.difference(Columns::POSITION))?;
         if want.contains(Columns::POSITION) {

@@ -10,9 +10,9 @@ use super::decoder::Act;
 use super::law::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
 use crate::error::{Error, Result};
 use crate::files::ply::write::{out_rows, put, value, write_rows_like};
-use crate::files::ply::{Encoding, Plane, Ply, PlyOptions, Property};
+use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
 use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 
 /// The property that no other kind of cloud has.
 pub(super) const MARK: &str = "trbf_center";
@@ -87,8 +87,8 @@ impl Cloud {
         };
         for column in Columns::all().iter() {
             let names = self.ply.layout().planes(column).iter().map(|plane| match plane {
-                Plane::Property(property) => property.name.as_str(),
-                Plane::Thin => "scale_2",
+                PlaneSource::Property(property) => property.name.as_str(),
+                PlaneSource::Thin => "scale_2",
             });
             names.enumerate().try_for_each(|(c, name)| self.check(name, raw.gaussians.column(column).plane(c)))?;
         }
@@ -124,9 +124,9 @@ impl Cloud {
     ///
     /// # Errors
     /// A file cut short since it was opened; a failed write.
-    pub(super) fn write(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+    pub(super) fn write(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let (layout, rows) = (self.ply.layout(), out_rows(reduction));
-        let big_endian = self.ply.header().encoding == Encoding::BigEndian;
+        let big_endian = self.ply.header().encoding == PlyEncoding::BigEndian;
         let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
         let places = |column: Columns| layout.planes(column).iter().enumerate();
         let columns: Vec<Columns> = Columns::all().iter().filter(|&of| of != Columns::SH || !self.is_full()).collect();
@@ -141,7 +141,7 @@ impl Cloud {
             |place, bytes| {
                 for &column in &columns {
                     for (c, plane) in places(column) {
-                        let Plane::Property(property) = plane else { continue };
+                        let PlaneSource::Property(property) = plane else { continue };
                         let change =
                             Some(by.column(column)).filter(|by| !by.is_empty()).map_or(0.0, |by| by.plane(c)[place]);
                         let proxy = rows[place].proxy.zip(proxies);

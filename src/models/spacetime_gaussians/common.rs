@@ -2,15 +2,15 @@
 
 use crate::error::{Error, Result};
 use crate::model::{Columns, Jacobian};
-use crate::models::family::Residence;
+use crate::models::family::MemoryProfile;
 use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 
 /// What an open model of `width` planes of its own keeps in memory.
-pub(super) fn residence(width: usize) -> Residence {
+pub(super) fn residence(width: usize) -> MemoryProfile {
     let whole = state_bytes(0, Columns::all()) + 4 * width as u64;
-    Residence {
+    MemoryProfile {
         per_gaussian: whole,
         opening: whole,
         // The raw parameters again, and what is prepared of them.

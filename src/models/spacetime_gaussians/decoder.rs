@@ -49,18 +49,18 @@ impl Act {
 
 /// The network.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Decoder {
+pub(super) struct ColorDecoder {
     first: [[f64; INPUTS]; HIDDEN],
     second: [[f64; HIDDEN]; 3],
     act: Act,
 }
 
-impl Decoder {
+impl ColorDecoder {
     /// The network of the state dict `tensors`, read from `path`.
     ///
     /// # Errors
     /// Weights that are missing, of other shapes, or no finite numbers.
-    pub(super) fn new(tensors: &Tensors, act: Act, path: &Path) -> Result<Decoder> {
+    pub(super) fn new(tensors: &Tensors, act: Act, path: &Path) -> Result<ColorDecoder> {
         let weights = |name: &str, shape: [usize; 4]| {
             let place = || format!("tensor {name}");
             let expected = format!("shape {shape:?}");
@@ -85,7 +85,7 @@ impl Decoder {
         };
         let first = weights("mlp1.weight", [HIDDEN, INPUTS, 1, 1])?;
         let second = weights("mlp2.weight", [3, HIDDEN, 1, 1])?;
-        Ok(Decoder {
+        Ok(ColorDecoder {
             first: std::array::from_fn(|i| std::array::from_fn(|j| first[i * INPUTS + j].into())),
             second: std::array::from_fn(|i| std::array::from_fn(|j| second[i * HIDDEN + j].into())),
             act,
@@ -125,7 +125,7 @@ pub(crate) mod tests {
         tensors.get_mut("mlp2.weight").unwrap().data.fill(0.0);
         let features = [0.5, -1.0, 2.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0];
         let colour =
-            |act| Decoder::new(&tensors, act, Path::new("x.pt")).unwrap().colour(&features, [1.0; 3], [1.0; 3]);
+            |act| ColorDecoder::new(&tensors, act, Path::new("x.pt")).unwrap().colour(&features, [1.0; 3], [1.0; 3]);
         assert_eq!(colour(Act::None), [0.5, -1.0, 2.0]);
         assert_eq!(colour(Act::Clamp), [0.5, 0.0, 1.0]);
         let sigmoid = colour(Act::Sigmoid);
@@ -142,7 +142,7 @@ pub(crate) mod tests {
         let second = &mut tensors.get_mut("mlp2.weight").unwrap().data;
         second.fill(0.0);
         (second[0], second[1], second[6 + 1]) = (1.0, 10.0, -1.0);
-        let decoder = Decoder::new(&tensors, Act::None, Path::new("x.pt")).unwrap();
+        let decoder = ColorDecoder::new(&tensors, Act::None, Path::new("x.pt")).unwrap();
         let mut features = [0.0; 9];
         features[3] = 0.25;
         assert_eq!(decoder.colour(&features, [0.0; 3], [0.0, 0.0, 1.0]), [0.5 + 30.0, -3.0, 0.0]);
@@ -154,7 +154,7 @@ pub(crate) mod tests {
         let said = |change: &dyn Fn(&mut Tensors)| {
             let mut tensors = weights();
             change(&mut tensors);
-            Decoder::new(&tensors, Act::None, Path::new("some/point_cloud.pt")).unwrap_err().to_string()
+            ColorDecoder::new(&tensors, Act::None, Path::new("some/point_cloud.pt")).unwrap_err().to_string()
         };
         let missing = said(&|tensors| drop(tensors.remove("mlp2.weight")));
         for part in ["some/point_cloud.pt", "mlp2.weight", "[3, 6, 1, 1]", "mlp1.weight"] {

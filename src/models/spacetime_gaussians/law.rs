@@ -1,14 +1,14 @@
-//! How the state of a Gaussian follows from what a model stores of it: [`Motion`] and its window.
+//! How the state of a Gaussian follows from what a model stores of it: [`SpacetimeMotion`] and its window.
 //!
 //! [`Raw::gaussians`] has position, quaternion, log scales and opacity logit as they are stored, and the colour as harmonics of
 //! degree 0; [`Raw::own`] has the planes named here.
 
-use super::decoder::{self, Decoder};
-use super::motion::Motion;
+use super::decoder::{self, ColorDecoder};
+use super::motion::SpacetimeMotion;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
 use crate::models::law::window::{faded, odds, slope};
-use crate::models::law::{Law, Shading, copy_stored};
+use crate::models::law::{MotionModel, Shading, copy_stored};
 
 /// Plane of the centre of the window.
 pub(super) const CENTRE: usize = 0;
@@ -27,12 +27,12 @@ pub(super) const FEATURES_IN_TIME: usize = 21;
 /// Planes of [`Raw::own`] of the full model.
 pub(super) const FULL_WIDTH: usize = 24;
 
-impl Motion {
+impl SpacetimeMotion {
     /// That of Gaussian `row`.
-    pub(super) fn of(raw: &Raw, row: usize) -> Motion {
+    pub(super) fn of(raw: &Raw, row: usize) -> SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
-        Motion {
+        SpacetimeMotion {
             centre: own(CENTRE),
             log_width: own(LOG_WIDTH),
             path: [raw.gaussians.position.row::<3>(row).map(f64::from), path(0), path(1), path(2)],
@@ -61,12 +61,12 @@ pub(super) struct Spacetime {
     /// Whether colours are features that a network reads.
     pub(super) is_full: bool,
     /// That network, where it is known.
-    pub(super) decoder: Option<Decoder>,
+    pub(super) decoder: Option<ColorDecoder>,
 }
 
 /// What follows from a Gaussian once for all times.
 #[derive(Debug)]
-pub(super) struct Prepared {
+pub(super) struct PreparedGaussian {
     /// 1 / width².
     inverse_squared: Vec<f64>,
     odds: Vec<f64>,
@@ -78,11 +78,11 @@ fn exponent(dt: f64, inverse_squared: f64) -> f64 {
     -dt * dt * inverse_squared
 }
 
-impl Law for Spacetime {
-    type Prepared = Prepared;
+impl MotionModel for Spacetime {
+    type Prepared = PreparedGaussian;
 
-    fn prepare(&self, raw: &Raw) -> Prepared {
-        Prepared {
+    fn prepare(&self, raw: &Raw) -> PreparedGaussian {
+        PreparedGaussian {
             inverse_squared: raw.own.plane(LOG_WIDTH).iter().map(|&log| (-2.0 * f64::from(log)).exp()).collect(),
             odds: raw.gaussians.opacity_logit.plane(0).iter().map(|&logit| odds(logit)).collect(),
         }
@@ -98,7 +98,14 @@ impl Law for Spacetime {
     }
 
     #[inline(always)]
-    fn state(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns, out: &mut Gaussians) -> Result<()> {
+    fn state(
+        &self,
+        time: f64,
+        raw: &Raw,
+        prepared: &PreparedGaussian,
+        want: Columns,
+        out: &mut Gaussians,
+    ) -> Result<()> {
         let (stored, own, centres) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
         let since = |centre: &f32| time - f64::from(*centre);
         if want.contains(Columns::POSITION) {
@@ -131,7 +138,7 @@ impl Law for Spacetime {
         Ok(())
     }
 
-    fn jacobian(&self, time: f64, raw: &Raw, prepared: &Prepared, want: Columns) -> Result<Jacobian> {
+    fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedGaussian, want: Columns) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Columns::OPACITY) {
             let centres = raw.own.plane(CENTRE);

@@ -18,10 +18,10 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{Entry, Family, OpenOptions, Residence, Timing};
+use super::family::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::files::copy;
 use super::iterations::iteration;
-use super::law::{Model, left, solve};
+use super::law::{MotionModelFrames, left, solve};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{NO_ARCHIVE, write_sequence};
 use crate::error::{Error, Result, quoted};
@@ -34,12 +34,12 @@ use crate::files::text::read_text;
 use crate::limits::Limits;
 use crate::model::{Raw, colour};
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 use cloud::{Cloud, MARK};
 use common::{check_kind, residence};
-use decoder::{Act, Decoder};
+use decoder::{Act, ColorDecoder};
 use law::{FULL_WIDTH, Spacetime, WIDTH};
 pub(super) use splatv::SPLATV;
 
@@ -51,7 +51,7 @@ const CFG_ARGS: &str = "cfg_args";
 const CAMERAS: &str = "cameras.json";
 
 /// A model's folder, or its PLY.
-pub(super) const ENTRY: Entry = Entry {
+pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a SpacetimeGaussians model folder",
     recognises: |found| match found.is_folder {
         true => iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_marked(&folder.join(CLOUD))),
@@ -103,15 +103,15 @@ impl Files {
 
 /// What of `cfg_args` matters here.
 #[derive(Debug, Clone, Default)]
-struct Configuration {
+struct SpacetimeConfig {
     source_path: Option<String>,
     rgb_function: Option<String>,
     /// Frames from 0 to 1.
     duration: Option<usize>,
 }
 
-impl Configuration {
-    fn read(path: &Path) -> Result<Configuration> {
+impl SpacetimeConfig {
+    fn read(path: &Path) -> Result<SpacetimeConfig> {
         let text = read_text(path, 1 << 20)?;
         let arguments = parse_call(&text, "Namespace").map_err(|error| error.in_file(path, &text))?;
         let named = |name: &str| arguments.iter().rev().find(|argument| argument.name == name);
@@ -127,7 +127,7 @@ impl Configuration {
                 return Err(Error::input(path, "key duration", "a number of frames, at least 1", other.to_string()));
             }
         };
-        Ok(Configuration { source_path: text_of("source_path")?, rgb_function: text_of("rgbfunction")?, duration })
+        Ok(SpacetimeConfig { source_path: text_of("source_path")?, rgb_function: text_of("rgbfunction")?, duration })
     }
 }
 
@@ -136,8 +136,8 @@ impl Configuration {
 struct SpacetimeGaussians {
     files: Files,
     cloud: Cloud,
-    model: Model<Spacetime>,
-    configuration: Configuration,
+    model: MotionModelFrames<Spacetime>,
+    configuration: SpacetimeConfig,
     act: Act,
     notes: Vec<String>,
 }
@@ -147,7 +147,7 @@ impl SpacetimeGaussians {
         let files = Files::of(path, options)?;
         let cloud = Cloud::open(&files.cloud, &options.ply())?;
         let configuration =
-            files.of_root(CFG_ARGS).map(|path| Configuration::read(&path)).transpose()?.unwrap_or_default();
+            files.of_root(CFG_ARGS).map(|path| SpacetimeConfig::read(&path)).transpose()?.unwrap_or_default();
         let mut notes = Vec::new();
         let act = match configuration.rgb_function.as_deref() {
             _ if !cloud.is_full() => Act::None,
@@ -163,7 +163,7 @@ impl SpacetimeGaussians {
             })?,
         };
         let decoder = match (cloud.is_full(), &files.decoder) {
-            (true, Some(path)) => Some(Decoder::new(&read_state_dict(path, options.memory)?, act, path)?),
+            (true, Some(path)) => Some(ColorDecoder::new(&read_state_dict(path, options.memory)?, act, path)?),
             (true, None) if files.folder.is_some() => {
                 let path = files.cloud.with_file_name(DECODER);
                 return Err(Error::input(&path, "", "the network of a model with nine features", "no such file")
@@ -184,12 +184,12 @@ impl SpacetimeGaussians {
         }
         let raw = cloud.raw(act)?;
         notes.extend(dark(&raw));
-        let model = Model::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
+        let model = MotionModelFrames::new(Spacetime { is_full: cloud.is_full(), decoder }, raw, 0);
         Ok(SpacetimeGaussians { files, cloud, model, configuration, act, notes })
     }
 
     /// Writes the model folder of what is left.
-    fn write_folder(&self, reduction: &Reduction, path: &Path) -> Result<()> {
+    fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
         let number = self.files.folder.as_ref().map_or(0, |(_, number)| *number);
         let folder = path.join(CLOUDS).join(format!("iteration_{number}"));
         fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
@@ -211,7 +211,7 @@ fn dark(raw: &Raw) -> Option<String> {
     })
 }
 
-impl Family for SpacetimeGaussians {
+impl InputModel for SpacetimeGaussians {
     fn kind(&self) -> &'static str {
         if self.cloud.is_full() { "SpacetimeGaussians full model" } else { "SpacetimeGaussians lite model" }
     }
@@ -249,7 +249,7 @@ impl Family for SpacetimeGaussians {
         }
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         residence(if self.cloud.is_full() { FULL_WIDTH } else { WIDTH })
     }
 
@@ -261,7 +261,7 @@ impl Family for SpacetimeGaussians {
         Clock::Given
     }
 
-    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.model = self.model.with_times(times)?;
         Ok(self)
     }
@@ -296,17 +296,23 @@ impl Family for SpacetimeGaussians {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         solve(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, self.act)
         })
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(Box::new(self.model.reduced(reduction)))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         match kind {
             OutputKind::Model => self.write_folder(reduction, path)?,
             OutputKind::Ply => self.cloud.write(reduction, path)?,

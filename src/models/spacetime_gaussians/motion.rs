@@ -8,7 +8,7 @@ use crate::fit::polynomial;
 
 /// The motion of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Motion {
+pub(super) struct SpacetimeMotion {
     /// Unit of time.
     pub(super) centre: f64,
     /// Natural log of √2 × the standard deviation in time.
@@ -21,7 +21,7 @@ pub(super) struct Motion {
     pub(super) omega: [f64; 4],
 }
 
-impl Motion {
+impl SpacetimeMotion {
     /// Where it is at `time`.
     pub(super) fn position(&self, time: f64) -> [f64; 3] {
         let (dt, [p0, p1, p2, p3]) = (time - self.centre, self.path);
@@ -42,7 +42,7 @@ impl Motion {
 
     /// The same motion, of another window, told from `centre`: positions are those that they were to rounding, and so are
     /// rotations, but that `rotation` has length 1 where it has any.
-    pub(super) fn about(&self, centre: f64) -> Motion {
+    pub(super) fn about(&self, centre: f64) -> SpacetimeMotion {
         let (by, [_, p1, p2, p3]) = (centre - self.centre, self.path);
         let path = [
             self.position(centre),
@@ -55,7 +55,7 @@ impl Motion {
         let length = dot(&rotation, &rotation).sqrt();
         let length = if length.is_normal() { length } else { 1.0 };
         let [rotation, omega] = [rotation, self.omega].map(|q| q.map(|x| x / length));
-        Motion { centre, path, rotation, omega, ..*self }
+        SpacetimeMotion { centre, path, rotation, omega, ..*self }
     }
 }
 
@@ -75,15 +75,15 @@ pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
 }
 
 /// Centre and log width of the window of several, by weights and theirs: the second moments in time of their sum.
-pub(super) fn merged_window(members: &[(f64, Motion)]) -> (f64, f64) {
+pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     // Areas in time count; the longest has 1, so that none overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
-    let area = |(weight, motion): &(f64, Motion)| weight * (motion.log_width - longest).exp();
+    let area = |(weight, motion): &(f64, SpacetimeMotion)| weight * (motion.log_width - longest).exp();
     let total: f64 = members.iter().map(area).sum();
-    let share = |member: &(f64, Motion)| area(member) / total;
+    let share = |member: &(f64, SpacetimeMotion)| area(member) / total;
     let centre: f64 = members.iter().map(|member| share(member) * member.1.centre).sum();
     let unit = longest.exp();
-    let second = |(_, motion): &(f64, Motion)| {
+    let second = |(_, motion): &(f64, SpacetimeMotion)| {
         let [width, off] = [(motion.log_width - longest).exp(), (motion.centre - centre) / unit];
         width * width + 2.0 * off * off
     };
@@ -93,7 +93,7 @@ pub(super) fn merged_window(members: &[(f64, Motion)]) -> (f64, f64) {
 
 /// The weighted mean of motions that are told from one centre: at every time its state is the weighted mean of theirs,
 /// quaternions in the sign of the heaviest one's.
-pub(super) fn mean(members: &[(f64, Motion)]) -> Option<Motion> {
+pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
     let (mut path, mut rotation, mut omega) = ([[0.0; 3]; 4], [0.0; 4], [0.0; 4]);
     for (weight, member) in members {
@@ -106,12 +106,12 @@ pub(super) fn mean(members: &[(f64, Motion)]) -> Option<Motion> {
             omega[c] += sign * member.omega[c];
         }
     }
-    Some(Motion { path, rotation, omega, ..heaviest })
+    Some(SpacetimeMotion { path, rotation, omega, ..heaviest })
 }
 
 /// A state that a motion should be near to.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Wanted {
+pub(super) struct TargetState {
     pub(super) time: f64,
     pub(super) weight: f64,
     pub(super) position: [f64; 3],
@@ -123,11 +123,11 @@ pub(super) struct Wanted {
 /// anything else. A ridge holds what the times do not determine.
 ///
 /// Lengths of time are in units of the window: coefficients then weigh alike, so that one ridge serves all.
-pub(super) fn fitted(about: &Motion, wanted: &[Wanted]) -> Motion {
+pub(super) fn fitted(about: &SpacetimeMotion, wanted: &[TargetState]) -> SpacetimeMotion {
     let unit = about.log_width.exp().clamp(1e-6, 1e6);
     let ridge = if wanted.len() < 4 { 1e-3 } else { 1e-6 };
     // What is still missing of each: nothing moves where `about` is right already.
-    let missing = |of: &Wanted| {
+    let missing = |of: &TargetState| {
         let [x, at] = [of.position, about.position(of.time)];
         let [q, turned] = [of.rotation, about.rotation(of.time)];
         (
@@ -156,10 +156,10 @@ mod tests {
 
     use super::*;
 
-    fn motion() -> impl Strategy<Value = Motion> {
+    fn motion() -> impl Strategy<Value = SpacetimeMotion> {
         let values = |most: f64, count: usize| prop::collection::vec(-most..most, count);
         (-0.5..1.5f64, -3.0..2.0f64, values(3.0, 12), values(1.0, 8)).prop_map(|(centre, log_width, path, turn)| {
-            Motion {
+            SpacetimeMotion {
                 centre,
                 log_width,
                 path: std::array::from_fn(|k| std::array::from_fn(|c| path[3 * k + c])),
@@ -202,7 +202,7 @@ mod tests {
         ) {
             let total: f64 = some.iter().map(|member| member.0).sum();
             let centre = merged_window(&some).0;
-            let mut about: Vec<(f64, Motion)> =
+            let mut about: Vec<(f64, SpacetimeMotion)> =
                 some.iter().map(|(weight, motion)| (weight / total, motion.about(centre))).collect();
             let expected = mean(&about).unwrap();
             // The same turns under the other sign.
@@ -245,15 +245,15 @@ mod tests {
 
         #[test]
         fn a_path_is_fitted_to_states_that_follow_one(about in motion(), motion in motion()) {
-            let about = Motion { log_width: 0.0, ..about };
-            let motion = Motion { log_width: 0.0, ..motion.about(about.centre) };
+            let about = SpacetimeMotion { log_width: 0.0, ..about };
+            let motion = SpacetimeMotion { log_width: 0.0, ..motion.about(about.centre) };
             let times = (0..20).map(|k| f64::from(k) / 20.0);
             let state = |time| {
-                Wanted { time, weight: 1.0 + time, position: motion.position(time), rotation: motion.rotation(time) }
+                TargetState { time, weight: 1.0 + time, position: motion.position(time), rotation: motion.rotation(time) }
             };
-            let wanted: Vec<Wanted> = times.map(state).collect();
+            let wanted: Vec<TargetState> = times.map(state).collect();
             let found = fitted(&about, &wanted);
-            for Wanted { time, position, rotation, .. } in wanted {
+            for TargetState { time, position, rotation, .. } in wanted {
                 // The ridge takes a millionth, of powers that are hard to tell from one another here.
                 prop_assert!(furthest(found.position(time), position) < 0.05, "{:?} {:?}", found.position(time), position);
                 prop_assert!(furthest(found.rotation(time), rotation) < 1e-4);

@@ -10,13 +10,13 @@ use rayon::prelude::*;
 
 use super::decoder::Act;
 use super::law::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
-use super::motion::{Motion, Wanted, dot, fitted, mean, merged_window, product};
+use super::motion::{SpacetimeMotion, TargetState, dot, fitted, mean, merged_window, product};
 use crate::error::Result;
-use crate::merging::moments::{Part, align_axes, moments};
+use crate::merging::moments::{WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::merge_state;
 use crate::model::{Columns, Gaussians, Raw, harmonic, opacity};
-use crate::models::law::{Law, Model};
-use crate::recipe::Merge;
+use crate::models::law::{MotionModel, MotionModelFrames};
+use crate::recipe::MergeParams;
 use crate::reduction::Cluster;
 use crate::source::FrameSource;
 
@@ -33,7 +33,12 @@ const OPACITY_MARGIN: f64 = 1e-6;
 ///
 /// # Errors
 /// States that cannot be evaluated.
-pub(super) fn propose(model: &Model<Spacetime>, clusters: &[Cluster], rule: &Merge, act: Act) -> Result<Raw> {
+pub(super) fn propose(
+    model: &MotionModelFrames<Spacetime>,
+    clusters: &[Cluster],
+    rule: &MergeParams,
+    act: Act,
+) -> Result<Raw> {
     let leaders: Vec<u32> = clusters.iter().map(|cluster| cluster.leader).collect();
     let mut raw = model.raw().pick(&leaders);
     let made: Vec<Raw> = clusters.par_iter().map(|cluster| proxy(model, cluster, rule, act)).collect::<Result<_>>()?;
@@ -42,25 +47,25 @@ pub(super) fn propose(model: &Model<Spacetime>, clusters: &[Cluster], rule: &Mer
 }
 
 /// The members of a cluster, with all that is asked of them again and again.
-struct Members<'a> {
-    model: &'a Model<Spacetime>,
+struct ClusterMembers<'a> {
+    model: &'a MotionModelFrames<Spacetime>,
     raw: Raw,
-    prepared: <Spacetime as Law>::Prepared,
+    prepared: <Spacetime as MotionModel>::Prepared,
     /// Weights, and motions as they are.
-    motions: Vec<(f64, Motion)>,
+    motions: Vec<(f64, SpacetimeMotion)>,
     /// Rows and weights.
     rows: Vec<(u32, f64)>,
     leader: u32,
 }
 
-impl Members<'_> {
-    fn of<'a>(model: &'a Model<Spacetime>, cluster: &Cluster) -> Members<'a> {
+impl ClusterMembers<'_> {
+    fn of<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
         let rows: Vec<(u32, f64)> = (0..).zip(&cluster.members).map(|(row, &(_, weight))| (row, weight)).collect();
-        let motions = rows.iter().map(|&(row, weight)| (weight, Motion::of(&raw, row as usize))).collect();
+        let motions = rows.iter().map(|&(row, weight)| (weight, SpacetimeMotion::of(&raw, row as usize))).collect();
         let leader = ids.iter().position(|&id| id == cluster.leader).unwrap_or(0) as u32;
-        Members { prepared: model.law().prepare(&raw), model, raw, motions, rows, leader }
+        ClusterMembers { prepared: model.law().prepare(&raw), model, raw, motions, rows, leader }
     }
 
     fn state(&self, time: f64) -> Result<Gaussians> {
@@ -70,7 +75,7 @@ impl Members<'_> {
     }
 
     /// Times of frames at which `of` is open, evenly spread if they are many; its centre where there are none.
-    fn times(&self, of: &Motion) -> Vec<f64> {
+    fn times(&self, of: &SpacetimeMotion) -> Vec<f64> {
         let times = &self.model.info().times;
         let open: Vec<f64> = times.iter().copied().filter(|&time| of.window(time) >= OPEN).collect();
         let count = open.len().min(SAMPLED_TIMES);
@@ -82,14 +87,14 @@ impl Members<'_> {
     }
 }
 
-fn proxy(model: &Model<Spacetime>, cluster: &Cluster, rule: &Merge, act: Act) -> Result<Raw> {
-    let members = Members::of(model, cluster);
+fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergeParams, act: Act) -> Result<Raw> {
+    let members = ClusterMembers::of(model, cluster);
     let (centre, log_width) = merged_window(&members.motions);
-    let about: Vec<(f64, Motion)> =
+    let about: Vec<(f64, SpacetimeMotion)> =
         members.motions.iter().map(|(weight, motion)| (*weight, motion.about(centre))).collect();
     let mut out = members.raw.pick(&[members.leader]);
     let Some(mean) = mean(&about) else { return Ok(out) };
-    let mut motion = Motion { centre, log_width, ..mean };
+    let mut motion = SpacetimeMotion { centre, log_width, ..mean };
     if differ(&members.motions, &motion) {
         motion = fitted(&motion, &wanted(&members, &about, &motion));
     }
@@ -117,13 +122,13 @@ fn proxy(model: &Model<Spacetime>, cluster: &Cluster, rule: &Merge, act: Act) ->
 }
 
 /// Weighted mean; alike values stay as they are.
-fn average(members: &Members<'_>, plane: &[f32]) -> f64 {
+fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
     let base = f64::from(plane[members.leader as usize]);
     base + members.rows.iter().map(|&(row, weight)| weight * (f64::from(plane[row as usize]) - base)).sum::<f64>()
 }
 
 /// Whether windows differ so much that who is there changes with time.
-fn differ(members: &[(f64, Motion)], proxy: &Motion) -> bool {
+fn differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
         let wider = (member.log_width - proxy.log_width).abs() > MOST_WIDER.ln();
         wider || (member.centre - proxy.centre).abs() > 0.5 * proxy.log_width.exp()
@@ -131,7 +136,7 @@ fn differ(members: &[(f64, Motion)], proxy: &Motion) -> bool {
 }
 
 /// States that a motion should be near to, quaternions in the sign of the mean's; weights change as the members' windows do.
-fn wanted(members: &Members<'_>, about: &[(f64, Motion)], mean: &Motion) -> Vec<Wanted> {
+fn wanted(members: &ClusterMembers<'_>, about: &[(f64, SpacetimeMotion)], mean: &SpacetimeMotion) -> Vec<TargetState> {
     let of_time = |&time: &f64| {
         let (mut total, mut position, mut rotation) = (0.0, [0.0; 3], [0.0; 4]);
         let near = mean.rotation(time);
@@ -143,7 +148,7 @@ fn wanted(members: &Members<'_>, about: &[(f64, Motion)], mean: &Motion) -> Vec<
             (0..3).for_each(|c| position[c] += weight * x[c]);
             (0..4).for_each(|c| rotation[c] += sign * q[c]);
         }
-        (total > 0.0).then(|| Wanted {
+        (total > 0.0).then(|| TargetState {
             time,
             weight: total,
             position: position.map(|x| x / total),
@@ -154,7 +159,7 @@ fn wanted(members: &Members<'_>, about: &[(f64, Motion)], mean: &Motion) -> Vec<
 }
 
 /// Natural logs of the proxy's scales, and its axes turned to go with them.
-fn shape(members: &Members<'_>, states: &[Gaussians], times: &[f64], motion: &mut Motion) -> [f64; 3] {
+fn shape(members: &ClusterMembers<'_>, states: &[Gaussians], times: &[f64], motion: &mut SpacetimeMotion) -> [f64; 3] {
     let mut parts = Vec::with_capacity(members.rows.len() * times.len());
     for (state, &time) in states.iter().zip(times) {
         let (middle, axes) = (DVec3::from(motion.position(time)), quaternion(motion.rotation(time)));
@@ -163,7 +168,7 @@ fn shape(members: &Members<'_>, states: &[Gaussians], times: &[f64], motion: &mu
             let at = row as usize;
             let position = DVec3::from(state.position.row::<3>(at).map(f64::from));
             let own = quaternion(state.rotation.row::<4>(at).map(f64::from));
-            parts.push(Part {
+            parts.push(WeightedGaussian {
                 weight: weight * open,
                 position: axes.inverse() * (position - middle),
                 rotation: (axes.inverse() * own).normalize(),
@@ -187,7 +192,13 @@ fn quaternion([w, x, y, z]: [f64; 4]) -> DQuat {
 }
 
 /// The logit of what the window is multiplied by.
-fn amplitude(members: &Members<'_>, states: &[Gaussians], times: &[f64], motion: &Motion, rule: &Merge) -> f64 {
+fn amplitude(
+    members: &ClusterMembers<'_>,
+    states: &[Gaussians],
+    times: &[f64],
+    motion: &SpacetimeMotion,
+    rule: &MergeParams,
+) -> f64 {
     let (mut of, mut by) = (0.0, 0.0);
     for (state, &time) in states.iter().zip(times) {
         let merged = merge_state(&members.rows, state, members.leader, rule, Columns::OPACITY);

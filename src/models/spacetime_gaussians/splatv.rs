@@ -17,17 +17,17 @@ use crate::files::cameras::Clock;
 use crate::files::digest::hash_file;
 use crate::files::json::read_json;
 use crate::files::splatv::write::{measure, seen_whole, words, write as write_file};
-use crate::files::splatv::{MAGIC, Row, Splatv};
+use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::{Limits, ReadLimit};
 use crate::model::{Column, Columns, Gaussians, Raw, colour, harmonic, logit, opacity};
-use crate::models::family::{Entry, Family, Residence, Timing};
+use crate::models::family::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::models::law::window::MOST;
-use crate::models::law::{Model, left, solve};
+use crate::models::law::{MotionModelFrames, left, solve};
 use crate::models::size::{Size, bytes_below, bytes_of};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
-use crate::recipe::Merge;
-use crate::reduction::{Cluster, Proxies, Reduction, Reference};
+use crate::recipe::MergeParams;
+use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// Maximum number of bytes of a list of cameras that a result gets: some seven thousand cameras.
@@ -36,31 +36,31 @@ const MAX_LISTED: u64 = 4 << 20;
 const LEAST_LENGTH: f64 = 1e-7;
 
 /// A `.splatv`.
-pub(in super::super) const SPLATV: Entry = Entry {
+pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     expected: "a .splatv",
     recognises: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
         options.refuse_for(path)?;
-        Ok(Box::new(File::open(path, options.memory)?))
+        Ok(Box::new(SplatvModel::open(path, options.memory)?))
     },
 };
 
 /// An open file.
 #[derive(Debug)]
-struct File {
+struct SplatvModel {
     file: Splatv,
-    model: Model<Spacetime>,
+    model: MotionModelFrames<Spacetime>,
 }
 
-impl File {
-    fn open(path: &Path, memory: ReadLimit) -> Result<File> {
+impl SplatvModel {
+    fn open(path: &Path, memory: ReadLimit) -> Result<SplatvModel> {
         let file = Splatv::open(path)?;
         let count = file.count();
         let values = (Columns::all().width(0) + WIDTH) as u64;
         memory.check(path, "its texture", "the Gaussians of the file", 4 * values * count as u64)?;
         let mut raw = Raw { gaussians: Gaussians::zeros(count, 0), own: Column::zeros(WIDTH, count) };
         for i in 0..count {
-            let row = Row::of_words(&file.words(i));
+            let row = SplatvGaussian::of_words(&file.words(i));
             let numbers =
                 [&row.position[..], &row.motion, &row.rotation, &row.omega, &row.scale, &[row.centre, row.width]];
             if let Some(x) = numbers.concat().iter().find(|x| !x.is_finite()) {
@@ -68,12 +68,12 @@ impl File {
             }
             set(&mut raw, i, &row);
         }
-        Ok(File { file, model: Model::new(Spacetime { is_full: false, decoder: None }, raw, 0) })
+        Ok(SplatvModel { file, model: MotionModelFrames::new(Spacetime { is_full: false, decoder: None }, raw, 0) })
     }
 }
 
 /// Makes Gaussian `i` what `row` is.
-fn set(raw: &mut Raw, i: usize, row: &Row) {
+fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
     let log = |length: f32| f64::from(length).max(LEAST_LENGTH).ln() as f32;
     raw.gaussians.position.set_row(i, row.position);
     raw.gaussians.rotation.set_row(i, row.rotation);
@@ -88,9 +88,9 @@ fn set(raw: &mut Raw, i: usize, row: &Row) {
 }
 
 /// What Gaussian `i` is as a row.
-fn row(raw: &Raw, i: usize) -> Row {
+fn row(raw: &Raw, i: usize) -> SplatvGaussian {
     let own = |plane: usize| raw.own.plane(plane)[i];
-    Row {
+    SplatvGaussian {
         position: raw.gaussians.position.row(i),
         motion: std::array::from_fn(|k| own(MOTION + k)),
         rotation: raw.gaussians.rotation.row(i),
@@ -118,7 +118,7 @@ pub(super) fn write(
     let cameras = listed.unwrap_or_else(|| seen_whole(&raw.gaussians.position));
     let row_of = |i: usize| {
         let row = row(raw, i);
-        Row { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
+        SplatvGaussian { rgb: known(i).map_or(row.rgb, |rgb| rgb.map(f64::from)), ..row }
     };
     let mut accuracy = Accuracy::new(&raw.gaussians.position);
     (0..raw.len()).for_each(|i| measure(&row_of(i), i, &mut accuracy));
@@ -126,7 +126,7 @@ pub(super) fn write(
     write_file(path, raw.len(), (0..raw.len()).map(|i| words(&row_of(i))), &cameras)
 }
 
-impl Family for File {
+impl InputModel for SplatvModel {
     fn kind(&self) -> &'static str {
         "splaTV model"
     }
@@ -156,7 +156,7 @@ impl Family for File {
         }
     }
 
-    fn residence(&self) -> Residence {
+    fn residence(&self) -> MemoryProfile {
         residence(WIDTH)
     }
 
@@ -168,7 +168,7 @@ impl Family for File {
         Clock::Given
     }
 
-    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn Family>> {
+    fn with_times(mut self: Box<Self>, times: Vec<f64>) -> Result<Box<dyn InputModel>> {
         self.model = self.model.with_times(times)?;
         Ok(self)
     }
@@ -190,17 +190,23 @@ impl Family for File {
         }
     }
 
-    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &Merge) -> Result<Proxies> {
+    fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
         solve(&self.model, clusters, reference, rule, |clusters| {
             proxies::propose(&self.model, clusters, rule, Act::None)
         })
     }
 
-    fn reduced<'a>(&'a self, reduction: &'a Reduction) -> Result<Box<dyn FrameSource + 'a>> {
+    fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {
         Ok(Box::new(self.model.reduced(reduction)))
     }
 
-    fn write(&self, reduction: &Reduction, kind: OutputKind, path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    fn write(
+        &self,
+        reduction: &CompressedModel,
+        kind: OutputKind,
+        path: &Path,
+        limits: &Limits,
+    ) -> Result<Vec<String>> {
         if kind != OutputKind::Splatv {
             return write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held);
         }

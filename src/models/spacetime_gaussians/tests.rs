@@ -1,13 +1,13 @@
 use super::*;
 use crate::deform::Tensors;
-use crate::files::splatv::{Row, Splatv};
-use crate::files::state_dict::{Stored, Values, write_state_dict};
+use crate::files::splatv::{Splatv, SplatvGaussian};
+use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
 use crate::model::{Column, Columns, Gaussians};
 use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::Change;
+use crate::reduction::ParamDelta;
 
 const COUNT: usize = 7;
 
@@ -51,8 +51,9 @@ fn ply(names: &[String], count: usize, value: impl Fn(&str, usize) -> f32) -> Ve
 }
 
 fn write_decoder(path: &Path, tensors: &Tensors) {
-    let stored =
-        tensors.iter().map(|(name, of)| Stored::dense(name.clone(), of.shape.clone(), Values::F32(of.data.clone())));
+    let stored = tensors
+        .iter()
+        .map(|(name, of)| StoredTensor::dense(name.clone(), of.shape.clone(), TensorValues::F32(of.data.clone())));
     write_state_dict(path, &stored.collect::<Vec<_>>()).unwrap();
 }
 
@@ -76,13 +77,13 @@ fn folder(is_full: bool) -> tempfile::TempDir {
     root
 }
 
-fn open(path: &Path) -> Result<Box<dyn Family>> {
+fn open(path: &Path) -> Result<Box<dyn InputModel>> {
     models::open(path, &OpenOptions::default())
 }
 
 const TIMES: [f64; 4] = [0.0, 0.25, 0.5, 0.9];
 
-fn opened(path: &Path) -> Box<dyn Family> {
+fn opened(path: &Path) -> Box<dyn InputModel> {
     open(path).unwrap().with_times(TIMES.to_vec()).unwrap()
 }
 
@@ -201,7 +202,7 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
         let model = opened(root.path());
         let rule = Recipe::preset("default").unwrap().merge;
         let result = tempfile::tempdir().unwrap();
-        let reduction = Reduction::pruned(vec![1, 4, 5], &rule);
+        let reduction = CompressedModel::pruned(vec![1, 4, 5], &rule);
         model.write(&reduction, OutputKind::Model, result.path(), &Limits::NONE).unwrap();
         let kept = |name: &str, i: usize| value(name, [1, 4, 5][i]);
         let iteration = result.path().join("point_cloud/iteration_300");
@@ -229,8 +230,8 @@ fn what_stays_of_a_folder_keeps_its_bytes() {
 }
 
 /// Three left, one of them a proxy, two of them changed.
-fn reduction(model: &dyn Family) -> Reduction {
-    let rule = Merge { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
+fn reduction(model: &dyn InputModel) -> CompressedModel {
+    let rule = MergeParams { max_drift: 1e6, ..Recipe::preset("default").unwrap().merge };
     let cluster = Cluster { output: 1, leader: 3, members: vec![(2, 0.25), (3, 0.75)] };
     let reference = Reference { frame: 0, extent: 1.0 };
     let proxies = model.solve(std::slice::from_ref(&cluster), reference, &rule).unwrap();
@@ -244,7 +245,12 @@ fn reduction(model: &dyn Family) -> Reduction {
         true => by.sh.set_row(2, [0.1, 0.2, 0.0]),
         false => by.sh = Column::default(),
     }
-    Reduction { clusters: vec![cluster], proxies, change: Change(by), ..Reduction::pruned(vec![0, 3, 6], &rule) }
+    CompressedModel {
+        clusters: vec![cluster],
+        proxies,
+        change: ParamDelta(by),
+        ..CompressedModel::pruned(vec![0, 3, 6], &rule)
+    }
 }
 
 #[test]
@@ -281,13 +287,14 @@ fn a_proxy_of_equals_is_their_mean_at_every_frame_and_of_copies_the_same_one() {
     };
     fs::write(path, ply(&properties(false), COUNT, alike)).unwrap();
     let model = opened(root.path());
-    let rule = Merge { max_drift: 1e-3, ..Recipe::preset("default").unwrap().merge };
+    let rule = MergeParams { max_drift: 1e-3, ..Recipe::preset("default").unwrap().merge };
     let clusters = [
         Cluster { output: 0, leader: 0, members: vec![(0, 0.5), (1, 0.5)] },
         Cluster { output: 1, leader: 2, members: vec![(2, 0.3), (3, 0.7)] },
     ];
     let proxies = model.solve(&clusters, Reference { frame: 0, extent: 1.0 }, &rule).unwrap();
-    let reduction = Reduction { clusters: clusters.to_vec(), proxies, ..Reduction::pruned(vec![0, 2], &rule) };
+    let reduction =
+        CompressedModel { clusters: clusters.to_vec(), proxies, ..CompressedModel::pruned(vec![0, 2], &rule) };
     let found = states(&*model.reduced(&reduction).unwrap());
     for (found, all) in found.iter().zip(states(model.source())) {
         for c in 0..3 {
@@ -314,7 +321,7 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
     let root = folder(false);
     let model = opened(root.path());
     let rule = Recipe::preset("default").unwrap().merge;
-    let all = Reduction::pruned((0..COUNT as u32).collect(), &rule);
+    let all = CompressedModel::pruned((0..COUNT as u32).collect(), &rule);
     let path = root.path().join("all.splatv");
     model.write(&all, OutputKind::Splatv, &path, &Limits::NONE).unwrap();
     let read = opened(&path);
@@ -334,18 +341,18 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
     let file = Splatv::open(&path).unwrap();
     assert_eq!(file.cameras()[0]["id"], 4);
     let kept = root.path().join("kept.splatv");
-    read.write(&Reduction::pruned(vec![2, 5], &rule), OutputKind::Splatv, &kept, &Limits::NONE).unwrap();
+    read.write(&CompressedModel::pruned(vec![2, 5], &rule), OutputKind::Splatv, &kept, &Limits::NONE).unwrap();
     let small = Splatv::open(&kept).unwrap();
     assert_eq!((small.count(), small.words(0), small.words(1)), (2, file.words(2), file.words(5)));
     assert_eq!(small.cameras(), file.cameras());
     let mut by = Gaussians { position: Column::zeros(3, 2), ..Gaussians::default() };
     by.position.set_row(1, [1.0, 0.0, 0.0]);
-    let moved = Reduction { change: Change(by), ..Reduction::pruned(vec![2, 5], &rule) };
+    let moved = CompressedModel { change: ParamDelta(by), ..CompressedModel::pruned(vec![2, 5], &rule) };
     read.write(&moved, OutputKind::Splatv, &kept, &Limits::NONE).unwrap();
     let moved = Splatv::open(&kept).unwrap();
     assert_eq!(moved.words(0), file.words(2));
-    let (to, from) = (Row::of_words(&moved.words(1)), Row::of_words(&file.words(5)));
-    assert_eq!(to, Row { position: [from.position[0] + 1.0, from.position[1], from.position[2]], ..from });
+    let (to, from) = (SplatvGaussian::of_words(&moved.words(1)), SplatvGaussian::of_words(&file.words(5)));
+    assert_eq!(to, SplatvGaussian { position: [from.position[0] + 1.0, from.position[1], from.position[2]], ..from });
     // Without cameras of its own there is one that a viewer can start at.
     fs::remove_file(root.path().join(CAMERAS)).unwrap();
     opened(root.path()).write(&all, OutputKind::Splatv, &kept, &Limits::NONE).unwrap();

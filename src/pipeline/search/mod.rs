@@ -10,22 +10,22 @@ pub(crate) mod size;
 
 use super::request::Quality;
 use super::summary::GoalSummary;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, Part, RENDER, Workload};
-use crate::cache::Key;
+use crate::budget::{MemoryPart, PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
+use crate::cache::CacheKey;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::Limits;
 use crate::model::{Columns, Picture};
-use crate::pipeline::search::quality_meter::{Gauge, With};
-use crate::pipeline::stages::bands::Bands;
+use crate::pipeline::search::quality_meter::{QualityMeter, With};
+use crate::pipeline::stages::bands::ShDegreeStage;
 use crate::pipeline::stages::choose::CLUSTERED;
-use crate::pipeline::stages::field::Field;
+use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored};
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::refinement::targets::Targets;
-use crate::refinement::{CUT, Refine, Walk};
+use crate::refinement::{CUT, RefineRun, RefineStage};
 use crate::render;
 use crate::scene::Scene;
 use crate::scene::photographs::Photographs;
@@ -54,44 +54,44 @@ const HELD_EVERY: usize = 4;
 
 /// The search of a run.
 #[derive(Debug, Clone)]
-pub struct Search {
+pub struct SearchStage {
     /// What is asked for.
     pub quality: Quality,
     /// Pictures of the original that sizes are compared and refined by.
     pub pictures: usize,
     /// How a size is refined.
-    pub refine: Option<Refine>,
+    pub refine: Option<RefineStage>,
     /// How its field is rounded.
-    pub field: Option<Field>,
+    pub field: Option<FieldPrecisionStage>,
     /// How bands of its harmonics are dropped.
-    pub bands: Option<Bands>,
+    pub bands: Option<ShDegreeStage>,
 }
 
 /// A size that was tried.
-struct Tried {
-    reduction: Reduction,
+struct TriedSize {
+    reduction: CompressedModel,
     /// dB or dB lost, by the pictures that are searched on.
     value: f64,
     journal: Journal,
 }
 
-impl Search {
+impl SearchStage {
     /// How many of `all` Gaussians rounds are to rank down to.
     pub fn fewest(&self, all: usize) -> usize {
         self.refine.as_ref().map_or((FEWEST * all as f64).ceil() as usize, |refine| refine.first(0, all))
     }
 
     /// What refining needs, what is kept of the way down, and of the best.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let (reader, held) = (work.input.reader, work.held(limits, Columns::all()));
         // Cuts of a fifth from two fifths: twice the Gaussians.
-        let ways: Vec<Part> = vec![("ways", 3 * (whole + 8)), ("result", work.input.reduced)];
+        let ways: Vec<MemoryPart> = vec![("ways", 3 * (whole + 8)), ("result", work.input.reduced)];
         let refined = self.refine.as_ref().map(|refine| refine.need(work, limits));
         let frames = work.frames.min(128);
         // A picture, what it is compared with as it is read, and as it is used.
         let compared = work.threads * (render::STRIP_BYTES as u64 + 28 * work.pixels);
-        let looked = Need {
+        let looked = ResourceEstimate {
             stage: NAME,
             reads: work.scattered_reads(frames, limits),
             seconds: work.reading(work.count(), frames as f64)
@@ -122,9 +122,9 @@ impl Search {
         scene: &Scene,
         scored: &Scored,
         ranked: &Ranking,
-        like: &Reduction,
+        like: &CompressedModel,
         journal: &mut Journal,
-    ) -> Result<(Reduction, GoalSummary)> {
+    ) -> Result<(CompressedModel, GoalSummary)> {
         let all = ranked.order().len();
         let key = self.key(scene, scored, ranked, like)?;
         let found = journal.kept_stage(NAME, all, scene, key, |journal| {
@@ -135,18 +135,18 @@ impl Search {
                 Some((of, photographs)) => {
                     journal.notes.push(format!("{} held-out pictures have photographs", of.len()));
                     let of = of.into_iter().enumerate().map(|(k, of)| (of, k % HELD_EVERY == HELD_EVERY - 1));
-                    Gauge::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))?
+                    QualityMeter::new(scene, &scene.rig.cameras, of.collect(), With::Photographs(photographs))?
                 }
                 None => {
                     let mut numbers = [&parts.apart[..], &parts.held[..]].concat();
                     numbers.sort_unstable();
                     let of = |&k: &usize| (targets.pictures[k], parts.held.contains(&k));
                     let of = numbers.iter().map(of).collect();
-                    Gauge::new(scene, &targets.cameras, of, With::Original(&targets, numbers))?
+                    QualityMeter::new(scene, &targets.cameras, of, With::Original(&targets, numbers))?
                 }
             };
-            let walk = self.refine.as_ref().map(|refine| Walk::new(NAME, refine, scene, scored, &targets, parts));
-            let mut way = Way { search: self, scene, scored, ranked, like, gauge: &gauge, walk, cuts: Vec::new() };
+            let walk = self.refine.as_ref().map(|refine| RefineRun::new(NAME, refine, scene, scored, &targets, parts));
+            let mut way = SearchState { search: self, scene, scored, ranked, like, gauge: &gauge, walk, cuts: Vec::new() };
             let (best, tried) = self.bracket(&mut way, scored.protected.len().max(1), all)?;
             if best.value.is_nan() {
                 return Err(Error::usage(format!(
@@ -171,7 +171,7 @@ impl Search {
     }
 
     /// What the search follows from.
-    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &Reduction) -> Result<Key> {
+    fn key(&self, scene: &Scene, scored: &Scored, ranked: &Ranking, like: &CompressedModel) -> Result<CacheKey> {
         let (asked, folder) = match &self.quality {
             Quality::Psnr(least) => (*least, None),
             Quality::Loss { most, photographs } => (*most, Some(photographs)),
@@ -181,7 +181,7 @@ impl Search {
             stamps(folder, &mut files)?;
         }
         let (field, bands) = (self.field.as_ref().map(|of| of.margin), self.bands.as_ref().map(|of| of.margin));
-        let refine = self.refine.as_ref().map(Refine::key);
+        let refine = self.refine.as_ref().map(RefineStage::key);
         Ok(scene.work.key(&((asked, files, self.pictures, field, bands, refine), &scored.protected, ranked, like)))
     }
 
@@ -209,9 +209,9 @@ impl Search {
     }
 
     /// Tries sizes from `least` to `all`; the smallest that does, or everything, and every size tried with what it has.
-    fn bracket(&self, way: &mut Way<'_>, least: usize, all: usize) -> Result<(Tried, Vec<(usize, f64)>)> {
+    fn bracket(&self, way: &mut SearchState<'_>, least: usize, all: usize) -> Result<(TriedSize, Vec<(usize, f64)>)> {
         let mut tried: Vec<(usize, f64)> = Vec::new();
-        let mut best: Option<Tried> = None;
+        let mut best: Option<TriedSize> = None;
         // Sizes, and halvings that each has to spare: below what does not do, above what does.
         let (mut low, mut high) = ((least.saturating_sub(1), None), (all, None));
         let mut next = FIRST * all as f64;
@@ -249,7 +249,7 @@ impl Search {
     }
 
     /// What the goal is about, dB or dB lost, of `result`, by the pictures that are searched on or by those held back.
-    fn value(&self, gauge: &Gauge<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
+    fn value(&self, gauge: &QualityMeter<'_>, result: &dyn FrameSource, scene: &Scene, held: bool) -> Result<f64> {
         let found = gauge.measure(result, held)?;
         match self.quality {
             Quality::Loss { .. } => Ok(gauge.measure(scene.source(), held)? - found),
@@ -275,7 +275,13 @@ impl Search {
         }
     }
 
-    fn summary(&self, best: &Tried, held: f64, held_pictures: Vec<String>, tried: Vec<(usize, f64)>) -> GoalSummary {
+    fn summary(
+        &self,
+        best: &TriedSize,
+        held: f64,
+        held_pictures: Vec<String>,
+        tried: Vec<(usize, f64)>,
+    ) -> GoalSummary {
         let asked = match self.quality {
             Quality::Psnr(least) => least,
             Quality::Loss { most, .. } => most,
@@ -306,21 +312,21 @@ fn note(summary: &GoalSummary, searched: usize, gaussians: usize, does: bool) ->
 }
 
 /// The way down, as far as it was gone.
-struct Way<'a> {
-    search: &'a Search,
+struct SearchState<'a> {
+    search: &'a SearchStage,
     scene: &'a Scene,
     scored: &'a Scored,
     ranked: &'a Ranking,
-    like: &'a Reduction,
-    gauge: &'a Gauge<'a>,
-    walk: Option<Walk<'a>>,
+    like: &'a CompressedModel,
+    gauge: &'a QualityMeter<'a>,
+    walk: Option<RefineRun<'a>>,
     /// What cuts left, larger ones first.
-    cuts: Vec<Reduction>,
+    cuts: Vec<CompressedModel>,
 }
 
-impl Way<'_> {
+impl SearchState<'_> {
     /// The best of `size` Gaussians.
-    fn at(&mut self, size: usize) -> Result<Tried> {
+    fn at(&mut self, size: usize) -> Result<TriedSize> {
         let mut journal = Journal::default();
         let all = self.ranked.order().len();
         let prefix = |size: usize| self.like.with(self.ranked.take(size));
@@ -349,7 +355,7 @@ impl Way<'_> {
         let result = self.scene.input.reduced(&reduction)?;
         let value = self.search.value(self.gauge, &*result, self.scene, false)?;
         drop(result);
-        Ok(Tried { reduction, value, journal })
+        Ok(TriedSize { reduction, value, journal })
     }
 }
 

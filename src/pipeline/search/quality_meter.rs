@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::error::{Error, Result};
 use crate::metrics::{decibels, psnr};
 use crate::model::{Camera, Picture};
-use crate::passes::{Batch, Subject, View, show};
+use crate::passes::{Batch, Subject, ViewStates, show};
 use crate::refinement::targets::{Targets, mean_square};
 use crate::render::render;
 use crate::scene::Scene;
@@ -21,7 +21,7 @@ pub(super) enum With<'a> {
 }
 
 /// Pictures that models are measured on.
-pub(super) struct Gauge<'a> {
+pub(super) struct QualityMeter<'a> {
     scene: &'a Scene,
     cameras: &'a [Camera],
     /// By frame, and whether each is held back.
@@ -29,7 +29,7 @@ pub(super) struct Gauge<'a> {
     with: With<'a>,
 }
 
-impl<'a> Gauge<'a> {
+impl<'a> QualityMeter<'a> {
     /// By `pictures`, by frame, of which some are held back.
     ///
     /// # Errors
@@ -39,7 +39,7 @@ impl<'a> Gauge<'a> {
         cameras: &'a [Camera],
         pictures: Vec<(Picture, bool)>,
         with: With<'a>,
-    ) -> Result<Gauge<'a>> {
+    ) -> Result<QualityMeter<'a>> {
         let held = pictures.iter().filter(|picture| picture.1).count();
         if held == 0 || held == pictures.len() {
             let found = pictures.len();
@@ -47,7 +47,7 @@ impl<'a> Gauge<'a> {
                 "a quality is searched on some pictures and reported by others: expected 4 or more, found {found}"
             )));
         }
-        Ok(Gauge { scene, cameras, pictures, with })
+        Ok(QualityMeter { scene, cameras, pictures, with })
     }
 
     /// Mean PSNR, dB, of what `source` shows, by the pictures that are searched on or by those held back.
@@ -61,7 +61,7 @@ impl<'a> Gauge<'a> {
         let mut found = Vec::with_capacity(pictures.len());
         show([Subject::all(source)], self.cameras, &pictures, Batch::of_frame(&self.scene.limits), |views| {
             let first = found.len();
-            let of_view = |(place, view): (usize, &View<'_, 1>)| {
+            let of_view = |(place, view): (usize, &ViewStates<'_, 1>)| {
                 match &self.with {
                     With::Photographs(photographs) => {
                         let picture = view.render(0, background);

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::cache::Key;
+use crate::cache::CacheKey;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::outputs::kind::OutputKind;
@@ -11,7 +11,7 @@ use crate::pipeline::stages::archive;
 use crate::pipeline::stages::emit::Emit;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::scene::Scene;
 
 /// What the stage is called.
@@ -24,7 +24,7 @@ const MOST_TRIED: usize = 8;
 const PICTURES: usize = 48;
 
 /// So many bytes for everything that is written.
-pub(crate) struct Space<'a> {
+pub(crate) struct ByteLimit<'a> {
     /// What writes.
     pub(crate) emit: &'a Emit,
     /// Bytes at most.
@@ -35,42 +35,42 @@ pub(crate) struct Space<'a> {
 
 /// What fits into so many bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Fit {
+pub(crate) struct ByteLimitFit {
     /// Highest SH degree.
     pub(crate) sh_degree: usize,
     /// How many Gaussians of that degree.
     pub(crate) gaussians: usize,
 }
 
-impl Space<'_> {
-    /// [`Space::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
+impl ByteLimit<'_> {
+    /// [`ByteLimit::count`] of the Gaussians `ids` for the SH degree of `like` and, where bands may go, every lower one, until everything fits.
     ///
     /// # Errors
-    /// Those of [`Space::count`].
+    /// Those of [`ByteLimit::count`].
     pub(crate) fn fits(
         &self,
         scene: &Scene,
         ids: &[u32],
-        like: &Reduction,
+        like: &CompressedModel,
         drops: bool,
         journal: &mut Journal,
-    ) -> Result<Vec<Fit>> {
+    ) -> Result<Vec<ByteLimitFit>> {
         let info = scene.source().info();
         let highest = like.sh_degree.min(info.sh_degree);
         let lowest = if drops && scene.input.needs_all_bands().is_none() { 0 } else { highest };
-        let mut fits: Vec<Fit> = Vec::new();
+        let mut fits: Vec<ByteLimitFit> = Vec::new();
         for sh_degree in (lowest..=highest).rev() {
             if fits.last().is_some_and(|fit| fit.gaussians == ids.len()) {
                 break;
             }
-            let like = Reduction { sh_degree, ..like.clone() };
-            fits.push(Fit { sh_degree, gaussians: self.count(scene, ids, &like, journal)? });
+            let like = CompressedModel { sh_degree, ..like.clone() };
+            fits.push(ByteLimitFit { sh_degree, gaussians: self.count(scene, ids, &like, journal)? });
         }
         Ok(fits)
     }
 
     /// What bytes follow from.
-    fn key(&self, scene: &Scene, reduction: &Reduction) -> Key {
+    fn key(&self, scene: &Scene, reduction: &CompressedModel) -> CacheKey {
         scene.work.key(&(self.emit.kind, self.emit.merges, self.most, self.recipe, reduction))
     }
 
@@ -78,7 +78,7 @@ impl Space<'_> {
     ///
     /// # Errors
     /// Not even one fits; frames that cannot be read, a failed write.
-    fn count(&self, scene: &Scene, ids: &[u32], like: &Reduction, journal: &mut Journal) -> Result<usize> {
+    fn count(&self, scene: &Scene, ids: &[u32], like: &CompressedModel, journal: &mut Journal) -> Result<usize> {
         let (all, most) = (ids.len(), self.most);
         journal.kept_stage(NAME, all, scene, self.key(scene, like), |_| {
             let bytes = |count: usize| {
@@ -130,12 +130,12 @@ impl Space<'_> {
         &self,
         scene: &Scene,
         scored: &Scored,
-        mut reduction: Reduction,
+        mut reduction: CompressedModel,
         journal: &mut Journal,
-    ) -> Result<Reduction> {
+    ) -> Result<CompressedModel> {
         let key = self.key(scene, &reduction).and(&scored.protected);
         journal.kept_stage(NAME, reduction.len(), scene, key, |_| {
-            let bytes = |reduction: &Reduction| self.emit.bytes(scene, reduction, self.recipe);
+            let bytes = |reduction: &CompressedModel| self.emit.bytes(scene, reduction, self.recipe);
             let empty = bytes(&reduction.pick(&[]))?;
             let mut tried = 0;
             loop {
@@ -162,7 +162,7 @@ impl Space<'_> {
     }
 
     /// Places of the `count` that are protected or that pictures would lose most with.
-    fn best(&self, scene: &Scene, scored: &Scored, reduction: &Reduction, count: usize) -> Result<Vec<u32>> {
+    fn best(&self, scene: &Scene, scored: &Scored, reduction: &CompressedModel, count: usize) -> Result<Vec<u32>> {
         let result = scene.input.reduced(reduction)?;
         let places: Vec<u32> = (0..reduction.len() as u32).collect();
         let pictures = spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE);

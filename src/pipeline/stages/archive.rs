@@ -12,11 +12,11 @@ use serde::{Deserialize, Serialize};
 
 use super::bounds;
 use super::near::{
-    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, PIXEL, ROUNDS, balanced, bisected, check_met,
-    measurable, pictures,
+    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, PIXEL, QualityTarget, ROUNDS, ReferenceViews,
+    balanced, bisected, check_met, measurable, pictures,
 };
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload};
+use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
@@ -24,7 +24,7 @@ use crate::limits::{Limits, ReadLimit};
 use crate::model::Columns;
 use crate::outputs::bounds::Bounds;
 use crate::pipeline::summary::ArchiveSummary;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::render;
 use crate::scene::Scene;
 
@@ -47,45 +47,45 @@ pub enum Archived {
 
 /// The making of an archive.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Archive {
+pub struct ArchiveStage {
     /// PSNR of its pictures against those of the result before, dB; none: by what it costs against the original's.
     pub psnr: Option<f64>,
 }
 
 /// A group of values with one step.
 #[derive(Debug, Clone)]
-enum Group {
+enum ValueGroup {
     Attribute(usize),
     Tensor(String),
 }
 
-impl Group {
+impl ValueGroup {
     fn name(&self) -> &str {
         match self {
-            Group::Attribute(k) => ATTRIBUTES[*k],
-            Group::Tensor(name) => name,
+            ValueGroup::Attribute(k) => ATTRIBUTES[*k],
+            ValueGroup::Tensor(name) => name,
         }
     }
 
     /// Steps that a deviation of its values is at first, finer than most end: where measuring begins.
     fn first(&self) -> f64 {
         match self {
-            Group::Attribute(0) => 512.0,
-            Group::Attribute(_) => 24.0,
-            Group::Tensor(name) if name.ends_with("bias") => 64.0,
-            Group::Tensor(_) => 16.0,
+            ValueGroup::Attribute(0) => 512.0,
+            ValueGroup::Attribute(_) => 24.0,
+            ValueGroup::Tensor(name) if name.ends_with("bias") => 64.0,
+            ValueGroup::Tensor(_) => 16.0,
         }
     }
 }
 
-impl Archive {
+impl ArchiveStage {
     /// What is left, its pictures, the archive and what it decodes to.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let count = pictures(work.pixels);
         // Of some forty groups in every round, and of all together.
         let looked = count as f64 * (2.0 * HALVINGS as f64 + ROUNDS as f64 * 40.0);
-        Need {
+        ResourceEstimate {
             stage: NAME,
             reads: 1.0,
             seconds: work.picturing(looked, 0.3 * work.count(), RENDER),
@@ -113,8 +113,8 @@ impl Archive {
     pub fn run(
         &self,
         scene: &Scene,
-        reduction: &Reduction,
-        asked: Asked,
+        reduction: &CompressedModel,
+        asked: ArchiveTarget,
         journal: &mut Journal,
     ) -> Result<(Archived, ArchiveSummary)> {
         let key = scene.work.key(&(self.psnr, asked, reduction));
@@ -135,12 +135,17 @@ impl Archive {
         Ok((archived, summary))
     }
 
-    fn make(&self, scene: &Scene, reduction: &Reduction, asked: Asked) -> Result<(Encoded, ArchiveSummary)> {
+    fn make(
+        &self,
+        scene: &Scene,
+        reduction: &CompressedModel,
+        asked: ArchiveTarget,
+    ) -> Result<(Encoded, ArchiveSummary)> {
         let mut content = scene.input.content(reduction)?;
-        let looks = Looks::of(scene, &*scene.input.showing(&content)?)?;
-        let original = Looks::of(scene, scene.source())?;
+        let looks = ReferenceViews::of(scene, &*scene.input.showing(&content)?)?;
+        let original = ReferenceViews::of(scene, scene.source())?;
         let level = measurable(looks.psnr(scene.source())?)?;
-        let aim = Aim::of(self.psnr, asked, level);
+        let aim = QualityTarget::of(self.psnr, asked, level);
         let asked = aim.close(level);
         let mut grids = Grids::of(&content);
         let mut measured = Vec::new();
@@ -154,7 +159,7 @@ impl Archive {
             Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
         };
         let (encoded, [psnr, loss]) = match aim {
-            Aim::Bytes(most) => {
+            QualityTarget::Bytes(most) => {
                 // The finest that fits.
                 let fits = |finer: f64| Ok(Some(encoded(-finer)?).filter(|found| found.bytes.len() as u64 <= most));
                 looked_at(match bisected(BYTES_ADDED.map(|added| -added), BYTES_HALVINGS, fits)? {
@@ -162,7 +167,7 @@ impl Archive {
                     None => coarsest(encoded(BYTES_ADDED[0])?, most, reduction.len())?,
                 })?
             }
-            Aim::Close(_) | Aim::Loss(_) => {
+            QualityTarget::Close(_) | QualityTarget::Loss(_) => {
                 let best = bisected(ADDED, HALVINGS, |added| {
                     Ok(Some(looked_at(encoded(added)?)?).filter(|&(_, found)| aim.does(found, asked)))
                 })?;
@@ -179,7 +184,7 @@ impl Archive {
 ///
 /// # Errors
 /// An input that no archive holds, values that are not finite.
-pub fn bytes(scene: &Scene, reduction: &Reduction) -> Result<u64> {
+pub fn bytes(scene: &Scene, reduction: &CompressedModel) -> Result<u64> {
     if scene.input.archives_frames() {
         return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
     }
@@ -201,7 +206,7 @@ fn coarsest(encoded: Encoded, most: u64, gaussians: usize) -> Result<Encoded> {
 
 /// The grids of all groups of a content.
 struct Grids {
-    groups: Vec<Group>,
+    groups: Vec<ValueGroup>,
     /// Standard deviation of each group's values.
     deviations: Vec<f64>,
     /// Log2 of each group's step.
@@ -214,7 +219,7 @@ impl Grids {
     fn of(content: &Content) -> Grids {
         let groups = groups(content);
         let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
-        let first = |(group, deviation): (&Group, &f64)| (deviation / group.first()).log2();
+        let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.first()).log2();
         let octaves = groups.iter().zip(&deviations).map(first).collect();
         let space = archive::space(content);
         let offsets = archive::offsets(&content.field, &content.tensors, &content.cloud.position, space, content.times);
@@ -226,8 +231,8 @@ impl Grids {
         let mut steps = Steps::default();
         for (group, octave) in self.groups.iter().zip(&self.octaves) {
             match group {
-                Group::Attribute(k) => steps.cloud[*k] = eighths(octave + added),
-                Group::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
+                ValueGroup::Attribute(k) => steps.cloud[*k] = eighths(octave + added),
+                ValueGroup::Tensor(name) => _ = steps.field.0.insert(name.clone(), self.tensor(name, octave + added)),
             }
         }
         steps
@@ -242,17 +247,18 @@ impl Grids {
     fn balance(
         &mut self,
         scene: &Scene,
-        looks: &Looks<'_>,
+        looks: &ReferenceViews<'_>,
         content: &mut Content,
         error: f64,
     ) -> Result<Vec<(String, f64, f64, f64)>> {
         let errors = self.errors(scene, looks, content)?;
         let fine = archive::encode(content, &self.steps(0.0))?.bits;
         let coarse = archive::encode(content, &self.steps(0.5))?.bits;
-        let bits = |of: &BTreeMap<String, f64>, group: &Group| of.get(group.name()).copied().unwrap_or(0.0);
+        let bits = |of: &BTreeMap<String, f64>, group: &ValueGroup| of.get(group.name()).copied().unwrap_or(0.0);
         // Never nothing: a group that has no bits left could become coarser without end.
-        let saved =
-            |group: &Group| (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group));
+        let saved = |group: &ValueGroup| {
+            (2.0 * (bits(&fine, group) - bits(&coarse, group))).max(1.0 + 0.05 * bits(&fine, group))
+        };
         let saved: Vec<f64> = self.groups.iter().map(saved).collect();
         let all: f64 = saved.iter().sum();
         let mut measured = Vec::with_capacity(self.groups.len());
@@ -266,11 +272,11 @@ impl Grids {
     }
 
     /// Squared errors of pictures where one group lies on its grid and all others do not. `content` is as it was after.
-    fn errors(&self, scene: &Scene, looks: &Looks<'_>, content: &mut Content) -> Result<Vec<f64>> {
+    fn errors(&self, scene: &Scene, looks: &ReferenceViews<'_>, content: &mut Content) -> Result<Vec<f64>> {
         let space = archive::space(content);
-        let one = |(group, &octave): (&Group, &f64)| -> Result<f64> {
+        let one = |(group, &octave): (&ValueGroup, &f64)| -> Result<f64> {
             match group {
-                Group::Attribute(k) => {
+                ValueGroup::Attribute(k) => {
                     let before = content.cloud.clone();
                     let mut steps = [0; ATTRIBUTES.len()];
                     steps[*k] = eighths(octave);
@@ -279,7 +285,7 @@ impl Grids {
                     content.cloud = before;
                     found
                 }
-                Group::Tensor(name) => {
+                ValueGroup::Tensor(name) => {
                     let (before, role) = (content.tensors[name].clone(), content.field[name]);
                     let steps = self.tensor(name, octave);
                     let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
@@ -294,14 +300,17 @@ impl Grids {
     }
 }
 
-fn groups(content: &Content) -> Vec<Group> {
+fn groups(content: &Content) -> Vec<ValueGroup> {
     let attributes = 4 + content.cloud.sh_degree() + 1;
     let tensors = content.field.iter().filter(|(_, role)| !matches!(role, Role::Exact | Role::Unread));
-    (0..attributes).map(Group::Attribute).chain(tensors.map(|(name, _)| Group::Tensor(name.clone()))).collect()
+    (0..attributes)
+        .map(ValueGroup::Attribute)
+        .chain(tensors.map(|(name, _)| ValueGroup::Tensor(name.clone())))
+        .collect()
 }
 
 /// Standard deviation of a group's values.
-fn deviation(content: &Content, group: &Group) -> f64 {
+fn deviation(content: &Content, group: &ValueGroup) -> f64 {
     let of = |values: &mut dyn Iterator<Item = f32>| {
         let (mut count, mut sum, mut squares) = (0.0, 0.0, 0.0);
         values.for_each(|value| {
@@ -313,8 +322,8 @@ fn deviation(content: &Content, group: &Group) -> f64 {
         (squares / f64::max(count, 1.0) - (sum / f64::max(count, 1.0)).powi(2)).max(0.0).sqrt()
     };
     let found = match group {
-        Group::Tensor(name) => of(&mut content.tensors[name].data.iter().copied()),
-        Group::Attribute(k) => of(&mut archive::attribute(&content.cloud, *k)),
+        ValueGroup::Tensor(name) => of(&mut content.tensors[name].data.iter().copied()),
+        ValueGroup::Attribute(k) => of(&mut archive::attribute(&content.cloud, *k)),
     };
     found.max(1e-9)
 }

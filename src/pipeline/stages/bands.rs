@@ -3,7 +3,7 @@
 //! Memory: a state of the original and two of what is left, and three pictures.
 
 use super::field::{PICTURES, least};
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
+use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::BandsSummary;
@@ -16,7 +16,7 @@ use crate::pipeline::request::Request;
 use crate::progress::Progress;
 use crate::pruning::score::scored;
 use crate::recipe::WhichBands;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -45,21 +45,21 @@ pub(crate) fn highest(scene: &Scene, degree: usize, journal: &mut Journal) -> us
 
 /// The bands of spherical harmonics of a result.
 #[derive(Debug, Clone)]
-pub struct Bands {
+pub struct ShDegreeStage {
     /// How much closer pictures stay to those with all bands than to the original's, dB.
     pub margin: f64,
 }
 
-impl Bands {
+impl ShDegreeStage {
     /// The stage, of a run whose output may have fewer. An archive has no bytes for bands that nobody sees.
-    pub fn of(request: &Request, kind: OutputKind) -> Option<Bands> {
+    pub fn of(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
-        drops.then_some(Bands { margin: bands.bands_margin })
+        drops.then_some(ShDegreeStage { margin: bands.bands_margin })
     }
 
     /// Three states, and pictures of them. A part `left` of the Gaussians stays.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let (whole, reader, held) = (work.state(Columns::all()), work.input.reader, work.held(limits, Columns::all()));
         let per_gaussian = vec![
             ("kept", of_left(left, 24)),
@@ -70,7 +70,7 @@ impl Bands {
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = if work.sh_degree > 0 { (PICTURES as u64).min(work.pictures) } else { 0 };
-        Need {
+        ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 2.0 * pictures as f64)
                 + work.picturing(pictures as f64, work.count(), RENDER)
@@ -85,14 +85,19 @@ impl Bands {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+    pub fn run(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         let count = reduction.len();
         let key = scene.work.key(&(self.margin, &reduction));
         journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.drop_some(scene, reduction, journal)?, count)))
     }
 
-    /// [`Bands::run`] as a part of another stage.
-    pub fn drop_some(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+    /// [`ShDegreeStage::run`] as a part of another stage.
+    pub fn drop_some(
+        &self,
+        scene: &Scene,
+        reduction: CompressedModel,
+        journal: &mut Journal,
+    ) -> Result<CompressedModel> {
         let all = scene.source().info().sh_degree;
         let pictures = spread(&scene.schedule, PICTURES, 1);
         let stay = match scene.input.needs_all_bands() {
@@ -120,7 +125,7 @@ impl Bands {
             journal.leave_out(WHAT, found.why());
         }
         journal.bands = Some(found);
-        Ok(Reduction { sh_degree, ..reduction })
+        Ok(CompressedModel { sh_degree, ..reduction })
     }
 }
 

@@ -10,9 +10,10 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use super::near::{
-    ADDED, Aim, Asked, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, Looks, ROUNDS, balanced, bisected, check_met, measurable,
+    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, QualityTarget, ROUNDS, ReferenceViews, balanced,
+    bisected, check_met, measurable,
 };
-use crate::budget::{Part, Workload};
+use crate::budget::{MemoryPart, Workload};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::model::{Columns, Gaussians, SequenceInfo};
@@ -20,7 +21,7 @@ use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
 use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_box};
-use crate::source::{BlockReader, FrameSource, Ids, Reads, Wanted};
+use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// zstd's level.
 const LEVEL: i32 = 15;
@@ -39,7 +40,7 @@ pub(crate) fn packing(bounds: Bounds) -> Packing {
 }
 
 /// What it takes to store frames of such an input within bounds; nothing of a model or a cloud, whose archive is another.
-pub(crate) fn storing(work: &Workload) -> Vec<Part> {
+pub(crate) fn storing(work: &Workload) -> Vec<MemoryPart> {
     if work.input.reduced > 0 || work.frames == 1 {
         return Vec::new();
     }
@@ -54,11 +55,11 @@ pub(crate) fn find(
     scene: &Scene,
     source: &dyn FrameSource,
     psnr: Option<f64>,
-    asked: Asked,
+    asked: ArchiveTarget,
 ) -> Result<(Bounds, ArchiveSummary)> {
-    let (looks, original) = (Looks::of(scene, source)?, Looks::of(scene, scene.source())?);
+    let (looks, original) = (ReferenceViews::of(scene, source)?, ReferenceViews::of(scene, scene.source())?);
     let level = measurable(looks.psnr(scene.source())?)?;
-    let aim = Aim::of(psnr, asked, level);
+    let aim = QualityTarget::of(psnr, asked, level);
     let asked = aim.close(level);
     let first = first(source)?;
     let mut widths = first;
@@ -82,7 +83,7 @@ pub(crate) fn find(
         Ok((widths, [looks.psnr(&shown)?, level - original.psnr(&shown)?]))
     };
     let (widths, [psnr, loss]) = match aim {
-        Aim::Bytes(most) => {
+        QualityTarget::Bytes(most) => {
             // The finest that fits.
             let size = |widths| stored(scene, source, widths);
             let fits = |finer: f64| {
@@ -105,7 +106,7 @@ pub(crate) fn find(
                 }
             })?
         }
-        Aim::Close(_) | Aim::Loss(_) => {
+        QualityTarget::Close(_) | QualityTarget::Loss(_) => {
             let best = bisected(ADDED, HALVINGS, |added| {
                 Ok(Some(looked_at(wider(&widths, added))?).filter(|&(_, found)| aim.does(found, asked)))
             })?;
@@ -150,7 +151,7 @@ fn wider(widths: &[f64; 5], octaves: f64) -> [f64; 5] {
 }
 
 /// Squared errors of pictures where one column is off and all others are not.
-fn errors(looks: &Looks<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
+fn errors(looks: &ReferenceViews<'_>, source: &dyn FrameSource, widths: &[f64; 5]) -> Result<Vec<f64>> {
     let alone = |k: usize| std::array::from_fn(|other| if other == k { widths[k] } else { 0.0 });
     (0..5).map(|k| looks.error(&Rounded { source, bounds: Bounds::new(alone(k)) })).collect()
 }
@@ -205,7 +206,7 @@ impl BlockReader for RoundedReader<'_> {
         Ok(())
     }
 
-    fn expect(&mut self, wanted: &Wanted) {
+    fn expect(&mut self, wanted: &ReadPlan) {
         self.reader.expect(wanted);
     }
 

@@ -4,17 +4,17 @@
 //! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
 
 use super::merge::Outcome;
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
+use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::metrics::{decibels_text, psnr};
 use crate::model::{Columns, Picture};
-use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, View, show, spread};
+use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
 use crate::progress::Progress;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, scored};
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::render::{self, Image};
 use crate::scene::Scene;
 
@@ -40,7 +40,7 @@ pub struct Choose {
 
 impl Choose {
     /// Both alternatives, two states of a frame, and pictures. A part `left` of the Gaussians stays.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         // Merged trajectories are read of all that merge.
         let merging = if work.input.reduced > 0 { left } else { 1.0 };
@@ -60,7 +60,7 @@ impl Choose {
         // The original, and two of about half as many Gaussians.
         let made = work.picturing(frames as f64, 2.0 * work.count(), RENDER)
             + work.picturing(2.0 * frames as f64, 0.0, RENDER);
-        Need {
+        ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), frames as f64) + made,
             reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
@@ -103,12 +103,12 @@ impl Choose {
         Progress::undone("merging", &why);
         journal.leave_out("merging", why);
         let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
-        Ok(Outcome { reduction: Reduction::pruned(kept, &reduction.rule), summary: None })
+        Ok(Outcome { reduction: CompressedModel::pruned(kept, &reduction.rule), summary: None })
     }
 }
 
 /// Mean PSNR of the Gaussians `pruned` and of `merged` against the original over `pictures`, dB.
-fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Picture]) -> Result<[f64; 2]> {
+fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &CompressedModel, pictures: &[Picture]) -> Result<[f64; 2]> {
     let result = scene.input.reduced(merged)?;
     let progress = Progress::new(NAME, "pictures", pictures.len() as u64);
     let mut sums = [0.0; 2];
@@ -116,7 +116,7 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Pict
     let batch = Batch { pictures: pictures_together, ..Batch::of_frame(&scene.limits) };
     let subjects = [Subject::all(scene.source()), Subject::all(&*result)];
     show(subjects, &scene.schedule.cameras, pictures, batch, |views| {
-        let picture = |subject: usize, view: &View<'_, 2>| view.render(subject, scene.background);
+        let picture = |subject: usize, view: &ViewStates<'_, 2>| view.render(subject, scene.background);
         let expected: Vec<Image> = views.iter().map(|view| picture(0, view)).collect();
         // All of one frame.
         let state = views[0].states[0].pick(pruned);
@@ -134,19 +134,24 @@ fn mean_psnr(scene: &Scene, pruned: &[u32], merged: &Reduction, pictures: &[Pict
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pipeline::stages::merge::Merge;
+    use crate::pipeline::stages::merge::MergeStage;
     use crate::pipeline::tests::{scene, score_scene};
     use crate::pruning::score::UserOverrides;
     use crate::recipe::Recipe;
 
     /// Mean PSNR over the pictures that decide.
-    fn quality(scene: &Scene, reduction: &Reduction) -> f64 {
+    fn quality(scene: &Scene, reduction: &CompressedModel) -> f64 {
         mean_psnr(scene, &[], reduction, &spread(&scene.schedule, PICTURES, VIEWS_AT_ONCE)).unwrap()[1]
     }
 
     /// What merging leaves of a scene, and what is chosen then.
-    fn chosen(scene: &Scene, scored: &Scored, recipe: &Recipe, target: Option<usize>) -> (Reduction, Outcome, Journal) {
-        let merge = Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
+    fn chosen(
+        scene: &Scene,
+        scored: &Scored,
+        recipe: &Recipe,
+        target: Option<usize>,
+    ) -> (CompressedModel, Outcome, Journal) {
+        let merge = MergeStage { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: true, target };
         let (ranked, mut journal) = (scored.ranked(), Journal::default());
         let survivors = target.map_or(scored.selection.counts.kept, |_| ranked.order().len());
         let merged = merge.run(scene, scored, &ranked, survivors, &mut journal).unwrap();
@@ -165,7 +170,7 @@ mod tests {
             let (merged, chosen, journal) = chosen(&scene, &scored, &recipe, Some(target));
             assert_eq!(chosen.reduction.len(), target);
             let got = quality(&scene, &chosen.reduction);
-            let own = Reduction::pruned(scored.ranked().take(target), &recipe.merge);
+            let own = CompressedModel::pruned(scored.ranked().take(target), &recipe.merge);
             for other in [&merged, &own] {
                 let expected = quality(&scene, other);
                 assert!(got >= expected, "{target}: got {got} dB, an alternative has {expected}");

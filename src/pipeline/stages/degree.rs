@@ -6,17 +6,17 @@
 //!
 //! Memory: that of refining.
 
-use crate::budget::{Need, Workload};
+use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::pipeline::request::{Goal, Request};
-use crate::pipeline::search::size::Fit;
+use crate::pipeline::search::size::ByteLimitFit;
 use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
 use crate::recipe::WhichBands;
-use crate::reduction::Reduction;
-use crate::refinement::Refine;
+use crate::reduction::CompressedModel;
+use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
 use crate::scene::Scene;
 
@@ -29,21 +29,21 @@ const STEPS: f64 = 0.2;
 #[derive(Debug, Clone)]
 pub struct Degree {
     /// How a degree is tried.
-    refine: Refine,
+    refine: RefineStage,
 }
 
 impl Degree {
     /// The stage, of a run that is asked for so many bytes, refines (`refine`), and may drop bands.
-    pub fn of(request: &Request, refine: Option<&Refine>) -> Option<Degree> {
+    pub fn of(request: &Request, refine: Option<&RefineStage>) -> Option<Degree> {
         let chooses = matches!(request.goal, Some(Goal::Bytes(_))) && request.recipe.bands.bands == WhichBands::Needed;
         refine.filter(|_| chooses).map(|refine| Degree { refine: refine.in_part(STEPS) })
     }
 
     /// What refining needs, once for every degree.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let need = self.refine.need(work, limits);
         let degrees = 1.0 + work.sh_degree as f64;
-        Need { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
+        ResourceEstimate { stage: NAME, seconds: degrees * need.seconds, reads: degrees * need.reads, ..need }
     }
 
     /// That of `fits`, of falling degrees, which is best in the manner of `like`.
@@ -55,18 +55,18 @@ impl Degree {
         scene: &Scene,
         scored: &Scored,
         ranked: &Ranking,
-        like: &Reduction,
-        fits: &[Fit],
+        like: &CompressedModel,
+        fits: &[ByteLimitFit],
         journal: &mut Journal,
-    ) -> Result<Fit> {
+    ) -> Result<ByteLimitFit> {
         let all = scored.count();
         let key = scene.work.key(&(self.refine.key(), ranked, like, fits));
         journal.kept_stage(NAME, all, scene, key, |journal| {
             let targets = Targets::new(scene, self.refine.pictures)?;
-            let mut tried: Vec<(Fit, f64)> = Vec::new();
+            let mut tried: Vec<(ByteLimitFit, f64)> = Vec::new();
             for &fit in fits {
                 let first = self.refine.first(fit.gaussians, all).min(ranked.order().len());
-                let start = Reduction { sh_degree: fit.sh_degree, ..like.with(ranked.take(first)) };
+                let start = CompressedModel { sh_degree: fit.sh_degree, ..like.with(ranked.take(first)) };
                 let psnr = self.refine.closeness(NAME, scene, scored, &targets, &start, fit.gaussians)?;
                 let is_no_better = tried.last().is_some_and(|before| psnr <= before.1);
                 tried.push((fit, psnr));
@@ -76,7 +76,7 @@ impl Degree {
             }
             // Of equal ones the one with more bands.
             let best = tried.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(fits[0], |best| best.0);
-            let of = |(fit, psnr): &(Fit, f64)| {
+            let of = |(fit, psnr): &(ByteLimitFit, f64)| {
                 let psnr = if psnr.is_nan() { "no number".to_owned() } else { format!("{psnr:.2}") };
                 format!("{} of degree {} {psnr}", fit.gaussians, fit.sh_degree)
             };

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::archive::Archived;
 use super::bounds;
 use super::choose::CLUSTERED;
-use crate::budget::{Need, Workload, of_left};
+use crate::budget::{ResourceEstimate, Workload, of_left};
 use crate::error::{Error, Result};
 use crate::files::atomic::{
     Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
@@ -15,7 +15,7 @@ use crate::files::atomic::{
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::model::Columns;
-use crate::models::{Family, Size};
+use crate::models::{InputModel, Size};
 use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{FRAME_BLOCK, write_container};
 use crate::outputs::index_map::write_index_map;
@@ -24,7 +24,7 @@ use crate::pipeline::request::Request;
 use crate::pipeline::summary::Summary;
 use crate::progress::Progress;
 use crate::pruning::score::scored;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
@@ -105,7 +105,7 @@ impl Emit {
     }
 
     /// What is left, a part `left` of the Gaussians, and buffers of what is written.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
@@ -149,14 +149,14 @@ impl Emit {
         let frames = if is_solved && !self.kind.holds_frames() { 0.0 } else { work.frames as f64 };
         let left = LEFT * work.count();
         let seconds = work.reading(left, frames) + left * frames * ENCODING;
-        Need { stage: NAME, reads, seconds, per_gaussian, fixed }
+        ResourceEstimate { stage: NAME, reads, seconds, per_gaussian, fixed }
     }
 
     /// Bytes of everything that is written of `reduction` with a recipe of so many; made in a scratch folder, and removed.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write.
-    pub fn bytes(&self, scene: &Scene, reduction: &Reduction, recipe: u64) -> Result<u64> {
+    pub fn bytes(&self, scene: &Scene, reduction: &CompressedModel, recipe: u64) -> Result<u64> {
         let folder = ScratchFolder::new(&scene.scratch)?;
         let path = folder.path().join("result");
         let written = write_alone(&*scene.input, reduction, self.kind, &path, &scene.limits)?;
@@ -172,7 +172,7 @@ impl Emit {
     pub fn run(
         &self,
         scene: &Scene,
-        reduction: &Reduction,
+        reduction: &CompressedModel,
         (map, archive): (&[Option<u32>], Option<&Archived>),
         recipe: &str,
         mut journal: Journal,
@@ -226,8 +226,8 @@ impl Emit {
 /// # Errors
 /// Frames that cannot be read, a failed write.
 pub fn write_alone(
-    input: &dyn Family,
-    reduction: &Reduction,
+    input: &dyn InputModel,
+    reduction: &CompressedModel,
     kind: OutputKind,
     path: &Path,
     limits: &Limits,

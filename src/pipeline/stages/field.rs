@@ -2,7 +2,7 @@
 //!
 //! Memory: two states of one frame, and two pictures.
 
-use crate::budget::{Need, PICTURE_ON_ALL_THREADS, RENDER, Workload, of_left};
+use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::FieldSummary;
@@ -15,7 +15,7 @@ use crate::pipeline::request::Request;
 use crate::progress::Progress;
 use crate::pruning::score::scored;
 use crate::recipe::Precision;
-use crate::reduction::Reduction;
+use crate::reduction::CompressedModel;
 use crate::refinement::CLOSE_ENOUGH;
 use crate::render::{self, render};
 use crate::scene::Scene;
@@ -28,20 +28,21 @@ pub(crate) const PICTURES: usize = 12;
 
 /// The precision of a result's field.
 #[derive(Debug, Clone)]
-pub struct Field {
+pub struct FieldPrecisionStage {
     /// How much closer pictures stay to those of the exact field than to the original's, dB.
     pub margin: f64,
 }
 
-impl Field {
+impl FieldPrecisionStage {
     /// The stage, of a run that writes a model and whose field may change.
-    pub fn of(request: &Request, kind: OutputKind) -> Option<Field> {
+    pub fn of(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
-        (kind == OutputKind::Model && field.field == Precision::Half).then_some(Field { margin: field.field_margin })
+        (kind == OutputKind::Model && field.field == Precision::Half)
+            .then_some(FieldPrecisionStage { margin: field.field_margin })
     }
 
     /// Two states, pictures, and the field once more. A part `left` of the Gaussians stays.
-    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits, left: f64) -> ResourceEstimate {
         let whole = work.state(Columns::all());
         let per_gaussian = vec![
             ("kept", of_left(left, 24)),
@@ -51,7 +52,7 @@ impl Field {
             ("pictures", PICTURE_ON_ALL_THREADS),
         ];
         let pictures = (PICTURES as u64).min(work.pictures);
-        Need {
+        ResourceEstimate {
             stage: NAME,
             seconds: work.reading(work.count(), 4.0 * pictures as f64)
                 + work.picturing(2.0 * pictures as f64, work.count(), RENDER)
@@ -70,14 +71,14 @@ impl Field {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    pub fn run(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+    pub fn run(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         let count = reduction.len();
         let key = scene.work.key(&(self.margin, &reduction));
         journal.kept_stage(NAME, count, scene, key, |journal| Ok((self.round(scene, reduction, journal)?, count)))
     }
 
-    /// [`Field::run`] of an input that can, as a part of another stage.
-    pub fn round(&self, scene: &Scene, reduction: Reduction, journal: &mut Journal) -> Result<Reduction> {
+    /// [`FieldPrecisionStage::run`] of an input that can, as a part of another stage.
+    pub fn round(&self, scene: &Scene, reduction: CompressedModel, journal: &mut Journal) -> Result<CompressedModel> {
         if !scene.input.can_round_field()? {
             return Ok(reduction);
         }
@@ -87,7 +88,7 @@ impl Field {
             journal.leave_out(what, "there is nothing to be seen");
             return Ok(reduction);
         }
-        let halved = Reduction { field: Precision::Half, ..reduction.clone() };
+        let halved = CompressedModel { field: Precision::Half, ..reduction.clone() };
         let [exact, half] = [&reduction, &halved].map(|of| scene.input.reduced(of));
         let (exact, half) = (exact?, half?);
         let rounding = closeness(scene, [&*exact, &*half], &pictures)?;

@@ -1,14 +1,14 @@
 //! From frames to a selection: the stages `scan`, `visible` and `score`, which `score` and `report` run too.
 
-use super::scan::Scan;
-use crate::budget::{Need, Workload};
+use super::scan::ScanStage;
+use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
 use crate::outputs::kind::OutputKind;
-use crate::pruning::contribution::Seen;
+use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score;
-use crate::pruning::score::{Score, Scored, UserOverrides};
+use crate::pruning::score::{ScoreStage, Scored, UserOverrides};
 use crate::pruning::visible::Visible;
 use crate::recipe::Recipe;
 use crate::scene::Scene;
@@ -16,7 +16,7 @@ use crate::statistics::pass::Scanned;
 
 /// What is known of a scene before its frames are read.
 #[derive(Debug, Clone, Copy)]
-pub struct Outlook {
+pub struct InputMeta {
     /// N.
     pub gaussians: usize,
     /// Whether the cameras are the scene's own, not a virtual rig.
@@ -25,10 +25,10 @@ pub struct Outlook {
     pub own_output: OutputKind,
 }
 
-impl Outlook {
+impl InputMeta {
     /// Of an open scene.
-    pub fn of(scene: &Scene) -> Outlook {
-        Outlook {
+    pub fn of(scene: &Scene) -> InputMeta {
+        InputMeta {
             gaussians: scene.source().info().count,
             has_cameras: scene.has_cameras,
             own_output: scene.input.own_output(),
@@ -42,10 +42,10 @@ pub trait Stages {
     fn measure(&self) -> &Measure;
 
     /// What all its stages need.
-    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need>;
+    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate>;
 
     /// What they need at best, where pictures hardly differ without a part `hardly_seen` of the Gaussians.
-    fn easiest(&self, work: &Workload, limits: &Limits, _hardly_seen: f64) -> Vec<Need> {
+    fn easiest(&self, work: &Workload, limits: &Limits, _hardly_seen: f64) -> Vec<ResourceEstimate> {
         self.needs(work, limits)
     }
 
@@ -59,11 +59,11 @@ pub trait Stages {
 #[derive(Debug, Clone)]
 pub struct Measure {
     /// Looks at every frame.
-    pub scan: Scan,
+    pub scan: ScanStage,
     /// Looks at pictures, where C is measured by them.
     pub visible: Option<Visible>,
     /// Scores and selects.
-    pub score: Score,
+    pub score: ScoreStage,
 }
 
 /// What the frames say before anything is scored.
@@ -71,16 +71,16 @@ pub struct Measured {
     /// Statistics of every Gaussian.
     pub scanned: Scanned,
     /// What the pictures show of each, where they were looked at.
-    pub seen: Option<Seen>,
+    pub seen: Option<VisibleContribution>,
 }
 
 impl Measure {
     /// As `recipe` has it; `has_cameras`: the scene has cameras of its own.
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
         Measure {
-            scan: Scan { recipe: recipe.scan.clone() },
+            scan: ScanStage { recipe: recipe.scan.clone() },
             visible: Visible::of(&recipe.scan, has_cameras),
-            score: Score {
+            score: ScoreStage {
                 rereads: recipe.scan.reread,
                 snap_noise: recipe.scan.snap_noise,
                 non_finite: recipe.scan.non_finite,
@@ -97,7 +97,7 @@ impl Measure {
     /// Those of the stages.
     pub fn run(&self, scene: &Scene, arrived: Option<Measured>, journal: &mut Journal) -> Result<Scored> {
         scene.set_absent(&[]);
-        let Score { snap_noise, non_finite, score, select, user, .. } = &self.score;
+        let ScoreStage { snap_noise, non_finite, score, select, user, .. } = &self.score;
         let key = scene.work.key(&(
             (&self.scan.recipe, self.visible.is_some(), snap_noise, non_finite, score, user),
             (select.keep_fraction, select.tau_static, select.tau_dynamic, select.low_priority),
@@ -141,7 +141,7 @@ impl Stages for Measure {
         self
     }
 
-    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<Need> {
+    fn needs(&self, work: &Workload, limits: &Limits) -> Vec<ResourceEstimate> {
         let visible = self.visible.as_ref().map(|visible| visible.need(work, limits));
         let scan = self.scan.need(work, limits);
         [Some(scan), visible, Some(self.score.need(work, limits))].into_iter().flatten().collect()

@@ -10,8 +10,8 @@ use std::ops::Range;
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
-use crate::budget::{Need, Workload};
-use crate::cache::Work;
+use crate::budget::{ResourceEstimate, Workload};
+use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::limits::Limits;
@@ -22,7 +22,7 @@ use crate::merging::motion_pass;
 use crate::merging::motion_pass::PairMeter;
 use crate::merging::proxy::{Importance, weights};
 use crate::merging::voxels::voxel_order;
-use crate::merging::{Asked, Merged, Survivors};
+use crate::merging::{Merged, RequestedPairs, Survivors};
 use crate::model::{Column, Columns, Gaussians};
 use crate::models::trajectories::state_bytes;
 use crate::passes::{BLOCK, gather};
@@ -32,7 +32,7 @@ use crate::pruning::Ranking;
 use crate::pruning::prune::Prune;
 use crate::pruning::score::{Scored, scored};
 use crate::recipe;
-use crate::reduction::{Cluster, Reduction};
+use crate::reduction::{Cluster, CompressedModel};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
@@ -62,11 +62,11 @@ const FOLLOWED: f64 = 0.3;
 
 /// The merging of a run.
 #[derive(Debug, Clone)]
-pub struct Merge {
+pub struct MergeStage {
     /// Tests, passes and how members make up a proxy.
-    pub recipe: recipe::Merge,
+    pub recipe: recipe::MergeParams,
     /// What is life, and what is a step.
-    pub scan: recipe::Scan,
+    pub scan: recipe::ScanParams,
     /// Whether survivors may be pruned to reach the target.
     pub prunes: bool,
     /// Exact size of the output.
@@ -77,19 +77,24 @@ pub struct Merge {
 #[derive(Serialize, Deserialize)]
 pub struct Outcome {
     /// What is left.
-    pub reduction: Reduction,
+    pub reduction: CompressedModel,
     /// Counts of every pass.
     pub summary: Option<MergeSummary>,
 }
 
-impl Merge {
+impl MergeStage {
     /// The merging that `recipe` has follow on `prune`.
-    pub fn after(prune: &Prune, recipe: &recipe::Recipe) -> Merge {
-        Merge { recipe: recipe.merge.clone(), scan: recipe.scan.clone(), prunes: prune.prunes, target: prune.target }
+    pub fn after(prune: &Prune, recipe: &recipe::Recipe) -> MergeStage {
+        MergeStage {
+            recipe: recipe.merge.clone(),
+            scan: recipe.scan.clone(),
+            prunes: prune.prunes,
+            target: prune.target,
+        }
     }
 
     /// What is known of pairs that are measured together and of all that may survive, and the proxies.
-    pub fn need(&self, work: &Workload, limits: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
         // Of the colours the first band; of proxies at most one for every two, before a pass and after it, then with
         // all colours.
@@ -108,7 +113,7 @@ impl Merge {
         // that coincide, if any do.
         let trials = if self.target.is_some() && self.prunes { TRIALS } else { 1.0 };
         let followed = 2.0 * trials * self.recipe.passes.len() as f64 * work.scattered_reads(work.frames, limits);
-        Need {
+        ResourceEstimate {
             stage: NAME,
             reads: work.scattered_reads(1, limits) + followed,
             seconds: MERGING * work.count() + FOLLOWED * work.reading(work.count(), work.frames as f64),
@@ -196,7 +201,7 @@ fn bracket(target: usize, all: usize, mut merged: impl FnMut(usize) -> Result<us
 struct Trial<'a> {
     scored: &'a Scored,
     /// The recipe's, with a noise floor no lower than that of the positions.
-    merge: recipe::Merge,
+    merge: recipe::MergeParams,
     /// Ids whose states are known, increasing.
     pool: Vec<u32>,
     /// Their states at the reference frame, of the harmonics the first band.
@@ -206,7 +211,7 @@ struct Trial<'a> {
     /// C and Vis by id.
     importance: [Cow<'a, [f64]>; 2],
     meter: PairMeter<'a>,
-    work: &'a Work,
+    work: &'a Cache,
     /// Pairs measured together.
     pairs_together: usize,
     /// How pairs of the pool move: it does not depend on who else survives.
@@ -219,7 +224,7 @@ impl<'a> Trial<'a> {
     fn new(
         scene: &'a Scene,
         scored: &'a Scored,
-        stage: &'a Merge,
+        stage: &'a MergeStage,
         pool: Vec<u32>,
         progress: &'a Progress,
     ) -> Result<Self> {
@@ -293,12 +298,12 @@ impl<'a> Trial<'a> {
 
 /// How alike each of `pairs` moves, in some order. Many of them can be divided, by where they are.
 fn measure(
-    work: &Work,
+    work: &Cache,
     meter: &mut PairMeter<'_>,
     (pool, reference): (&[u32], &Column),
     mut pairs: Vec<(u32, u32)>,
-    asked: &Asked<'_>,
-    merge: &recipe::Merge,
+    asked: &RequestedPairs<'_>,
+    merge: &recipe::MergeParams,
 ) -> Result<Vec<Likeness>> {
     if !work.keeps() || pairs.len() < DIVIDED {
         return meter.measure(pool, reference, pairs, asked.reach, asked.is_part);
@@ -326,7 +331,7 @@ fn measure(
 }
 
 /// What `merged` leaves of `survivors`.
-fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::Merge) -> Outcome {
+fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, merge: &recipe::MergeParams) -> Outcome {
     let (groups, importance) = (&merged.groups, &survivors.importance);
     let id = |row: u32| importance.ids[row as usize];
     let clusters: Vec<Cluster> = groups
@@ -348,7 +353,7 @@ fn outcome(survivors: &Survivors<'_>, merged: &Merged, reference_frame: usize, m
     };
     summary.count(&clusters);
     let kept = groups.leaders().iter().map(|&row| id(row)).collect();
-    Outcome { reduction: Reduction { clusters, ..Reduction::pruned(kept, merge) }, summary: Some(summary) }
+    Outcome { reduction: CompressedModel { clusters, ..CompressedModel::pruned(kept, merge) }, summary: Some(summary) }
 }
 
 /// States of the Gaussians `ids` (increasing) at `frame`, of the harmonics the first band; and whether the whole state

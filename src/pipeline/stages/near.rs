@@ -50,7 +50,7 @@ pub(crate) fn pictures(pixels: u64) -> u64 {
 
 /// What an archive is asked for, beside what its own flag says.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub enum Asked {
+pub enum ArchiveTarget {
     /// Nothing.
     Nothing,
     /// To cost no more than this against the original's pictures, dB.
@@ -61,7 +61,7 @@ pub enum Asked {
 
 /// What an archive is to be.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Aim {
+pub(crate) enum QualityTarget {
     /// So close to the result's, dB.
     Close(f64),
     /// No more than so much further from the original's than the result's are, dB.
@@ -70,15 +70,15 @@ pub(crate) enum Aim {
     Bytes(u64),
 }
 
-impl Aim {
+impl QualityTarget {
     /// For a result whose pictures are `level` from the original's, where its own flag says `psnr`.
-    pub(crate) fn of(psnr: Option<f64>, asked: Asked, level: f64) -> Aim {
+    pub(crate) fn of(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
         match (psnr, asked) {
-            (_, Asked::Bytes(most)) => Aim::Bytes(most),
-            (Some(psnr), _) => Aim::Close(psnr),
-            (None, Asked::Loss(loss)) if loss > 0.0 => Aim::Loss(loss),
-            (None, Asked::Nothing) if level < ENOUGH => Aim::Loss(LOSS),
-            _ => Aim::Close(ENOUGH),
+            (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
+            (Some(psnr), _) => QualityTarget::Close(psnr),
+            (None, ArchiveTarget::Loss(loss)) if loss > 0.0 => QualityTarget::Loss(loss),
+            (None, ArchiveTarget::Nothing) if level < ENOUGH => QualityTarget::Loss(LOSS),
+            _ => QualityTarget::Close(ENOUGH),
         }
     }
 
@@ -86,33 +86,33 @@ impl Aim {
     /// says `asked`.
     pub(crate) fn does(self, [psnr, loss]: [f64; 2], asked: f64) -> bool {
         match self {
-            Aim::Loss(most) => loss <= most,
-            Aim::Close(_) | Aim::Bytes(_) => psnr >= asked,
+            QualityTarget::Loss(most) => loss <= most,
+            QualityTarget::Close(_) | QualityTarget::Bytes(_) => psnr >= asked,
         }
     }
 
     /// PSNR against the result's pictures, dB, that comes to where these are `level` from the original's.
     pub(crate) fn close(self, level: f64) -> f64 {
         match self {
-            Aim::Close(psnr) => psnr,
+            QualityTarget::Close(psnr) => psnr,
             // Squared errors add.
-            Aim::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
-            Aim::Bytes(_) => Aim::Loss(LEFT_BY_SEARCH).close(level.min(ENOUGH)),
+            QualityTarget::Loss(loss) => level - 10.0 * (10f64.powf(0.1 * loss) - 1.0).log10(),
+            QualityTarget::Bytes(_) => QualityTarget::Loss(LEFT_BY_SEARCH).close(level.min(ENOUGH)),
         }
     }
 }
 
 /// Pictures of the result, which others are compared with.
-pub(crate) struct Looks<'a> {
+pub(crate) struct ReferenceViews<'a> {
     scene: &'a Scene,
     pictures: Vec<Picture>,
     images: Vec<Image>,
 }
 
-impl Looks<'_> {
-    pub(crate) fn of<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<Looks<'a>> {
+impl ReferenceViews<'_> {
+    pub(crate) fn of<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
         let count = pictures(scene.workload().pixels) as usize;
-        let mut looks = Looks { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
+        let mut looks = ReferenceViews { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
         looks.images = looks.render(source, |_, image| image)?;
         Ok(looks)
     }
@@ -122,7 +122,7 @@ impl Looks<'_> {
         let batch = Batch::of_frame(&self.scene.limits);
         show([Subject::all(source)], &self.scene.schedule.cameras, &self.pictures, batch, |views| {
             let first = made.len();
-            let view = |(k, view): (usize, &crate::passes::View<'_, 1>)| {
+            let view = |(k, view): (usize, &crate::passes::ViewStates<'_, 1>)| {
                 of(first + k, render(view.states[0], view.camera, self.scene.background))
             };
             made.par_extend(views.par_iter().enumerate().map(view));
@@ -163,8 +163,8 @@ pub(crate) fn measurable(psnr: f64) -> Result<f64> {
 ///
 /// # Errors
 /// One that has [`SHORT`] less than that or than [`ENOUGH`]: there are values that its grids cannot hold beside the others.
-pub(crate) fn check_met(aim: Aim, asked: f64, found: f64) -> Result<()> {
-    let is_met = matches!(aim, Aim::Bytes(_)) || found >= asked.min(ENOUGH) - SHORT;
+pub(crate) fn check_met(aim: QualityTarget, asked: f64, found: f64) -> Result<()> {
+    let is_met = matches!(aim, QualityTarget::Bytes(_)) || found >= asked.min(ENOUGH) - SHORT;
     match is_met {
         true => Ok(()),
         false => Err(Error::usage(format!(

@@ -1,6 +1,6 @@
 //! Stage `scan`: every Gaussian at every frame once, through one fixed-size accumulator each.
 
-use crate::budget::{Need, Workload};
+use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
@@ -23,19 +23,19 @@ const PROJECTING: f64 = 8e-9;
 
 /// The scan of a run.
 #[derive(Debug, Clone)]
-pub struct Scan {
+pub struct ScanStage {
     /// Its parameters.
-    pub recipe: recipe::Scan,
+    pub recipe: recipe::ScanParams,
 }
 
-impl Scan {
+impl ScanStage {
     /// A block of Gaussians at a time, then the rows of all, joined.
-    pub fn need(&self, work: &Workload, _: &Limits) -> Need {
+    pub fn need(&self, work: &Workload, _: &Limits) -> ResourceEstimate {
         // In stages a second reader decodes while the first is read.
         let block = statistics::BYTES_PER_GAUSSIAN as u64 + 2 * work.held(&Limits::NONE, Columns::all());
         // How many live in each, in the blocks of all threads; the steps between uneven ones.
         let frames = work.frames * (4 * work.threads + 8);
-        Need {
+        ResourceEstimate {
             stage: NAME,
             reads: 1.0,
             seconds: work.pace.states
@@ -85,7 +85,7 @@ mod tests {
     fn every_gaussian_gets_a_row_and_the_stage_is_written_down() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
-        let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
+        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
         let mut journal = Journal::default();
         let found = scan.run(&scene, &mut journal).unwrap();
         assert_eq!((found.rows.len(), found.alive_per_frame.len()), (1500, 6));
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn memory_beside_the_rows_does_not_grow_with_gaussians_beyond_a_block() {
-        let scan = Scan { recipe: Recipe::preset("default").unwrap().scan };
+        let scan = ScanStage { recipe: Recipe::preset("default").unwrap().scan };
         let need = |count| {
             let need = scan.need(&work(count), &Limits::NONE);
             (need.per_gaussian, need.fixed)

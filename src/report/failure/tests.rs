@@ -3,8 +3,8 @@
 use glam::DVec3;
 
 use super::*;
-use crate::diagnostics::demo_scene::{Body, Scene};
-use crate::evaluation::Taken;
+use crate::diagnostics::demo_scene::{DemoBody, Scene};
+use crate::evaluation::RenderedViews;
 use crate::files::container::Container;
 use crate::model::Split;
 use crate::outputs::container::write_container;
@@ -39,7 +39,7 @@ fn looked() -> Looked {
 
 impl Looked {
     /// Part of the visible members of a body that have a trait.
-    fn part(&self, body: Body, kind: Kind) -> f64 {
+    fn part(&self, body: DemoBody, kind: GaussianKind) -> f64 {
         let rows = self.scored.rows().unwrap();
         let members: Vec<usize> = self.made.members(body).filter(|&i| rows.c[i] > 0.0).collect();
         let with = members.iter().filter(|&&i| self.traits[i][kind as usize]).count();
@@ -56,7 +56,7 @@ impl Looked {
             let state = gather(&self.made, &all, frame, crate::model::Columns::all()).unwrap();
             for view in [1usize, 2, 4] {
                 let camera = &rig.cameras[view];
-                let taken = Taken {
+                let taken = RenderedViews {
                     original: render(&state, camera, [0.0; 3]),
                     compressed: render(&state.pick(&left), camera, [0.0; 3]),
                     truth: None,
@@ -66,11 +66,11 @@ impl Looked {
             }
         }
         let shares = shares(&self.scored.rows().unwrap(), &self.traits, &lost);
-        Kind::ALL.map(|kind| {
+        GaussianKind::ALL.map(|kind| {
             let of = |wanted: bool| {
                 (0..self.traits.len()).filter(|&i| self.traits[i][kind as usize] && (!wanted || lost(i))).count()
             };
-            let members = Members { count: of(false), fates: Some((of(true), 0)), shares: shares[kind as usize] };
+            let members = KindMembers { count: of(false), fates: Some((of(true), 0)), shares: shares[kind as usize] };
             judge(kind, members, &seen, &names)
         })
     }
@@ -79,23 +79,31 @@ impl Looked {
 #[test]
 fn kinds_are_found_where_the_scene_has_them_and_nowhere_else() {
     let scene = looked();
-    assert!(scene.part(Body::Cloth, Kind::Motion) > 0.3, "got {}", scene.part(Body::Cloth, Kind::Motion));
-    assert!(scene.part(Body::Egg, Kind::Motion) < 0.15, "a rigid motion: {}", scene.part(Body::Egg, Kind::Motion));
-    assert_eq!(scene.part(Body::Wire, Kind::Thin), 1.0);
-    assert!(scene.part(Body::Fading, Kind::Appearance) > 0.9);
-    for body in [Body::Wall, Body::Double] {
-        for kind in Kind::ALL {
+    assert!(
+        scene.part(DemoBody::Cloth, GaussianKind::Motion) > 0.3,
+        "got {}",
+        scene.part(DemoBody::Cloth, GaussianKind::Motion)
+    );
+    assert!(
+        scene.part(DemoBody::Egg, GaussianKind::Motion) < 0.15,
+        "a rigid motion: {}",
+        scene.part(DemoBody::Egg, GaussianKind::Motion)
+    );
+    assert_eq!(scene.part(DemoBody::Wire, GaussianKind::Thin), 1.0);
+    assert!(scene.part(DemoBody::Fading, GaussianKind::Appearance) > 0.9);
+    for body in [DemoBody::Wall, DemoBody::Double] {
+        for kind in GaussianKind::ALL {
             assert_eq!(scene.part(body, kind), 0.0, "{} {kind:?}", body.name());
         }
     }
-    let buried = scene.made.members(Body::Buried);
+    let buried = scene.made.members(DemoBody::Buried);
     assert!(scene.traits[buried].iter().all(|of| *of == [false; 3]), "what is never seen is of no kind");
 }
 
 #[test]
 fn each_mode_is_flagged_where_its_own_kind_is_lost_and_only_there() {
     let scene = looked();
-    for (number, kind) in Kind::ALL.into_iter().enumerate() {
+    for (number, kind) in GaussianKind::ALL.into_iter().enumerate() {
         let found = scene.without(|i| scene.traits[i][number]);
         let at = &found[number];
         assert_eq!(at.verdict, Verdict::Flagged, "{kind:?}: {at:?}");
@@ -103,7 +111,7 @@ fn each_mode_is_flagged_where_its_own_kind_is_lost_and_only_there() {
         assert!(at.worst.unwrap().psnr <= at.psnr_there.unwrap(), "{kind:?}: the worst is not better than the mean");
         assert!(at.detail_lost.unwrap() > 0.1, "{kind:?}: {at:?}");
         for (other, of) in found.iter().enumerate().filter(|(other, _)| *other != number) {
-            assert_ne!(of.verdict, Verdict::Flagged, "{kind:?} lost: {:?} {of:?}", Kind::ALL[other]);
+            assert_ne!(of.verdict, Verdict::Flagged, "{kind:?} lost: {:?} {of:?}", GaussianKind::ALL[other]);
         }
     }
 }
@@ -120,27 +128,28 @@ fn losing_what_is_of_no_kind_flags_nothing() {
 }
 
 fn sums(weight: f64, error: f64) -> Observed {
-    let one = Sums { weight, error, kept_detail: weight, detail: weight };
-    Observed { kinds: [one, Sums::default(), Sums::default()], error: 2.0 * error, pixels: 1e4 }
+    let one = FailureSums { weight, error, kept_detail: weight, detail: weight };
+    Observed { kinds: [one, FailureSums::default(), FailureSums::default()], error: 2.0 * error, pixels: 1e4 }
 }
 
 #[test]
 fn verdicts_follow_the_stated_thresholds() {
-    let verdict = |members: Members, observed: Observed| judge(Kind::Motion, members, &[observed], &[(3, 7)]).verdict;
-    let lost = Members { count: 5, fates: Some((5, 0)), shares: (0.1, 0.5) };
+    let verdict =
+        |members: KindMembers, observed: Observed| judge(GaussianKind::Motion, members, &[observed], &[(3, 7)]).verdict;
+    let lost = KindMembers { count: 5, fates: Some((5, 0)), shares: (0.1, 0.5) };
     // 100 pixels of 10,000 with a squared error of 0.01 each: 20 dB; elsewhere 40 dB.
     assert_eq!(verdict(lost, sums(100.0, 1.0)), Verdict::Flagged);
-    assert_eq!(verdict(Members { count: 0, ..lost }, sums(0.0, 0.0)), Verdict::Absent);
+    assert_eq!(verdict(KindMembers { count: 0, ..lost }, sums(0.0, 0.0)), Verdict::Absent);
     assert_eq!(verdict(lost, sums(9.9, 0.1)), Verdict::Unseen, "under a thousandth of the pixels");
-    assert_eq!(verdict(Members { shares: (0.1, 0.009), ..lost }, sums(100.0, 1.0)), Verdict::Untouched);
+    assert_eq!(verdict(KindMembers { shares: (0.1, 0.009), ..lost }, sums(100.0, 1.0)), Verdict::Untouched);
     assert_eq!(verdict(lost, sums(100.0, 0.009)), Verdict::Passed, "40.5 dB cannot be seen");
     assert_eq!(verdict(lost, sums(4000.0, 40.0)), Verdict::Passed, "20 dB against 21.8 is not apart");
     // Without an index map the pictures alone decide.
-    assert_eq!(verdict(Members { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
-    let found = judge(Kind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
+    assert_eq!(verdict(KindMembers { fates: None, shares: (0.1, 0.0), ..lost }, sums(100.0, 1.0)), Verdict::Flagged);
+    let found = judge(GaussianKind::Motion, lost, &[sums(100.0, 1.0)], &[(3, 7)]);
     assert_eq!(found.psnr_there, Some(20.0));
     assert_eq!(found.worst.map(|worst| (worst.frame, worst.view)), Some((3, 7)));
-    assert_eq!(judge(Kind::Thin, Members::default(), &[], &[]).verdict, Verdict::Absent);
+    assert_eq!(judge(GaussianKind::Thin, KindMembers::default(), &[], &[]).verdict, Verdict::Absent);
 }
 
 #[test]
@@ -164,17 +173,17 @@ fn shares_of_pixels_are_those_of_the_gaussians_seen_there() {
 #[test]
 fn the_worst_square_is_where_the_kinds_error_is() {
     let image = |value: f32| Image { width: 100, height: 90, data: vec![value; 27_000] };
-    let mut taken = Taken { original: image(0.5), compressed: image(0.5), truth: None };
+    let mut taken = RenderedViews { original: image(0.5), compressed: image(0.5), truth: None };
     let mut shares = image(0.0);
     let mut mark = |x: usize, y: usize, error: f32, share: f32| {
         let at = 3 * (y * 100 + x);
         taken.compressed.data[at] += error;
-        shares.data[at + Kind::Thin as usize] = share;
+        shares.data[at + GaussianKind::Thin as usize] = share;
     };
     // A larger error that is not the kind's, and the kind's own, at the lower right border.
     mark(2, 3, 0.5, 0.0);
     mark(99, 89, 0.2, 1.0);
-    let (left, top) = worst_corner(&taken, &shares, Kind::Thin);
+    let (left, top) = worst_corner(&taken, &shares, GaussianKind::Thin);
     assert_eq!((left, top), (36, 26), "the first square that holds the last pixel");
     let part = crop(&taken.compressed, (left, top));
     assert_eq!((part.width, part.height), (CROP, CROP));

@@ -19,7 +19,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use super::blocks::BlockScans;
 use crate::error::{Error, Result};
 use crate::model::Rows;
-use crate::source::{Ahead, BlockReader, Ids};
+use crate::source::{BlockReader, Ids, Prefetch};
 
 /// Units that have been fetched and wait for a lane's decoder, at most.
 const FETCHED: usize = 4;
@@ -34,17 +34,17 @@ struct Unit {
 type OfBlock<'a> = (usize, Box<dyn BlockReader + 'a>);
 
 /// What came of the blocks.
-struct Found {
+struct StagedResult {
     blocks: Vec<Option<(Rows, f32)>>,
     /// The error of the first block that has one.
     error: Option<(usize, Error)>,
 }
 
 /// The rows of all blocks of `scan` and their largest coordinates, in order.
-pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Ahead) -> Result<Vec<(Rows, f32)>> {
+pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Prefetch) -> Result<Vec<(Rows, f32)>> {
     let blocks = scan.blocks();
     let lanes = rayon::current_num_threads().min(blocks);
-    let found = Mutex::new(Found { blocks: (0..blocks).map(|_| None).collect(), error: None });
+    let found = Mutex::new(StagedResult { blocks: (0..blocks).map(|_| None).collect(), error: None });
     thread::scope(|scope| {
         let mut to_lanes = Vec::with_capacity(lanes);
         for _ in 0..lanes {
@@ -59,7 +59,7 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Ahead) -> Result
         }
         scope.spawn(move || fetch(scan, ahead, to_lanes));
     });
-    let Found { blocks, error } = found.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let StagedResult { blocks, error } = found.into_inner().unwrap_or_else(PoisonError::into_inner);
     match error {
         Some((_, error)) => Err(error),
         None => Ok(blocks.into_iter().flatten().collect()),
@@ -67,7 +67,7 @@ pub(crate) fn scan_in_stages(scan: &BlockScans<'_>, ahead: &dyn Ahead) -> Result
 }
 
 /// Brings the bytes of every unit and sends it to its lane, until a lane is gone.
-fn fetch(scan: &BlockScans<'_>, ahead: &dyn Ahead, to_lanes: Vec<Sender<Unit>>) {
+fn fetch(scan: &BlockScans<'_>, ahead: &dyn Prefetch, to_lanes: Vec<Sender<Unit>>) {
     let frame_block = ahead.frame_block().max(1);
     for first in (0..scan.blocks()).step_by(to_lanes.len().max(1)) {
         for start in (0..scan.frames()).step_by(frame_block) {
@@ -108,7 +108,7 @@ fn accumulate<'a>(
     scan: &BlockScans<'a>,
     ready: &Receiver<(Unit, Result<OfBlock<'a>>)>,
     done: &Sender<OfBlock<'a>>,
-    found: &Mutex<Found>,
+    found: &Mutex<StagedResult>,
 ) {
     let mut running = None;
     for (unit, prepared) in ready {
@@ -178,12 +178,12 @@ mod tests {
             Ok(Box::new(SlowReader { reader: self.scene.open(ids)?, fails_from: self.fails_from }))
         }
 
-        fn ahead(&self) -> Option<&dyn Ahead> {
+        fn ahead(&self) -> Option<&dyn Prefetch> {
             self.frame_block.is_some().then_some(self)
         }
     }
 
-    impl Ahead for Slow {
+    impl Prefetch for Slow {
         fn frame_block(&self) -> usize {
             self.frame_block.unwrap_or_default()
         }

@@ -7,7 +7,7 @@
 mod norm;
 pub mod sketch;
 
-pub use norm::{Looks, Norm};
+pub use norm::{Norm, PercentilePasses};
 pub use sketch::FloatSketch;
 
 use serde::{Deserialize, Serialize};
@@ -96,12 +96,12 @@ impl Graded {
 ///
 /// Rows with [`Flags::NON_FINITE`] count in no percentile and score 0 throughout. `rows.e` is used
 /// only when λ > 0. No rows give empty scores.
-pub fn score(rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
-    score_by(Looks::Two, rows, frames, recipe)
+pub fn score(rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
+    score_by(PercentilePasses::Two, rows, frames, recipe)
 }
 
 /// [`score`] with percentiles found by `looks`.
-pub fn score_by(looks: Looks, rows: &Rows, frames: usize, recipe: &recipe::Score) -> Scores {
+pub fn score_by(looks: PercentilePasses, rows: &Rows, frames: usize, recipe: &recipe::ScoreParams) -> Scores {
     use Graded::By;
     use Statistic::{C, D, E, Kappa, Life, V, W};
     let counts: Vec<bool> = rows.flags.iter().map(|flags| !flags.contains(Flags::NON_FINITE)).collect();
@@ -137,8 +137,8 @@ pub fn score_by(looks: Looks, rows: &Rows, frames: usize, recipe: &recipe::Score
 /// Adds up normalised terms.
 struct Summation<'a> {
     counts: &'a [bool],
-    recipe: &'a recipe::Score,
-    looks: Looks,
+    recipe: &'a recipe::ScoreParams,
+    looks: PercentilePasses,
     terms: Vec<Term>,
 }
 
@@ -179,15 +179,22 @@ mod tests {
         }
     }
 
-    fn preset(name: &str) -> recipe::Score {
+    fn preset(name: &str) -> recipe::ScoreParams {
         Recipe::preset(name).unwrap().score
     }
 
     #[test]
     fn paper_scores_equal_the_formulas_written_out() {
         let rows = rows(1000);
-        let recipe =
-            recipe::Score { lambda: 0.3, mu: 0.7, eta: 0.9, xi: 0.2, w_static: 1.5, w_dynamic: 2.5, ..preset("paper") };
+        let recipe = recipe::ScoreParams {
+            lambda: 0.3,
+            mu: 0.7,
+            eta: 0.9,
+            xi: 0.2,
+            w_static: 1.5,
+            w_dynamic: 2.5,
+            ..preset("paper")
+        };
         let scores = score(&rows, 2000, &recipe);
         // Every statistic is a ramp 0..999: nearest rank puts P1 at 9 and P99 at 989 steps.
         let norm = |i: usize, scale: f64| (i as f64 - 9.0) * scale / (980.0 * scale + 1e-8);
@@ -275,7 +282,7 @@ mod tests {
         let mut rows = rows(200);
         rows.life = vec![50; 200];
         let plain = score(&rows, 100, &preset("paper"));
-        let weighed = score(&rows, 100, &recipe::Score { weigh_motion_by_life: true, ..preset("paper") });
+        let weighed = score(&rows, 100, &recipe::ScoreParams { weigh_motion_by_life: true, ..preset("paper") });
         let d = |scores: &Scores| scores.terms.iter().find(|t| t.of == Graded::By(Statistic::D)).unwrap().norm.p99;
         assert_eq!(d(&weighed), 0.5 * d(&plain));
     }

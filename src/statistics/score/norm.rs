@@ -22,7 +22,7 @@ pub struct Norm {
 
 /// How often the values are looked at for a percentile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Looks {
+pub enum PercentilePasses {
     /// Twice: exact.
     Two,
     /// Once, by so many mantissa bits: the middle of the bucket that holds it.
@@ -31,13 +31,17 @@ pub enum Looks {
 
 impl Norm {
     /// The normalisation of a set of values; NaN and infinities are passed over.
-    pub fn of<I: Iterator<Item = f64>>(values: impl Fn() -> I, recipe: &recipe::Score, looks: Looks) -> Self {
+    pub fn of<I: Iterator<Item = f64>>(
+        values: impl Fn() -> I,
+        recipe: &recipe::ScoreParams,
+        looks: PercentilePasses,
+    ) -> Self {
         let [p1, p99] = match looks {
-            Looks::Two => {
+            PercentilePasses::Two => {
                 let sketch = FloatSketch::of(values());
                 [1.0, 99.0].map(|p| sketch.percentile(p, values()))
             }
-            Looks::One(bits) => {
+            PercentilePasses::One(bits) => {
                 let sketch = FloatSketch::keyed_by(bits, values());
                 [1.0, 99.0].map(|p| sketch.rough_percentile(p))
             }
@@ -67,7 +71,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     fn norm_of(preset: &str, values: &[f64]) -> Norm {
-        Norm::of(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score, Looks::Two)
+        Norm::of(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score, PercentilePasses::Two)
     }
 
     #[test]

@@ -1,10 +1,10 @@
 use super::*;
 use crate::synthetic::Noise;
-use crate::synthetic::deep::{KINDS, Kind, tensors};
+use crate::synthetic::deep::{DeepVariant, KINDS, tensors};
 
 const FILE: &str = "deform.pth";
 
-fn network(kind: Kind) -> Network {
+fn network(kind: DeepVariant) -> Network {
     Network::new(&tensors(kind), "network.", Path::new(FILE)).unwrap()
 }
 
@@ -37,7 +37,7 @@ impl Oracle {
     }
 
     /// Outputs of the heads, one after the other.
-    fn motion(&self, kind: Kind, position: [f64; 3], time: f64) -> Vec<f64> {
+    fn motion(&self, kind: DeepVariant, position: [f64; 3], time: f64) -> Vec<f64> {
         let relu = |x: Vec<f64>| x.into_iter().map(|x| x.max(0.0)).collect::<Vec<f64>>();
         let of_time = match kind.time_network {
             true => self.linear("timenet.2", &relu(self.linear("timenet.0", &Self::encoding(&[time], 6)))),
@@ -58,8 +58,8 @@ impl Oracle {
     }
 }
 
-fn row(motion: &Motion, i: usize) -> Vec<f64> {
-    let Motion { warp, rotation, scaling, opacity, colour } = motion;
+fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
+    let PredictedMotion { warp, rotation, scaling, opacity, colour } = motion;
     let columns = [warp, rotation, scaling, opacity, colour];
     columns.into_iter().flat_map(|column| (0..column.width()).map(|c| f64::from(column.plane(c)[i]))).collect()
 }
@@ -70,7 +70,7 @@ fn every_kind_agrees_with_the_f64_oracle() {
         let (network, oracle, positions) = (network(kind), Oracle(tensors(kind)), positions(37));
         assert_eq!((network.has_screws(), network.active().contains(Columns::SH)), (kind.screws, kind.all_heads));
         let encoded = network.encode(&positions);
-        let mut motion = Motion::default();
+        let mut motion = PredictedMotion::default();
         for time in [0.0f32, 0.37, 1.0] {
             network.motion(&encoded, f64::from(time), Columns::all(), &mut motion).unwrap();
             for i in 0..positions.len() {
@@ -138,10 +138,10 @@ fn slopes_are_those_of_finite_differences() {
 fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_heads() {
     let network = network(KINDS[0]);
     let all = positions(70);
-    let mut whole = Motion::default();
+    let mut whole = PredictedMotion::default();
     network.motion(&network.encode(&all), 0.6, Columns::all(), &mut whole).unwrap();
     for ids in [vec![0], vec![3, 69, 4], (20..55).collect()] {
-        let mut part = Motion::default();
+        let mut part = PredictedMotion::default();
         let encoded = network.encode(&all.pick(&ids));
         network.motion(&encoded, 0.6, Columns::LOG_SCALE, &mut part).unwrap();
         assert!(part.warp.is_empty());
@@ -153,7 +153,7 @@ fn a_gaussian_has_the_same_bits_in_every_block_and_for_every_choice_of_heads() {
 #[test]
 fn tensors_that_do_not_fit_are_named() {
     type Break = fn(&mut Tensors);
-    let cases: [(Kind, Break, &[&str]); 7] = [
+    let cases: [(DeepVariant, Break, &[&str]); 7] = [
         (KINDS[0], |t| drop(t.remove("network.linear.0.weight")), &["network.linear.0.weight", "none"]),
         (KINDS[0], |t| drop(t.remove("network.linear.3.bias")), &["network.linear.3.bias", "none"]),
         (KINDS[0], |t| drop(t.remove("network.gaussian_scaling.weight")), &["network.gaussian_scaling.weight"]),
@@ -190,5 +190,9 @@ fn tensors_that_do_not_fit_are_named() {
             assert!(message.contains(part), "{part:?} is not in {message:?}");
         }
     }
-    assert!(network(KINDS[0]).motion(&Encoded::default(), f64::NAN, Columns::all(), &mut Motion::default()).is_err());
+    assert!(
+        network(KINDS[0])
+            .motion(&Encoded::default(), f64::NAN, Columns::all(), &mut PredictedMotion::default())
+            .is_err()
+    );
 }

@@ -11,7 +11,7 @@ const POSITION_INPUTS: usize = 3 + 2 * 3 * 10;
 
 /// Variants of the architecture.
 #[derive(Clone, Copy, Debug)]
-pub struct Kind {
+pub struct DeepVariant {
     /// Whether a network of its own encodes the time.
     pub time_network: bool,
     /// Whether positions move by screw motions (rotation and translation) instead of offsets.
@@ -21,14 +21,14 @@ pub struct Kind {
 }
 
 /// Examples in which each option is on and off.
-pub const KINDS: [Kind; 3] = [
-    Kind { time_network: true, screws: false, all_heads: false },
-    Kind { time_network: false, screws: true, all_heads: false },
-    Kind { time_network: true, screws: false, all_heads: true },
+pub const KINDS: [DeepVariant; 3] = [
+    DeepVariant { time_network: true, screws: false, all_heads: false },
+    DeepVariant { time_network: false, screws: true, all_heads: false },
+    DeepVariant { time_network: true, screws: false, all_heads: true },
 ];
 
 /// Tensors `network.*` of five layers, of which the fourth joins; outputs are of size 1.
-pub fn tensors(kind: Kind) -> Tensors {
+pub fn tensors(kind: DeepVariant) -> Tensors {
     let mut noise = Noise(5);
     let mut tensors = Tensors::new();
     let mut add = |name: &str, outputs: usize, inputs: usize, size: f32| {

@@ -16,24 +16,24 @@ mod tile;
 use rayon::prelude::*;
 
 use super::bin::STRIP_PAIRS;
-use super::blend::Lattice;
+use super::blend::SampledPixels;
 use super::convention::BLOCK;
-use super::project::View;
+use super::project::CameraTerms;
 use super::renderer::{BYTES_PER_VISIBLE, Image, Renderer, fill_pairs};
 use splat_core::{Camera, Columns, Gaussians, GradientSpan, Gradients};
-use sums::{Sums, Taken};
+use sums::{ImageGradientSums, SplatSums};
 use tile::{Pull, Pulled};
 
 /// Gaussians whose gradients one task adds to: whole blocks.
 const SPAN: usize = 32 * BLOCK;
 
 /// Memory of a picture that is differentiated per Gaussian it shows.
-pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<Sums<f64>>();
+pub const GRADIENT_BYTES_PER_VISIBLE: usize = BYTES_PER_VISIBLE + size_of::<SplatSums<f64>>();
 /// Pairs of splats and tiles whose sums lie ready at a time: of small pictures all, of others a part of the strip.
 const SUMMED_PAIRS: usize = STRIP_PAIRS / 4;
 
 /// Memory of a picture that is differentiated for pairs of Gaussians and tiles.
-pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<Sums<f32>>();
+pub const GRADIENT_STRIP_BYTES: usize = STRIP_PAIRS * size_of::<u32>() + SUMMED_PAIRS * size_of::<SplatSums<f32>>();
 
 impl Renderer {
     /// Renders as [`Renderer::render`], asks `loss` for a number and its derivative by each value of the picture,
@@ -55,7 +55,7 @@ impl Renderer {
     ) -> f64 {
         assert_eq!(out.len(), gaussians.len(), "gradients of another model");
         assert!(out.column(Columns::SH).width() <= gaussians.sh.width(), "gradients of harmonics that do not exist");
-        let view = View::new(camera);
+        let view = CameraTerms::new(camera);
         self.prepare(gaussians, &view, true);
         let picture = self.picture(&view, background);
         let (value, pull) = loss(&picture);
@@ -81,10 +81,10 @@ impl Renderer {
     }
 
     /// What every splat takes: tiles at once, then splats at once, each adding up its tiles in their order.
-    fn second_walk<const SHAPE: bool>(&mut self, view: &View, picture: &Image, pull: &Image) {
-        let Taken { totals, of_pairs } = &mut self.taken;
+    fn second_walk<const SHAPE: bool>(&mut self, view: &CameraTerms, picture: &Image, pull: &Image) {
+        let ImageGradientSums { totals, of_pairs } = &mut self.taken;
         totals.clear();
-        totals.resize(self.splats.splats.len(), Sums::default());
+        totals.resize(self.splats.splats.len(), SplatSums::default());
         let part = match self.parallel {
             true => totals.len().div_ceil(rayon::current_num_threads()).max(1),
             false => totals.len().max(1),
@@ -94,11 +94,11 @@ impl Renderer {
             let (bins, splats, blend) = (&self.bins, &self.splats.splats, self.blend);
             for tiles in bins.parts(strip, self.strip_pairs.min(SUMMED_PAIRS)) {
                 fill_pairs(bins, tiles.clone(), self.parallel, of_pairs, |tile, pairs, sums| {
-                    let lattice = Lattice::new(tile, view.size, 1);
+                    let lattice = SampledPixels::new(tile, view.size, 1);
                     let mut ink = Pulled::<SHAPE> { pull: Pull::new(picture, pull, tile), pairs: sums };
                     blend.tile(splats, pairs, &lattice, &mut ink);
                 });
-                let add = |(k, totals): (usize, &mut [Sums<f64>])| {
+                let add = |(k, totals): (usize, &mut [SplatSums<f64>])| {
                     for (&splat, sums) in bins.pairs(tiles.clone()).iter().zip(&*of_pairs) {
                         // Of another part it wraps or lies beyond.
                         if let Some(total) = totals.get_mut((splat as usize).wrapping_sub(k * part)) {

@@ -9,12 +9,18 @@ use std::ops::Range;
 
 use super::super::colour;
 use super::super::convention::BLOCK;
-use super::super::project::{LOGARITHM_LIMIT, Shape, Splat, View, cross, dot, opacity};
-use super::sums::Sums;
+use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat, cross, dot, opacity};
+use super::sums::SplatSums;
 use splat_core::{Columns, Gaussians, GradientSpan, sh_coefficients};
 
 /// Adds what the Gaussians behind `splats` take to `out`, whose splats these are; `sums` is what each splat takes.
-pub(super) fn add(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], view: &View, out: &mut GradientSpan) {
+pub(super) fn add(
+    gaussians: &Gaussians,
+    splats: &[Splat],
+    sums: &[SplatSums<f64>],
+    view: &CameraTerms,
+    out: &mut GradientSpan,
+) {
     #[cfg(target_arch = "x86_64")]
     {
         /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
@@ -22,8 +28,8 @@ pub(super) fn add(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], v
         fn add_avx2(
             gaussians: &Gaussians,
             splats: &[Splat],
-            sums: &[Sums<f64>],
-            view: &View,
+            sums: &[SplatSums<f64>],
+            view: &CameraTerms,
             out: &mut GradientSpan<'_>,
         ) {
             add_blocks(gaussians, splats, sums, view, out);
@@ -33,8 +39,8 @@ pub(super) fn add(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], v
         fn add_avx512(
             gaussians: &Gaussians,
             splats: &[Splat],
-            sums: &[Sums<f64>],
-            view: &View,
+            sums: &[SplatSums<f64>],
+            view: &CameraTerms,
             out: &mut GradientSpan<'_>,
         ) {
             add_blocks(gaussians, splats, sums, view, out);
@@ -55,8 +61,14 @@ pub(super) fn add(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], v
 }
 
 #[inline(always)]
-fn add_blocks(gaussians: &Gaussians, splats: &[Splat], sums: &[Sums<f64>], view: &View, out: &mut GradientSpan<'_>) {
-    let mut block = Block::default();
+fn add_blocks(
+    gaussians: &Gaussians,
+    splats: &[Splat],
+    sums: &[SplatSums<f64>],
+    view: &CameraTerms,
+    out: &mut GradientSpan<'_>,
+) {
+    let mut block = GradientBlock::default();
     let (mut splats, mut sums) = (splats, sums);
     for start in out.ids().step_by(BLOCK) {
         let ids = start..(start + BLOCK).min(out.ids().end);
@@ -91,7 +103,7 @@ struct Directions {
 
 impl Directions {
     #[inline(always)]
-    fn new(gaussians: &Gaussians, ids: Range<usize>, view: &View) -> Self {
+    fn new(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms) -> Self {
         let n = ids.len().min(BLOCK);
         let position: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.position.plane(c)[ids.clone()][..n]);
         let mut directions = Directions { unit: [[0.0; BLOCK]; 3], per_distance: [0.0; BLOCK] };
@@ -110,8 +122,8 @@ impl Directions {
     }
 }
 
-/// What the Gaussians of a block take, as in [`Sums`]; 0 where they are not visible.
-struct Block {
+/// What the Gaussians of a block take, as in [`SplatSums`]; 0 where they are not visible.
+struct GradientBlock {
     p: [f64; BLOCK],
     first: [[f64; BLOCK]; 2],
     second: [[f64; BLOCK]; 3],
@@ -119,16 +131,16 @@ struct Block {
     colour: [[f32; BLOCK]; 3],
 }
 
-impl Default for Block {
+impl Default for GradientBlock {
     fn default() -> Self {
         let zero = [0.0; BLOCK];
-        Block { p: zero, first: [zero; 2], second: [zero; 3], colour: [[0.0; BLOCK]; 3] }
+        GradientBlock { p: zero, first: [zero; 2], second: [zero; 3], colour: [[0.0; BLOCK]; 3] }
     }
 }
 
-impl Block {
-    fn fill(&mut self, splats: &[Splat], sums: &[Sums<f64>], start: usize) {
-        *self = Block::default();
+impl GradientBlock {
+    fn fill(&mut self, splats: &[Splat], sums: &[SplatSums<f64>], start: usize) {
+        *self = GradientBlock::default();
         for (splat, sums) in splats.iter().zip(sums) {
             let i = splat.id as usize - start;
             self.p[i] = sums.p;
@@ -204,7 +216,7 @@ impl Block {
 
     /// Opacity, scale, rotation, and position through the footprint.
     #[inline(always)]
-    fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &View, out: &mut GradientSpan<'_>) {
+    fn add_shape(&self, gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, out: &mut GradientSpan<'_>) {
         let n = ids.len().min(BLOCK);
         let plane = |column: Columns, c: usize| &gaussians.column(column).plane(c)[ids.clone()][..n];
         let position: [&[f32]; 3] = std::array::from_fn(|c| plane(Columns::POSITION, c));
@@ -212,9 +224,9 @@ impl Block {
         let log_scale: [&[f32]; 3] = std::array::from_fn(|c| plane(Columns::LOG_SCALE, c));
         let logit = plane(Columns::OPACITY, 0);
         let mut parts = [[0.0f32; BLOCK]; 11];
-        let Block { p, first, second, .. } = self;
+        let GradientBlock { p, first, second, .. } = self;
         for i in 0..n {
-            let taken = Taken::new(
+            let taken = GeometryGradient::new(
                 [position[0][i].into(), position[1][i].into(), position[2][i].into()],
                 [rotation[0][i].into(), rotation[1][i].into(), rotation[2][i].into(), rotation[3][i].into()],
                 [log_scale[0][i], log_scale[1][i], log_scale[2][i]],
@@ -246,14 +258,14 @@ impl Block {
 }
 
 /// What one Gaussian's geometry takes.
-struct Taken {
+struct GeometryGradient {
     position: [f64; 3],
     rotation: [f64; 4],
     log_scale: [f64; 3],
 }
 
-impl Taken {
-    /// `first` and `second` are those of [`Sums`].
+impl GeometryGradient {
+    /// `first` and `second` are those of [`SplatSums`].
     #[inline(always)]
     fn new(
         position: [f64; 3],
@@ -261,9 +273,9 @@ impl Taken {
         log_scale: [f32; 3],
         [x, y]: [f64; 2],
         [xx, xy, yy]: [f64; 3],
-        view: &View,
+        view: &CameraTerms,
     ) -> Self {
-        let shape = Shape::new(position, q, log_scale, view);
+        let shape = ProjectedShape::new(position, q, log_scale, view);
         let seen = shape.covariance();
         let [a, b] = shape.spread;
 
@@ -307,7 +319,7 @@ impl Taken {
         let inverse = 1.0 / shape.depth;
         let along =
             |axis: usize| inverse * (row_x[axis] * by_slope_x + row_y[axis] * by_slope_y + row_z[axis] * by_depth);
-        Taken {
+        GeometryGradient {
             position: [along(0), along(1), along(2)],
             rotation: by_quaternion(q, torque),
             log_scale: [scale_0, scale_1, scale_2],

@@ -5,7 +5,7 @@
 /// With p = alpha · ∂L/∂alpha and a pixel's offset (x, y), pixels: y along v from the splat's centre, x along u from the
 /// middle of the row.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Sums<T> {
+pub(super) struct SplatSums<T> {
     /// Σ p.
     pub(super) p: T,
     /// Σ p·x and Σ p·y.
@@ -16,9 +16,9 @@ pub(super) struct Sums<T> {
     pub(super) colour: [T; 3],
 }
 
-impl Sums<f64> {
+impl SplatSums<f64> {
     #[inline(always)]
-    pub(super) fn add(&mut self, tile: &Sums<f32>) {
+    pub(super) fn add(&mut self, tile: &SplatSums<f32>) {
         self.p += f64::from(tile.p);
         (0..2).for_each(|k| self.first[k] += f64::from(tile.first[k]));
         (0..3).for_each(|k| self.second[k] += f64::from(tile.second[k]));
@@ -28,9 +28,9 @@ impl Sums<f64> {
 
 /// What splats take of a picture.
 #[derive(Debug, Default)]
-pub(in super::super) struct Taken {
+pub(in super::super) struct ImageGradientSums {
     /// One for every splat.
-    pub(super) totals: Vec<Sums<f64>>,
+    pub(super) totals: Vec<SplatSums<f64>>,
     /// One for every pair of a strip.
-    pub(super) of_pairs: Vec<Sums<f32>>,
+    pub(super) of_pairs: Vec<SplatSums<f32>>,
 }

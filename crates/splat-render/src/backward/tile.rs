@@ -4,12 +4,12 @@
 //! takes its own part away, and what is left is what lies behind it (method.md, section 8.1). Data in: the tile's
 //! splats, ∂L/∂ pixel, and the pixels. Data out: nine sums per pair of a splat and the tile.
 
-use super::super::blend::{GROUPS, Ink, Plane, Stroke};
+use super::super::blend::{BlendSink, Fragment, GROUPS, TilePlane};
 use super::super::convention::{MAX_ALPHA, TILE};
 use super::super::lanes::{LANES, Lanes, Sums as _, Twins};
 use super::super::project::Splat;
 use super::super::renderer::Image;
-use super::sums::Sums;
+use super::sums::SplatSums;
 
 /// The largest alpha that was not cut.
 const UNCUT: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
@@ -17,9 +17,9 @@ const UNCUT: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 /// What the pixels of a tile take, before the walk.
 pub(super) struct Pull {
     /// ∂L/∂ pixel, by channel.
-    pixel: [Plane; 3],
+    pixel: [TilePlane; 3],
     /// Inner product of that with the pixel's colour.
-    rest: Plane,
+    rest: TilePlane,
 }
 
 impl Pull {
@@ -27,7 +27,7 @@ impl Pull {
     pub(super) fn new(picture: &Image, pull: &Image, tile: [u32; 2]) -> Self {
         // Copied first: the copies wait for memory together, one pixel after the other would wait alone.
         let (colours, pulls) = (picture.tile(tile), pull.tile(tile));
-        let (mut pixel, mut rest) = ([Plane::default(); 3], Plane::default());
+        let (mut pixel, mut rest) = ([TilePlane::default(); 3], TilePlane::default());
         for group in 0..GROUPS {
             let (v, first) = (group % TILE as usize, group / TILE as usize * LANES);
             for lane in 0..LANES {
@@ -47,7 +47,7 @@ impl Pull {
 pub(super) struct Pulled<'a, const SHAPE: bool> {
     pub(super) pull: Pull,
     /// One per pair of the tile.
-    pub(super) pairs: &'a mut [Sums<f32>],
+    pub(super) pairs: &'a mut [SplatSums<f32>],
 }
 
 /// A splat that is walked over.
@@ -60,7 +60,7 @@ pub(super) struct Walked<V: Lanes> {
     taken: [V::Twins; 3],
 }
 
-impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
+impl<const SHAPE: bool> BlendSink for Pulled<'_, SHAPE> {
     type Drop<V: Lanes> = Walked<V>;
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> Walked<V> {
@@ -68,8 +68,8 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
         Walked { colour: splat.colour.map(V::splat), p: zero, first: [zero; 2], second: [zero; 3], taken: [zero; 3] }
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Stroke<V>) -> Walked<V> {
-        let Stroke { alpha, blended, weight, across, down, .. } = stroke;
+    fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Fragment<V>) -> Walked<V> {
+        let Fragment { alpha, blended, weight, across, down, .. } = stroke;
         let by_colour: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c], group)));
         for (taken, by_colour) in walked.taken.iter_mut().zip(by_colour) {
             *taken = by_colour.add_to_own(*taken);
@@ -113,10 +113,10 @@ impl<const SHAPE: bool> Ink for Pulled<'_, SHAPE> {
             let (x, y, xx, xy, yy) = (x.together(), y.together(), xx.together(), xy.together(), yy.together());
             let (red, green, blue) = (red.together(), green.together(), blue.together());
             let [x, y, xx, xy, yy, red, green, blue] = V::Sums::totals([x, y, xx, xy, yy, red, green, blue]);
-            Sums { p: p.together().total(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
+            SplatSums { p: p.together().total(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
         } else {
             let colour = [red.together().total(), green.together().total(), blue.together().total()];
-            Sums { colour, ..Sums::default() }
+            SplatSums { colour, ..SplatSums::default() }
         };
     }
 }

@@ -5,14 +5,14 @@ use crate::model::{Camera, Gaussians};
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 
 /// What the oracle sees in one picture.
-pub struct Picture {
+pub struct OracleRender {
     /// `[height · width]`.
     pub rgb: Vec<[f64; 3]>,
     /// Whether some decision of the pixel fell within 1e-4 (relative) of its threshold: f32 may differ.
     pub doubtful: Vec<bool>,
     /// Per Gaussian Σ and max over sampled pixels of alpha · transmittance.
     pub sum: Vec<f64>,
-    /// See [`Picture::sum`].
+    /// See [`OracleRender::sum`].
     pub max: Vec<f64>,
     /// Number of (Gaussian, pixel) pairs blended.
     pub events: u64,
@@ -114,7 +114,7 @@ fn footprint(gaussians: &Gaussians, id: usize, camera: &Camera) -> Option<Footpr
 }
 
 /// Renders, and weighs the pixels of every `stride`-th column and row.
-pub fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> Picture {
+pub fn picture(gaussians: &Gaussians, camera: &Camera, background: [f32; 3], stride: u32) -> OracleRender {
     picture_of(gaussians, camera, background, stride, |_, _| ())
 }
 
@@ -147,7 +147,7 @@ fn picture_of(
     background: [f32; 3],
     stride: u32,
     mut blended: impl FnMut(usize, usize),
-) -> Picture {
+) -> OracleRender {
     let mut footprints: Vec<Footprint> =
         (0..gaussians.len()).filter_map(|id| footprint(gaussians, id, camera)).collect();
     footprints.sort_by(|a, b| a.depth.total_cmp(&b.depth).then(a.id.cmp(&b.id)));
@@ -162,7 +162,7 @@ fn picture_of(
             }
         }
     }
-    let mut seen = Picture {
+    let mut seen = OracleRender {
         rgb: Vec::with_capacity(width * height),
         doubtful: Vec::with_capacity(width * height),
         sum: vec![0.0; gaussians.len()],

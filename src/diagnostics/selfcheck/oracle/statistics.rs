@@ -2,10 +2,10 @@
 //! f64, sharing no code with the streaming scan.
 
 use crate::model::{Camera, Gaussians, Schedule};
-use crate::recipe::{Motion, Scan};
+use crate::recipe::{MotionParams, ScanParams};
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Row {
+pub(crate) struct OracleRow {
     pub(crate) d: f64,
     pub(crate) kappa: f64,
     pub(crate) v: f64,
@@ -15,7 +15,7 @@ pub(crate) struct Row {
 }
 
 /// The row of Gaussian `i`; frames are evenly spaced.
-pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Scan) -> Row {
+pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &ScanParams) -> OracleRow {
     let last = frames.len() - 1;
     let x = |t: usize| frames[t].position.row::<3>(i).map(f64::from);
     let alpha: Vec<f64> =
@@ -25,13 +25,13 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Sc
     let step = |t: usize| norm(sub(x(t), x(t - 1)));
     let turn = |t: usize| norm(sub(sub(x(t + 1), x(t)), sub(x(t), x(t - 1))));
     let (d, kappa) = match scan.motion {
-        Motion::Literal => {
+        MotionParams::Literal => {
             let steps: f64 = life.iter().filter(|&&t| t > 0).map(|&t| step(t).powi(2)).sum();
             let centres = life.get(1..life.len().max(2) - 1).unwrap_or(&[]);
             let turns: f64 = centres.iter().map(|&t| turn(t)).sum();
             ((steps / life.len().max(1) as f64).sqrt(), turns / centres.len().max(1) as f64)
         }
-        Motion::Runs => {
+        MotionParams::Runs => {
             let steps: Vec<f64> = (1..=last).filter(|&t| alive(t) && alive(t - 1)).map(|t| step(t).powi(2)).collect();
             let turns: Vec<f64> =
                 (1..last.max(1)).filter(|&t| alive(t - 1) && alive(t) && alive(t + 1)).map(turn).collect();
@@ -50,7 +50,7 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Sc
         }
     }
     let pairs = schedule.pairs().max(1) as f64;
-    Row { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
+    OracleRow { d, kappa, v: mean(&deviations), life: life.len() as u32, c: c / pairs, vis: f64::from(touched) / pairs }
 }
 
 /// Area, px², by way of the 3-D covariance and its projection.

@@ -22,10 +22,10 @@ impl Scratch {
     }
 
     fn write(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians) -> Vec<u8> {
-        self.write_changed(template, rows, proxies, &Change::default())
+        self.write_changed(template, rows, proxies, &ParamDelta::default())
     }
 
-    fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Change) -> Vec<u8> {
+    fn write_changed(&self, template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &ParamDelta) -> Vec<u8> {
         write_like(template, rows, proxies, change, ALL_HARMONICS, &self.path("out.ply")).unwrap();
         fs::read(self.path("out.ply")).unwrap()
     }
@@ -161,12 +161,12 @@ fn a_change_adds_to_any_column_of_rows_and_proxies_and_zeros_leave_the_bytes() {
         for column in Columns::all().difference(Columns::LOG_SCALE).iter() {
             by.column_mut(column).plane_mut(0).copy_from_slice(&[3.0, -2.0]);
         }
-        let written = scratch.write_changed(&ply, &rows, &proxies, &Change(by.clone()));
+        let written = scratch.write_changed(&ply, &rows, &proxies, &ParamDelta(by.clone()));
         let (folder, other) = (Scratch::new(), Scratch::new());
         let mut expected = all(&folder.open(&plain));
-        Change(by).add_to(&mut expected, Columns::all());
+        ParamDelta(by).add_to(&mut expected, Columns::all());
         assert!(all(&other.open(&written)) == expected, "{format} {kind}");
-        let zeros = scratch.write_changed(&ply, &rows, &proxies, &Change(Gaussians::zeros(2, 1)));
+        let zeros = scratch.write_changed(&ply, &rows, &proxies, &ParamDelta(Gaussians::zeros(2, 1)));
         assert!(zeros == plain, "{format} {kind}");
     }
 }
@@ -183,12 +183,12 @@ fn harmonics_above_a_degree_go_and_those_below_are_where_a_file_of_that_degree_h
         assert_eq!(fewer.sh_degree(), degree.min(3));
         let [expected, found] = ["expected.ply", "found.ply"].map(|name| scratch.path(name));
         write_inria(&fewer, ply.comments(), &expected).unwrap();
-        write_like(&ply, &kept(0..4), &Gaussians::default(), &Change::default(), degree, &found).unwrap();
+        write_like(&ply, &kept(0..4), &Gaussians::default(), &ParamDelta::default(), degree, &found).unwrap();
         assert!(fs::read(&found).unwrap() == fs::read(&expected).unwrap(), "degree {degree}");
     }
     // Proxies and changes have all of them; what is no attribute stays where it was.
     let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
-    let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], Change(proxies(2, 1)));
+    let (rows, change) = ([OutRow { source: 2, proxy: Some(0) }, kept([1])[0]], ParamDelta(proxies(2, 1)));
     let mut expected = all(&scratch.open(&scratch.write_changed(&ply, &rows, &proxies(1, 1), &change)));
     let ply = scratch.open(&file("binary_big_endian", "double", &names(), 3, "\r\n"));
     write_like(&ply, &rows, &proxies(1, 1), &change, 0, &scratch.path("out.ply")).unwrap();
@@ -222,14 +222,14 @@ fn rows_and_proxies_that_do_not_exist_are_refused() {
     let scratch = Scratch::new();
     let ply = scratch.open(&file("binary_little_endian", "float", &names(), 2, "\n"));
     let refusal = |rows: &[OutRow], proxies: &Gaussians| {
-        write_like(&ply, rows, proxies, &Change::default(), ALL_HARMONICS, &scratch.path("none.ply"))
+        write_like(&ply, rows, proxies, &ParamDelta::default(), ALL_HARMONICS, &scratch.path("none.ply"))
             .unwrap_err()
             .to_string()
     };
     assert!(refusal(&kept([2]), &Gaussians::default()).contains("Gaussian 2 "));
     assert!(refusal(&[OutRow { source: 0, proxy: Some(1) }], &proxies(1, 1)).contains("proxy 1 "));
     assert!(refusal(&[OutRow { source: 0, proxy: Some(0) }], &proxies(1, 3)).contains("48 SH planes"));
-    let short = Change(Gaussians::zeros(1, 1));
+    let short = ParamDelta(Gaussians::zeros(1, 1));
     let path = scratch.path("none.ply");
     let message = write_like(&ply, &kept([0, 1]), &Gaussians::default(), &short, ALL_HARMONICS, &path);
     assert!(message.unwrap_err().to_string().contains("1 changes of 2 rows"));

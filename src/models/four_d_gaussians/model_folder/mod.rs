@@ -15,8 +15,8 @@ use crate::deform::{Deltas, Field, Prepared, Scratch};
 use crate::error::{Error, Result};
 use crate::limits::ReadLimit;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
-use crate::passes::{BLOCK, InBlocks, Parts};
-use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, Reads, Wanted};
+use crate::passes::{BLOCK, BlockSlices, InBlocks};
+use crate::source::{BlockReader, Count, Deformation, FrameSource, Ids, ReadPlan, Reads};
 
 use super::cfg_args::ModelConfig;
 use super::small_field::rounded;
@@ -237,7 +237,7 @@ impl FrameSource for ModelFolder {
     }
 
     /// Nothing is decoded together, so that nothing is gained by what readers of all Gaussians would keep.
-    fn open_all(&self, _: &Wanted) -> Option<Result<Box<dyn BlockReader + '_>>> {
+    fn open_all(&self, _: &ReadPlan) -> Option<Result<Box<dyn BlockReader + '_>>> {
         Some(Ok(Box::new(InBlocks::new(self))))
     }
 
@@ -265,7 +265,7 @@ impl Deformation for ModelFolder {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
-        let parts = Parts::of(out, want, ids.len());
+        let parts = BlockSlices::of(out, want, ids.len());
         ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
             || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
             |(raw, state, scratch, deltas), (ids, parts)| {
