@@ -76,7 +76,7 @@ fn benches(criterion: &mut Criterion) {
         write(&scene, &raw_path, Compression::Raw);
         let bounds: Vec<MaxError> =
             Columns::all().iter().map(|column| format!("{}=1e-3", column.name()).parse().unwrap()).collect();
-        write(&scene, &within_path, Packing::within(Bounds::of(&bounds, || Ok(1.0)).unwrap(), 15));
+        write(&scene, &within_path, Packing::within(Bounds::from_errors(&bounds, || Ok(1.0)).unwrap(), 15));
         let [reader, raw_reader, within] = [&path, &raw_path, &within_path].map(|path| Reader::open(path).unwrap());
         let most = raw.iter().map(Vec::len).max().unwrap_or(0);
         let (mut copy, mut buffer) = (vec![0; most], TileBuffer::default());

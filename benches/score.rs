@@ -34,11 +34,11 @@ fn benches(criterion: &mut Criterion) {
         let all = || values.iter().copied();
         group.throughput(Throughput::Elements(len as u64));
         group.bench_function(BenchmarkId::new("count", len), |bencher| {
-            bencher.iter(|| black_box(FloatSketch::of(all())));
+            bencher.iter(|| black_box(FloatSketch::from_values(all())));
         });
         group.bench_function(BenchmarkId::new("sketch", len), |bencher| {
             bencher.iter(|| {
-                let sketch = FloatSketch::of(all());
+                let sketch = FloatSketch::from_values(all());
                 (sketch.percentile(1.0, all()), sketch.percentile(99.0, all()))
             });
         });

@@ -7,14 +7,14 @@
 //! | folders | what is in them |
 //! |---|---|
 //! | crates [`gseq`], `splat-core`, `splat-render`, `splat-fields` | the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
-//! | [`limits`], [`machine`], [`recipe`], [`reduction`], [`source`] | memory limits, parameters of a run, what is left of a model, and how frames are read |
+//! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, what is left of a model, and how frames are read |
 //! | [`archive`], [`fit`] | the codec of `.gsz` archives; curves fitted to the states of a Gaussian |
 //! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; results that stages keep |
 //! | [`progress`], [`passes`] | progress on standard error; driving a pass over frames on all threads |
 //! | [`outputs`] | sequences as containers, curves, streams, films and tables |
 //! | [`tracking`], [`merging`] | which Gaussian of one frame is which of the next; which Gaussians become one |
 //! | [`models`] | one folder per model format: recognize, open, evaluate, write back |
-//! | [`budget`], [`statistics`], [`scene`], [`journal`] | the memory plan; statistics and scores; an input with its cameras; what stages record |
+//! | [`memory_plan`], [`statistics`], [`scene`], [`journal`] | the memory plan; statistics and scores; an input with its cameras; what stages record |
 //! | [`pruning`], [`refinement`], [`pipeline`] | stages, and the order they run in |
 //! | [`evaluation`], [`commands`], [`report`], [`diagnostics`], [`player`] | measuring a result, the other commands, pages for people, the self-check and experiments |
 //!
@@ -26,14 +26,15 @@
 pub const TOOL: &str = concat!("splatsieve ", env!("CARGO_PKG_VERSION"));
 
 pub mod archive;
-pub mod budget;
 pub mod cache;
 pub mod commands;
+pub mod compressed_model;
 pub mod evaluation;
 pub mod files;
 pub mod fit;
 pub mod journal;
 pub mod machine;
+pub mod memory_plan;
 pub mod merging;
 pub mod models;
 pub mod outputs;
@@ -50,7 +51,6 @@ pub mod method {}
 pub mod limits;
 pub mod player;
 pub mod recipe;
-pub mod reduction;
 pub mod report;
 pub mod scene;
 pub mod source;

@@ -60,7 +60,7 @@ impl ReadPlan {
     }
 
     /// These frames, in increasing order.
-    pub fn of(frames: impl IntoIterator<Item = usize>) -> ReadPlan {
+    pub fn new(frames: impl IntoIterator<Item = usize>) -> ReadPlan {
         let mut frames: Vec<usize> = frames.into_iter().collect();
         frames.sort_unstable();
         frames.dedup();
@@ -259,7 +259,7 @@ mod tests {
 
     #[test]
     fn wanted_frames_are_found_from_any_of_them_and_a_stranger_stands_alone() {
-        let wanted = ReadPlan::of([40, 3, 9, 3, 31]).holding(0);
+        let wanted = ReadPlan::new([40, 3, 9, 3, 31]).holding(0);
         assert_eq!(wanted.held(), 1);
         assert_eq!(wanted.between(3, 32), [3, 9, 31]);
         assert_eq!(wanted.between(9, 32), [9, 31]);

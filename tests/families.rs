@@ -6,13 +6,13 @@ mod scene;
 use std::path::Path;
 
 use scene::{Workplace, state, tiny, without_sh_head};
+use splatsieve::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
 use splatsieve::limits::Limits;
 use splatsieve::model::{ALL_HARMONICS, Columns, Gaussians};
 use splatsieve::models;
 use splatsieve::models::{InputModel, OpenOptions};
 use splatsieve::outputs::kind::OutputKind;
 use splatsieve::recipe::{Precision, Recipe};
-use splatsieve::reduction::{Cluster, CompressedModel, ParamDelta, Reference};
 
 /// Opens `path`, at three times where it leaves them open.
 fn open(path: &Path) -> Box<dyn InputModel> {

@@ -55,7 +55,7 @@ fn a_container_of_raw_tiles_is_read_without_its_pages_staying_resident() {
     drop(frames);
     // Some of all tiles, some frames of each.
     let scattered: Vec<u32> = (0..COUNT as u32).step_by(7).collect();
-    let wanted = ReadPlan::of((0..FRAMES).step_by(5));
+    let wanted = ReadPlan::new((0..FRAMES).step_by(5));
     let mut frames = FrameReaders::open(&container, Ids::List(&scattered), varying, &wanted).unwrap();
     let mut state = frames.state();
     for frame in (0..FRAMES).step_by(5) {

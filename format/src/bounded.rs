@@ -43,8 +43,8 @@ pub(crate) struct Bounded {
 /// are kept as they are, or the bytes are no fewer than 4 a value.
 pub(crate) fn encode(values: &[f32], plane: usize, max_error: f64, level: i32) -> io::Result<Option<Bounded>> {
     let step = step(values, max_error);
-    let whole = Multiples::of(values, plane, max_error, step, 0);
-    let halved = Multiples::of(values, plane, max_error, step, 1);
+    let whole = Multiples::new(values, plane, max_error, step, 0);
+    let halved = Multiples::new(values, plane, max_error, step, 1);
     let multiples = if halved.still() > whole.still() {
         let size = |multiples: &Multiples| zstd::bulk::compress(&multiples.body(multiples.order()), TRIAL_LEVEL);
         if size(&halved)?.len() < size(&whole)?.len() { halved } else { whole }
@@ -102,7 +102,7 @@ struct Multiples {
 }
 
 impl Multiples {
-    fn of(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
+    fn new(values: &[f32], plane: usize, max_error: f64, step: f64, halvings: u32) -> Multiples {
         let still = still_step(step, halvings);
         // The multiple nearest to `x` if it is near enough to all of `values`.
         let near = |x: f64, step: f64, values: [f32; 2]| {

@@ -195,7 +195,7 @@ impl TensorEntry {
 struct Shared(Vec<((u8, usize), Residuals)>);
 
 impl Shared {
-    fn of(&mut self, entry: &TensorEntry) -> &mut Residuals {
+    fn residuals(&mut self, entry: &TensorEntry) -> &mut Residuals {
         let family = entry.family();
         let place = self.0.iter().position(|(known, _)| *known == family).unwrap_or_else(|| {
             self.0.push((family, Residuals::new()));
@@ -228,7 +228,7 @@ pub(super) fn encode(
             entry.parts = parts;
             let before = encoder.cost();
             entry.lay(readers, |lattice| {
-                lattice.encode(&parts, shared.of(entry), &mut tensor.data.clone(), &mut encoder);
+                lattice.encode(&parts, shared.residuals(entry), &mut tensor.data.clone(), &mut encoder);
             });
             bits.insert(entry.name.clone(), encoder.cost() - before);
         }
@@ -254,7 +254,8 @@ pub(super) fn decode(
             own.to_vec()
         } else {
             let mut data = vec![0.0; count];
-            entry.lay(readers, |lattice| lattice.decode(&entry.parts, shared.of(entry), &mut data, &mut decoder));
+            entry
+                .lay(readers, |lattice| lattice.decode(&entry.parts, shared.residuals(entry), &mut data, &mut decoder));
             data
         };
         tensors.insert(entry.name.clone(), Tensor { shape: entry.shape.clone(), data });

@@ -57,7 +57,7 @@ pub struct ArchiveSize {
 }
 
 impl ArchiveSize {
-    fn of(total: u64, cloud: u64, field: u64) -> ArchiveSize {
+    fn new(total: u64, cloud: u64, field: u64) -> ArchiveSize {
         ArchiveSize { cloud, field, rest: total - cloud - field }
     }
 
@@ -80,7 +80,7 @@ impl Damage {
         Damage { place: place.to_owned(), expected: expected.into(), found: found.into() }
     }
 
-    pub(super) fn of(self, path: &Path) -> Error {
+    pub(super) fn in_file(self, path: &Path) -> Error {
         Error::input(path, self.place, self.expected, self.found)
             .hint("the archive is damaged or cut short; copy it again")
     }
@@ -105,7 +105,7 @@ pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     }
     out.extend(xxh3_64(&out).to_le_bytes());
     stored.iter().for_each(|bytes| out.extend_from_slice(bytes));
-    let parts = ArchiveSize::of(out.len() as u64, sections.cloud.len() as u64, sections.field.len() as u64);
+    let parts = ArchiveSize::new(out.len() as u64, sections.cloud.len() as u64, sections.field.len() as u64);
     Ok((out, parts))
 }
 
@@ -195,7 +195,7 @@ pub(super) fn read(head: &ArchiveHeader, bytes: &[u8]) -> std::result::Result<(S
         if content.len() == length { Ok(content) } else { Err(wrong(content.len().to_string())) }
     };
     let [_, cloud, field, _] = sections;
-    let parts = ArchiveSize::of(bytes.len() as u64, cloud.len() as u64, field.len() as u64);
+    let parts = ArchiveSize::new(bytes.len() as u64, cloud.len() as u64, field.len() as u64);
     let content = Sections { table: unpack(0)?, cloud: cloud.to_vec(), field: field.to_vec(), blobs: unpack(3)? };
     Ok((content, parts))
 }

@@ -33,7 +33,7 @@ pub fn offsets(
     let Some(space) = space else { return found };
     let Some(trunk) = network.layers("deformation_net.feature_out", 0, 2) else { return found };
     // Samples of what the trunk reads, and squares of what each plane is multiplied by.
-    let Some(samples) = Samples::of(tensors, position, space, times) else { return found };
+    let Some(samples) = Samples::new(tensors, position, space, times) else { return found };
     if trunk[0].inputs() != samples.width {
         return found;
     }
@@ -197,7 +197,7 @@ const AXES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 impl Samples {
     /// None where the planes are not as they are to be.
-    fn of(tensors: &Tensors, position: &Column, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
+    fn new(tensors: &Tensors, position: &Column, space: Box3, [first, last]: [f32; 2]) -> Option<Samples> {
         let name = |level: usize, plane: usize| format!("deformation_net.grid.grids.{level}.{plane}");
         let mut levels: Vec<[&Tensor; 6]> = Vec::new();
         while let Some(plane) = tensors.get(&name(levels.len(), 0)) {

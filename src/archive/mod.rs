@@ -137,15 +137,15 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
 /// Bytes that are no archive, are cut short or damaged, of a later version, or that declare more than they can hold, or
 /// more than `memory`. Nothing is allocated by what they declare before it is checked.
 pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, ArchiveSize)> {
-    let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.of(path))?;
+    let head = ArchiveHeader::parse(bytes, bytes.len() as u64).map_err(|damage| damage.in_file(path))?;
     head.admit(path, memory)?;
-    let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.of(path))?;
-    let table = table(&sections, bytes.len()).map_err(|damage| damage.of(path))?;
+    let (sections, parts) = file::read(&head, bytes).map_err(|damage| damage.in_file(path))?;
+    let table = table(&sections, bytes.len()).map_err(|damage| damage.in_file(path))?;
     let values = table.tensors.iter().filter_map(TensorEntry::values).chain(table.cloud.values()).sum::<usize>() as u64;
     // Decoding knows two values of each Gaussian and its error.
     let needed = head.bytes() + 4 * values + 12 * table.cloud.gaussians as u64;
     memory.check(path, "table", "the archive and its content", needed)?;
-    decoded(sections, table, parts).map_err(|damage| damage.of(path))
+    decoded(sections, table, parts).map_err(|damage| damage.in_file(path))
 }
 
 /// Checks the first [`HEAD`] bytes of the archive at `path`, which has `whole` bytes, before the others are read.
@@ -153,7 +153,7 @@ pub fn decode(bytes: &[u8], path: &Path, memory: ReadLimit) -> Result<(Content, 
 /// # Errors
 /// A head that is not that of an archive of so many bytes; an archive that exceeds `memory` with its content.
 pub fn check_head(head: &[u8], whole: u64, path: &Path, memory: ReadLimit) -> Result<()> {
-    ArchiveHeader::parse(head, whole).map_err(|damage| damage.of(path))?.admit(path, memory)
+    ArchiveHeader::parse(head, whole).map_err(|damage| damage.in_file(path))?.admit(path, memory)
 }
 
 /// The table of an archive of `length` bytes, whose parts go together.

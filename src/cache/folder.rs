@@ -8,7 +8,7 @@ use std::path::Path;
 use bytesize::ByteSize;
 use serde::Serialize;
 
-use super::piece::{CacheEntry, ENDING, EntryName, names};
+use crate::cache::entry::{CacheEntry, ENDING, EntryName, names};
 use crate::error::{Error, Result};
 use crate::files::atomic::remove_leftovers;
 use crate::model::ranges;

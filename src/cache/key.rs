@@ -14,7 +14,7 @@ impl CacheKey {
     pub const NONE: CacheKey = CacheKey(None);
 
     /// Of `value`, by its bits.
-    pub fn of(value: &impl Serialize) -> CacheKey {
+    pub fn new(value: &impl Serialize) -> CacheKey {
         let mut hash = Hash(Xxh3::new());
         // Nothing that is hashed here has a part that cannot be written down.
         postcard::to_io(value, &mut hash).expect("plain data");
@@ -23,7 +23,7 @@ impl CacheKey {
 
     /// Of what this stands for, and `value`.
     pub fn and(self, value: &impl Serialize) -> CacheKey {
-        self.0.map_or(CacheKey::NONE, |before| CacheKey::of(&(before, CacheKey::of(value))))
+        self.0.map_or(CacheKey::NONE, |before| CacheKey::new(&(before, CacheKey::new(value))))
     }
 
     /// In 32 digits.

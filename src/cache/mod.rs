@@ -8,11 +8,11 @@
 //!
 //! Without a folder nothing is kept: the same calls compute what they are asked for.
 
+pub(crate) mod dir;
+pub(crate) mod entry;
 mod folder;
 mod key;
-mod part;
-mod piece;
-mod place;
+pub(crate) mod shard;
 mod spill;
 
 use std::collections::BTreeSet;
@@ -23,14 +23,14 @@ use std::sync::{Mutex, PoisonError};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use crate::cache::dir::CacheDir;
+use crate::cache::entry::EntryName;
+use crate::cache::shard::MOST_PARTS;
+pub use crate::cache::shard::Shard;
 use crate::error::{Error, Result};
 use crate::model::ranges;
 pub use folder::{Listed, clean, list, text};
 pub use key::CacheKey;
-use part::MOST_PARTS;
-pub use part::Shard;
-use piece::EntryName;
-use place::CacheDir;
 pub use spill::{Spill, SpillWriter};
 
 /// What a user asks for.
@@ -81,7 +81,7 @@ impl Cache {
     /// Has all keys made from now on follow from the ids of the Gaussians that the input is read without, if there are any.
     pub fn set_absent(&self, ids: &[u32]) {
         *self.absent.lock().unwrap_or_else(PoisonError::into_inner) =
-            (self.keeps() && !ids.is_empty()).then(|| CacheKey::of(&ids));
+            (self.keeps() && !ids.is_empty()).then(|| CacheKey::new(&ids));
     }
 
     /// The key of `value`; where nothing is kept it stands for nothing, and takes no time.
@@ -89,8 +89,8 @@ impl Cache {
         let absent = *self.absent.lock().unwrap_or_else(PoisonError::into_inner);
         match (self.keeps(), absent) {
             (false, _) => CacheKey::NONE,
-            (true, None) => CacheKey::of(value),
-            (true, Some(absent)) => CacheKey::of(value).and(&absent),
+            (true, None) => CacheKey::new(value),
+            (true, Some(absent)) => CacheKey::new(value).and(&absent),
         }
     }
 

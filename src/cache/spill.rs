@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
 
-use super::piece::EntryWriter;
+use crate::cache::entry::EntryWriter;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, StagedFile};
 

@@ -25,7 +25,7 @@ fn squares(work: &Cache, units: usize) -> (Result<Vec<u64>>, Vec<usize>) {
         }
         Ok(all)
     };
-    let found = work.divided("squares", CacheKey::of(&units), units, compute, join);
+    let found = work.divided("squares", CacheKey::new(&units), units, compute, join);
     (found, computed.into_inner())
 }
 
@@ -88,7 +88,7 @@ fn parts_of_another_input_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let of = |about: &str, part: Option<&str>| {
         let mut work = Cache::open(&asked(folder.path(), part), about.to_owned()).unwrap();
-        work.follow_from(CacheKey::of(&about));
+        work.follow_from(CacheKey::new(&about));
         work
     };
     _ = squares(&of("the first", Some("1/2")), 8);
@@ -103,16 +103,16 @@ fn parts_of_another_input_are_refused_by_name() {
 #[test]
 fn other_inputs_and_parameters_find_nothing() {
     let folder = tempfile::tempdir().unwrap();
-    let key = |number: f64| CacheKey::of(&("stage", number));
+    let key = |number: f64| CacheKey::new(&("stage", number));
     let mut work = open(folder.path(), None);
-    work.follow_from(CacheKey::of(&"an input"));
+    work.follow_from(CacheKey::new(&"an input"));
     work.keep("stage", key(0.0), &7u32).unwrap();
     assert_eq!(work.find("stage", key(0.0)).unwrap(), Some(7u32));
     assert_eq!(work.find::<u32>("stage", key(-0.0)).unwrap(), None);
     assert_eq!(work.find::<u32>("another", key(0.0)).unwrap(), None);
     let mut other = open(folder.path(), None);
     assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
-    other.follow_from(CacheKey::of(&"another input"));
+    other.follow_from(CacheKey::new(&"another input"));
     assert_eq!(other.find::<u32>("stage", key(0.0)).unwrap(), None);
 }
 
@@ -159,7 +159,7 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
     };
     let expected: Vec<u8> = (0..50).collect();
     let folder = tempfile::tempdir().unwrap();
-    let spilled = |work: &Cache| work.divided_spill("bytes", CacheKey::of(&1), 50, folder.path(), write);
+    let spilled = |work: &Cache| work.divided_spill("bytes", CacheKey::new(&1), 50, folder.path(), write);
     assert_eq!(read(spilled(&Cache::none()).unwrap()), expected);
     assert!(names_in(folder.path()).is_empty());
     for index in 1..=3 {
@@ -177,7 +177,7 @@ fn content_on_the_disk_is_divided_too_and_without_a_folder_it_has_no_name() {
 #[test]
 fn what_is_not_divided_ends_a_run_of_a_part() {
     let folder = tempfile::tempdir().unwrap();
-    let of_part = |work: &Cache| work.known("alone", CacheKey::of(&1), || work.not_divided("alone").map(|()| 5u8));
+    let of_part = |work: &Cache| work.known("alone", CacheKey::new(&1), || work.not_divided("alone").map(|()| 5u8));
     let message = of_part(&open(folder.path(), Some("1/2"))).unwrap_err().to_string();
     assert!(message.contains("what comes next, alone, is not divided"), "{message}");
     assert_eq!(of_part(&open(folder.path(), None)).unwrap(), 5);
@@ -189,7 +189,7 @@ fn a_folder_says_what_is_in_it_and_is_removed_but_for_what_is_somebody_elses() {
     let folder = tempfile::tempdir().unwrap();
     let work = folder.path().join("work");
     _ = squares(&open(folder.path(), Some("2/3")), 9);
-    open(folder.path(), None).keep("stage", CacheKey::of(&1), &[1u64, 2]).unwrap();
+    open(folder.path(), None).keep("stage", CacheKey::new(&1), &[1u64, 2]).unwrap();
     let listed = list(&work).unwrap();
     assert_eq!(listed.len(), 2);
     let [squares, stage] = [0, 1].map(|k| &listed[k]);
@@ -215,8 +215,8 @@ fn a_folder_that_is_none_or_has_vanished_is_an_error_that_names_it() {
     let work = open(folder.path(), None);
     fs::remove_dir(folder.path().join("work")).unwrap();
     for message in [
-        work.keep("stage", CacheKey::of(&1), &1).unwrap_err(),
-        work.find::<i32>("stage", CacheKey::of(&1)).unwrap_err(),
+        work.keep("stage", CacheKey::new(&1), &1).unwrap_err(),
+        work.find::<i32>("stage", CacheKey::new(&1)).unwrap_err(),
     ] {
         assert!(message.to_string().contains("work"), "{message}");
     }

@@ -21,7 +21,6 @@ use args::{
     SplitArg, Sweep, Trained, Verb, View,
 };
 use output::{print, print_as};
-use splatsieve::budget::{self, Budget, Verbosity};
 use splatsieve::cache;
 use splatsieve::commands::container::Storing;
 use splatsieve::commands::render::{RenderOptions, RenderSelection};
@@ -39,6 +38,8 @@ use splatsieve::evaluation::method::Method;
 use splatsieve::files::atomic::{Replace, as_named, take_warnings};
 use splatsieve::files::cameras::Times;
 use splatsieve::files::image::write::ImageFormat;
+use splatsieve::memory_plan;
+use splatsieve::memory_plan::{Budget, Verbosity};
 use splatsieve::model::Split;
 use splatsieve::models::{Conventions, Link};
 use splatsieve::outputs::kind::OutputKind;
@@ -77,7 +78,7 @@ pub(crate) fn main() -> ExitCode {
     }
     match result {
         Ok(()) => {
-            if let Some(taken) = budget::taken().filter(|_| explains) {
+            if let Some(taken) = memory_plan::taken().filter(|_| explains) {
                 tell(&taken);
             }
             ExitCode::SUCCESS

@@ -10,13 +10,13 @@ use gseq::{Compression, Reader, RecoverReport, VerifyReport};
 use serde::Serialize;
 
 use crate::TOOL;
-use crate::budget::{Budget, Plan, ResourceEstimate, Workload};
 use crate::cache::SpillWriter;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::container::Container;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
+use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::model::Columns;
 use crate::models;
 use crate::models::stream::pack_stream;
@@ -29,7 +29,7 @@ use crate::outputs::container::{
 use crate::outputs::frame_stream::StreamWriter;
 use crate::outputs::kind::{OutputKind, check_container_name, check_folder_name};
 use crate::passes::FrameReaders;
-use crate::pipeline::stages::emit::ENCODING;
+use crate::pipeline::stages::write::ENCODING;
 use crate::pipeline::summary::InputSummary;
 use crate::progress::Progress;
 use crate::scene::{
@@ -69,7 +69,7 @@ impl Storing {
     fn packing(&self, extent: impl Fn() -> Result<f64>) -> Result<Packing> {
         match self {
             Storing::Exact(compression) => Ok((*compression).into()),
-            Storing::Within(asked, level) => Ok(Packing::within(Bounds::of(asked, extent)?, *level)),
+            Storing::Within(asked, level) => Ok(Packing::within(Bounds::from_errors(asked, extent)?, *level)),
         }
     }
 }
@@ -185,7 +185,7 @@ pub fn unpack(input: &InputOptions, output: &Path, overwrite: Replace) -> Result
     write_sequence(source, OutputKind::PlySequence, staged.path(), held)?;
     let marker = serde_json::json!({
         "tool": TOOL,
-        "input": InputSummary::of(&*opened.input, &input.path, opened.input.digest()?)?.without_folders(),
+        "input": InputSummary::new(&*opened.input, &input.path, opened.input.digest()?)?.without_folders(),
     });
     let path = staged.path().join(MARKER);
     fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;
@@ -235,7 +235,7 @@ pub fn info(options: &InputOptions) -> Result<InputInfo> {
     };
     let times = &input.source().info().times;
     let times = times.first().zip(times.last()).map(|(&first, &last)| (first, last));
-    let mut summary = InputSummary::of(&*input, &options.path, input.digest()?)?;
+    let mut summary = InputSummary::new(&*input, &options.path, input.digest()?)?;
     if input.timing() == Timing::Continuous {
         summary.frames = None;
     }

@@ -6,17 +6,17 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::TOOL;
-use crate::budget::{Plan, ResourceEstimate, Workload};
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
+use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::model::Columns;
 use crate::outputs::kind::OutputKind;
 use crate::passes::TRACKED;
-use crate::pipeline::stages::emit::ENCODING;
+use crate::pipeline::stages::write::ENCODING;
 use crate::pipeline::summary::InputSummary;
 use crate::recipe::Recipe;
-use crate::reduction::CompressedModel;
 use crate::scene::{InputOptions, open_input};
 
 /// Bytes that a Gaussian takes while formats are fitted to it and encoded, about: a few pieces of it.
@@ -57,7 +57,7 @@ pub fn convert(
     }
     let opened = open_input(input)?;
     let (family, source) = (&*opened.input, opened.input.source());
-    let kind = OutputKind::of(output, asked, family.own_output());
+    let kind = OutputKind::from_path(output, asked, family.own_output());
     if kind == OutputKind::Archive {
         return Err(Error::usage("an archive is what compress writes: splatsieve compress INPUT -o NAME.gsz"));
     }
@@ -80,7 +80,7 @@ pub fn convert(
         let bytes = write(staged.path())?;
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::of(family, &input.path, family.digest()?)?.without_folders(),
+            "input": InputSummary::new(family, &input.path, family.digest()?)?.without_folders(),
         });
         let path = staged.path().join(MARKER);
         fs::write(&path, format!("{marker:#}\n")).map_err(Error::io("write", &path))?;

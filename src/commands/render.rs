@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use crate::TOOL;
-use crate::budget::{ResourceEstimate, Workload};
 use crate::cache::{Spill, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::image::write::{ImageFormat, image_bytes, write_image};
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::model::{Camera, Picture};
 use crate::outputs::kind::check_folder_name;
 use crate::passes::{Batch, Subject, ViewStates, show};
@@ -120,7 +120,7 @@ pub fn render(options: &RenderOptions) -> Result<Rendered> {
         };
         let marker = serde_json::json!({
             "tool": TOOL,
-            "input": InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?.without_folders(),
+            "input": InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.without_folders(),
             "cameras": CameraSummary {
                 origin: scene.rig.origin.clone(),
                 cameras: scene.rig.cameras.len(),
@@ -142,7 +142,7 @@ fn needs(work: &Workload, limits: &Limits, waiting: bool) -> Vec<ResourceEstimat
 }
 
 fn format_of(output: &Path) -> Result<ImageFormat> {
-    ImageFormat::of(output).ok_or_else(|| {
+    ImageFormat::from_path(output).ok_or_else(|| {
         Error::usage(format!(
             "{}: expected a name that ends in .png or .npy\n  for every picture into a folder, say --all",
             output.shown()

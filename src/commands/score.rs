@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::budget::Workload;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::journal::Journal;
+use crate::memory_plan::Workload;
 use crate::outputs::rows::RowTable;
 use crate::pipeline::open_to_measure;
 use crate::pipeline::stages::measure::{InputMeta, Measure};

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use crate::budget::ResourceEstimate;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::open_compressed;
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
+use crate::memory_plan::ResourceEstimate;
 use crate::model::{Camera, Picture, Rig, Shot};
 use crate::outputs::film::{FilmFormat, FilmOutput};
 use crate::passes::{Batch, Subject, ViewStates, show};
@@ -73,7 +73,7 @@ pub struct Filmed {
 /// there or fails. Nothing is left behind then.
 pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let output = options.output.as_path();
-    let format = FilmFormat::of(output)?;
+    let format = FilmFormat::from_path(output)?;
     if options.input.work.is_some() {
         return Err(Error::usage("--work: a film is not divided; --all renders pictures in parts"));
     }

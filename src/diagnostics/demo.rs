@@ -4,12 +4,12 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::budget::Budget;
 use crate::diagnostics::demo_scene;
 use crate::diagnostics::demo_scene::DemoBody;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Kind, MARKER, Replace, ScratchFolder, StagedFolder, check_target};
 use crate::files::container::Container;
+use crate::memory_plan::Budget;
 use crate::model::{Camera, Rig, Split};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;

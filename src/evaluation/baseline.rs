@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::limits::Limits;
 use crate::model::hash_id;
@@ -10,9 +11,8 @@ use crate::model::{Columns, Gaussians};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather;
 use crate::pipeline::Target;
-use crate::pipeline::stages::emit::write_alone;
+use crate::pipeline::stages::write::write_alone;
 use crate::recipe::Recipe;
-use crate::reduction::CompressedModel;
 use crate::scene::{InputOptions, open_scene};
 
 /// What a baseline ranks by, largest first, ties by hashed id.
@@ -43,7 +43,7 @@ pub fn prune_by(baseline: Baseline, options: &InputOptions, target: Option<Targe
         None => gather(source, &ids, 0, Columns::OPACITY | Columns::LOG_SCALE)?,
     };
     let kept = best(baseline, &state, ids, wanted);
-    let kind = OutputKind::of(output, None, scene.input.own_output());
+    let kind = OutputKind::from_path(output, None, scene.input.own_output());
     scene.input.check_output(kind, output)?;
     let reduction = CompressedModel::pruned(kept, &Recipe::preset("default")?.merge);
     write_alone(&*scene.input, &reduction, kind, output, &Limits::NONE)

@@ -33,7 +33,7 @@ pub struct Spread {
 
 impl Spread {
     /// Of at least one value.
-    pub fn of(mut values: Vec<f64>) -> Spread {
+    pub fn from_values(mut values: Vec<f64>) -> Spread {
         values.sort_unstable_by(f64::total_cmp);
         let last = values.len() - 1;
         Spread { median: 0.5 * (values[last / 2] + values[values.len() / 2]), least: values[0], most: values[last] }
@@ -75,8 +75,8 @@ impl Repeats {
             peak = peak.max(if resets { peak_memory_bytes() } else { None });
             if seconds.len() >= self.most || seconds.iter().sum::<f64>() >= self.enough {
                 let runs = seconds.len();
-                let processor_seconds = (processors.len() == runs).then(|| Spread::of(processors));
-                let seconds = Spread::of(seconds);
+                let processor_seconds = (processors.len() == runs).then(|| Spread::from_values(processors));
+                let seconds = Spread::from_values(seconds);
                 return Ok((value, Cost { runs, seconds, processor_seconds, peak_memory_bytes: peak }));
             }
             clear()?;
@@ -93,7 +93,7 @@ mod tests {
         for (values, expected) in
             [(vec![7.0], [7.0; 3]), (vec![9.0, 1.0], [5.0, 1.0, 9.0]), (vec![9.0, 1.0, 2.0], [2.0, 1.0, 9.0])]
         {
-            let Spread { median, least, most } = Spread::of(values);
+            let Spread { median, least, most } = Spread::from_values(values);
             assert_eq!([median, least, most], expected);
         }
     }

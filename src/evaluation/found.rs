@@ -13,7 +13,7 @@ use crate::error::ShowPath;
 use crate::files::csv::{known, table};
 use crate::files::names::name_of;
 use crate::models::Size;
-use crate::models::size::of;
+use crate::models::size::compared;
 use crate::pipeline::summary::CameraSummary;
 
 /// One value for the model before compression and one for the model after it.
@@ -153,7 +153,7 @@ pub struct Evaluation {
 
 impl QualityMeans {
     /// Of nothing: no pairs, and NaN, which JSON shows as null.
-    fn of(scores: &[ImageScore]) -> QualityMeans {
+    fn from_scores(scores: &[ImageScore]) -> QualityMeans {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         let all = |value: fn(&ImageScore) -> f64| mean(&scores.iter().map(value).collect::<Vec<_>>());
         let given = |value: fn(&ImageScore) -> Option<f64>| {
@@ -172,7 +172,10 @@ impl QualityMeans {
 
 impl Comparison {
     /// Averages what `score` picks of each picture; of those that have it; none if all lack it.
-    pub fn of(pictures: &[PictureScores], score: impl Fn(&PictureScores) -> Option<ImageScore>) -> Option<Comparison> {
+    pub fn from_pictures(
+        pictures: &[PictureScores],
+        score: impl Fn(&PictureScores) -> Option<ImageScore>,
+    ) -> Option<Comparison> {
         let (pictures, scores): (Vec<&PictureScores>, Vec<ImageScore>) =
             pictures.iter().filter_map(|picture| Some((picture, score(picture)?))).unzip();
         if scores.is_empty() {
@@ -186,12 +189,19 @@ impl Comparison {
         let mut rest = &scores[..];
         for frame in pictures.chunk_by(|a, b| a.frame == b.frame) {
             let (these, after) = rest.split_at(frame.len());
-            per_frame.push(FrameMeans { frame: frame[0].frame, time: frame[0].time, means: QualityMeans::of(these) });
+            per_frame.push(FrameMeans {
+                frame: frame[0].frame,
+                time: frame[0].time,
+                means: QualityMeans::from_scores(these),
+            });
             rest = after;
         }
         Some(Comparison {
-            overall: QualityMeans::of(&scores),
-            per_view: views.iter().map(|(&view, scores)| ViewMeans { view, means: QualityMeans::of(scores) }).collect(),
+            overall: QualityMeans::from_scores(&scores),
+            per_view: views
+                .iter()
+                .map(|(&view, scores)| ViewMeans { view, means: QualityMeans::from_scores(scores) })
+                .collect(),
             per_frame,
         })
     }
@@ -225,7 +235,7 @@ impl Evaluation {
             out,
             "{}: {compressed} Gaussians ({percent:.1}%); bytes: {}: {}",
             Path::new(&self.path.compressed).shown(),
-            of(after.whole(), before.whole()),
+            compared(after.whole(), before.whole()),
             after.parts_of(&before)
         );
         let frames = self.loss.per_frame.len();
@@ -306,17 +316,17 @@ mod tests {
             picture(2, 7, 20.0, None),
             picture(3, 1, 10.0, Some(0.75)),
         ];
-        let found = Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap();
+        let found = Comparison::from_pictures(&pictures, |picture| Some(picture.loss)).unwrap();
         assert_eq!(found.overall, QualityMeans { pairs: 5, psnr: 30.0, ssim: 0.3, temporal: Some(0.5), flip: None });
         let views: Vec<_> = found.per_view.iter().map(|v| (v.view, v.means.pairs, v.means.psnr)).collect();
         assert_eq!(views, [(1, 3, 30.0), (2, 1, 40.0), (7, 1, 20.0)]);
         let frames: Vec<_> = found.per_frame.iter().map(|f| (f.frame, f.means.psnr, f.means.temporal)).collect();
         assert_eq!(frames, [(0, 35.0, None), (2, 35.0, Some(0.25)), (3, 10.0, Some(0.75))]);
-        assert!(Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
+        assert!(Comparison::from_pictures(&pictures, |picture| picture.truth.map(|truth| truth.original)).is_none());
     }
 
     fn evaluation(pictures: Vec<PictureScores>) -> Evaluation {
-        let truth = Comparison::of(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
+        let truth = Comparison::from_pictures(&pictures, |picture| picture.truth.map(|truth| truth.compressed));
         Evaluation {
             tool: String::new(),
             path: Both { original: String::new(), compressed: String::new() },
@@ -325,7 +335,7 @@ mod tests {
             size: Both { original: Size::default(), compressed: Size::default() },
             cameras: CameraSummary { origin: String::new(), cameras: 1, pairs: 2 },
             background: [0.0; 3],
-            loss: Comparison::of(&pictures, |picture| Some(picture.loss)).unwrap(),
+            loss: Comparison::from_pictures(&pictures, |picture| Some(picture.loss)).unwrap(),
             ground_truth: truth.map(|of| TruthComparison {
                 folder: String::new(),
                 of: 2,

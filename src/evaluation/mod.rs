@@ -20,12 +20,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::TOOL;
-use crate::budget::{Budget, Plan, ResourceEstimate, Workload};
 use crate::cache::CacheKey;
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::found::{Both, Comparison, Evaluation, ImageScore, PictureScores, TruthComparison};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
 use crate::limits::Limits;
+use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::metrics::{self, flip, psnr, ssim, temporal_error};
 use crate::model::{Camera, Gaussians, Picture};
 use crate::models;
@@ -260,8 +260,8 @@ impl ModelPair {
             Some(TruthComparison {
                 folder: folder.to_string_lossy().into_owned(),
                 of: self.pictures.len(),
-                compressed: Comparison::of(&scores, |picture| Some(picture.truth?.compressed))?,
-                original: Comparison::of(&scores, |picture| Some(picture.truth?.original))?,
+                compressed: Comparison::from_pictures(&scores, |picture| Some(picture.truth?.compressed))?,
+                original: Comparison::from_pictures(&scores, |picture| Some(picture.truth?.original))?,
             })
         });
         let scene = &self.scene;
@@ -283,7 +283,8 @@ impl ModelPair {
                 pairs: self.pictures.len(),
             },
             background: self.background,
-            loss: Comparison::of(&scores, |picture| Some(picture.loss)).expect("every picture has this score"),
+            loss: Comparison::from_pictures(&scores, |picture| Some(picture.loss))
+                .expect("every picture has this score"),
             ground_truth,
             notes: scene.notes.iter().cloned().chain(size.compressed.why_larger_than(&size.original)).collect(),
             work_notes: scene.work.take_notes(),
@@ -298,7 +299,7 @@ impl ModelPair {
         }
         let compressed = self.scene.digest_of(&self.compressed_as, &*self.compressed)?;
         let photographs = self.truth.as_ref().map(|truth| truth.stamps(&self.pictures)).transpose()?;
-        Ok(CacheKey::of(&(compressed, photographs, &self.pictures, self.background, self.flip)))
+        Ok(CacheKey::new(&(compressed, photographs, &self.pictures, self.background, self.flip)))
     }
 
     /// Makes the pictures numbered `places` among [`Evaluation::pictures`] again (to keep all of them would

@@ -323,7 +323,7 @@ mod tests {
     use super::*;
 
     fn mark(value: f64, step: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
-        let seconds = Spread::of(vec![value]);
+        let seconds = Spread::from_values(vec![value]);
         PrecisionSetting {
             value,
             step,

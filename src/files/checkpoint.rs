@@ -60,7 +60,7 @@ pub(crate) enum ValueType {
 }
 
 impl ValueType {
-    fn of(global: &str) -> Option<ValueType> {
+    fn from_global(global: &str) -> Option<ValueType> {
         Some(match global {
             "torch.HalfStorage" => ValueType::F16,
             "torch.BFloat16Storage" => ValueType::BF16,
@@ -312,7 +312,7 @@ impl Checkpoint {
         Some(TensorView {
             id,
             storage: self.pickle.text(key)?.to_owned(),
-            kind: ValueType::of(kind)?,
+            kind: ValueType::from_global(kind)?,
             shape,
             stride,
             offset,

@@ -76,7 +76,7 @@ impl Float {
     /// Four bytes, the lowest first.
     const F32: Float = Float { bytes: 4, big_endian: false };
 
-    fn of(header: &NpyHeader) -> Option<Float> {
+    fn from_header(header: &NpyHeader) -> Option<Float> {
         let DType::Plain(plain) = header.dtype() else { return None };
         let bytes = plain.num_bytes().filter(|bytes| [2, 4, 8].contains(bytes))?;
         let is_float = plain.type_char() == TypeChar::Float && header.order() == Order::C;
@@ -297,7 +297,7 @@ impl NpzArray {
         Ok(NpzArray {
             name,
             shape: header.shape().iter().map(|&length| length as usize).collect(),
-            float: Float::of(&header),
+            float: Float::from_header(&header),
             descr: header.dtype().descr(),
             is_fortran: header.order() == Order::Fortran,
             is_compressed,

@@ -109,7 +109,7 @@ impl FrameSource for PlySequence {
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         check_ids(&self.paths()[0], &ids, self.info.count)?;
-        Ok(Box::new(PlyBlock { sequence: self, ids: OwnedIds::of(ids) }))
+        Ok(Box::new(PlyBlock { sequence: self, ids: OwnedIds::from_ids(ids) }))
     }
 
     fn reads(&self) -> Reads {
@@ -139,7 +139,7 @@ enum OwnedIds {
 }
 
 impl OwnedIds {
-    fn of(ids: Ids<'_>) -> OwnedIds {
+    fn from_ids(ids: Ids<'_>) -> OwnedIds {
         match ids {
             Ids::Range(range) => OwnedIds::Range(range),
             Ids::List(list) => OwnedIds::List(list.to_vec()),

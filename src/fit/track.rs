@@ -24,7 +24,7 @@ pub struct FittedTrack {
 
 impl FittedTrack {
     /// Of Gaussian `row` of the states at `times`, in order.
-    pub fn of(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
+    pub fn from_states(times: &[f64], states: &[Gaussians], row: usize) -> FittedTrack {
         let mut track = FittedTrack { times: times.to_vec(), ..FittedTrack::default() };
         let mut last = [1.0, 0.0, 0.0, 0.0];
         for state in states {

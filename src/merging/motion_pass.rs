@@ -133,7 +133,7 @@ impl PairMeter<'_> {
         let varying = info.varying & NEEDED;
         let frames = if varying.is_empty() { info.times.len().min(1) } else { info.times.len() };
         let progress = Progress::new("merge", "states", (ids.len() * frames) as u64);
-        let wanted = ReadPlan::of(0..frames).holding(self.frames_held);
+        let wanted = ReadPlan::new(0..frames).holding(self.frames_held);
         let mut readers = FrameReaders::open(self.source, Ids::List(ids), NEEDED, &wanted)?;
         let mut state = readers.state();
         for frame in 0..frames {

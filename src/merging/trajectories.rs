@@ -148,7 +148,7 @@ fn take(
 ) -> Result<()> {
     let width = columns.width(0);
     values.resize(places.len() * frames.len() * width, 0.0);
-    let wanted = ReadPlan::of(frames.clone());
+    let wanted = ReadPlan::new(frames.clone());
     let read = |block: &[(u32, u32)]| -> Result<Vec<Gaussians>> {
         let ids: Vec<u32> = block.iter().map(|&(id, _)| id).collect();
         let mut reader = source.open(Ids::List(&ids))?;

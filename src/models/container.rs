@@ -2,11 +2,11 @@
 
 use gseq::{Encoding, Reader, TileId};
 
-use super::family::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
 use super::linked::LinkedFrames;
 use super::size::bytes_of;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::container::Container;
+use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::source::FrameSource;
 
 /// A container.
@@ -18,7 +18,7 @@ pub(super) const ENTRY: ModelFormat = ModelFormat {
         options.refuse_for(path)?;
         if options.link.is_asked() && container.info().times.len() > 1 {
             let joins = options.link.joins();
-            return Ok(Box::new(LinkedFrames::anew(&container, "linked gseq container", joins, &options.ply())?));
+            return Ok(Box::new(LinkedFrames::relink(&container, "linked gseq container", joins, &options.ply())?));
         }
         Ok(Box::new(container))
     },
@@ -45,7 +45,7 @@ impl InputModel for Container {
         true
     }
 
-    fn stands_in_frames(&self) -> bool {
+    fn has_explicit_frames(&self) -> bool {
         true
     }
 

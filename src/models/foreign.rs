@@ -4,10 +4,10 @@
 
 use std::path::Path;
 
-use super::family::ModelFormat;
 use crate::error::Error;
 use crate::files::checkpoint::{Checkpoint, Pickle};
 use crate::limits::ReadLimit;
+use crate::models::input_model::ModelFormat;
 
 /// The way that works with every renderer.
 const WAY: &str = "write its frames as PLY files, one per frame and all with the same Gaussians in the same order, or as a \

@@ -1,21 +1,21 @@
 //! Model formats: each can be recognized, read as frames, reduced and written back.
 //!
-//! A family is one module here and one line of `FAMILIES`; outside its module nobody asks which one it is.
+//! A family is one module here and one line of `MODEL_FORMATS`; outside its module nobody asks which one it is.
 
 pub mod archive;
 mod container;
 mod deform_folder;
 mod deformable_3d_gaussians;
 mod dynamic_3d_gaussians;
-mod family;
 mod files;
 mod foreign;
 mod four_d_gaussians;
 mod free_time_gs;
 mod in_checkpoint;
+pub(crate) mod input_model;
 mod iterations;
-mod law;
 mod linked;
+pub(crate) mod motion_model;
 mod native_4d_gaussians;
 mod ply_sequence;
 mod sc_gs;
@@ -29,18 +29,18 @@ use std::fs;
 use std::io::Read;
 use std::path::Path;
 
+pub use crate::models::input_model::{ColumnInfo, Conventions, InputModel, Link, MemoryProfile, OpenOptions, Timing};
 use deform_folder::Arguments;
-pub use family::{ColumnInfo, Conventions, InputModel, Link, MemoryProfile, OpenOptions, Timing};
 pub use four_d_gaussians::ModelFolder;
 pub use linked::LinkedFrames;
 pub use size::Size;
 
 use crate::error::{Error, Result, ShowPath};
 use crate::files::open::open_file;
-use family::{FoundInput, ModelFormat};
+use crate::models::input_model::{FoundInput, ModelFormat};
 
 /// Every family that lies in files; the first that recognises a path opens it.
-const FAMILIES: [ModelFormat; 14] = [
+const MODEL_FORMATS: [ModelFormat; 14] = [
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
     sc_gs::ENTRY,
@@ -80,10 +80,10 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
         refuse_inside_a_model(path)?;
     }
     let found = FoundInput { path, is_folder, head, memory: options.memory };
-    match FAMILIES.iter().find(|entry| (entry.recognises)(&found)) {
+    match MODEL_FORMATS.iter().find(|entry| (entry.recognises)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None => {
-            let expected = FAMILIES.iter().map(|entry| entry.expected).filter(|expected| !expected.is_empty());
+            let expected = MODEL_FORMATS.iter().map(|entry| entry.expected).filter(|expected| !expected.is_empty());
             let expected: Vec<&str> = expected.collect();
             Err(Error::input(path, "", expected.join(", "), "another kind of file"))
         }

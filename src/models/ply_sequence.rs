@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::archive::files::add_cloud;
-use super::family::{InputModel, Link, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::linked::LinkedFrames;
 use super::size::bytes_of;
 use super::trajectories::{check_output, merged, state_bytes, write_trajectories};
 use crate::archive::Content;
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::names::shown_name;
 use crate::files::ply::write::{out_rows, write_like};
@@ -20,11 +20,11 @@ use crate::files::ply_frames::PlyFrames;
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians};
+use crate::models::input_model::{InputModel, Link, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{HeldFrames, gather_all};
 use crate::progress::Progress;
-use crate::reduction::CompressedModel;
 use crate::source::{FrameSource, Ids};
 use crate::tracking::{OrderDifference, identity};
 
@@ -134,7 +134,7 @@ impl InputModel for PlySequence {
         bytes_of(self.paths().iter().map(PathBuf::as_path))
     }
 
-    fn stands_in_frames(&self) -> bool {
+    fn has_explicit_frames(&self) -> bool {
         true
     }
 
@@ -182,7 +182,7 @@ impl InputModel for PlySequence {
         Ok(content)
     }
 
-    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
         let (count, degree) = (content.cloud.len(), content.cloud.sh_degree());
         let mut frames = HeldFrames::new(count, degree, Columns::empty(), content.cloud.clone());
         self.info().times.iter().for_each(|&time| frames.push(time, Gaussians::zeros(0, degree)));

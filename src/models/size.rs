@@ -56,7 +56,7 @@ impl Size {
             (0, 0) => None,
             (0, before) => Some(format!("{name} none of {before}")),
             (after, 0) => Some(format!("{name} {after} of none")),
-            (after, before) => Some(format!("{name} {}", of(after, before))),
+            (after, before) => Some(format!("{name} {}", compared(after, before))),
         };
         self.named().into_iter().zip(before.named()).filter_map(part).collect::<Vec<_>>().join(", ")
     }
@@ -73,7 +73,7 @@ impl Size {
 }
 
 /// So many bytes of so many, with what part that is.
-pub fn of(after: u64, before: u64) -> String {
+pub fn compared(after: u64, before: u64) -> String {
     format!("{after} of {before} ({:.1}%)", 100.0 * after as f64 / before.max(1) as f64)
 }
 

@@ -6,17 +6,17 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::family::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::files::copy;
 use super::four_d_gaussians::cfg_args;
 use super::iterations::iteration;
 use super::size::{Size, bytes_below, bytes_of};
 use crate::archive::Content;
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply_sequence::PlySequence;
 use crate::limits::Limits;
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::outputs::kind::OutputKind;
-use crate::reduction::CompressedModel;
 use crate::source::FrameSource;
 
 const CLOUDS: &str = "point_cloud";
@@ -132,8 +132,8 @@ impl InputModel for Static {
         self.cloud.content(reduction)
     }
 
-    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
-        self.cloud.showing(content)
+    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        self.cloud.decode_frames(content)
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

@@ -11,12 +11,12 @@ use std::thread;
 use crossbeam_channel::bounded;
 use gseq::Compression;
 
-use super::family::{InputModel, MemoryProfile, Timing};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFile;
 use crate::files::container::Container;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::model::Gaussians;
+use crate::models::input_model::{InputModel, MemoryProfile, Timing};
 use crate::outputs::container::{ContainerWriter, FRAME_BLOCK, Packing};
 use crate::passes::HeldFrames;
 use crate::progress::Progress;
@@ -81,7 +81,7 @@ impl InputModel for Streamed {
         true
     }
 
-    fn stands_in_frames(&self) -> bool {
+    fn has_explicit_frames(&self) -> bool {
         true
     }
 

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use gseq::Compression;
 
+use crate::compressed_model::{CompressedModel, TrajectoryDelta};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::write::write_inria;
 use crate::files::spz::write_spz;
@@ -19,7 +20,6 @@ use crate::outputs::four_dgs::write_four_dgs;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Changed, HeldFrames, States, gather_all};
 use crate::progress::Progress;
-use crate::reduction::{CompressedModel, TrajectoryDelta};
 use crate::source::{FrameSource, ReadPlan};
 
 /// zstd level of containers that are a result: higher ones gain about 1% on trained models.
@@ -95,7 +95,7 @@ fn write_merged(source: &dyn FrameSource, reduction: &CompressedModel, path: &Pa
         let of_block = start..times.len().min(start + FRAME_BLOCK);
         writer.begin(&times[of_block.clone()])?;
         for part in &parts {
-            let mut frames = merged.together(part.clone(), &ReadPlan::of(of_block.clone()).holding(FRAME_BLOCK))?;
+            let mut frames = merged.together(part.clone(), &ReadPlan::new(of_block.clone()).holding(FRAME_BLOCK))?;
             let mut constant = Gaussians::zeros(0, *sh_degree);
             if start == 0 {
                 frames.read(start, Columns::all().difference(*varying), &mut constant)?;

@@ -30,7 +30,7 @@ impl Bounds {
     ///
     /// # Errors
     /// A column that is named twice; no extent.
-    pub fn of(asked: &[MaxError], extent: impl Fn() -> Result<f64>) -> Result<Bounds> {
+    pub fn from_errors(asked: &[MaxError], extent: impl Fn() -> Result<f64>) -> Result<Bounds> {
         let mut bounds = Bounds::default();
         for &MaxError { column, bound, of_extent } in asked {
             let of_column = &mut bounds.0[column.bits().trailing_zeros() as usize];
@@ -79,12 +79,12 @@ mod tests {
     #[test]
     fn bounds_are_read_by_column_and_of_positions_as_a_percentage() {
         let asked = ["position=0.5%", "sh=1e-2"].map(|text| text.parse::<MaxError>().unwrap());
-        let bounds = Bounds::of(&asked, || Ok(20.0)).unwrap();
+        let bounds = Bounds::from_errors(&asked, || Ok(20.0)).unwrap();
         let found: Vec<f64> = Columns::all().iter().map(|column| bounds.column(column)).collect();
         assert_eq!(found, [0.1, 0.0, 0.0, 0.0, 0.01]);
-        assert!(Bounds::of(&asked, || Err(Error::usage("no extent"))).is_err());
+        assert!(Bounds::from_errors(&asked, || Err(Error::usage("no extent"))).is_err());
         let twice = [asked[1], asked[1]];
-        assert!(Bounds::of(&twice, || Ok(1.0)).unwrap_err().to_string().contains("sh is named twice"));
+        assert!(Bounds::from_errors(&twice, || Ok(1.0)).unwrap_err().to_string().contains("sh is named twice"));
     }
 
     #[test]

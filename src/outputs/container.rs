@@ -69,7 +69,7 @@ impl Packing {
             Compression::Bounded { max_error, level } => (2, max_error, level),
         };
         let columns: Vec<(u8, f64, i32)> = Columns::all().iter().map(of_column).collect();
-        CacheKey::of(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
+        CacheKey::new(&(GAUSSIAN_BLOCK, self.frame_block(), columns))
     }
 
     /// How a column is encoded.
@@ -91,7 +91,7 @@ pub fn write_container(
     advance: impl Fn(u64) + Sync,
 ) -> Result<()> {
     let packing = packing.into();
-    let mut writer = ContainerWriter::of(source, path, packing, attributes)?;
+    let mut writer = ContainerWriter::from_source(source, path, packing, attributes)?;
     for block in 0..packing.frame_blocks(source) {
         writer.append(source, packing.frames(source, block), &advance)?;
     }
@@ -132,7 +132,7 @@ pub fn join_container(
     spills: &[(Range<usize>, Spill)],
 ) -> Result<()> {
     let info = source.info();
-    let mut writer = ContainerWriter::of(source, path, packing, attributes)?;
+    let mut writer = ContainerWriter::from_source(source, path, packing, attributes)?;
     let mut bytes = Vec::new();
     for (blocks, spill) in spills {
         let mut at = 0;
@@ -184,7 +184,7 @@ impl ContainerWriter {
     }
 
     /// Starts that of `source`.
-    fn of(
+    fn from_source(
         source: &dyn FrameSource,
         path: &Path,
         packing: Packing,

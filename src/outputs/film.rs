@@ -45,7 +45,7 @@ impl FilmFormat {
     ///
     /// # Errors
     /// A name that asks for none; one that asks for an encoder that is not there.
-    pub fn of(path: &Path) -> Result<FilmFormat> {
+    pub fn from_path(path: &Path) -> Result<FilmFormat> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         let codec = match extension.as_str() {
             "png" | "apng" => return Ok(FilmFormat::Apng),
@@ -296,10 +296,10 @@ mod tests {
     #[test]
     fn names_that_ask_for_no_film_and_frames_of_another_size_are_refused() {
         for name in ["x", "x.npy", "film.avi"] {
-            let message = FilmFormat::of(Path::new(name)).unwrap_err().to_string();
+            let message = FilmFormat::from_path(Path::new(name)).unwrap_err().to_string();
             assert!(message.contains(name) && message.contains(".gif, .mp4"), "{message}");
         }
-        assert_eq!(FilmFormat::of(Path::new("A.APNG")).unwrap(), FilmFormat::Apng);
+        assert_eq!(FilmFormat::from_path(Path::new("A.APNG")).unwrap(), FilmFormat::Apng);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.png");
         let mut film = FilmOutput::create((&path, &path), &FilmFormat::Apng, (4, 3), 2, 10).unwrap();

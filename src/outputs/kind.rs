@@ -31,7 +31,7 @@ pub enum OutputKind {
 
 impl OutputKind {
     /// The kind that is asked for outright, else by the name `path`, else `own`.
-    pub fn of(path: &Path, asked: Option<OutputKind>, own: OutputKind) -> OutputKind {
+    pub fn from_path(path: &Path, asked: Option<OutputKind>, own: OutputKind) -> OutputKind {
         asked.or(Self::by_name(path)).unwrap_or(own)
     }
 

@@ -1,8 +1,8 @@
 //! A sequence with its Gaussians changed, or without the last of their harmonics, frame by frame as it is read.
 
+use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, SequenceInfo};
-use crate::reduction::{ParamDelta, TrajectoryDelta};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// A source whose parameters are changed, the same at every frame and along a course.

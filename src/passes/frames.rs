@@ -62,7 +62,7 @@ impl BlockReader for FrameReaders<'_> {
             return Ok(());
         }
         let sh_degree = self.sh_degree();
-        self.readers.par_iter_mut().zip(BlockSlices::of(state, want, self.count)).try_for_each_init(
+        self.readers.par_iter_mut().zip(BlockSlices::split(state, want, self.count)).try_for_each_init(
             || Gaussians::zeros(0, sh_degree),
             |block, (reader, parts)| {
                 reader.read(frame, want, block)?;

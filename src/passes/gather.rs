@@ -16,8 +16,8 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns) -> Result<Gaussians> {
     let sh_degree = source.info().sh_degree;
     let mut all = Gaussians::zeros(0, sh_degree);
-    let parts = BlockSlices::of(&mut all, want, ids.len());
-    let wanted = ReadPlan::of([frame]);
+    let parts = BlockSlices::split(&mut all, want, ids.len());
+    let wanted = ReadPlan::new([frame]);
     ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
         || Gaussians::zeros(0, sh_degree),
         |block, (ids, parts)| {
@@ -34,7 +34,7 @@ pub fn gather(source: &dyn FrameSource, ids: &[u32], frame: usize, want: Columns
 /// Columns `want` of all Gaussians at `frame`; all other columns are empty.
 pub fn gather_all(source: &dyn FrameSource, frame: usize, want: Columns) -> Result<Gaussians> {
     let mut all = Gaussians::zeros(0, source.info().sh_degree);
-    open_all(source, want, &ReadPlan::of([frame]))?.read(frame, want, &mut all)?;
+    open_all(source, want, &ReadPlan::new([frame]))?.read(frame, want, &mut all)?;
     Ok(all)
 }
 

@@ -8,7 +8,7 @@ pub struct BlockSlices<'a>(Vec<&'a mut [f32]>);
 
 impl<'a> BlockSlices<'a> {
     /// The parts of the columns `want` of `state`, which are resized to `count` Gaussians: one for each [`BLOCK`].
-    pub fn of(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<BlockSlices<'a>> {
+    pub fn split(state: &'a mut Gaussians, want: Columns, count: usize) -> Vec<BlockSlices<'a>> {
         let mut parts: Vec<BlockSlices<'a>> = (0..count.div_ceil(BLOCK)).map(|_| BlockSlices(Vec::new())).collect();
         for column in state.columns_mut(want) {
             column.resize(count);

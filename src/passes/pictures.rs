@@ -159,7 +159,7 @@ pub fn show<const S: usize>(
     most: Batch,
     mut visit: impl FnMut(&[ViewStates<'_, S>]) -> Result<()>,
 ) -> Result<()> {
-    let wanted = ReadPlan::of(pictures.iter().map(|picture| picture.frame)).holding(most.held);
+    let wanted = ReadPlan::new(pictures.iter().map(|picture| picture.frame)).holding(most.held);
     let mut readers = Vec::with_capacity(S);
     for subject in &subjects {
         readers.push(subject.open(&wanted)?);

@@ -64,7 +64,7 @@ mod tests {
         let constant = Columns::all().difference(container.info().varying);
         assert!(!constant.is_empty(), "the scene has no constant column to tell by");
         let frames = [0, 3, 31, 32, 39];
-        let mut states = States::open(&container, &ReadPlan::of(frames)).unwrap();
+        let mut states = States::open(&container, &ReadPlan::new(frames)).unwrap();
         assert!(states.now().is_empty());
         for frame in frames {
             let expected = gather_all(&scene, frame, Columns::all()).unwrap();

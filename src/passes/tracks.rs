@@ -38,7 +38,7 @@ pub fn tracks<R: Send>(
             states.push(state);
         }
         progress.advance((ids.len() * states.len()) as u64);
-        Ok((0..ids.len()).map(|row| make(&FittedTrack::of(times, &states, row))).collect())
+        Ok((0..ids.len()).map(|row| make(&FittedTrack::from_states(times, &states, row))).collect())
     };
     let blocks: Vec<Vec<R>> = (0..info.count.div_ceil(TRACKED))
         .into_par_iter()

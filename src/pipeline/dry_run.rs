@@ -8,15 +8,15 @@ use serde::{Deserialize, Serialize};
 use super::request::{Goal, Quality, Request};
 use super::summary::CameraSummary;
 use crate::TOOL;
-use crate::budget::{Budget, Plan, Verbosity, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::Forecast;
 use crate::journal::records::LeftOut;
+use crate::memory_plan::{Budget, Plan, Verbosity, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::plan::Job;
-use crate::pipeline::stages::emit::beside_names;
 use crate::pipeline::stages::measure::{InputMeta, Stages};
+use crate::pipeline::stages::write::beside_names;
 use crate::pipeline::throughput::measured;
 use crate::scene::{InputOptions, open_scene};
 
@@ -72,7 +72,7 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
     }
     let input = InputOptions { work: None, ..request.input.clone() };
     let mut scene = open_scene(&input)?;
-    let outlook = InputMeta::of(&scene);
+    let outlook = InputMeta::from_scene(&scene);
     let job = Job::within(request, outlook, &scene.workload())?;
     job.emit.check(&[&request.input.path])?;
     job.emit.kind.check_frames(scene.source().info().times.len(), &request.output)?;
@@ -95,7 +95,7 @@ pub fn foresee(request: &Request) -> Result<Foreseen> {
         frames: info.times.len(),
         sh_degree: info.sh_degree,
         bytes: scene.input.bytes()?,
-        cameras: CameraSummary::of(&scene),
+        cameras: CameraSummary::from_scene(&scene),
         gaussians,
         size_by: size_by(request),
         would_write: std::iter::once(output.clone()).chain(beside_names(&request.output, job.emit.kind)).collect(),

@@ -20,24 +20,24 @@ pub use record::{RecipeRecord, RunOptions};
 pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
-use crate::budget::{Budget, Verbosity, Workload, seconds};
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::names::name_of;
 use crate::journal::Journal;
+use crate::memory_plan::{Budget, Verbosity, Workload, seconds};
 use crate::model::ALL_HARMONICS;
 use crate::models::Size;
+use crate::pipeline::stages::reference_views::{ArchiveTarget, LEFT_BY_SEARCH};
 use crate::progress::begin_run;
 use crate::pruning::Ranking;
 use crate::pruning::score::{Scored, UserOverrides};
 use crate::recipe::{Precision, Recipe, WhichBands};
-use crate::reduction::CompressedModel;
 use crate::scene::{InputOptions, Scene};
 use open::measured_already;
 use search::size::ByteLimit;
 use stages::archive::Archived;
 use stages::measure::{InputMeta, Measure, Measured, Stages};
 use stages::merge::Outcome;
-use stages::near::{ArchiveTarget, LEFT_BY_SEARCH};
 use summary::{CameraSummary, InputSummary, Summary};
 
 /// Writes a smaller model and says what was done.
@@ -60,7 +60,7 @@ pub fn compress(request: &Request) -> Result<Summary> {
 /// # Errors
 /// Those of [`compress`].
 pub fn compress_scene(scene: &Scene, request: &Request) -> Result<(Summary, Vec<Option<u32>>)> {
-    let job = Job::within(request, InputMeta::of(scene), &scene.workload())?;
+    let job = Job::within(request, InputMeta::from_scene(scene), &scene.workload())?;
     job.emit.check(&[&scene.path])?;
     reduce(scene, &job, None, request, Journal::default())
 }
@@ -82,7 +82,7 @@ pub fn divided_stages(request: &Request) -> Result<Vec<String>> {
 /// # Errors
 /// A budget that cannot work, and those of [`Job::new`].
 pub fn keep_to_budget(scene: &mut Scene, request: &Request) -> Result<()> {
-    let job = Job::within(request, InputMeta::of(scene), &scene.workload())?;
+    let job = Job::within(request, InputMeta::from_scene(scene), &scene.workload())?;
     scene.keep_to(request.input.memory, |work, limits| job.needs(work, limits))
 }
 
@@ -110,12 +110,12 @@ fn reduce(
     let stages = seconds(&work, &job.needs(&work, &scene.limits));
     // What was measured on arrival is not done again.
     let _numbered = begin_run(stages[measured_already(&arrived)..].to_vec());
-    let input = InputSummary::of(&*scene.input, &scene.path, scene.digest()?)?.without_folders();
+    let input = InputSummary::new(&*scene.input, &scene.path, scene.digest()?)?.without_folders();
     if let Some(other) = request.made_for.as_ref().filter(|digest| **digest != input.digest) {
         let own = &input.digest;
         journal.notes.push(format!("the recipe was made for another input, with digest {other}; this one has {own}"));
     }
-    let recipe = RecipeRecord::of(request, &job.measure.score.user, input.digest.clone());
+    let recipe = RecipeRecord::new(request, &job.measure.score.user, input.digest.clone());
     let recipe = recipe.text(request, &job.emit.recipe_folder());
 
     let sh_degree = match request.recipe.bands.bands {
@@ -132,7 +132,7 @@ fn reduce(
         search.check(scene)?;
     }
     let scored = job.measure.run(scene, arrived, &mut journal)?;
-    let outlook = InputMeta::of(scene);
+    let outlook = InputMeta::from_scene(scene);
     let (mut job, fits) = match &space {
         Some(space) => {
             // A field that is to stay exact takes its room at the end.
@@ -209,7 +209,7 @@ fn reduce(
         schema: summary::SCHEMA,
         files: Vec::new(),
         tool: TOOL.to_owned(),
-        cameras: CameraSummary::of(scene),
+        cameras: CameraSummary::from_scene(scene),
         output: name_of(&request.output),
         gaussians: reduction.len(),
         output_bytes: Some(output.whole()),

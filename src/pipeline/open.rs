@@ -12,11 +12,11 @@ use std::io::Stdin;
 
 use glam::DVec3;
 
-use crate::budget::{Budget, Plan, Verbosity, Workload, size};
 use crate::error::Result;
 use crate::files::cameras;
 use crate::files::frame_stream::FrameStream;
 use crate::journal::{Clock, Journal};
+use crate::memory_plan::{Budget, Plan, Verbosity, Workload, size};
 use crate::model::RobustBox;
 use crate::model::{Camera, Picture, Rig, Schedule, Split};
 use crate::models::stream::{AHEAD, Streamed, frame_block};
@@ -58,7 +58,7 @@ pub fn open_to_measure<S: Stages>(
     } else {
         open_scene(options)?
     };
-    let stages = plan(InputMeta::of(&scene), &scene.workload())?;
+    let stages = plan(InputMeta::from_scene(&scene), &scene.workload())?;
     let plan = Plan::fit(scene.workload(), options.memory, |work, limits| stages.needs(work, limits))?;
     scene.follow(&plan);
     // What measuring beforehand reads is no part of the plan.

@@ -3,23 +3,23 @@
 use super::ids::parse_ids;
 use super::request::{Goal, Only, Quality, Request, decibels};
 use super::search::SearchStage;
-use crate::budget::{Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::records::Saved;
 use crate::limits::Limits;
+use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pipeline::stages::archive::ArchiveStage;
 use crate::pipeline::stages::bands::ShDegreeStage;
 use crate::pipeline::stages::choose::Choose;
 use crate::pipeline::stages::degree::Degree;
-use crate::pipeline::stages::emit::Emit;
 use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pipeline::stages::measure::{InputMeta, Measure, Stages};
 use crate::pipeline::stages::merge;
 use crate::pipeline::stages::merge::MergeStage;
-use crate::pipeline::stages::near::LEFT_BY_SEARCH;
+use crate::pipeline::stages::reference_views::LEFT_BY_SEARCH;
 use crate::pipeline::stages::scan;
+use crate::pipeline::stages::write::Emit;
 use crate::pruning::prune::Prune;
 use crate::pruning::rounds::Rounds;
 use crate::pruning::score::UserOverrides;
@@ -147,7 +147,7 @@ impl Job {
         let looks = measure.visible.is_some();
         let prunes = *only != Only::Merge;
         let part = target.map(|target| target as f64 / outlook.gaussians.max(1) as f64);
-        let refine = RefineStage::of(recipe, part, looks && prunes).and_then(|refine| match spared {
+        let refine = RefineStage::from_recipe(recipe, part, looks && prunes).and_then(|refine| match spared {
             MemoryFallback::Nothing => Some(refine),
             MemoryFallback::ConstantInTime { .. } => Some(refine.without_course()),
             MemoryFallback::WithoutHarmonics { .. } => Some(refine.without_course().without_bands()),
@@ -156,7 +156,7 @@ impl Job {
         if request.kind.is_none() {
             OutputKind::check_name(&request.output)?;
         }
-        let kind = OutputKind::of(&request.output, request.kind, outlook.own_output);
+        let kind = OutputKind::from_path(&request.output, request.kind, outlook.own_output);
         let is_archive = kind == OutputKind::Archive;
         if request.archive_psnr.is_some() && !is_archive {
             return Err(Error::usage("--archive-psnr is for archives: write to NAME.gsz, or --as archive"));
@@ -185,11 +185,11 @@ impl Job {
         let merges = !prunes_alone && !recipe.merge.passes.is_empty();
         let prune = Prune { prunes, merges, target };
         let emit = Emit::new(request, outlook.own_output, merges);
-        let field = FieldPrecisionStage::of(request, emit.kind);
-        let bands = ShDegreeStage::of(request, emit.kind);
+        let field = FieldPrecisionStage::from_request(request, emit.kind);
+        let bands = ShDegreeStage::from_request(request, emit.kind);
         Ok(Job {
-            rounds: Rounds::of(&recipe.select, part).filter(|_| looks && prunes),
-            degree: Degree::of(request, refine.as_ref()),
+            rounds: Rounds::from_recipe(&recipe.select, part).filter(|_| looks && prunes),
+            degree: Degree::from_request(request, refine.as_ref()),
             merge: merges.then(|| MergeStage::after(&prune, recipe)),
             prune,
             choose: (looks && prunes && merges && recipe.select.choose_by_views)
@@ -348,7 +348,7 @@ impl Stages for Job {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Budget;
+    use crate::memory_plan::Budget;
     use crate::model::ALL_HARMONICS;
     use crate::pipeline::tests::work;
     use crate::recipe::Recipe;

@@ -133,7 +133,7 @@ impl RunOptions {
 
 impl RecipeRecord {
     /// Of `request`, whose ids are those of `user`.
-    pub(super) fn of(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
+    pub(super) fn new(request: &Request, user: &UserOverrides, input_digest: String) -> RecipeRecord {
         let (target_count, target_ratio) = match request.target {
             None => (None, None),
             Some(Target::Count(count)) => (Some(count), None),
@@ -223,7 +223,7 @@ mod tests {
         (request.only, request.target) = (Only::Prune, Some(Target::Ratio(0.3)));
         (request.keep_box, request.kind) = (Some([-1.0, 0.0, 0.5, 1.0, 2.0, 1e9]), Some(OutputKind::PlySequence));
         let user = UserOverrides { keep: vec![1, 2, 3, 9], drop: Vec::new(), keep_box: request.keep_box };
-        let record = RecipeRecord::of(&request, &user, "00ff".to_owned());
+        let record = RecipeRecord::new(&request, &user, "00ff".to_owned());
         let folder = Path::new("/somewhere/else");
         let text = record.text(&request, folder);
         // The folder is far from the working directory, so that the cameras keep their name alone.

@@ -12,6 +12,7 @@ use bytesize::ByteSize;
 use serde::{Deserialize, Serialize};
 
 use crate::archive::ArchiveSize;
+use crate::compressed_model::Cluster;
 use crate::error::{Result, ShowPath};
 use crate::files::names::name_of;
 use crate::journal::records::{
@@ -23,7 +24,6 @@ use crate::models::{InputModel, Size};
 use crate::progress::duration;
 use crate::pruning::Counts;
 use crate::recipe::ProxyOpacity;
-use crate::reduction::Cluster;
 use crate::scene::Scene;
 
 /// What the output's size was found by.
@@ -99,7 +99,7 @@ impl InputSummary {
     ///
     /// # Errors
     /// A file that cannot be read.
-    pub fn of(input: &dyn InputModel, path: &Path, digest: String) -> Result<InputSummary> {
+    pub fn new(input: &dyn InputModel, path: &Path, digest: String) -> Result<InputSummary> {
         let info = input.source().info();
         Ok(InputSummary {
             path: path.to_string_lossy().into_owned(),
@@ -135,7 +135,7 @@ pub struct CameraSummary {
 
 impl CameraSummary {
     /// Of the pictures that are scored.
-    pub fn of(scene: &Scene) -> CameraSummary {
+    pub fn from_scene(scene: &Scene) -> CameraSummary {
         CameraSummary {
             origin: scene.rig.origin.clone(),
             cameras: scene.schedule.cameras.len(),

@@ -8,10 +8,10 @@ use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use crate::budget::{LOOK, Plan, REMOVE, RENDER, Throughput, Workload};
 use crate::error::Result;
 use crate::journal::Clock;
 use crate::journal::records::Forecast;
+use crate::memory_plan::{LOOK, Plan, REMOVE, RENDER, Throughput, Workload};
 use crate::model::{Camera, Columns, Gaussians};
 use crate::passes::{BLOCK, gather_all};
 use crate::pipeline::stages::measure::Stages;
@@ -43,13 +43,13 @@ const SHORT: f64 = 2.0;
 pub(super) fn measured(scene: &mut Scene, plan: &Plan, stages: &impl Stages, done: usize) -> Result<Forecast> {
     let work = scene.workload();
     let expected = core_seconds(&stages.needs(&work, &scene.limits)[done..]) / work.threads as f64;
-    let found = if expected < SHORT { Calibration::NONE } else { Calibration::of(scene, expected)? };
+    let found = if expected < SHORT { Calibration::NONE } else { Calibration::measure(scene, expected)? };
     scene.pace = found.pace;
     let work = scene.workload();
     let easiest = stages.easiest(&work, &scene.limits, found.hardly_seen);
     let needs = stages.needs(&work, &scene.limits);
     let least = core_seconds(&easiest[done..]);
-    Ok(Forecast::of(&work, &needs[done..], least, stages.searches(), plan.peak()))
+    Ok(Forecast::new(&work, &needs[done..], least, stages.searches(), plan.peak()))
 }
 
 /// What was found before a run.
@@ -70,7 +70,7 @@ impl Calibration {
     ///
     /// # Errors
     /// Frames that cannot be read.
-    fn of(scene: &Scene, expected: f64) -> Result<Calibration> {
+    fn measure(scene: &Scene, expected: f64) -> Result<Calibration> {
         let work = scene.workload();
         if work.gaussians == 0 || work.frames == 0 {
             return Ok(Calibration::NONE);
@@ -164,7 +164,7 @@ fn states(scene: &Scene, work: &Workload, room: f64, spent: &mut Spent) -> Resul
     let open = |k: usize| -> Result<_> {
         let start = k * all / blocks * BLOCK;
         let mut reader = source.open(Ids::Range(start..source.info().count.min(start + BLOCK)))?;
-        reader.expect(&ReadPlan::of(0..frames));
+        reader.expect(&ReadPlan::new(0..frames));
         let mut state = Gaussians::zeros(0, source.info().sh_degree);
         reader.read(0, columns, &mut state)?;
         Ok((reader, state))
@@ -215,10 +215,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let before = scene.workload();
-        let found = Calibration::of(&scene, 1e3).unwrap();
+        let found = Calibration::measure(&scene, 1e3).unwrap();
         assert!(found.pace.states > 0.0 && found.pace.look > 0.0 && found.pace.remove > 0.0, "{found:?}");
         assert_ne!(found.pace.look, found.pace.states, "pictures were made");
-        let short = Calibration::of(&scene, 1e-6).unwrap();
+        let short = Calibration::measure(&scene, 1e-6).unwrap();
         assert_eq!((short.pace.look, short.hardly_seen), (short.pace.states, 0.0));
         assert_eq!(scene.workload(), before);
     }

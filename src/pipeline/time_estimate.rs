@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
-use crate::budget::{ResourceEstimate, Verbosity, Workload, size};
 use crate::journal::records::{Forecast, Range, StageForecast};
+use crate::memory_plan::{ResourceEstimate, Verbosity, Workload, size};
 use crate::progress::duration;
 
 /// How far off core-seconds were on three trained models at several sizes after a calibration (`scripts/estimate.py`), as
@@ -20,7 +20,7 @@ const AT_LEAST: f64 = 0.5;
 
 impl Forecast {
     /// Of stages that need what `needs` says, or at best take `least` core-seconds.
-    pub(super) fn of(
+    pub(super) fn new(
         work: &Workload,
         needs: &[ResourceEstimate],
         least: f64,
@@ -107,7 +107,7 @@ fn rounded(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Throughput;
+    use crate::memory_plan::Throughput;
     use crate::pipeline::tests::work;
 
     fn need(seconds: f64) -> ResourceEstimate {
@@ -117,9 +117,11 @@ mod tests {
     #[test]
     fn a_range_holds_what_is_likely_and_is_wider_where_less_is_known() {
         let unmeasured = work(1000);
-        let measured =
-            crate::budget::Workload { pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN }, ..unmeasured };
-        let of = |work: &Workload, searches| Forecast::of(work, &[need(40.0)], 40.0, searches, 1 << 20);
+        let measured = crate::memory_plan::Workload {
+            pace: Throughput { processors: Some(1.5), ..Throughput::UNKNOWN },
+            ..unmeasured
+        };
+        let of = |work: &Workload, searches| Forecast::new(work, &[need(40.0)], 40.0, searches, 1 << 20);
         let all = [of(&measured, false), of(&unmeasured, false), of(&measured, true)];
         for Forecast { seconds, core_seconds, .. } in &all {
             for range in [seconds, core_seconds] {

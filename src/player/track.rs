@@ -102,7 +102,7 @@ pub fn encode(
 ) -> Result<()> {
     let Some(&first) = frames.first() else { return Ok(()) };
     let progress = Progress::new("view", "frames", frames.len() as u64);
-    let mut states = States::open(source, &ReadPlan::of(frames.iter().copied()).holding(held))?;
+    let mut states = States::open(source, &ReadPlan::new(frames.iter().copied()).holding(held))?;
     let mut shown = Gaussians::default();
     let (count, degree) = (track.count, track.sh_degree);
     let mut points = vec![0; width(degree) * count];

@@ -4,11 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::TOOL;
-use crate::budget::{Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::evaluation::open_compressed;
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::limits::Limits;
+use crate::memory_plan::{Plan, ResourceEstimate, Workload};
 use crate::model::{ALL_HARMONICS, Columns, SequenceInfo};
 use crate::models::InputModel;
 use crate::player::lattice::{Steps, width};

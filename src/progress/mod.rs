@@ -164,7 +164,7 @@ impl Progress {
                 let columns = Term::stderr().size_checked().map_or(USUAL_COLUMNS, |(_, columns)| columns);
                 // Writing to what is drawn cannot fail. The last column stays free: some terminals go on to the next line.
                 let _ = out.write_str(
-                    &BarSnapshot::of(state, (&name, is_stage), &unit).line(usize::from(columns).saturating_sub(1)),
+                    &BarSnapshot::new(state, (&name, is_stage), &unit).line(usize::from(columns).saturating_sub(1)),
                 );
             };
             bar.set_style(style.with_key("line", line));
@@ -190,7 +190,7 @@ impl Progress {
     }
 
     /// Tells that what the stage `what` did is undone, and `why`: nobody is to take it for progress.
-    pub fn undone(what: &str, why: &str) {
+    pub fn report_skipped(what: &str, why: &str) {
         if QUIET.load(Ordering::Relaxed) {
             return;
         }
@@ -238,7 +238,7 @@ struct BarSnapshot<'a> {
 }
 
 impl<'a> BarSnapshot<'a> {
-    fn of(state: &ProgressState, (name, is_stage): (&'a str, bool), unit: &'a str) -> BarSnapshot<'a> {
+    fn new(state: &ProgressState, (name, is_stage): (&'a str, bool), unit: &'a str) -> BarSnapshot<'a> {
         let (done, total) = (state.pos(), state.len());
         // Of what has not begun to move nobody knows how fast it is.
         let left = total.filter(|&total| done > 0 && total > done).map(|_| state.eta().as_secs_f64());

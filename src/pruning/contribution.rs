@@ -29,14 +29,14 @@ pub struct VisibleContribution {
 
 impl VisibleContribution {
     /// What `found` in so many pictures comes to.
-    pub fn of(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
+    pub fn new(found: &Contribution, pictures: usize, pixel_stride: NonZeroU32) -> VisibleContribution {
         let per_pixel = f64::from(pixel_stride.get()).powi(2);
         let coverage = (0..found.len()).map(|i| found.pixels(i) * per_pixel / pictures.max(1) as f64).collect();
         VisibleContribution { coverage, peak: found.max.iter().map(|&max| f64::from(max)).collect() }
     }
 }
 
-/// Looks at every `pixel_stride`-th pixel each way of `pictures`; [`VisibleContribution::of`] says what that comes to.
+/// Looks at every `pixel_stride`-th pixel each way of `pictures`; [`VisibleContribution::new`] says what that comes to.
 ///
 /// A Gaussian with NaN or infinity in a frame adds nothing there, nor does a picture without pixels; no
 /// pictures at all give zeros.
@@ -97,7 +97,7 @@ impl RunningContribution {
     /// What was seen in all pictures.
     pub fn finish(self) -> VisibleContribution {
         let (pictures, pixel_stride) = (self.pictures, self.pixel_stride);
-        VisibleContribution::of(&self.sum(), pictures, pixel_stride)
+        VisibleContribution::new(&self.sum(), pictures, pixel_stride)
     }
 
     fn sum(self) -> Contribution {
@@ -158,7 +158,7 @@ mod tests {
             for (threads, limits) in [(1, Limits::NONE), (2, Limits::NONE), (5, Limits::NONE), (3, one)] {
                 let look =
                     || visible_contribution(&scene, (&schedule.cameras, &sample), scan.pixel_stride, limits).unwrap();
-                let seen = VisibleContribution::of(&on_threads(threads, look), sample.len(), scan.pixel_stride);
+                let seen = VisibleContribution::new(&on_threads(threads, look), sample.len(), scan.pixel_stride);
                 for i in 0..2500 {
                     let expected = plain.pixels(i) * f64::from(pixel * pixel) / pictures as f64;
                     assert_eq!(seen.coverage[i], expected, "C of {i} on {threads} threads");
@@ -176,7 +176,7 @@ mod tests {
             let scan = strides(pixel, 1, 1);
             let sample = (&schedule.cameras[..], &looked_at(&schedule, &scan, 1)[..]);
             let found = visible_contribution(&scene, sample, scan.pixel_stride, Limits::NONE).unwrap();
-            VisibleContribution::of(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
+            VisibleContribution::new(&found, sample.1.len(), scan.pixel_stride).coverage.iter().sum::<f64>()
         };
         let (all, third) = (total(1), total(3));
         assert!((third / all - 1.0).abs() < 0.02, "got {third}, expected about {all}");
@@ -257,7 +257,7 @@ mod tests {
             Limits::NONE,
         )
         .unwrap();
-        let seen = VisibleContribution::of(&seen, sample.len(), recipe.scan.pixel_stride);
+        let seen = VisibleContribution::new(&seen, sample.len(), recipe.scan.pixel_stride);
         assert_eq!((seen.coverage[HIDDEN], seen.peak[HIDDEN]), (0.0, 0.0));
         assert!(seen.coverage[FAINT] > 0.0 && seen.peak[FAINT] > 0.0);
 
@@ -288,7 +288,7 @@ mod tests {
             let sample = looked_at(schedule, &strides(1, 1, 1), 1);
             let sample = (&schedule.cameras[..], &sample[..]);
             let found = visible_contribution(source, sample, NonZeroU32::MIN, Limits::NONE).unwrap();
-            VisibleContribution::of(&found, sample.1.len(), NonZeroU32::MIN)
+            VisibleContribution::new(&found, sample.1.len(), NonZeroU32::MIN)
         };
         let seen = look(&scene, &schedule);
         assert_eq!(seen, VisibleContribution { coverage: vec![0.0; 300], peak: vec![0.0; 300] });

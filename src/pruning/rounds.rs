@@ -10,12 +10,12 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::score::{Scored, scored};
-use crate::budget::{REMOVE, ResourceEstimate, Workload};
+use super::score::{Scored, scored_memory};
 use crate::cache::CacheKey;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{REMOVE, ResourceEstimate, Workload};
 use crate::model::{Columns, Picture};
 use crate::passes::spread_over;
 use crate::progress::Progress;
@@ -52,7 +52,7 @@ const USUAL: f64 = 0.5;
 impl Rounds {
     /// The stage, unless `recipe` ranks once; `target`: the part of the Gaussians that is asked for. Takes visible
     /// contributions.
-    pub fn of(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
+    pub fn from_recipe(recipe: &recipe::Select, target: Option<f64>) -> Option<Rounds> {
         let recipe::Select {
             round_fraction: fraction,
             round_pictures: pictures,
@@ -70,7 +70,8 @@ impl Rounds {
         let all = (self.pictures as u64).min(work.pictures);
         let turns = (self.turns as u64).min(all).max(1);
         let per_gaussian =
-            [scored(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking].concat();
+            [scored_memory(limits), vec![("ranking", 32), ("errors", 8 * turns), ("found", 8 * turns)], looking]
+                .concat();
         let seconds = (0..self.rounds(self.usual)).map(|round| {
             let left = work.count() * self.fraction.powi(round as i32);
             let pictures = all as f64 / if round == 0 { 1.0 } else { turns as f64 };
@@ -262,7 +263,7 @@ mod tests {
     fn ranked(scene: &Scene, user: &UserOverrides, fewest: usize) -> (Ranking, Ranking) {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(scene, &recipe, user);
-        let rounds = Rounds::of(&recipe.select, None).unwrap();
+        let rounds = Rounds::from_recipe(&recipe.select, None).unwrap();
         let found = rounds.run(scene, &scored, scored.ranked(), fewest, &mut Journal::default()).unwrap();
         (scored.ranked(), found)
     }
@@ -321,7 +322,7 @@ mod tests {
         let recipe = Recipe::preset("default").unwrap();
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         for (turns, frames_apart) in [(1, true), (4, true), (10, false), (1000, false)] {
-            let rounds = Rounds { turns, ..Rounds::of(&recipe.select, None).unwrap() };
+            let rounds = Rounds { turns, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             let parts = rounds.turns(&scene, &scored);
             let all = spread_over(&scene.schedule, rounds.pictures, scored.frames_to_see);
             assert_eq!(parts.len(), turns.min(all.len()));
@@ -338,7 +339,7 @@ mod tests {
     fn every_round_removes_a_gaussian_whatever_the_fraction() {
         let recipe = Recipe::preset("default").unwrap();
         for fraction in [0.1, 0.5, 0.9, recipe::MOST_LEFT_BY_ROUND, 0.999_999_999_9, 1.0 - f64::EPSILON / 2.0] {
-            let rounds = Rounds { fraction, ..Rounds::of(&recipe.select, None).unwrap() };
+            let rounds = Rounds { fraction, ..Rounds::from_recipe(&recipe.select, None).unwrap() };
             for (count, protected) in (0..=50).flat_map(|count| [(count, 0), (count, 7)]) {
                 for fewest in 0..=count {
                     let sizes = rounds.sizes(count, protected, fewest);
@@ -356,7 +357,8 @@ mod tests {
     #[test]
     fn the_number_of_rounds_is_bounded_for_no_gaussians_at_all() {
         let recipe = Recipe::preset("default").unwrap();
-        let rounds = Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::of(&recipe.select, Some(0.0)).unwrap() };
+        let rounds =
+            Rounds { fraction: recipe::MOST_LEFT_BY_ROUND, ..Rounds::from_recipe(&recipe.select, Some(0.0)).unwrap() };
         assert_eq!([0.0, 1e-300, 1.0, 2.0].map(|fewest| rounds.rounds(fewest)), [2207, 2207, 0, 0]);
     }
 

@@ -5,11 +5,12 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::budget::{MemoryPart, ResourceEstimate, Workload};
+use crate::compressed_model::Reference;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::records::{FlagSummary, Saved, TermSummary};
 use crate::limits::Limits;
+use crate::memory_plan::{MemoryPart, ResourceEstimate, Workload};
 use crate::model::RobustBox;
 use crate::model::{Columns, Flags, Gaussians, Rows};
 use crate::models::trajectories::state_bytes;
@@ -19,7 +20,6 @@ use crate::pruning;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::{Overrides, Ranking, Selection, select};
 use crate::recipe::{self, NonFinite};
-use crate::reduction::Reference;
 use crate::scene::Scene;
 use crate::statistics::aside::StatisticsRows;
 use crate::statistics::pass::Scanned;
@@ -33,7 +33,7 @@ pub(crate) const NAME: &str = "score";
 pub const SCORED: u64 = (Rows::BYTES_PER_GAUSSIAN + Scores::BYTES_PER_GAUSSIAN + pruning::BYTES_PER_GAUSSIAN) as u64;
 
 /// What stays of scoring: the selection, and the statistics unless they are set aside.
-pub fn scored(limits: &Limits) -> Vec<MemoryPart> {
+pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
     let rows = if limits.rows_aside { 0 } else { Rows::BYTES_PER_GAUSSIAN as u64 };
     vec![("rows", rows), ("selection", pruning::BYTES_PER_GAUSSIAN as u64)]
 }

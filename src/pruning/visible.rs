@@ -2,10 +2,10 @@
 
 use std::ops::Range;
 
-use crate::budget::{LOOK, ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{LOOK, ResourceEstimate, Workload};
 use crate::model::{Columns, Rows, Statistic};
 use crate::passes::{frames_to_see, looked_at};
 use crate::pruning::contribution::{VisibleContribution, visible_contribution};
@@ -25,7 +25,7 @@ pub struct Visible {
 
 impl Visible {
     /// The stage, if `recipe` measures C by pictures; `has_cameras`: these are the scene's own, not a virtual rig.
-    pub fn of(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<Visible> {
+    pub fn from_recipe(recipe: &recipe::ScanParams, has_cameras: bool) -> Option<Visible> {
         let looks = match recipe.coverage {
             Coverage::Auto => has_cameras,
             Coverage::Visible => true,
@@ -80,7 +80,7 @@ impl Visible {
                 for part in parts {
                     sum.merge(&part?);
                 }
-                Ok(VisibleContribution::of(&sum, pictures.len(), stride))
+                Ok(VisibleContribution::new(&sum, pictures.len(), stride))
             })?;
             Ok((found, count))
         });
@@ -127,7 +127,8 @@ mod tests {
     #[test]
     fn pictures_of_a_virtual_rig_are_looked_at_only_when_asked_for() {
         let mut recipe = Recipe::preset("default").unwrap().scan;
-        let looks = |recipe: &recipe::ScanParams| [true, false].map(|cameras| Visible::of(recipe, cameras).is_some());
+        let looks =
+            |recipe: &recipe::ScanParams| [true, false].map(|cameras| Visible::from_recipe(recipe, cameras).is_some());
         assert_eq!(looks(&recipe), [true, false]);
         recipe.coverage = Coverage::Visible;
         assert_eq!(looks(&recipe), [true, true]);

@@ -46,7 +46,7 @@ impl Loss {
     }
 
     /// Mean square error of a picture, and 1 − SSIM where that is asked for.
-    pub(super) fn of(&self, picture: &Image, target: &[u16]) -> [f64; 2] {
+    pub(super) fn errors(&self, picture: &Image, target: &[u16]) -> [f64; 2] {
         let unlike = if self.ssim > 0.0 { 1.0 - ssim(picture, &image(picture, target)) } else { 0.0 };
         [mean_square(picture, target), unlike]
     }
@@ -66,7 +66,7 @@ impl Loss {
 
 impl RenderQuality {
     /// Of pictures with a [`Loss::of`] each.
-    pub(super) fn of(pictures: &[[f64; 2]]) -> RenderQuality {
+    pub(super) fn from_errors(pictures: &[[f64; 2]]) -> RenderQuality {
         let mean = |of: &dyn Fn(&[f64; 2]) -> f64| pictures.iter().map(of).sum::<f64>() / pictures.len().max(1) as f64;
         RenderQuality {
             psnr: mean(&|&[square, _]| decibels(square)),
@@ -104,7 +104,7 @@ mod tests {
             let at = |k: usize, by: f32| {
                 let mut moved = picture.clone();
                 moved.data[k] += by;
-                let [square, unlike] = loss.of(&moved, &target);
+                let [square, unlike] = loss.errors(&moved, &target);
                 count * (squared * square + ssim * unlike)
             };
             // A difference across the end of what a screen shows is none of either side.
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn closer_is_by_decibels_alone_or_by_the_loss() {
-        let close = |square: f64, unlike: f64| RenderQuality::of(&[[square, unlike], [square, unlike]]);
+        let close = |square: f64, unlike: f64| RenderQuality::from_errors(&[[square, unlike], [square, unlike]]);
         let (sharp, soft) = (close(1e-3, 0.02), close(0.9e-3, 0.08));
         assert!((sharp.psnr - 30.0).abs() < 1e-9 && (sharp.error - 1e-3f64.sqrt()).abs() < 1e-12);
         assert!(Loss { ssim: 0.0 }.is_closer(&soft, &sharp) && !Loss { ssim: 0.0 }.is_closer(&sharp, &sharp));

@@ -11,8 +11,8 @@
 
 mod local;
 mod loss;
-mod moving;
 pub mod optimizer;
+pub(crate) mod optimizer_state;
 pub(crate) mod targets;
 
 use std::time::{Duration, Instant};
@@ -20,24 +20,24 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::journal::Journal;
-use crate::budget::{MemoryPart, PICTURE_ON_ALL_THREADS, REMOVE, RENDER, ResourceEstimate, Workload, of_left};
 use crate::cache::CacheKey;
+use crate::compressed_model::{CompressedModel, ParamDelta, TrajectoryDelta};
 use crate::error::Result;
 use crate::journal::records::RefinedSummary;
 use crate::limits::Limits;
+use crate::memory_plan::{MemoryPart, PICTURE_ON_ALL_THREADS, REMOVE, RENDER, ResourceEstimate, Workload, of_left};
 use crate::metrics::decibels_text;
 use crate::model::{ALL_HARMONICS, Columns};
 use crate::progress::Progress;
-use crate::pruning::score::{Scored, scored};
+use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
-use crate::reduction::{CompressedModel, ParamDelta, TrajectoryDelta};
 use crate::refinement::optimizer::RateSchedule;
+use crate::refinement::optimizer_state::{OptimizerState, StepParams, knots};
 use crate::render::{GRADIENT_BYTES_PER_VISIBLE, GRADIENT_STRIP_BYTES};
 use crate::scene::Scene;
 use crate::scene::between::SplitMix64;
 use crate::source::FrameSource;
 use loss::{Loss, RenderQuality};
-use moving::{OptimizerState, StepParams, knots};
 use targets::{Parted, Targets};
 
 /// What the stage is called.
@@ -96,7 +96,7 @@ pub struct RefineStage {
 
 impl RefineStage {
     /// The stage, unless `recipe` lets nothing move. Of a run that ranks by pictures (`cuts`), down to the part `target`.
-    pub fn of(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
+    pub fn from_recipe(recipe: &recipe::Recipe, target: Option<f64>, cuts: bool) -> Option<RefineStage> {
         let recipe::RefineParams { refine, refine_steps, refine_cut_steps, refine_pictures, refine_ssim, refine_knots } =
             recipe.refine;
         let refine = RefineStage {
@@ -133,7 +133,7 @@ impl RefineStage {
     /// What it does follows from this, and what it is done to.
     pub(crate) fn key(&self) -> CacheKey {
         let of_steps = (self.steps, self.cut_steps, self.pictures, self.cuts, self.knots);
-        CacheKey::of(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, of_steps))
+        CacheKey::new(&(self.columns.bits(), self.sh_degree, self.loss, self.contrast_floor, of_steps))
     }
 
     fn manner(&self) -> StepParams {
@@ -207,7 +207,11 @@ impl RefineStage {
                 false => (self.steps_before(size, left), LOOKED_AT as f64, RANKED_ON as f64),
             };
             // States and twice as long again for how they change.
-            let found = if work.input.jacobian > 0 { 3.0 * steps as f64 / moving::FOUND_EVERY as f64 } else { 0.0 };
+            let found = if work.input.jacobian > 0 {
+                3.0 * steps as f64 / crate::refinement::optimizer_state::FOUND_EVERY as f64
+            } else {
+                0.0
+            };
             work.reading(of, frames as f64 * found)
                 + work.picturing(renders + STEP * steps as f64, of, RENDER)
                 + work.picturing(ranked, of, REMOVE)
@@ -218,7 +222,7 @@ impl RefineStage {
             seconds: 2.0 * work.reading(work.count(), frames as f64)
                 + work.picturing(pictures, work.count(), RENDER)
                 + sizes.iter().enumerate().map(seconds).sum::<f64>(),
-            per_gaussian: [scored(limits), vec![("kept", 24)], per_gaussian].concat(),
+            per_gaussian: [scored_memory(limits), vec![("kept", 24)], per_gaussian].concat(),
             fixed: vec![
                 work.arriving(),
                 ("pairs", GRADIENT_STRIP_BYTES as u64),
@@ -309,7 +313,7 @@ struct EpochSampler {
 }
 
 impl EpochSampler {
-    fn of(pictures: Vec<usize>) -> EpochSampler {
+    fn new(pictures: Vec<usize>) -> EpochSampler {
         EpochSampler { at: pictures.len(), pictures, dice: SplitMix64(1), taken: 0 }
     }
 
@@ -400,7 +404,7 @@ impl<'a> RefineRun<'a> {
     ) -> RefineRun<'a> {
         let along = (&targets.cameras, &targets.pictures, &parts.stepped, &parts.apart);
         let key = scene.work.key(&(refine.key(), along, &scored.protected));
-        let (turns, apart) = (EpochSampler::of(parts.stepped), parts.apart);
+        let (turns, apart) = (EpochSampler::new(parts.stepped), parts.apart);
         let progress = Progress::new(stage, "steps", 0);
         RefineRun { refine, scene, scored, targets, turns, apart, stage, progress, key }
     }
@@ -494,7 +498,7 @@ impl<'a> RefineRun<'a> {
 
     /// Knots of the course of what is refined.
     fn knots(&self) -> usize {
-        match self.scene.input.stands_in_frames() {
+        match self.scene.input.has_explicit_frames() {
             true => knots(self.refine.knots, self.scene.source().info().times.len()),
             false => 0,
         }
@@ -518,8 +522,9 @@ impl<'a> RefineRun<'a> {
 
     /// Goes to where the leg was when it was kept last, if it was.
     fn go_on(&mut self, moving: &mut OptimizerState<'_>, trail: &CheckpointTimer) -> Result<Option<Reached>> {
-        let kept: Option<ResumePoint<moving::KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>> =
-            self.scene.work.find(&self.name(), trail.key)?;
+        let kept: Option<
+            ResumePoint<crate::refinement::optimizer_state::KeptCheckpoint, BestState<ParamDelta, TrajectoryDelta>>,
+        > = self.scene.work.find(&self.name(), trail.key)?;
         let Some(kept) = kept.filter(|kept| kept.leg == trail.leg) else { return Ok(None) };
         moving.go_on(kept.standing)?;
         self.turns.skip_to(kept.taken);
@@ -557,7 +562,8 @@ impl<'a> RefineRun<'a> {
         size: usize,
     ) -> Result<Vec<u32>> {
         let (name, key, work) = (format!("{}-cut-{:02}", self.stage, trail.leg + 1), trail.key, &self.scene.work);
-        let kept: Option<(moving::KeptCheckpoint, Vec<u32>, usize)> = work.find(&name, key)?;
+        let kept: Option<(crate::refinement::optimizer_state::KeptCheckpoint, Vec<u32>, usize)> =
+            work.find(&name, key)?;
         let left = match kept {
             Some((standing, left, taken)) => {
                 moving.go_on(standing)?;
@@ -603,7 +609,7 @@ impl<'a> RefineRun<'a> {
         let (done, mut schedule, mut end) = match self.go_on(moving, trail)? {
             Some((done, schedule, Some(end))) => (done, schedule, end),
             _ => {
-                moving.find()?;
+                moving.reevaluate_states()?;
                 let before = moving.closeness(&self.apart)?;
                 if before.psnr.is_nan() {
                     let why = format!("{count} pictures kept apart have {}", decibels_text(before.psnr, 2));
@@ -622,7 +628,7 @@ impl<'a> RefineRun<'a> {
         for step in done + 1..=steps {
             self.step(moving, &schedule)?;
             if step % judge_every == 0 || step == steps {
-                moving.find()?;
+                moving.reevaluate_states()?;
                 let now = moving.closeness(&self.apart)?;
                 if self.refine.loss.is_closer(&now, &end.best) {
                     (end.best, end.kept) = (now, moving.change());
@@ -670,7 +676,7 @@ impl<'a> RefineRun<'a> {
         if done <= steps {
             let knots = self.knots();
             moving.turn_back(&end.kept)?;
-            if !moving.bend(knots) {
+            if !moving.enable_keyframes(knots) {
                 return Ok(false);
             }
             // Each picture is a step of two knots.
@@ -732,7 +738,7 @@ mod tests {
         let scored = score_scene(scene, &recipe, &UserOverrides { keep, ..UserOverrides::default() });
         let reduction = CompressedModel::pruned(scored.ranked().take(count), &recipe.merge);
         let mut journal = Journal::default();
-        let refine = RefineStage { steps, ..RefineStage::of(&recipe, None, false).unwrap() };
+        let refine = RefineStage { steps, ..RefineStage::from_recipe(&recipe, None, false).unwrap() };
         (refine.run(scene, &scored, reduction, count, &mut journal).unwrap(), journal)
     }
 
@@ -814,8 +820,12 @@ mod tests {
                 let scored = crate::pipeline::score_scene(scene, &recipe, &UserOverrides::default())?;
                 let count = scored.count();
                 let reduction = CompressedModel::pruned(scored.ranked().take(2 * count / 5), &recipe.merge);
-                let few =
-                    RefineStage { steps, cut_steps: 40, pictures, ..RefineStage::of(&recipe, None, true).unwrap() };
+                let few = RefineStage {
+                    steps,
+                    cut_steps: 40,
+                    pictures,
+                    ..RefineStage::from_recipe(&recipe, None, true).unwrap()
+                };
                 few.run(scene, &scored, reduction, count / 4, &mut Journal::default())
             };
             let start = Instant::now();
@@ -895,7 +905,8 @@ mod tests {
             let recipe = Recipe::preset("default").unwrap();
             let scored = score_scene(&scene, &recipe, &UserOverrides::default());
             let reduction = CompressedModel::pruned(scored.ranked().take(600), &recipe.merge);
-            let few = RefineStage { steps: 100, cut_steps: 40, ..RefineStage::of(&recipe, None, true).unwrap() };
+            let few =
+                RefineStage { steps: 100, cut_steps: 40, ..RefineStage::from_recipe(&recipe, None, true).unwrap() };
             few.run(&scene, &scored, reduction, 250, &mut Journal::default()).unwrap()
         });
         assert!(!away.change.is_empty() && away.change == unseen.change);
@@ -934,7 +945,7 @@ mod tests {
             let kept: Vec<u32> = (0..given[0].len() as u32).filter(part).collect();
             let [alike, along] = [0, 4].map(|knots| {
                 let reduction = CompressedModel::pruned(kept.clone(), &recipe.merge);
-                let few = RefineStage { steps: 300, knots, ..RefineStage::of(&recipe, None, false).unwrap() };
+                let few = RefineStage { steps: 300, knots, ..RefineStage::from_recipe(&recipe, None, false).unwrap() };
                 few.run(&scene, &scored, reduction, kept.len(), &mut Journal::default()).unwrap()
             });
             assert_eq!((alike.course.0.len(), along.course.0.len()), (0, 4));
@@ -976,7 +987,8 @@ mod tests {
         let scored = score_scene(&scene, &recipe, &UserOverrides::default());
         let reduction = CompressedModel::pruned(scored.ranked().take(300), &recipe.merge);
         let (mut journal, count) = (Journal::default(), reduction.len());
-        let refine = RefineStage { steps: 100, ..RefineStage::of(&recipe, None, false).unwrap() }.without_bands();
+        let refine =
+            RefineStage { steps: 100, ..RefineStage::from_recipe(&recipe, None, false).unwrap() }.without_bands();
         let moved = refine.run(&scene, &scored, reduction, count, &mut journal).unwrap();
         assert_eq!((moved.change.0.sh.width(), moved.change.0.sh.len()), (3, count));
         assert!(scene.source().info().sh_degree > 0 && journal.notes.len() == 1, "{journal:?}");
@@ -1005,7 +1017,7 @@ mod tests {
             let kept = (0..count as u32).step_by(2).collect();
             let reduction = CompressedModel::pruned(kept, &Recipe::preset("default").unwrap().merge);
             let result = scene.input.reduced(&reduction).unwrap();
-            let refine = RefineStage::of(&Recipe::preset("default").unwrap(), None, false).unwrap();
+            let refine = RefineStage::from_recipe(&Recipe::preset("default").unwrap(), None, false).unwrap();
             let fixed = vec![false; reduction.len()];
             let mut moving = OptimizerState::new(&scene, &*result, &targets, refine.manner(), fixed).unwrap();
             let (of, schedule) = ([0, 7, 20], RateSchedule::new(20, 1.0, 1.0));
@@ -1013,12 +1025,12 @@ mod tests {
             let nowhere = moving.change();
             let walk = |moving: &mut OptimizerState<'_>| (0..20).for_each(|k| moving.step(k, &schedule).unwrap());
             walk(&mut moving);
-            moving.find().unwrap();
+            moving.reevaluate_states().unwrap();
             moving.turn_back(&nowhere).unwrap();
             let back = moving.closeness(&of).unwrap().psnr;
             assert!((back - start).abs() < 1e-3, "{start:.4} dB at the start, {back:.4} when back");
             walk(&mut moving);
-            moving.find().unwrap();
+            moving.reevaluate_states().unwrap();
             let (there, change) = (moving.closeness(&of).unwrap().psnr, moving.change());
             assert!(there > start + 0.5, "{start:.2} dB before, {there:.2} after");
             walk(&mut moving);

@@ -7,8 +7,8 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::compressed_model::ParamDelta;
 use crate::model::{Column, Columns, Gaussians, Gradients, sh_coefficients};
-use crate::reduction::ParamDelta;
 
 /// Decay of the means of a derivative and of its square, and what keeps a division from 0.
 const BETAS: [f32; 2] = [0.9, 0.999];

@@ -98,7 +98,7 @@ struct AxisScale {
 
 impl AxisScale {
     /// Covers `values` with a little room, from pixel `from` to pixel `to`.
-    fn of(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
+    fn new(axis: &ChartAxis, values: impl Iterator<Item = f64>, [from, to]: [f64; 2]) -> Option<AxisScale> {
         let fits = |v: &f64| v.is_finite() && (!axis.log || *v > 0.0);
         let (mut low, mut high) =
             values.filter(fits).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
@@ -186,8 +186,8 @@ impl Plot {
             .collect();
         let mut out = Drawing::new(&self.title, &legend, HEIGHT);
         let points = || self.series.iter().flat_map(|series| series.points.iter().copied());
-        let x = AxisScale::of(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
-        let y = AxisScale::of(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
+        let x = AxisScale::new(&self.x, points().map(|p| p.0), [LEFT, WIDTH - RIGHT]);
+        let y = AxisScale::new(&self.y, points().map(|p| p.1), [HEIGHT - BOTTOM, out.top]);
         let (Some(mut x), Some(y)) = (x, y) else { return out.empty() };
         let longest = self.series.iter().flat_map(|series| &series.labels).map(|label| label.chars().count()).max();
         x.leave(longest.unwrap_or(0) as f64 * LETTER);
@@ -216,7 +216,7 @@ impl Plot {
         let look = |series: &Series| {
             let hollow = series.paired && colours > 0;
             colours += usize::from(!hollow);
-            SeriesStyle { hollow, ..SeriesStyle::of(colours - 1) }
+            SeriesStyle { hollow, ..SeriesStyle::from_number(colours - 1) }
         };
         self.series.iter().map(look).collect()
     }
@@ -232,7 +232,7 @@ impl Bars {
         let left = (longest * LETTER + 14.0).max(LEFT);
         let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
         let values = self.bars.iter().map(|bar| bar.1);
-        let Some(x) = AxisScale::of(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
+        let Some(x) = AxisScale::new(&axis, values, [left, WIDTH - RIGHT - 60.0]) else { return out.empty() };
         out.x_axis(&x, &self.label, [8.0, height - BOTTOM]);
         for (row, (name, value)) in self.bars.iter().enumerate() {
             let (Some(start), Some(end)) = (x.at(0.0), x.at(*value)) else { continue };
@@ -260,15 +260,15 @@ impl Stack {
     pub fn svg(&self) -> String {
         let names = self.groups.iter().enumerate();
         let legend: Vec<LegendEntry<'_>> = names
-            .map(|(number, of)| LegendEntry { name: &of.0, look: SeriesStyle::of(number), joined: false })
+            .map(|(number, of)| LegendEntry { name: &of.0, look: SeriesStyle::from_number(number), joined: false })
             .collect();
         let mut out = Drawing::new(&self.title, &legend, HEIGHT);
         let bins = self.edges.len().saturating_sub(1);
         let count = |group: &(String, Vec<usize>), bin: usize| group.1.get(bin).copied().unwrap_or(0);
         let total = |bin| self.groups.iter().map(|group| count(group, bin)).sum::<usize>() as f64;
         let up = ChartAxis { from_zero: true, ..ChartAxis::default() };
-        let x = AxisScale::of(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
-        let y = AxisScale::of(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
+        let x = AxisScale::new(&self.x, self.edges.iter().copied(), [LEFT, WIDTH - RIGHT]);
+        let y = AxisScale::new(&up, (0..bins).map(total), [HEIGHT - BOTTOM, out.top]);
         let (Some(x), Some(y)) = (x, y) else { return out.empty() };
         out.axes(&x, &y, &self.x.label, "Gaussians");
         for bin in 0..bins {
@@ -283,7 +283,7 @@ impl Stack {
                     out.push(&format!(
                         "<rect class=\"area {}\" x=\"{left:.1}\" y=\"{top:.1}\" width=\"{:.1}\" height=\"{:.1}\">\
                          <title>{}: {here} from {} to {}</title></rect>",
-                        SeriesStyle::of(number),
+                        SeriesStyle::from_number(number),
                         (right - left - 0.6).max(0.4),
                         bottom - top,
                         escape(&group.0),
@@ -307,7 +307,7 @@ struct SeriesStyle {
 
 impl SeriesStyle {
     /// Of the series of that number, alone.
-    fn of(number: usize) -> SeriesStyle {
+    fn from_number(number: usize) -> SeriesStyle {
         SeriesStyle { number: number % LOOKS, hollow: false }
     }
 }
@@ -507,7 +507,7 @@ mod tests {
         assert_eq!(["first", "lost", "last"].map(times), [1, 0, 4], "{svg}");
         // A pair needs a first.
         let alone = Plot { series: vec![series(true)], ..Plot::default() };
-        assert_eq!(alone.looks(), [SeriesStyle::of(0)]);
+        assert_eq!(alone.looks(), [SeriesStyle::from_number(0)]);
     }
 
     #[test]
@@ -527,7 +527,7 @@ mod tests {
     #[test]
     fn higher_values_lie_higher_and_bins_stand_on_one_another() {
         let axis = ChartAxis { from_zero: true, ..ChartAxis::default() };
-        let scale = AxisScale::of(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
+        let scale = AxisScale::new(&axis, [1.0, 4.0].into_iter(), [200.0, 0.0]).unwrap();
         assert_eq!(scale.at(0.0), Some(200.0));
         assert!(scale.at(4.0) < scale.at(1.0));
         let groups = vec![("kept".to_owned(), vec![3, 0]), ("dropped".to_owned(), vec![1, 2])];

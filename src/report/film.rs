@@ -10,10 +10,10 @@ use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
 use super::shown::{ShownImage, brighter, difference, shrink, shrinkage};
-use crate::budget::Workload;
 use crate::error::{Error, Result};
 use crate::evaluation::ModelPair;
 use crate::files::image::write::jpeg_bytes;
+use crate::memory_plan::Workload;
 use crate::metrics::psnr;
 use crate::model::Picture;
 use crate::render::Image;

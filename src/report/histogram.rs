@@ -31,7 +31,7 @@ pub struct ByFate<T> {
 
 impl<T> ByFate<T> {
     /// The one of a fate.
-    pub fn of(&mut self, fate: Fate) -> &mut T {
+    pub fn get_mut(&mut self, fate: Fate) -> &mut T {
         match fate {
             Fate::Kept => &mut self.kept,
             Fate::Merged => &mut self.merged,
@@ -80,7 +80,7 @@ pub fn histograms(rows: &Rows, scores: &Scores, frames: usize, fates: &[Fate]) -
     all.filter(|(_, _, values, _)| values.len() == fates.len() && !fates.is_empty())
         .map(|(name, meaning, values, parts)| match parts {
             Some(frames) => Histogram::within(name, meaning, even(frames), &values, fates),
-            None => Histogram::of(name, meaning, &values, fates),
+            None => Histogram::from_values(name, meaning, &values, fates),
         })
         .collect()
 }
@@ -93,7 +93,7 @@ fn even(frames: usize) -> Vec<f64> {
 
 impl Histogram {
     /// Of `values`, one per fate, by powers of ten.
-    fn of(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
+    fn from_values(name: &'static str, meaning: &'static str, values: &[f64], fates: &[Fate]) -> Histogram {
         let positive = |v: &f64| *v > 0.0 && v.is_finite();
         let (mut low, high) = values
             .iter()
@@ -132,12 +132,12 @@ impl Histogram {
         };
         for (value, &fate) in values.iter().zip(fates) {
             if !positive(value) {
-                *found.zero.of(fate) += 1;
+                *found.zero.get_mut(fate) += 1;
                 continue;
             }
             // Not by the logarithm, whose rounding could put an edge into the bin below.
             let bin = found.edges.partition_point(|edge| edge <= value).clamp(1, bins) - 1;
-            found.bins.of(fate)[bin] += 1;
+            found.bins.get_mut(fate)[bin] += 1;
         }
         found
     }
@@ -167,7 +167,7 @@ mod tests {
     fn every_gaussian_is_counted_once_in_the_bin_that_holds_it() {
         let values: Vec<f64> = (0..1000).map(|i| if i % 7 == 0 { 0.0 } else { 1.01f64.powi(i) }).collect();
         let fates: Vec<Fate> = (0..1000).map(|i| [Fate::Kept, Fate::Merged, Fate::Dropped][(i % 3) as usize]).collect();
-        let found = Histogram::of("S", "", &values, &fates);
+        let found = Histogram::from_values("S", "", &values, &fates);
         for (fate, bins, zero) in [
             (Fate::Kept, &found.bins.kept, found.zero.kept),
             (Fate::Merged, &found.bins.merged, found.zero.merged),
@@ -185,12 +185,12 @@ mod tests {
 
     #[test]
     fn one_value_has_one_bin_and_none_has_none() {
-        let found = Histogram::of("V", "", &[2.0, 2.0, f64::NAN], &[Fate::Kept; 3]);
+        let found = Histogram::from_values("V", "", &[2.0, 2.0, f64::NAN], &[Fate::Kept; 3]);
         assert_eq!((found.bins.kept.clone(), found.zero.kept), (vec![2], 1));
         assert!(found.edges[0] < 2.0 && found.edges[1] > 2.0);
-        let found = Histogram::of("V", "", &[0.0; 3], &[Fate::Dropped; 3]);
+        let found = Histogram::from_values("V", "", &[0.0; 3], &[Fate::Dropped; 3]);
         assert_eq!((found.edges.len(), found.zero.dropped), (0, 3));
-        let far = Histogram::of("D", "", &[1e-300, 1.0], &[Fate::Kept; 2]);
+        let far = Histogram::from_values("D", "", &[1e-300, 1.0], &[Fate::Kept; 2]);
         assert_eq!(far.bins.kept.iter().sum::<usize>(), 2);
         assert_eq!(far.bins.kept[0], 1, "what is far below is in the first bin");
     }

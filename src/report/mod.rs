@@ -104,7 +104,7 @@ pub fn report(options: &ReportOptions) -> Result<ReportData> {
     side.scene.schedule = scored_pictures(&side.scene, &run)?;
     if in_parts {
         // What comes now follows from this too; the comparison is that of `evaluate`.
-        side.scene.work.follow_from(CacheKey::of(&(&side.scene.schedule, &recipe)));
+        side.scene.work.follow_from(CacheKey::new(&(&side.scene.schedule, &recipe)));
     }
     let scored = measure.run(&side.scene, None, &mut Journal::default())?;
     notes.extend(differing_terms(&run, &scored));

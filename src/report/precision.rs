@@ -185,7 +185,7 @@ mod tests {
     use crate::evaluation::precision::Source;
 
     fn mark(value: f64, errors: &[(&str, f64)]) -> PrecisionSetting {
-        let seconds = Spread::of(vec![value]);
+        let seconds = Spread::from_values(vec![value]);
         let errors: BTreeMap<String, f64> = errors.iter().map(|&(of, error)| (of.to_owned(), error)).collect();
         let cost = Cost { runs: 1, seconds, processor_seconds: Some(seconds), peak_memory_bytes: Some(1 << 22) };
         PrecisionSetting { value, step: 1.0 / value, cost, errors, psnr: None }

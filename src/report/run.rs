@@ -14,7 +14,7 @@ use crate::files::names::shown_name;
 use crate::files::npy::header_is_sound;
 use crate::files::open::open_file;
 use crate::files::text::read_text;
-use crate::pipeline::stages::emit::{INDEX_MAP, RECIPE, beside};
+use crate::pipeline::stages::write::{INDEX_MAP, RECIPE, beside};
 use crate::pipeline::summary::Summary;
 use crate::recipe::Recipe;
 

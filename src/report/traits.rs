@@ -7,9 +7,9 @@
 
 use rayon::prelude::*;
 
-use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging::neighbors::PointIndex;
 use crate::merging::tree::TreePoint;
 use crate::model::{Columns, Gaussians, Rows, SH_C0, opacity};
@@ -163,7 +163,7 @@ fn bending(
         (0..3).map(|c| (f64::from(a[c]) - f64::from(b[c])).powi(2)).sum::<f64>().sqrt()
     };
     let mut reader =
-        FrameReaders::open(source, Ids::List(&followed), Columns::POSITION, &ReadPlan::of(frames.to_vec()))?;
+        FrameReaders::open(source, Ids::List(&followed), Columns::POSITION, &ReadPlan::new(frames.to_vec()))?;
     let mut state = reader.state();
     for &frame in frames {
         reader.read(frame, Columns::POSITION, &mut state)?;
@@ -195,7 +195,7 @@ fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_
     let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
     let columns = Columns::SH | Columns::OPACITY;
-    let mut reader = FrameReaders::open(source, Ids::List(all), columns, &ReadPlan::of(frames.to_vec()))?;
+    let mut reader = FrameReaders::open(source, Ids::List(all), columns, &ReadPlan::new(frames.to_vec()))?;
     let mut now = reader.state();
     for &frame in frames {
         reader.read(frame, columns, &mut now)?;

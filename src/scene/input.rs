@@ -3,11 +3,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::budget::Budget;
 use crate::cache;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras;
 use crate::files::cameras::{CameraOptions, Clock, Times};
+use crate::memory_plan::Budget;
 use crate::model::{Rig, Split};
 use crate::models;
 use crate::models::{Conventions, InputModel, Link, OpenOptions};
@@ -128,7 +128,7 @@ pub fn load_cameras(
         path,
         &CameraOptions { size: options.size, frames, times, clock, memory: options.memory.read_limit() },
     )?;
-    let is_states = input.is_none_or(InputModel::stands_in_frames);
+    let is_states = input.is_none_or(InputModel::has_explicit_frames);
     let beside = || is_states.then(|| models::trained_background(path)).flatten();
     Ok(Some(Rig { background: rig.background.or_else(beside), ..rig }))
 }

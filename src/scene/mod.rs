@@ -13,10 +13,10 @@ mod work;
 
 use std::path::PathBuf;
 
-use crate::budget::{Budget, Plan, ResourceEstimate, Throughput, Workload};
 use crate::cache::Cache;
 use crate::error::Result;
 use crate::limits::Limits;
+use crate::memory_plan::{Budget, Plan, ResourceEstimate, Throughput, Workload};
 use crate::model::{Rig, Schedule, Split};
 use crate::models::InputModel;
 use crate::source::Reads;

@@ -1,9 +1,9 @@
 //! Which pictures of a rig to make: at which frame, by which camera, over what background.
 
 use super::Scene;
-use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::limits::Limits;
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::model::{Columns, Picture, Rig, Split};
 use crate::render;
 

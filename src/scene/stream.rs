@@ -4,11 +4,11 @@ use std::io::{IsTerminal, Stdin};
 use std::path::Path;
 
 use super::input::{InputOptions, Opened, load_cameras};
-use crate::budget::{Budget, Plan, ResourceEstimate, Workload};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::frame_stream::{FrameStream, StreamHeader};
 use crate::limits::Limits;
+use crate::memory_plan::{Budget, Plan, ResourceEstimate, Workload};
 use crate::model::{Columns, Rig};
 use crate::models::MemoryProfile;
 use crate::models::stream::{AHEAD, Streamed, frame_block};
@@ -71,7 +71,7 @@ pub fn link_stream(stream: FrameStream<Stdin>, options: &InputOptions, rig: Opti
     let joins = options.link.joins();
     let input = match stream.header().is_unlinked {
         true => LinkedFrames::receive(stream, Path::new(STANDARD_INPUT), joins, &options.opening().ply())?,
-        false => LinkedFrames::anew(
+        false => LinkedFrames::relink(
             &pack_arriving(stream, options)?,
             "linked frame stream",
             joins,

@@ -44,7 +44,7 @@ impl Scene {
     /// From where the input is looked at.
     fn key(&self) -> CacheKey {
         let shots: Vec<_> = self.rig.shots.iter().map(|of| (of.view, of.camera, of.time, of.split)).collect();
-        CacheKey::of(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
+        CacheKey::new(&(&self.rig.cameras, shots, &self.schedule, self.background, self.has_cameras))
     }
 }
 
@@ -59,7 +59,7 @@ pub fn kept_work(options: &InputOptions, input: &dyn InputModel) -> Result<(Cach
     let digest = known_digest(&work, options, input)?;
     // This program and this machine, the input's content as it was opened; not where it lies.
     let info = input.source().info();
-    work.follow_from(CacheKey::of(&(TOOL, instructions, &digest)).and(&(
+    work.follow_from(CacheKey::new(&(TOOL, instructions, &digest)).and(&(
         info.count,
         &info.times,
         info.sh_degree,
@@ -83,7 +83,7 @@ fn stamp(options: &InputOptions) -> Result<CacheKey> {
     let path = fs::canonicalize(&options.path).map_err(Error::io("find", &options.path))?;
     let mut files = Vec::new();
     stamps(&path, &mut files)?;
-    Ok(CacheKey::of(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
+    Ok(CacheKey::new(&(TOOL, path, options.iteration, options.conventions, options.link, files)))
 }
 
 /// Of every file at `path` and below, in order: name, length, and when it was last changed, ns.

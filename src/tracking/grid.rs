@@ -79,7 +79,7 @@ impl CellGrid {
                 let low = cell(f64::from(at[c]) - f64::from(radius));
                 low..=cell(f64::from(at[c]) + f64::from(radius)).min(low.saturating_add(MOST_CELLS - 1))
             };
-            let (along, level) = ([along(0), along(1), along(2)], CellKey::of(level));
+            let (along, level) = ([along(0), along(1), along(2)], CellKey::from_level(level));
             for x in along[0].clone() {
                 let x = level.then(x);
                 for y in along[1].clone() {
@@ -130,7 +130,7 @@ fn side(level: i64, reach: f64) -> f64 {
 fn own_cell(look: &ComparedAppearance, reach: f64) -> u64 {
     let level = floor(f64::from(look.ln_size) / std::f64::consts::LN_2);
     let side = side(level, reach);
-    look.position.iter().fold(CellKey::of(level), |name, &x| name.then(floor(f64::from(x) / side))).cell()
+    look.position.iter().fold(CellKey::from_level(level), |name, &x| name.then(floor(f64::from(x) / side))).cell()
 }
 
 /// The largest integer that is not above `x`, inlined where the machine's own instruction may not be counted on.
@@ -148,7 +148,7 @@ struct CellKey {
 }
 
 impl CellKey {
-    fn of(level: i64) -> CellKey {
+    fn from_level(level: i64) -> CellKey {
         CellKey { cube: mix(level as u64), within: 0 }
     }
 

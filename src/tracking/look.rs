@@ -35,10 +35,10 @@ pub(super) struct ComparedAppearance {
 impl ComparedAppearance {
     /// Those of all Gaussians of a frame.
     pub(super) fn of_all(state: &Gaussians) -> Vec<ComparedAppearance> {
-        (0..state.len()).into_par_iter().with_min_len(4096).map(|i| ComparedAppearance::of(state, i)).collect()
+        (0..state.len()).into_par_iter().with_min_len(4096).map(|i| ComparedAppearance::from_state(state, i)).collect()
     }
 
-    fn of(state: &Gaussians, i: usize) -> ComparedAppearance {
+    fn from_state(state: &Gaussians, i: usize) -> ComparedAppearance {
         let row = |column: &Column| column.row::<3>(i);
         let (position, rotation, log_scale) = (row(&state.position), state.rotation.row::<4>(i), row(&state.log_scale));
         let (logit, dc) = (state.opacity_logit.row::<1>(i), row(&state.sh));
@@ -76,7 +76,7 @@ impl ComparedAppearance {
     }
 
     /// Whether both are one to the eye, but for their opacity: in the same place by what the first round calls it.
-    pub(super) fn is_twin(&self, other: &ComparedAppearance) -> bool {
+    pub(super) fn is_near_duplicate(&self, other: &ComparedAppearance) -> bool {
         self.apart(other, TWIN_REACH, TWIN_STRICTNESS) <= 1.0
     }
 

@@ -119,7 +119,7 @@ fn unlike(a: &Seen, b: &Seen) -> f64 {
     size * size + shape / 0.25f64.powi(2) + colour / 0.1f64.powi(2)
 }
 
-fn is_twin(a: &Seen, b: &Seen) -> bool {
+fn is_near_duplicate(a: &Seen, b: &Seen) -> bool {
     let distance: f64 = (0..3).map(|c| (b.at[c] - a.at[c]).powi(2)).sum();
     distance / (0.25 * a.size.min(b.size)).powi(2) + 4.0 * unlike(a, b) <= 1.0
 }
@@ -211,9 +211,9 @@ impl Slow {
                     }
                 }
             }
-            let twins = |a: usize, b: usize| is_twin(&self.tracks[a].seen, &self.tracks[b].seen);
+            let twins = |a: usize, b: usize| is_near_duplicate(&self.tracks[a].seen, &self.tracks[b].seen);
             let are_twins = |c, d, own: Option<usize>, other: Option<usize>| {
-                other.is_some_and(|e| twins(c, e)) || own.is_some_and(|b: usize| is_twin(&all[b], &all[d]))
+                other.is_some_and(|e| twins(c, e)) || own.is_some_and(|b: usize| is_near_duplicate(&all[b], &all[d]))
             };
             chances.extend(Self::chances(&by_track, &of_track, &taken, cost, are_twins));
         }

@@ -46,8 +46,8 @@ impl LinkConfidence {
             }
             for offer in others {
                 let other = links.of_point[offer.point as usize];
-                let of_tracks = |a: u32, b: u32| tracks[a as usize].look.is_twin(&tracks[b as usize].look);
-                let of_points = |a: u32, b: u32| looks[a as usize].is_twin(&looks[b as usize]);
+                let of_tracks = |a: u32, b: u32| tracks[a as usize].look.is_near_duplicate(&tracks[b as usize].look);
+                let of_points = |a: u32, b: u32| looks[a as usize].is_near_duplicate(&looks[b as usize]);
                 if (other != NONE && of_tracks(*track, other)) || (own != NONE && of_points(own, offer.point)) {
                     continue;
                 }

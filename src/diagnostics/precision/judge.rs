@@ -64,13 +64,13 @@ impl Judge {
         let mut originals = self.originals.iter();
         let mut found = Vec::with_capacity(self.originals.len());
         made(scene, subject, &self.pictures, |image| found.extend(originals.next().map(|of| psnr(&image, of))))?;
-        Ok(JudgedQuality::of(&found))
+        Ok(JudgedQuality::from_psnr(&found))
     }
 }
 
 impl JudgedQuality {
     /// Of the PSNR of pictures of one size.
-    pub(super) fn of(psnr: &[f64]) -> JudgedQuality {
+    pub(super) fn from_psnr(psnr: &[f64]) -> JudgedQuality {
         let count = psnr.len().max(1) as f64;
         let mean_square = psnr.iter().map(|psnr| 10f64.powf(-psnr / 10.0)).sum::<f64>() / count;
         JudgedQuality { error: mean_square.sqrt(), psnr: psnr.iter().sum::<f64>() / count }
@@ -95,8 +95,8 @@ mod tests {
     #[test]
     fn errors_of_pictures_add_up_in_squares_and_decibels_are_their_mean() {
         // A tenth and a hundredth of the range.
-        let JudgedQuality { error, psnr } = JudgedQuality::of(&[20.0, 40.0]);
+        let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&[20.0, 40.0]);
         assert!((error - (0.5f64 * (0.01 + 0.0001)).sqrt()).abs() < 1e-15, "{error}");
-        assert_eq!((psnr, JudgedQuality::of(&[f64::INFINITY]).error), (30.0, 0.0));
+        assert_eq!((psnr, JudgedQuality::from_psnr(&[f64::INFINITY]).error), (30.0, 0.0));
     }
 }

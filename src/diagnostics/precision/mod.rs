@@ -18,13 +18,13 @@ use std::path::{Path, PathBuf};
 
 use super::whole_run::{result_name, trained};
 use crate::TOOL;
-use crate::budget::{Budget, Verbosity, Workload};
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::cost::Repeats;
 use crate::evaluation::precision::{PrecisionDiagram, PrecisionKnob};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFolder, check_target};
 use crate::files::names::name_of;
 use crate::journal::Journal;
+use crate::memory_plan::{Budget, Verbosity, Workload};
 use crate::model::{Rows, Schedule};
 use crate::outputs::kind::check_folder_name;
 use crate::pipeline::stages::measure::{InputMeta, Measure, Stages};
@@ -188,7 +188,7 @@ pub fn precision(options: &PrecisionOptions) -> Result<PrecisionDiagram> {
         target: Some(options.target),
         ..Request::new(input.clone(), options.output.join(name), options.recipe.clone())
     };
-    let job = Job::within(&request, InputMeta::of(&scene), &scene.workload())?;
+    let job = Job::within(&request, InputMeta::from_scene(&scene), &scene.workload())?;
     scene.keep_to(input.memory, |work, limits| {
         let mut needs = job.needs(work, limits);
         for need in &mut needs {

@@ -178,7 +178,7 @@ impl Bench<'_> {
 
     /// What rounds of `select` keep.
     fn ranked(&self, scored: &Scored, select: &recipe::Select, value: f64, step: f64) -> Result<TriedRanking> {
-        let rounds = Rounds::of(select, None);
+        let rounds = Rounds::from_recipe(select, None);
         let rank = || {
             let order = match &rounds {
                 Some(rounds) => rounds.run(self.scene, scored, scored.ranked(), self.kept, &mut Journal::default())?,

@@ -5,12 +5,12 @@ use std::path::Path;
 
 use super::Bench;
 use super::judge::JudgedQuality;
-use crate::budget::{Budget, Plan};
 use crate::diagnostics::whole_run::{WholeRun, trained};
 use crate::error::{Error, Result};
 use crate::evaluation::cost::Cost;
 use crate::evaluation::method::MethodKind;
 use crate::evaluation::precision::{BYTES, PICTURES, PrecisionCurve, PrecisionKnob, PrecisionSetting, Source};
+use crate::memory_plan::{Budget, Plan};
 use crate::pipeline::stages::measure::{InputMeta, Stages};
 use crate::pipeline::{Job, Only, Request, Target};
 use crate::recipe::{MergePass, Recipe};
@@ -121,7 +121,7 @@ impl Bench<'_> {
             target: Some(self.target()),
             ..Request::new(trained(self.input), self.scratch.join(self.name), recipe.clone())
         };
-        let job = Job::new(&request, InputMeta::of(self.scene))?;
+        let job = Job::new(&request, InputMeta::from_scene(self.scene))?;
         let least = Plan::closest(self.work, 1, |work, limits| job.needs(work, limits)).peak();
         let mut by_memory = Vec::new();
         for part in BUDGETS {
@@ -151,7 +151,7 @@ impl Bench<'_> {
     fn ran(&self, recipe: &Recipe, value: f64, step: f64) -> Result<PrecisionSetting> {
         let (evaluation, cost) = self.run(recipe, self.input, |run, result| run.compared(result))?;
         let psnr: Vec<f64> = evaluation.pictures.iter().map(|picture| picture.loss.psnr).collect();
-        let JudgedQuality { error, psnr } = JudgedQuality::of(&psnr);
+        let JudgedQuality { error, psnr } = JudgedQuality::from_psnr(&psnr);
         Ok(PrecisionSetting {
             value,
             step,

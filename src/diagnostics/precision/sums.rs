@@ -101,14 +101,14 @@ impl Bench<'_> {
         let ids: Vec<u32> = (0..count).map(|k| ids[k * ids.len() / count]).collect();
         let shown: Vec<usize> = (0..frames).step_by(every).collect();
         let columns = Columns::POSITION | Columns::OPACITY;
-        let mut reader = FrameReaders::open(source, Ids::List(&ids), NEEDED, &ReadPlan::of(shown.iter().copied()))?;
+        let mut reader = FrameReaders::open(source, Ids::List(&ids), NEEDED, &ReadPlan::new(shown.iter().copied()))?;
         let mut states = Vec::with_capacity(shown.len());
         for frame in shown {
             let mut state = Gaussians::zeros(0, 0);
             reader.read(frame, NEEDED, &mut state)?;
             states.push(state);
         }
-        let decoded: Vec<Decoded> = states.iter().map(Decoded::of).collect();
+        let decoded: Vec<Decoded> = states.iter().map(Decoded::from_state).collect();
         let mut curves = Vec::new();
         type Way = (&'static str, fn(&[Decoded], usize) -> SummedStatistics);
         let ways: [Way; 2] =
@@ -166,7 +166,7 @@ struct Decoded {
 }
 
 impl Decoded {
-    fn of(state: &Gaussians) -> Decoded {
+    fn from_state(state: &Gaussians) -> Decoded {
         Decoded {
             position: (0..state.len()).map(|row| state.position.row(row)).collect(),
             opacity: state.opacity_logit.plane(0).iter().map(|&logit| opacity(logit)).collect(),

@@ -75,11 +75,11 @@ pub struct SelfcheckReport {
 pub fn run() -> SelfcheckReport {
     let start = Instant::now();
     let cases: Vec<Case> = CASES.iter().map(|case| case()).collect();
-    SelfcheckReport::of(cases, start.elapsed().as_secs_f64())
+    SelfcheckReport::new(cases, start.elapsed().as_secs_f64())
 }
 
 impl SelfcheckReport {
-    fn of(cases: Vec<Case>, seconds: f64) -> SelfcheckReport {
+    fn new(cases: Vec<Case>, seconds: f64) -> SelfcheckReport {
         SelfcheckReport { tool: TOOL, pass: cases.iter().all(|case| case.pass), seconds, cases }
     }
 
@@ -148,7 +148,7 @@ mod tests {
         let refused = Case::new("refused", "nothing", 1e-9, || Err(Error::usage("no disk")));
         let idle = Case::new("idle", "nothing", 1e-9, || Ok(LargestError::default()));
         let panics = Case::new("panics", "nothing", 1e-9, || panic!("as it should"));
-        let report = SelfcheckReport::of(
+        let report = SelfcheckReport::new(
             vec![case(LargestError(1e-9)), case(LargestError(1.1e-9)), case(nan()), refused, panics, idle],
             0.5,
         );

@@ -12,7 +12,7 @@ pub(super) fn percentiles() -> Case {
         let mut worst = LargestError::default();
         for count in [1, 2, 50, 99, 100, 101, 1000, 20_011] {
             let values = values(count);
-            let sketch = FloatSketch::of(values.iter().copied());
+            let sketch = FloatSketch::from_values(values.iter().copied());
             for p in [0, 1, 50, 99, 100] {
                 let got = sketch.percentile(p as f64, values.iter().copied());
                 worst.same(&got, &Some(sorted_percentile(&values, p)));

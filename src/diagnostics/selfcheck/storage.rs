@@ -44,7 +44,7 @@ pub(super) fn bounded_container() -> Case {
         let asked = ["position=1e-3", "rotation=2e-3", "log_scale=0.01", "opacity_logit=0.02", "sh=0.005"];
         let asked: Vec<MaxError> =
             asked.iter().map(|text| text.parse()).collect::<std::result::Result<_, _>>().map_err(Error::usage)?;
-        let bounds = Bounds::of(&asked, || Ok(1.0))?;
+        let bounds = Bounds::from_errors(&asked, || Ok(1.0))?;
         through_container(&made, Packing::within(bounds, 3), |got, expected, column| {
             worst.near(got.into(), expected.into(), bounds.column(column));
         })?;

@@ -4,11 +4,11 @@ use std::fs;
 
 use super::case::{Case, LargestError};
 use super::made::clouds::{camera, scene};
-use crate::budget::Budget;
 use crate::diagnostics::demo;
 use crate::diagnostics::demo::DemoOptions;
 use crate::error::{Error, Result};
 use crate::files::atomic::{Replace, ScratchFolder};
+use crate::memory_plan::Budget;
 use crate::model::{Columns, Gradients};
 use crate::pipeline::Target;
 use crate::recipe::Recipe;

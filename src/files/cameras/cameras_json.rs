@@ -38,7 +38,7 @@ const CAMERA: [&str; 7] = ["width", "height", "fx", "fy", "img_name", "rotation"
 
 /// Reads this project's own file, of which `outline` is what lies around the pictures.
 pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) -> Result<Rig> {
-    let shared = CameraFields::of(file, None, outline)?;
+    let shared = CameraFields::new(file, None, outline)?;
     let background = shared.optional_vector("background")?;
     if background.is_some_and(|rgb| rgb.iter().any(|c| !(0.0..=1.0).contains(c))) {
         return Err(shared.wrong("background", "red, green and blue from 0 to 1"));
@@ -46,7 +46,7 @@ pub(super) fn load_per_picture(file: &Path, outline: &Small, memory: ReadLimit) 
     let mut assembly = Assembly::new(memory);
     assembly.begin(file, shared.list("frames")?)?;
     each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(per_picture(file, CameraFields::of(file, Some(index), frame)?)?)
+        assembly.add(per_picture(file, CameraFields::new(file, Some(index), frame)?)?)
     })?;
     let background = background.map(|rgb| rgb.map(|c| c as f32));
     assembly.finish(background, shown_name(file))
@@ -103,7 +103,7 @@ pub(super) fn load_per_camera(file: &Path, count: usize, options: &CameraOptions
     }
     each_picture(file, None, &CAMERA, |index, camera| {
         let time = times.get(index).copied().flatten();
-        assembly.add(ListedImage { time, ..per_camera(file, CameraFields::of(file, Some(index), camera)?)? })
+        assembly.add(ListedImage { time, ..per_camera(file, CameraFields::new(file, Some(index), camera)?)? })
     })?;
     assembly.finish(None, origin)
 }

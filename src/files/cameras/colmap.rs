@@ -110,7 +110,7 @@ pub(super) fn load(found: &Path, options: &CameraOptions) -> Result<Rig> {
             view: None,
         })
     };
-    if let (Some(first), Times::Own) = (frames::of(&folder), &options.times) {
+    if let (Some(first), Times::Own) = (frames::find(&folder), &options.times) {
         let frames = options.frames.unwrap_or_else(|| frames::count(&first.0, first.1));
         if listed.len().saturating_mul(frames) > MAX_PICTURES {
             return Err(Error::usage(format!(

@@ -22,7 +22,7 @@ pub(super) struct CameraFields<'a> {
 
 impl<'a> CameraFields<'a> {
     /// The keys of `value`, which must be an object.
-    pub(super) fn of(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
+    pub(super) fn new(path: &'a Path, frame: Option<usize>, value: &'a Small) -> Result<Self> {
         match value {
             Small::Object(map) => Ok(CameraFields { path, frame, map }),
             other => Err(Error::input(path, place(frame), "an object", other.describe())),

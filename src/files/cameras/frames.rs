@@ -25,7 +25,7 @@ fn number(folder: &Path) -> Option<u32> {
 }
 
 /// The folder `colmap_K` that a reconstruction lies in, and K.
-pub(super) fn of(sparse: &Path) -> Option<(PathBuf, u32)> {
+pub(super) fn find(sparse: &Path) -> Option<(PathBuf, u32)> {
     // A path may begin where it was called.
     let sparse = std::path::absolute(sparse).ok()?;
     let root = sparse.ends_with("sparse/0").then(|| sparse.ancestors().nth(2)).flatten()?;

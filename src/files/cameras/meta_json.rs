@@ -117,7 +117,7 @@ impl Tables {
 /// Adds the pictures of a file; returns how many frames it has.
 fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
     let outline = outline(file)?;
-    let shared = CameraFields::of(file, None, &outline)?;
+    let shared = CameraFields::new(file, None, &outline)?;
     let (width, height) = (shared.side("w")?, shared.side("h")?);
     let frames = shared.list("k")?;
     let mut tables = Tables {
@@ -145,7 +145,7 @@ fn add(assembly: &mut Assembly, file: &Path, split: Split) -> Result<usize> {
         used += taken;
         if inner.is_some() {
             let entry = Small::of_entry(name, value);
-            return tables.take(CameraFields::of(file, Some(index), &entry)?, key);
+            return tables.take(CameraFields::new(file, Some(index), &entry)?, key);
         }
         next[key] += 1;
         match value {

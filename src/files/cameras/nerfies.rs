@@ -61,7 +61,7 @@ const NAME_BYTES: u64 = 200;
 /// Reads the names of `file`. Those for training may be left out where none are held out.
 fn names(file: &Path, gauge: &mut MemoryCounter) -> Result<[Vec<Box<str>>; 3]> {
     let outline = whole(file, &LISTS)?;
-    let of = CameraFields::of(file, None, &outline)?;
+    let of = CameraFields::new(file, None, &outline)?;
     let held_out = of.list(LISTS[1])?;
     of.list(LISTS[0])?;
     if held_out > 0 {
@@ -97,7 +97,7 @@ fn warps(file: &Path, ids: &[Box<str>], gauge: &mut MemoryCounter) -> Result<Vec
     }
     each_entry(file, &["warp_id"], |id, own| {
         if let Some(&place) = places.get(id) {
-            let own = CameraFields::of(file, None, &own)?;
+            let own = CameraFields::new(file, None, &own)?;
             found[place as usize] =
                 Some(own.optional_index("warp_id")?.ok_or_else(|| own.wrong("warp_id", "a number"))?);
         }
@@ -134,7 +134,7 @@ fn splits(ids: &[Box<str>], val: &[Box<str>], train: &[Box<str>]) -> Vec<Vec<Spl
 fn picture(folder: &Path, id: &str, options: &CameraOptions) -> Result<ListedImage> {
     let file = folder.join("camera").join(format!("{id}.json"));
     let document = whole(&file, &CAMERA)?;
-    let own = CameraFields::of(&file, None, &document)?;
+    let own = CameraFields::new(&file, None, &document)?;
     let [width, height] = own.sides("image_size")?;
     let image = folder.join("rgb/2x").join(format!("{id}.png"));
     let size = options.size.or_else(|| measure(&image)).unwrap_or(((width / 2).max(1), (height / 2).max(1)));

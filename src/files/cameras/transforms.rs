@@ -90,11 +90,11 @@ fn latest_in(file: &Path) -> Result<f64> {
 /// Adds the pictures of `file`.
 fn add(assembly: &mut Assembly, file: &Path, options: &CameraOptions) -> Result<()> {
     let outline = outline(file)?;
-    let shared = CameraFields::of(file, None, &outline)?;
+    let shared = CameraFields::new(file, None, &outline)?;
     assembly.begin(file, shared.list("frames")?)?;
     let split = split_of(file);
     each_picture(file, Some("frames"), &PICTURE, |index, frame| {
-        assembly.add(picture(file, shared, CameraFields::of(file, Some(index), frame)?, split, options)?)
+        assembly.add(picture(file, shared, CameraFields::new(file, Some(index), frame)?, split, options)?)
     })
 }
 

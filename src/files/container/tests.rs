@@ -202,7 +202,7 @@ fn of_wanted_frames_those_of_a_frame_block_take_its_tiles_once_unless_memory_for
             for (held, times) in [(usize::MAX, 3), (5, 3), (2, 6)] {
                 let (_folder, container) = made.pack(compression);
                 let mut reader = container.open(ids.clone()).unwrap();
-                reader.expect(&ReadPlan::of(wanted).holding(held));
+                reader.expect(&ReadPlan::new(wanted).holding(held));
                 let mut got = Gaussians::zeros(0, 1);
                 for frame in wanted {
                     reader.read(frame, Columns::POSITION, &mut got).unwrap();
@@ -229,7 +229,7 @@ fn tiles_that_are_held_are_read_once_by_whomever_and_hold_the_same_values() {
             let (_folder, container) = made.pack(compression);
             container.hold_decoded(capacity);
             for ids in blocks(&scattered) {
-                for wanted in [ReadPlan::every(), ReadPlan::every().holding(1), ReadPlan::of([7, 8, 40])] {
+                for wanted in [ReadPlan::every(), ReadPlan::every().holding(1), ReadPlan::new([7, 8, 40])] {
                     let mut reader = container.open(ids.clone()).unwrap();
                     reader.expect(&wanted);
                     for frame in [0, 7, 8, 40, FRAMES - 1, 7] {

@@ -33,7 +33,7 @@ impl ImageFormat {
     }
 
     /// The format a file's name asks for, in letters of either case.
-    pub fn of(path: &Path) -> Option<ImageFormat> {
+    pub fn from_path(path: &Path) -> Option<ImageFormat> {
         let extension = path.extension()?;
         [ImageFormat::Png, ImageFormat::Npy]
             .into_iter()
@@ -140,9 +140,9 @@ mod tests {
 
     #[test]
     fn a_name_says_the_format() {
-        assert_eq!(ImageFormat::of(Path::new("a/x.PNG")), Some(ImageFormat::Png));
-        assert_eq!(ImageFormat::of(Path::new("x.npy")), Some(ImageFormat::Npy));
-        assert_eq!(ImageFormat::of(Path::new("x.jpg")), None);
-        assert_eq!(ImageFormat::of(Path::new("png")), None);
+        assert_eq!(ImageFormat::from_path(Path::new("a/x.PNG")), Some(ImageFormat::Png));
+        assert_eq!(ImageFormat::from_path(Path::new("x.npy")), Some(ImageFormat::Npy));
+        assert_eq!(ImageFormat::from_path(Path::new("x.jpg")), None);
+        assert_eq!(ImageFormat::from_path(Path::new("png")), None);
     }
 }

@@ -34,7 +34,7 @@ impl PlyLayout {
     ///
     /// # Errors
     /// A missing property, or a number of `f_rest` that belongs to no degree.
-    pub(crate) fn of(path: &Path, vertex: &Element) -> Result<PlyLayout> {
+    pub(crate) fn from_element(path: &Path, vertex: &Element) -> Result<PlyLayout> {
         let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
         let need = |name: &str| match find(name) {
             Some(property) => Ok(PlaneSource::Property(property.clone())),

@@ -61,7 +61,7 @@ impl Default for PlyOptions {
 pub fn check_header(bytes: &[u8], path: &Path) -> Result<u64> {
     let header = PlyHeader::parse(path, bytes)?;
     let vertex = vertex_of(&header, path)?;
-    PlyLayout::of(path, vertex)?;
+    PlyLayout::from_element(path, vertex)?;
     Ok(vertex.count)
 }
 
@@ -141,7 +141,7 @@ impl Ply {
         let header = PlyHeader::parse(path, &map)?;
         let vertex = vertex_of(&header, path)?;
         let (stride, properties) = (vertex.stride, vertex.properties.clone());
-        let layout = PlyLayout::of(path, vertex)?;
+        let layout = PlyLayout::from_element(path, vertex)?;
         let count = u32::try_from(vertex.count)
             .map_err(|_| Error::input(path, "element vertex", "at most 4294967295 rows", vertex.count.to_string()))?;
         let body = match header.encoding {

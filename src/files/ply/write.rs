@@ -8,12 +8,12 @@ use std::io::{self, BufWriter, Write};
 use std::ops::Range;
 use std::path::Path;
 
+use crate::compressed_model::{CompressedModel, ParamDelta};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::{
     PlaneSource, Ply, PlyEncoding, PlyHeader, PlyLayout, Property, Scalar, name_without_bands, read_plane,
 };
 use crate::model::{Columns, Gaussians, HIGHEST_DEGREE, sh_coefficients};
-use crate::reduction::{CompressedModel, ParamDelta};
 
 /// One row of a smaller PLY.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -181,7 +181,7 @@ pub(crate) fn write_rows(
     let Some(vertex) = header.vertex().filter(|vertex| vertex.count == cloud.len() as u64) else {
         return Err(mismatch(format!("{} rows", cloud.len())));
     };
-    let layout = PlyLayout::of(from, vertex)?;
+    let layout = PlyLayout::from_element(from, vertex)?;
     let ranges = ranges_beside(&vertex.properties, &layout);
     let width: usize = ranges.iter().map(|range| range.len()).sum();
     if layout.planes(Columns::SH).len() != cloud.sh.width() || width * cloud.len() != beside.len() {

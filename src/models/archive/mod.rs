@@ -12,18 +12,18 @@ use xxhash_rust::xxh3::xxh3_128;
 
 use files::{CFG_ARGS, ITERATION, write_cloud};
 
-use super::family::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::size::Size;
 use super::{four_d_gaussians, ply_sequence};
 use crate::archive::{self, ArchiveSize, Content};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
 use crate::files::open::open_file;
 use crate::limits::{Limits, ReadLimit};
 use crate::model::Gaussians;
+use crate::models::input_model::{ColumnInfo, InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// An archive.
@@ -207,7 +207,7 @@ impl InputModel for OpenArchive {
         self.inner.content(reduction)
     }
 
-    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
-        self.inner.showing(content)
+    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+        self.inner.decode_frames(content)
     }
 }

@@ -18,12 +18,11 @@ pub(super) use arguments::Arguments;
 use paths::Paths;
 pub(super) use paths::{has_network, names_of_network};
 
-use super::family::{InputModel, MemoryProfile, OpenOptions, Timing};
 use super::files::copy;
 use super::four_d_gaussians::cfg_args::read_for_degree;
-use super::law::{MotionModel, MotionModelFrames, solve};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::deform::Tensors;
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
@@ -31,10 +30,11 @@ use crate::files::ply::write::{out_rows, write_like};
 use crate::files::ply::{Ply, PlyEncoding, read_plane};
 use crate::limits::Limits;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
+use crate::models::input_model::{InputModel, MemoryProfile, OpenOptions, Timing};
+use crate::models::motion_model::{MotionModel, MotionModelFrames, solve};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// Smallest scale that has a logarithm here.
@@ -113,7 +113,7 @@ impl<L: Deforming + 'static> Folder<L> {
 
     /// Writes what is left as a folder at `path`.
     fn write_folder(&self, reduction: &CompressedModel, path: &Path) -> Result<()> {
-        let to = Paths::of(path, self.paths.iteration);
+        let to = Paths::new(path, self.paths.iteration);
         for file in [&to.point_cloud, &to.network] {
             let folder = file.parent().unwrap_or(path);
             fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
@@ -202,7 +202,7 @@ impl<L: Deforming + 'static> InputModel for Folder<L> {
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
-            OutputKind::Model => size_of(&Paths::of(path, self.paths.iteration)),
+            OutputKind::Model => size_of(&Paths::new(path, self.paths.iteration)),
             _ => Ok(Size::of_frames(bytes_below(path)?)),
         }
     }

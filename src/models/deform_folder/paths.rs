@@ -35,7 +35,7 @@ pub(in crate::models) fn has_network(root: &Path) -> bool {
 /// Names of the tensors of the last network of a folder; none of what cannot be read, which is for its reader to say.
 pub(in crate::models) fn names_of_network(root: &Path, memory: ReadLimit) -> Vec<String> {
     let last = iterations(&root.join(NETWORKS), NETWORK).ok().and_then(|found| found.last().copied());
-    last.and_then(|k| names(&Paths::of(root, k).network, memory).ok()).unwrap_or_default()
+    last.and_then(|k| names(&Paths::new(root, k).network, memory).ok()).unwrap_or_default()
 }
 
 /// K of the folders `iteration_K` in `within` that hold `file`, increasing.
@@ -64,7 +64,7 @@ impl Paths {
             let found = format!("clouds of {}, networks of {}", names(&of_cloud), names(&of_network));
             return Err(Error::input(root, "", format!("{CLOUDS} and {NETWORKS} of the same {wanted}"), found));
         };
-        let paths = Paths::of(root, k);
+        let paths = Paths::new(root, k);
         match paths.cfg_args.is_file() {
             true => Ok(paths),
             false => Err(Error::input(&paths.cfg_args, "", "a file of the model folder", "none")
@@ -73,7 +73,7 @@ impl Paths {
     }
 
     /// Those of training iteration `k` in `root`.
-    pub(super) fn of(root: &Path, k: u32) -> Paths {
+    pub(super) fn new(root: &Path, k: u32) -> Paths {
         let within = |folder: &str| root.join(folder).join(format!("iteration_{k}"));
         Paths {
             root: root.to_owned(),

@@ -8,13 +8,13 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::{Deforming, LEAST_SCALE, heaviest};
+use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, Raw, logit, opacity};
-use crate::models::law::MotionModelFrames;
+use crate::models::motion_model::MotionModelFrames;
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 use crate::source::{Deformation, FrameSource};
 
 /// Frames at which places are compared, and over which sizes and rotations are averaged.

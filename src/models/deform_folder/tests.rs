@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use tempfile::TempDir;
 
+use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
 use crate::deform::synthetic::Noise;
 use crate::deform::synthetic::deep::{DeepVariant, KINDS, tensors};
 use crate::deform::{Network, PredictedMotion, Tensor, Tensors};
@@ -18,7 +19,6 @@ use crate::models::{InputModel, OpenOptions};
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::{Cluster, CompressedModel, ParamDelta, Reference};
 use crate::source::FrameSource;
 
 const COUNT: usize = 40;

@@ -11,11 +11,11 @@ mod screw;
 use glam::{DMat3, DVec3};
 
 use super::deform_folder::{Deforming, Folder, Parts, has_network};
-use super::family::ModelFormat;
-use super::law::{MotionModel, copy_stored};
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
+use crate::models::input_model::ModelFormat;
+use crate::models::motion_model::{MotionModel, copy_stored};
 
 /// A model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {

@@ -10,18 +10,18 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{InputModel, MemoryProfile, ModelFormat, Timing};
 use super::size::bytes_of;
 use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::Result;
 use crate::files::digest::hash_file;
 use crate::files::npz::write::write_like;
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, SH_C0, colour};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::{FrameSource, Ids};
 use params::{COLOURS, LOG_SCALES, MEANS, OPACITIES, Params, ROTATIONS};
 use proxies::Settled;

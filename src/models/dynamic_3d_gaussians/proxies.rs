@@ -4,13 +4,13 @@
 //! means along time.
 
 use super::params::Params;
+use crate::compressed_model::{Cluster, CompressedModel, Proxies};
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, SequenceInfo, logit, opacity};
 use crate::models::trajectories::merged;
 use crate::passes::{Changed, gather_all};
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
 
 /// Frames over which sizes and opacities are averaged.

@@ -7,11 +7,11 @@ use zip::CompressionMethod;
 use zip::write::FileOptions;
 
 use super::*;
+use crate::compressed_model::ParamDelta;
 use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::ParamDelta;
 
 /// Arrays of a model, by name: shape and values.
 type Arrays = Vec<(&'static str, Vec<u64>, Vec<f32>)>;

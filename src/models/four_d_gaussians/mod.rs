@@ -13,12 +13,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::archive::files::{CFG_ARGS, ITERATION, add_cloud};
-use super::family::{InputModel, MemoryProfile, ModelFormat, Timing};
 use super::files::copy;
-use super::law::left;
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{state_bytes, write_sequence};
 use crate::archive::{Content, Role};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::deform::{Field, FieldConfig, Tensor, Tensors};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::ply::Ply;
@@ -26,10 +25,11 @@ use crate::files::ply::write::{out_rows, write_like};
 use crate::files::state_dict::{StoredTensor, TensorValues, is_floating, read_state_dict, write_state_dict};
 use crate::limits::Limits;
 use crate::model::{Columns, Gaussians, Jacobian};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
+use crate::models::motion_model::left;
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::recipe::{MergeParams, Precision};
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::{Deformation, FrameSource};
 pub use model_folder::ModelFolder;
 
@@ -171,7 +171,7 @@ impl InputModel for ModelFolder {
         Ok(content)
     }
 
-    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
         let field =
             Field::new(&content.tensors, self.config().field(), self.info().sh_degree, &self.paths().deformation)?;
         Ok(Box::new(self.with_canonical(content.cloud.clone()).with_field(field)))

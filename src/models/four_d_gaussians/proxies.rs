@@ -2,13 +2,13 @@
 //! the merged one (method.md, section 5.6).
 
 use super::ModelFolder;
+use crate::compressed_model::{Cluster, Proxies, Reference};
 use crate::deform::Deltas;
 use crate::error::Result;
 use crate::merging::proxy::merge_state;
 use crate::model::{Columns, Gaussians};
 use crate::passes::{BLOCK, gather};
 use crate::recipe::{MergeParams, Placement};
-use crate::reduction::{Cluster, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// Frames at which proxies are compared with their members.

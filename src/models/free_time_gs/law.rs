@@ -5,14 +5,14 @@
 
 use xxhash_rust::xxh3::Xxh3;
 
+use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
 use crate::models::in_checkpoint::ProxyRule;
 use crate::models::in_checkpoint::linear::{LinearPath, match_all};
-use crate::models::law::window::{faded, odds, slope};
-use crate::models::law::{MotionModel, MotionModelFrames, copy_stored};
+use crate::models::motion_model::window::{faded, odds, slope};
+use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 
 /// Planes of [`Raw::own`]: centre in time, logarithm of the standard deviation, velocity.
 pub(super) const TIME: usize = 0;

@@ -9,13 +9,13 @@ mod law;
 
 use std::path::{Path, PathBuf};
 
-use super::family::{InputModel, ModelFormat, OpenOptions};
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{About, InCheckpoint, Reading, RowElement, count_of, numbered};
 use crate::error::{Error, Result, quoted};
 use crate::files::checkpoint::{Checkpoint, NodeId};
 use crate::limits::ReadLimit;
 use crate::model::{Columns, HIGHEST_DEGREE, sh_coefficients};
+use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
 use law::{DURATION, FreeTime, OWN, TIME, VELOCITY};
 
 /// Where a result's folder has its checkpoints.
@@ -138,7 +138,7 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
         (Columns::SH, &[bands - 1, 3], 3, 3 * (bands - 1)),
     ];
     for ((name, id), (column, row, skipped, width)) in names.iter().zip(nodes).zip(planes) {
-        reading.read(id, &place(name), row, RowElement::of(column, skipped, width))?;
+        reading.read(id, &place(name), row, RowElement::all_of(column, skipped, width))?;
     }
     let of_own = [("times", &[1][..], TIME, 1), ("durations", &[1], DURATION, 1), ("velocities", &[3], VELOCITY, 3)];
     for (id, (name, row, first, width)) in own.into_iter().zip(of_own) {

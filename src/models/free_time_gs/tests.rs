@@ -1,6 +1,7 @@
 use std::fs;
 
 use super::*;
+use crate::compressed_model::{Cluster, CompressedModel, Reference};
 use crate::files::checkpoint::made::{Made, MadeTensor, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
@@ -9,7 +10,6 @@ use crate::models;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::recipe::{MergeParams, Recipe};
-use crate::reduction::{Cluster, CompressedModel, Reference};
 
 const COUNT: usize = 5;
 const TIMES: [f64; 4] = [0.0, 0.25, 0.5, 1.0];

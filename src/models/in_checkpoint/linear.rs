@@ -5,12 +5,12 @@
 //! and opacity follow from the moment matches of the members at frames (least squares). Source: method.md, section 5.6, for
 //! the match at a frame.
 
+use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, logit, opacity};
 use crate::passes::{BLOCK, gather_all};
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 use crate::source::FrameSource;
 
 /// Most frames at which proxies are matched.

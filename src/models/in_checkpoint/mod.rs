@@ -11,20 +11,21 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{InputModel, MemoryProfile, Timing};
 use super::files::copy;
-use super::law::{self, MotionModel, MotionModelFrames};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{check_output, state_bytes, write_sequence};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::cameras::Clock;
 use crate::files::digest::hash_file;
 use crate::limits::Limits;
 use crate::model::{Columns, Jacobian, Raw};
+use crate::models::input_model::{InputModel, MemoryProfile, Timing};
+use crate::models::motion_model;
+use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 pub(super) use rows::{Reading, RowElement, RowTensors, count_of};
 
@@ -122,7 +123,7 @@ impl<L: ProxyRule> InCheckpoint<L> {
         let to = path.join(self.place());
         let folder = to.parent().unwrap_or(path);
         fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-        self.table.write(self.model.raw(), &law::left(self.model.raw(), reduction), reduction, &to)
+        self.table.write(self.model.raw(), &motion_model::left(self.model.raw(), reduction), reduction, &to)
     }
 }
 
@@ -236,7 +237,7 @@ impl<L: ProxyRule + 'static> InputModel for InCheckpoint<L> {
     }
 
     fn solve(&self, clusters: &[Cluster], reference: Reference, rule: &MergeParams) -> Result<Proxies> {
-        law::solve(&self.model, clusters, reference, rule, |clusters| L::proposed(&self.model, clusters, rule))
+        motion_model::solve(&self.model, clusters, reference, rule, |clusters| L::proposed(&self.model, clusters, rule))
     }
 
     fn reduced<'a>(&'a self, reduction: &'a CompressedModel) -> Result<Box<dyn FrameSource + 'a>> {

@@ -5,12 +5,12 @@
 
 use std::path::Path;
 
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::checkpoint::write::{GaussianRows, write_like};
 use crate::files::checkpoint::{Checkpoint, NodeId, TensorView};
 use crate::model::{Column, Columns, Gaussians, Raw};
 use crate::models::trajectories::state_bytes;
-use crate::reduction::CompressedModel;
 
 /// What an element of a tensor's row is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,7 +25,7 @@ pub(in crate::models) enum RowElement {
 
 impl RowElement {
     /// All planes of a column but the first `skipped`, so many.
-    pub(in crate::models) fn of(column: Columns, skipped: usize, count: usize) -> Vec<RowElement> {
+    pub(in crate::models) fn all_of(column: Columns, skipped: usize, count: usize) -> Vec<RowElement> {
         (skipped..skipped + count).map(|c| RowElement::Of(column, c)).collect()
     }
 

@@ -3,13 +3,13 @@
 use xxhash_rust::xxh3::Xxh3;
 
 use super::ProxyRule;
+use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Gaussians, Raw};
-use crate::models::law::{MotionModel, MotionModelFrames, copy_stored};
+use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 
 /// States are what is stored.
 #[derive(Debug)]

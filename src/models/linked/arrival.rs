@@ -95,7 +95,12 @@ impl LinkedFrames {
     ///
     /// # Errors
     /// A frame that cannot be read; a failed write.
-    pub fn anew(input: &dyn InputModel, kind: &'static str, joins: bool, options: &PlyOptions) -> Result<LinkedFrames> {
+    pub fn relink(
+        input: &dyn InputModel,
+        kind: &'static str,
+        joins: bool,
+        options: &PlyOptions,
+    ) -> Result<LinkedFrames> {
         let (source, info) = (input.source(), input.source().info());
         let seen = count_seen(source)?;
         let state = state_bytes(info.sh_degree, Columns::all());
@@ -164,7 +169,7 @@ fn count_seen(source: &dyn FrameSource) -> Result<Vec<u64>> {
 
 /// Those of every block that are [seen] in each of `frames`.
 fn unpack(source: &dyn FrameSource, frames: Range<usize>) -> Result<Vec<Vec<Gaussians>>> {
-    let wanted = ReadPlan::of(frames.clone());
+    let wanted = ReadPlan::new(frames.clone());
     let unpack = |range: Range<usize>| {
         let (mut reader, mut state) = (source.open(Ids::Range(range))?, Gaussians::zeros(0, source.info().sh_degree));
         reader.expect(&wanted);

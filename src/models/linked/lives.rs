@@ -58,7 +58,7 @@ pub(super) fn hold(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<S
     for bound in BOUNDS {
         // Tracks are numbered by their births.
         let sums = |range: Range<usize>| sums(tracks, first[range.start].frame as usize, range);
-        let steady = Steady::of(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
+        let steady = Steady::from_sums(tracks.count(), tracks.frames().sh_degree(), sums, bound, scratch)?;
         let parts = steady.parts();
         if parts == [0.0; 4] {
             return Ok(None);

@@ -22,9 +22,9 @@ use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_128;
 
 use self::tracks::LinkedTracks;
-use super::family::{InputModel, MemoryProfile, Timing};
 use super::size::bytes_of;
 use super::trajectories::write_trajectories;
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::atomic::{ScratchFile, ScratchFolder};
 use crate::files::container::Container;
@@ -32,8 +32,8 @@ use crate::files::ply::PlyOptions;
 use crate::files::ply_frames::PlyFrames;
 use crate::limits::Limits;
 use crate::model::SequenceInfo;
+use crate::models::input_model::{InputModel, MemoryProfile, Timing};
 use crate::outputs::kind::OutputKind;
-use crate::reduction::CompressedModel;
 use crate::source::{BlockReader, FrameSource, Ids, Prefetch, ReadPlan, Reads};
 use crate::tracking::Joiner;
 
@@ -141,7 +141,7 @@ impl InputModel for LinkedFrames {
         self.container.bytes()
     }
 
-    fn stands_in_frames(&self) -> bool {
+    fn has_explicit_frames(&self) -> bool {
         true
     }
 

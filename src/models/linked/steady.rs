@@ -51,7 +51,7 @@ impl Steady {
     ///
     /// # Errors
     /// Those of `sums`; a failed write to `scratch`.
-    pub(super) fn of(
+    pub(super) fn from_sums(
         count: usize,
         sh_degree: usize,
         sums: impl Fn(Range<usize>) -> Result<TrackSums> + Sync,

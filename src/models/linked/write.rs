@@ -7,12 +7,12 @@ use hashbrown::HashSet;
 use rayon::prelude::*;
 
 use super::LinkedFrames;
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::files::ply::write::{OutRow, out_rows, write_like};
 use crate::model::{Columns, Gaussians};
 use crate::models::trajectories::merged;
 use crate::progress::Progress;
-use crate::reduction::CompressedModel;
 use crate::source::{FrameSource, Ids};
 
 /// What no row of a frame is of.

@@ -12,8 +12,8 @@ use std::f64::consts::TAU;
 use super::rotation::{covariance, rotation};
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, scale_rotation};
-use crate::models::law::window::{MOST, faded, odds, slope};
-use crate::models::law::{MotionModel, copy_stored};
+use crate::models::motion_model::window::{MOST, faded, odds, slope};
+use crate::models::motion_model::{MotionModel, copy_stored};
 
 /// Planes of [`Raw::own`]: μ, the logarithm of the scale along time, the right quaternion, harmonics in time term by term.
 pub(super) const TIME: usize = 0;

@@ -13,16 +13,16 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{InputModel, ModelFormat, OpenOptions};
 use super::in_checkpoint::still::Still;
 use super::in_checkpoint::{About, InCheckpoint, ProxyRule, Reading, RowElement, count_of, numbered};
-use super::law::MotionModelFrames;
+use crate::compressed_model::Cluster;
 use crate::error::{Error, Result};
 use crate::files::checkpoint::{Checkpoint, Node, NodeId};
 use crate::limits::ReadLimit;
 use crate::model::{Columns, Raw, sh_coefficients};
+use crate::models::input_model::{InputModel, ModelFormat, OpenOptions};
+use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 use configuration::TrainingConfig;
 use law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 
@@ -169,7 +169,7 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
     }
     let own = law.as_ref().map_or(0, |law| TERMS + TERM * law.terms);
     let bands = sh_coefficients(degree);
-    let mut of_rest = RowElement::of(Columns::SH, 3, 3 * (bands - 1));
+    let mut of_rest = RowElement::all_of(Columns::SH, 3, 3 * (bands - 1));
     of_rest.extend(RowElement::own(TERMS, TERM * law.as_ref().map_or(0, |law| law.terms)));
     of_rest.resize(3 * (coefficients - 1), RowElement::Unread);
     let mut reading = Reading::new(checkpoint, count, degree, own)?;
@@ -177,12 +177,12 @@ fn open(about: About, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
         let (id, place) = part(i, name);
         reading.read(id, &place, row, planes)
     };
-    read(1, "xyz", &[3], RowElement::of(Columns::POSITION, 0, 3))?;
-    read(2, "features_dc", &[1, 3], RowElement::of(Columns::SH, 0, 3))?;
+    read(1, "xyz", &[3], RowElement::all_of(Columns::POSITION, 0, 3))?;
+    read(2, "features_dc", &[1, 3], RowElement::all_of(Columns::SH, 0, 3))?;
     read(3, "features_rest", &[coefficients - 1, 3], of_rest)?;
-    read(4, "scaling", &[3], RowElement::of(Columns::LOG_SCALE, 0, 3))?;
-    read(5, "rotation", &[4], RowElement::of(Columns::ROTATION, 0, 4))?;
-    read(6, "opacity", &[1], RowElement::of(Columns::OPACITY, 0, 1))?;
+    read(4, "scaling", &[3], RowElement::all_of(Columns::LOG_SCALE, 0, 3))?;
+    read(5, "rotation", &[4], RowElement::all_of(Columns::ROTATION, 0, 4))?;
+    read(6, "opacity", &[1], RowElement::all_of(Columns::OPACITY, 0, 1))?;
     if let Some(law) = &law {
         read(13, "t", &[1], RowElement::own(TIME, 1))?;
         read(14, "scaling_t", &[1], RowElement::own(SCALING_T, 1))?;

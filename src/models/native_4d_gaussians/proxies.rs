@@ -6,12 +6,12 @@
 
 use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};
 use super::rotation::{decomposed, quaternions};
+use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::model::{Columns, Raw, scale_rotation};
 use crate::models::in_checkpoint::linear::{LinearPath, match_all};
-use crate::models::law::MotionModelFrames;
+use crate::models::motion_model::MotionModelFrames;
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 
 /// Part of the frames' weight that holds waves near 0 where frames do not tell them from the constant.
 const RIDGE: f64 = 1e-3;

@@ -4,6 +4,7 @@ use std::path::Path;
 use glam::{DMat3, DMat4, DVec4};
 
 use super::*;
+use crate::compressed_model::{Cluster, CompressedModel, ParamDelta, Reference};
 use crate::files::checkpoint::made::{Made, MadeTensor, named, tensor};
 use crate::limits::Limits;
 use crate::limits::ReadLimit;
@@ -15,7 +16,6 @@ use crate::models::in_checkpoint::linear::covariance;
 use crate::outputs::kind::OutputKind;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::{Cluster, CompressedModel, ParamDelta, Reference};
 
 const COUNT: usize = 6;
 const TIMES: [f64; 5] = [0.0, 0.3, 0.5, 1.1, 1.9];

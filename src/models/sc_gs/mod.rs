@@ -13,12 +13,12 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::deform_folder::{Arguments, Deforming, Folder, LEAST_SCALE, Parts, has_network, names_of_network};
-use super::family::ModelFormat;
-use super::law::{MotionModel, copy_stored};
 use crate::deform::{Encoded, Network, PredictedMotion};
 use crate::error::{Error, Result, quoted};
 use crate::model::functions::{exp, ln};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, logit, opacity};
+use crate::models::input_model::ModelFormat;
+use crate::models::motion_model::{MotionModel, copy_stored};
 use nodes::Nodes;
 
 /// A model folder, told from the other family of such by a key of its configuration or by its nodes.

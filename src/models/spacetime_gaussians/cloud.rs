@@ -8,11 +8,11 @@ use std::path::Path;
 
 use super::decoder::Act;
 use super::law::{FEATURES, FULL_WIDTH, MOTION, OMEGA, WIDTH};
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::ply::write::{out_rows, put, value, write_rows_like};
 use crate::files::ply::{PlaneSource, Ply, PlyEncoding, PlyOptions, Property};
 use crate::model::{Column, Columns, Raw, SH_C0, harmonic};
-use crate::reduction::CompressedModel;
 
 /// The property that no other kind of cloud has.
 pub(super) const MARK: &str = "trbf_center";
@@ -185,7 +185,7 @@ fn paint(raw: &mut Raw, act: Option<Act>) {
     for c in 0..3 {
         let features = raw.own.width() > FEATURES;
         let from: Vec<f32> = if features { raw.own.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
-        let colour = |x: f32| act.map_or(f64::from(x), |act| act.of(f64::from(x)));
+        let colour = |x: f32| act.map_or(f64::from(x), |act| act.apply(f64::from(x)));
         raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = harmonic(colour(x)));
     }
 }

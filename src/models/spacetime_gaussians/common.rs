@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::model::{Columns, Jacobian};
-use crate::models::family::MemoryProfile;
+use crate::models::input_model::MemoryProfile;
 use crate::models::trajectories::{NO_ARCHIVE, state_bytes};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;

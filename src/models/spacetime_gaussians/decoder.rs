@@ -38,7 +38,7 @@ impl Act {
     }
 
     /// Of a colour before it.
-    pub(super) fn of(self, x: f64) -> f64 {
+    pub(super) fn apply(self, x: f64) -> f64 {
         match self {
             Act::Sigmoid => 1.0 / (1.0 + (-x).exp()),
             Act::Clamp => x.clamp(0.0, 1.0),
@@ -99,7 +99,7 @@ impl ColorDecoder {
         inputs.iter_mut().zip(all).for_each(|(to, &of)| *to = of.into());
         let sum = |weights: &[f64], of: &[f64]| weights.iter().zip(of).map(|(w, x)| w * x).sum::<f64>();
         let hidden = self.first.map(|row| sum(&row, &inputs).max(0.0));
-        std::array::from_fn(|c| self.act.of(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
+        std::array::from_fn(|c| self.act.apply(f64::from(features[c]) + sum(&self.second[c], &hidden)) as f32)
     }
 }
 

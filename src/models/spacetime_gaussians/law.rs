@@ -7,8 +7,8 @@ use super::decoder::{self, ColorDecoder};
 use super::motion::SpacetimeMotion;
 use crate::error::Result;
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
-use crate::models::law::window::{faded, odds, slope};
-use crate::models::law::{MotionModel, Shading, copy_stored};
+use crate::models::motion_model::window::{faded, odds, slope};
+use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
 /// Plane of the centre of the window.
 pub(super) const CENTRE: usize = 0;
@@ -29,7 +29,7 @@ pub(super) const FULL_WIDTH: usize = 24;
 
 impl SpacetimeMotion {
     /// That of Gaussian `row`.
-    pub(super) fn of(raw: &Raw, row: usize) -> SpacetimeMotion {
+    pub(super) fn from_raw(raw: &Raw, row: usize) -> SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
         SpacetimeMotion {

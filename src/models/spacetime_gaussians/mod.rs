@@ -18,12 +18,11 @@ use std::path::{Path, PathBuf};
 
 use xxhash_rust::xxh3::Xxh3;
 
-use super::family::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use super::files::copy;
 use super::iterations::iteration;
-use super::law::{MotionModelFrames, left, solve};
 use super::size::{Size, bytes_below, bytes_of};
 use super::trajectories::{NO_ARCHIVE, write_sequence};
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, quoted};
 use crate::files::cameras::Clock;
 use crate::files::digest::hash_file;
@@ -33,9 +32,10 @@ use crate::files::state_dict::read_state_dict;
 use crate::files::text::read_text;
 use crate::limits::Limits;
 use crate::model::{Raw, colour};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
+use crate::models::motion_model::{MotionModelFrames, left, solve};
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 use cloud::{Cloud, MARK};
 use common::{check_kind, residence};
@@ -80,7 +80,7 @@ struct Files {
 }
 
 impl Files {
-    fn of(path: &Path, options: &OpenOptions) -> Result<Files> {
+    fn find(path: &Path, options: &OpenOptions) -> Result<Files> {
         if !path.is_dir() {
             options.refuse_for(path)?;
             return Ok(Files { cloud: path.to_owned(), folder: None, decoder: None });
@@ -144,7 +144,7 @@ struct SpacetimeGaussians {
 
 impl SpacetimeGaussians {
     fn open(path: &Path, options: &OpenOptions) -> Result<SpacetimeGaussians> {
-        let files = Files::of(path, options)?;
+        let files = Files::find(path, options)?;
         let cloud = Cloud::open(&files.cloud, &options.ply())?;
         let configuration =
             files.of_root(CFG_ARGS).map(|path| SpacetimeConfig::read(&path)).transpose()?.unwrap_or_default();
@@ -239,7 +239,7 @@ impl InputModel for SpacetimeGaussians {
 
     fn size_written(&self, kind: OutputKind, path: &Path) -> Result<Size> {
         match kind {
-            OutputKind::Model => Files::of(path, &OpenOptions::default()).and_then(|files| {
+            OutputKind::Model => Files::find(path, &OpenOptions::default()).and_then(|files| {
                 let rest = files.rest();
                 let (cloud, rest) = (bytes_of([&*files.cloud])?, bytes_of(rest.iter().map(PathBuf::as_path))?);
                 Ok(Size { cloud, rest, ..Size::default() })

@@ -11,13 +11,13 @@ use rayon::prelude::*;
 use super::decoder::Act;
 use super::law::{FEATURES, FULL_WIDTH, Spacetime, WIDTH};
 use super::motion::{SpacetimeMotion, TargetState, dot, fitted, mean, merged_window, product};
+use crate::compressed_model::Cluster;
 use crate::error::Result;
 use crate::merging::moments::{WeightedGaussian, align_axes, moments};
 use crate::merging::proxy::merge_state;
 use crate::model::{Columns, Gaussians, Raw, harmonic, opacity};
-use crate::models::law::{MotionModel, MotionModelFrames};
+use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
-use crate::reduction::Cluster;
 use crate::source::FrameSource;
 
 /// Windows differ where one is wider by this factor than another, or off its proxy's centre by half its width.
@@ -59,11 +59,12 @@ struct ClusterMembers<'a> {
 }
 
 impl ClusterMembers<'_> {
-    fn of<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
+    fn new<'a>(model: &'a MotionModelFrames<Spacetime>, cluster: &Cluster) -> ClusterMembers<'a> {
         let ids: Vec<u32> = cluster.members.iter().map(|&(id, _)| id).collect();
         let raw = model.raw().pick(&ids);
         let rows: Vec<(u32, f64)> = (0..).zip(&cluster.members).map(|(row, &(_, weight))| (row, weight)).collect();
-        let motions = rows.iter().map(|&(row, weight)| (weight, SpacetimeMotion::of(&raw, row as usize))).collect();
+        let motions =
+            rows.iter().map(|&(row, weight)| (weight, SpacetimeMotion::from_raw(&raw, row as usize))).collect();
         let leader = ids.iter().position(|&id| id == cluster.leader).unwrap_or(0) as u32;
         ClusterMembers { prepared: model.law().prepare(&raw), model, raw, motions, rows, leader }
     }
@@ -88,7 +89,7 @@ impl ClusterMembers<'_> {
 }
 
 fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergeParams, act: Act) -> Result<Raw> {
-    let members = ClusterMembers::of(model, cluster);
+    let members = ClusterMembers::new(model, cluster);
     let (centre, log_width) = merged_window(&members.motions);
     let about: Vec<(f64, SpacetimeMotion)> =
         members.motions.iter().map(|(weight, motion)| (*weight, motion.about(centre))).collect();
@@ -115,7 +116,7 @@ fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergePa
         }
         for c in 0..3 {
             let feature = f64::from(out.own.plane(FEATURES + c)[0]);
-            out.gaussians.sh.plane_mut(c)[0] = harmonic(act.of(feature));
+            out.gaussians.sh.plane_mut(c)[0] = harmonic(act.apply(feature));
         }
     }
     Ok(out)

@@ -11,6 +11,7 @@ use super::common::{check_kind, residence};
 use super::decoder::Act;
 use super::law::{CENTRE, LOG_WIDTH, MOTION, OMEGA, Spacetime, WIDTH};
 use super::proxies;
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result};
 use crate::files::accuracy::Accuracy;
 use crate::files::cameras::Clock;
@@ -20,14 +21,13 @@ use crate::files::splatv::write::{measure, seen_whole, words, write as write_fil
 use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::{Limits, ReadLimit};
 use crate::model::{Column, Columns, Gaussians, Raw, colour, harmonic, logit, opacity};
-use crate::models::family::{InputModel, MemoryProfile, ModelFormat, Timing};
-use crate::models::law::window::MOST;
-use crate::models::law::{MotionModelFrames, left, solve};
+use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
+use crate::models::motion_model::window::MOST;
+use crate::models::motion_model::{MotionModelFrames, left, solve};
 use crate::models::size::{Size, bytes_below, bytes_of};
 use crate::models::trajectories::write_sequence;
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// Maximum number of bytes of a list of cameras that a result gets: some seven thousand cameras.

@@ -1,4 +1,5 @@
 use super::*;
+use crate::compressed_model::ParamDelta;
 use crate::deform::Tensors;
 use crate::files::splatv::{Splatv, SplatvGaussian};
 use crate::files::state_dict::{StoredTensor, TensorValues, write_state_dict};
@@ -7,7 +8,6 @@ use crate::models;
 use crate::models::OpenOptions;
 use crate::passes::gather_all;
 use crate::recipe::Recipe;
-use crate::reduction::ParamDelta;
 
 const COUNT: usize = 7;
 

@@ -10,20 +10,20 @@ pub(crate) mod size;
 
 use super::request::Quality;
 use super::summary::GoalSummary;
-use crate::budget::{MemoryPart, PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::cache::CacheKey;
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result, ShowPath};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::Limits;
+use crate::memory_plan::{MemoryPart, PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::model::{Columns, Picture};
 use crate::pipeline::search::quality_meter::{QualityMeter, With};
 use crate::pipeline::stages::bands::ShDegreeStage;
 use crate::pipeline::stages::choose::CLUSTERED;
 use crate::pipeline::stages::field::FieldPrecisionStage;
 use crate::pruning::Ranking;
-use crate::pruning::score::{Scored, scored};
-use crate::reduction::CompressedModel;
+use crate::pruning::score::{Scored, scored_memory};
 use crate::refinement::targets::Targets;
 use crate::refinement::{CUT, RefineRun, RefineStage};
 use crate::render;
@@ -97,7 +97,7 @@ impl SearchStage {
             seconds: work.reading(work.count(), frames as f64)
                 + work.picturing(self.pictures as f64, work.count(), RENDER),
             per_gaussian: [
-                scored(limits),
+                scored_memory(limits),
                 vec![("states", whole), ("readers", reader), ("held", held), ("pictures", PICTURE_ON_ALL_THREADS)],
             ]
             .concat(),

@@ -3,15 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use crate::cache::CacheKey;
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::outputs::kind::OutputKind;
 use crate::passes::{VIEWS_AT_ONCE, spread};
 use crate::pipeline::stages::archive;
-use crate::pipeline::stages::emit::Emit;
+use crate::pipeline::stages::write::Emit;
 use crate::pruning::removal::removal_error;
 use crate::pruning::score::Scored;
-use crate::reduction::CompressedModel;
 use crate::scene::Scene;
 
 /// What the stage is called.

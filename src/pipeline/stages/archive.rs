@@ -11,20 +11,20 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::bounds;
-use super::near::{
-    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, PIXEL, QualityTarget, ROUNDS, ReferenceViews,
-    balanced, bisected, check_met, measurable, pictures,
-};
 use crate::archive::{self, ATTRIBUTES, Content, Encoded, Role, STEPS, Steps, TensorSteps};
-use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::journal::as_toml::AsToml;
 use crate::limits::{Limits, ReadLimit};
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload};
 use crate::model::Columns;
 use crate::outputs::bounds::Bounds;
+use crate::pipeline::stages::reference_views::{
+    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, PIXEL, QualityTarget, ROUNDS, ReferenceViews,
+    balanced, bisected, check_met, measurable, pictures,
+};
 use crate::pipeline::summary::ArchiveSummary;
-use crate::reduction::CompressedModel;
 use crate::render;
 use crate::scene::Scene;
 
@@ -142,12 +142,12 @@ impl ArchiveStage {
         asked: ArchiveTarget,
     ) -> Result<(Encoded, ArchiveSummary)> {
         let mut content = scene.input.content(reduction)?;
-        let looks = ReferenceViews::of(scene, &*scene.input.showing(&content)?)?;
-        let original = ReferenceViews::of(scene, scene.source())?;
+        let looks = ReferenceViews::new(scene, &*scene.input.decode_frames(&content)?)?;
+        let original = ReferenceViews::new(scene, scene.source())?;
         let level = measurable(looks.psnr(scene.source())?)?;
-        let aim = QualityTarget::of(self.psnr, asked, level);
+        let aim = QualityTarget::new(self.psnr, asked, level);
         let asked = aim.close(level);
-        let mut grids = Grids::of(&content);
+        let mut grids = Grids::from_content(&content);
         let mut measured = Vec::new();
         for _ in 0..ROUNDS {
             measured = grids.balance(scene, &looks, &mut content, 10f64.powf(-0.1 * asked))?;
@@ -155,7 +155,7 @@ impl ArchiveStage {
         let encoded = |added: f64| archive::encode(&content, &grids.steps(added));
         let looked_at = |encoded: Encoded| -> Result<(Encoded, [f64; 2])> {
             let (decoded, _) = archive::decode(&encoded.bytes, &scene.path, ReadLimit::NONE)?;
-            let shown = scene.input.showing(&decoded)?;
+            let shown = scene.input.decode_frames(&decoded)?;
             Ok((encoded, [looks.psnr(&*shown)?, level - original.psnr(&*shown)?]))
         };
         let (encoded, [psnr, loss]) = match aim {
@@ -189,7 +189,7 @@ pub fn bytes(scene: &Scene, reduction: &CompressedModel) -> Result<u64> {
         return bounds::bytes(scene, &*scene.input.reduced(reduction)?);
     }
     let content = scene.input.content(reduction)?;
-    Ok(archive::encode(&content, &Grids::of(&content).steps(GUESSED))?.bytes.len() as u64)
+    Ok(archive::encode(&content, &Grids::from_content(&content).steps(GUESSED))?.bytes.len() as u64)
 }
 
 /// The coarsest archive of `gaussians` Gaussians, if it has no more than `most` bytes.
@@ -216,7 +216,7 @@ struct Grids {
 }
 
 impl Grids {
-    fn of(content: &Content) -> Grids {
+    fn from_content(content: &Content) -> Grids {
         let groups = groups(content);
         let deviations: Vec<f64> = groups.iter().map(|group| deviation(content, group)).collect();
         let first = |(group, deviation): (&ValueGroup, &f64)| (deviation / group.first()).log2();
@@ -281,7 +281,7 @@ impl Grids {
                     let mut steps = [0; ATTRIBUTES.len()];
                     steps[*k] = eighths(octave);
                     archive::round_cloud(&mut content.cloud, &steps, &[*k]);
-                    let found = looks.error(&*scene.input.showing(content)?);
+                    let found = looks.error(&*scene.input.decode_frames(content)?);
                     content.cloud = before;
                     found
                 }
@@ -290,7 +290,7 @@ impl Grids {
                     let steps = self.tensor(name, octave);
                     let rounded = archive::rounded(&before, role, &steps, &content.cloud.position, space);
                     content.tensors.insert(name.clone(), rounded);
-                    let found = looks.error(&*scene.input.showing(content)?);
+                    let found = looks.error(&*scene.input.decode_frames(content)?);
                     content.tensors.insert(name.clone(), before);
                     found
                 }

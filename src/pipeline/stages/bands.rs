@@ -3,20 +3,20 @@
 //! Memory: a state of the original and two of what is left, and three pictures.
 
 use super::field::{PICTURES, least};
-use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::BandsSummary;
 use crate::limits::Limits;
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
 use crate::metrics::psnr;
 use crate::model::{Columns, Gaussians, Picture};
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Batch, Subject, show, spread};
 use crate::pipeline::request::Request;
 use crate::progress::Progress;
-use crate::pruning::score::scored;
+use crate::pruning::score::scored_memory;
 use crate::recipe::WhichBands;
-use crate::reduction::CompressedModel;
 use crate::render::{self, render};
 use crate::scene::Scene;
 use crate::source::FrameSource;
@@ -52,7 +52,7 @@ pub struct ShDegreeStage {
 
 impl ShDegreeStage {
     /// The stage, of a run whose output may have fewer. An archive has no bytes for bands that nobody sees.
-    pub fn of(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
+    pub fn from_request(request: &Request, kind: OutputKind) -> Option<ShDegreeStage> {
         let bands = &request.recipe.bands;
         let drops = kind != OutputKind::Archive && bands.bands == WhichBands::Needed;
         drops.then_some(ShDegreeStage { margin: bands.bands_margin })
@@ -76,7 +76,7 @@ impl ShDegreeStage {
                 + work.picturing(pictures as f64, work.count(), RENDER)
                 + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: 2.0 * work.scattered_reads(pictures, limits),
-            per_gaussian: [scored(limits), per_gaussian].concat(),
+            per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.arriving(), ("pictures", render::STRIP_BYTES as u64 + 36 * work.pixels)],
         }
     }

@@ -9,16 +9,16 @@
 use std::collections::BTreeMap;
 use std::fs;
 
-use super::near::{
-    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, QualityTarget, ROUNDS, ReferenceViews, balanced,
-    bisected, check_met, measurable,
-};
-use crate::budget::{MemoryPart, Workload};
 use crate::error::{Error, Result};
 use crate::files::atomic::ScratchFolder;
+use crate::memory_plan::{MemoryPart, Workload};
 use crate::model::{Columns, Gaussians, SequenceInfo};
 use crate::outputs::bounds::Bounds;
 use crate::outputs::container::{BOUNDED_FRAME_BLOCK, GAUSSIAN_BLOCK, Packing, column_bytes, write_container};
+use crate::pipeline::stages::reference_views::{
+    ADDED, ArchiveTarget, BYTES_ADDED, BYTES_HALVINGS, HALVINGS, QualityTarget, ROUNDS, ReferenceViews, balanced,
+    bisected, check_met, measurable,
+};
 use crate::pipeline::summary::ArchiveSummary;
 use crate::scene::{Scene, first_box};
 use crate::source::{BlockReader, FrameSource, Ids, ReadPlan, Reads};
@@ -57,9 +57,9 @@ pub(crate) fn find(
     psnr: Option<f64>,
     asked: ArchiveTarget,
 ) -> Result<(Bounds, ArchiveSummary)> {
-    let (looks, original) = (ReferenceViews::of(scene, source)?, ReferenceViews::of(scene, scene.source())?);
+    let (looks, original) = (ReferenceViews::new(scene, source)?, ReferenceViews::new(scene, scene.source())?);
     let level = measurable(looks.psnr(scene.source())?)?;
-    let aim = QualityTarget::of(psnr, asked, level);
+    let aim = QualityTarget::new(psnr, asked, level);
     let asked = aim.close(level);
     let first = first(source)?;
     let mut widths = first;

@@ -4,17 +4,17 @@
 //! Memory: two states of one frame, the original's and an alternative's, and [`AT_ONCE`] pictures.
 
 use super::merge::Outcome;
-use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
 use crate::metrics::{decibels_text, psnr};
 use crate::model::{Columns, Picture};
 use crate::passes::{Batch, Subject, VIEWS_AT_ONCE, ViewStates, show, spread};
 use crate::progress::Progress;
 use crate::pruning::Ranking;
-use crate::pruning::score::{Scored, scored};
-use crate::reduction::CompressedModel;
+use crate::pruning::score::{Scored, scored_memory};
 use crate::render::{self, Image};
 use crate::scene::Scene;
 
@@ -64,7 +64,7 @@ impl Choose {
             stage: NAME,
             seconds: work.reading(work.count(), frames as f64) + made,
             reads: work.reads(frames, limits) + work.scattered_reads(frames, limits),
-            per_gaussian: [scored(limits), per_gaussian].concat(),
+            per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![work.arriving(), ("pictures", pictures)],
         }
     }
@@ -100,7 +100,7 @@ impl Choose {
             "at the same {count} Gaussians scoring pictures keep {} without it, {with:.2} with it",
             decibels_text(without, 2)
         );
-        Progress::undone("merging", &why);
+        Progress::report_skipped("merging", &why);
         journal.leave_out("merging", why);
         let kept = if self.has_target { pruned } else { ranked.take(scored.selection.counts.kept) };
         Ok(Outcome { reduction: CompressedModel::pruned(kept, &reduction.rule), summary: None })

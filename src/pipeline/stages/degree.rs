@@ -6,16 +6,16 @@
 //!
 //! Memory: that of refining.
 
-use crate::budget::{ResourceEstimate, Workload};
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::pipeline::request::{Goal, Request};
 use crate::pipeline::search::size::ByteLimitFit;
 use crate::pruning::Ranking;
 use crate::pruning::score::Scored;
 use crate::recipe::WhichBands;
-use crate::reduction::CompressedModel;
 use crate::refinement::RefineStage;
 use crate::refinement::targets::Targets;
 use crate::scene::Scene;
@@ -34,7 +34,7 @@ pub struct Degree {
 
 impl Degree {
     /// The stage, of a run that is asked for so many bytes, refines (`refine`), and may drop bands.
-    pub fn of(request: &Request, refine: Option<&RefineStage>) -> Option<Degree> {
+    pub fn from_request(request: &Request, refine: Option<&RefineStage>) -> Option<Degree> {
         let chooses = matches!(request.goal, Some(Goal::Bytes(_))) && request.recipe.bands.bands == WhichBands::Needed;
         refine.filter(|_| chooses).map(|refine| Degree { refine: refine.in_part(STEPS) })
     }

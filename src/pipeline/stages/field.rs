@@ -2,20 +2,20 @@
 //!
 //! Memory: two states of one frame, and two pictures.
 
-use crate::budget::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
+use crate::compressed_model::CompressedModel;
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::journal::records::FieldSummary;
 use crate::limits::Limits;
+use crate::memory_plan::{PICTURE_ON_ALL_THREADS, RENDER, ResourceEstimate, Workload, of_left};
 use crate::metrics::psnr;
 use crate::model::{Columns, Picture};
 use crate::outputs::kind::OutputKind;
 use crate::passes::{Batch, Subject, show, spread};
 use crate::pipeline::request::Request;
 use crate::progress::Progress;
-use crate::pruning::score::scored;
+use crate::pruning::score::scored_memory;
 use crate::recipe::Precision;
-use crate::reduction::CompressedModel;
 use crate::refinement::CLOSE_ENOUGH;
 use crate::render::{self, render};
 use crate::scene::Scene;
@@ -35,7 +35,7 @@ pub struct FieldPrecisionStage {
 
 impl FieldPrecisionStage {
     /// The stage, of a run that writes a model and whose field may change.
-    pub fn of(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
+    pub fn from_request(request: &Request, kind: OutputKind) -> Option<FieldPrecisionStage> {
         let field = &request.recipe.field;
         (kind == OutputKind::Model && field.field == Precision::Half)
             .then_some(FieldPrecisionStage { margin: field.field_margin })
@@ -58,7 +58,7 @@ impl FieldPrecisionStage {
                 + work.picturing(2.0 * pictures as f64, work.count(), RENDER)
                 + work.picturing(2.0 * pictures as f64, left * work.count(), RENDER),
             reads: work.reads(pictures, limits),
-            per_gaussian: [scored(limits), per_gaussian].concat(),
+            per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![
                 work.arriving(),
                 ("field", work.input.fixed),

@@ -1,10 +1,10 @@
 //! From frames to a selection: the stages `scan`, `visible` and `score`, which `score` and `report` run too.
 
 use super::scan::ScanStage;
-use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::outputs::kind::OutputKind;
 use crate::pruning::contribution::VisibleContribution;
 use crate::pruning::score;
@@ -27,7 +27,7 @@ pub struct InputMeta {
 
 impl InputMeta {
     /// Of an open scene.
-    pub fn of(scene: &Scene) -> InputMeta {
+    pub fn from_scene(scene: &Scene) -> InputMeta {
         InputMeta {
             gaussians: scene.source().info().count,
             has_cameras: scene.has_cameras,
@@ -79,7 +79,7 @@ impl Measure {
     pub fn new(recipe: &Recipe, has_cameras: bool, user: UserOverrides) -> Measure {
         Measure {
             scan: ScanStage { recipe: recipe.scan.clone() },
-            visible: Visible::of(&recipe.scan, has_cameras),
+            visible: Visible::from_recipe(&recipe.scan, has_cameras),
             score: ScoreStage {
                 rereads: recipe.scan.reread,
                 snap_noise: recipe.scan.snap_noise,

@@ -10,11 +10,12 @@ use std::ops::Range;
 use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
-use crate::budget::{ResourceEstimate, Workload};
 use crate::cache::Cache;
+use crate::compressed_model::{Cluster, CompressedModel};
 use crate::error::{Error, Result};
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::merging;
 use crate::merging::known::{KnownPairs, Likeness};
 use crate::merging::motion::MotionGate;
@@ -30,9 +31,8 @@ use crate::pipeline::summary::MergeSummary;
 use crate::progress::Progress;
 use crate::pruning::Ranking;
 use crate::pruning::prune::Prune;
-use crate::pruning::score::{Scored, scored};
+use crate::pruning::score::{Scored, scored_memory};
 use crate::recipe;
-use crate::reduction::{Cluster, CompressedModel};
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
@@ -117,7 +117,7 @@ impl MergeStage {
             stage: NAME,
             reads: work.scattered_reads(1, limits) + followed,
             seconds: MERGING * work.count() + FOLLOWED * work.reading(work.count(), work.frames as f64),
-            per_gaussian: [scored(limits), per_gaussian].concat(),
+            per_gaussian: [scored_memory(limits), per_gaussian].concat(),
             fixed: vec![("pairs", (limits.pairs_together as u64).saturating_mul(pairs)), work.arriving()],
         }
     }

@@ -1,9 +1,9 @@
 //! Stage `scan`: every Gaussian at every frame once, through one fixed-size accumulator each.
 
-use crate::budget::{ResourceEstimate, Workload};
 use crate::error::Result;
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload};
 use crate::model::{Columns, Rows};
 use crate::passes::BLOCK;
 use crate::recipe;

@@ -149,7 +149,7 @@ impl Summation<'_> {
             return;
         }
         let counted = || (0..total.len()).filter(|&i| self.counts[i]);
-        let norm = Norm::of(|| counted().map(&value), self.recipe, self.looks);
+        let norm = Norm::from_values(|| counted().map(&value), self.recipe, self.looks);
         for (i, total) in total.iter_mut().enumerate() {
             if self.counts[i] {
                 *total += weight * norm.apply(value(i));

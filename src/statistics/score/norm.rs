@@ -31,14 +31,14 @@ pub enum PercentilePasses {
 
 impl Norm {
     /// The normalisation of a set of values; NaN and infinities are passed over.
-    pub fn of<I: Iterator<Item = f64>>(
+    pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,
         looks: PercentilePasses,
     ) -> Self {
         let [p1, p99] = match looks {
             PercentilePasses::Two => {
-                let sketch = FloatSketch::of(values());
+                let sketch = FloatSketch::from_values(values());
                 [1.0, 99.0].map(|p| sketch.percentile(p, values()))
             }
             PercentilePasses::One(bits) => {
@@ -71,7 +71,7 @@ mod tests {
     use crate::recipe::Recipe;
 
     fn norm_of(preset: &str, values: &[f64]) -> Norm {
-        Norm::of(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score, PercentilePasses::Two)
+        Norm::from_values(|| values.iter().copied(), &Recipe::preset(preset).unwrap().score, PercentilePasses::Two)
     }
 
     #[test]

@@ -25,7 +25,7 @@ pub struct FloatSketch {
 impl FloatSketch {
     /// The sketch of all of `values`; NaN and infinities are passed over. −0 counts as 0, and a finite value beyond f32
     /// as the largest f32.
-    pub fn of(values: impl IntoIterator<Item = f64>) -> Self {
+    pub fn from_values(values: impl IntoIterator<Item = f64>) -> Self {
         Self::keyed_by(MANTISSA_BITS, values)
     }
 
@@ -113,7 +113,7 @@ mod tests {
     proptest! {
         #[test]
         fn percentiles_equal_the_sorted_answer(values in prop::collection::vec(any_value(), 0..300), p in 0u32..=100) {
-            let sketch = FloatSketch::of(values.iter().copied());
+            let sketch = FloatSketch::from_values(values.iter().copied());
             let got = sketch.percentile(f64::from(p), values.iter().copied());
             prop_assert_eq!(got, sorted_percentile(&values, p));
         }
@@ -143,17 +143,17 @@ mod tests {
         let key = |value| key(value, ALL_BITS - MANTISSA_BITS);
         assert_eq!(key(-0.0), key(0.0));
         assert!(key(-1e-39) < key(0.0) && key(0.0) < key(1e-39) && key(1e-39) < key(1e-38));
-        assert!(FloatSketch::of([-0.0; 5]).percentile(50.0, [-0.0; 5]).unwrap().is_sign_positive());
+        assert!(FloatSketch::from_values([-0.0; 5]).percentile(50.0, [-0.0; 5]).unwrap().is_sign_positive());
     }
 
     #[test]
     fn nan_and_infinity_touch_no_percentile() {
         let odd = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -f64::NAN];
         let values = || odd.into_iter().chain((1..=100).map(f64::from));
-        let sketch = FloatSketch::of(values());
+        let sketch = FloatSketch::from_values(values());
         for (p, expected) in [(0.0, 1.0), (1.0, 1.0), (50.0, 50.0), (99.0, 99.0), (100.0, 100.0)] {
             assert_eq!(sketch.percentile(p, values()), Some(expected), "P{p}");
         }
-        assert_eq!(FloatSketch::of(odd).percentile(50.0, odd), None);
+        assert_eq!(FloatSketch::from_values(odd).percentile(50.0, odd), None);
     }
 }

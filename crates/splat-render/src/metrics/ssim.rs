@@ -34,7 +34,7 @@ pub fn ssim(a: &Image, b: &Image) -> f64 {
     let mut total = 0.0;
     for channel in 0..3 {
         moments.window_of(a, b, channel);
-        total += (0..count).map(|i| Terms::of(moments.at(i)).similarity()).sum::<f64>();
+        total += (0..count).map(|i| Terms::new(moments.at(i)).similarity()).sum::<f64>();
     }
     total / (3 * count) as f64
 }
@@ -52,7 +52,7 @@ pub fn ssim_slope(a: &Image, b: &Image) -> Image {
         let mut moments = Moments::new(count);
         moments.window_of(a, b, channel);
         for i in 0..count {
-            let slopes = Terms::of(moments.at(i)).slopes();
+            let slopes = Terms::new(moments.at(i)).slopes();
             // What they were is not needed any more.
             moments.sums.iter_mut().zip(slopes).for_each(|(sum, slope)| sum[i] = slope);
         }
@@ -112,7 +112,7 @@ struct Terms {
 }
 
 impl Terms {
-    fn of([a, b, squares, products]: [f64; 4]) -> Terms {
+    fn new([a, b, squares, products]: [f64; 4]) -> Terms {
         let (both, across) = (a * a + b * b, a * b);
         Terms {
             means: [a, b],

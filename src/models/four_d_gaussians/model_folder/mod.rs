@@ -265,7 +265,7 @@ impl Deformation for ModelFolder {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let nothing = || Gaussians::zeros(0, self.info.sh_degree);
-        let parts = BlockSlices::of(out, want, ids.len());
+        let parts = BlockSlices::split(out, want, ids.len());
         ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
             || (nothing(), nothing(), Scratch::default(), Deltas::new(self.info.sh_degree)),
             |(raw, state, scratch, deltas), (ids, parts)| {

@@ -23,7 +23,7 @@ use serde::de::DeserializeOwned;
 use xxhash_rust::xxh3::Xxh3;
 
 use super::key::CacheKey;
-use super::part::Shard;
+use crate::cache::shard::Shard;
 use crate::error::{Error, Result};
 use crate::files::digest::hash_rest;
 
@@ -60,7 +60,7 @@ impl EntryName {
     }
 
     /// That of a file, if it is one of a piece.
-    pub(super) fn of(file: &str) -> Option<EntryName> {
+    pub(super) fn parse(file: &str) -> Option<EntryName> {
         let mut fields = file.strip_suffix(ENDING)?.split('.');
         let (stage, key, part) = (fields.next()?, fields.next()?, fields.next());
         let part = match part {
@@ -81,7 +81,7 @@ pub(super) fn names(folder: &Path) -> Result<Vec<EntryName>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).map_err(Error::io("read the work folder", folder))? {
         let entry = entry.map_err(Error::io("read the work folder", folder))?;
-        found.extend(entry.file_name().to_str().and_then(EntryName::of));
+        found.extend(entry.file_name().to_str().and_then(EntryName::parse));
     }
     found.sort();
     Ok(found)
@@ -171,7 +171,7 @@ struct EntryHeader {
 }
 
 impl EntryHeader {
-    fn of(bytes: &[u8; HEADER]) -> std::result::Result<EntryHeader, String> {
+    fn from_bytes(bytes: &[u8; HEADER]) -> std::result::Result<EntryHeader, String> {
         let number = |start: usize, length: usize| {
             bytes[start..start + length].iter().rev().fold(0u128, |number, &byte| number << 8 | u128::from(byte))
         };
@@ -199,7 +199,7 @@ impl CacheEntry {
         }
         let mut bytes = [0; HEADER];
         file.read_exact(&mut bytes).map_err(failed)?;
-        let EntryHeader { text, content, hash, key: own } = match EntryHeader::of(&bytes) {
+        let EntryHeader { text, content, hash, key: own } = match EntryHeader::from_bytes(&bytes) {
             Ok(header) => header,
             Err(why) => return Ok(Err(why)),
         };

@@ -1,13 +1,13 @@
 //! Proxies in a family's own parameters, held to what their members do.
 
 use super::{MotionModel, MotionModelFrames};
+use crate::compressed_model::{Cluster, Proxies, Reference};
 use crate::error::Result;
 use crate::fit::SEEN;
 use crate::merging::merged::MergedSequence;
 use crate::model::{Columns, Raw, opacity};
 use crate::passes::gather_all;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// Furthest that a proxy's opacity may be from that of its members' moment match, at any frame.

@@ -7,13 +7,14 @@ use std::path::{Path, PathBuf};
 use super::archive::Archived;
 use super::bounds;
 use super::choose::CLUSTERED;
-use crate::budget::{ResourceEstimate, Workload, of_left};
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::atomic::{
     Kind, MARKER, Replace, ScratchFolder, StagedFiles, StagedFolder, check_target, check_targets,
 };
 use crate::journal::Journal;
 use crate::limits::Limits;
+use crate::memory_plan::{ResourceEstimate, Workload, of_left};
 use crate::model::Columns;
 use crate::models::{InputModel, Size};
 use crate::outputs::bounds::Bounds;
@@ -23,8 +24,7 @@ use crate::outputs::kind::OutputKind;
 use crate::pipeline::request::Request;
 use crate::pipeline::summary::Summary;
 use crate::progress::Progress;
-use crate::pruning::score::scored;
-use crate::reduction::CompressedModel;
+use crate::pruning::score::scored_memory;
 use crate::scene::Scene;
 use crate::source::FrameSource;
 
@@ -76,7 +76,7 @@ pub struct Emit {
 impl Emit {
     /// As `request` asks, of an input whose own kind of result is `own`.
     pub fn new(request: &Request, own: OutputKind, merges: bool) -> Emit {
-        let kind = OutputKind::of(&request.output, request.kind, own);
+        let kind = OutputKind::from_path(&request.output, request.kind, own);
         Emit { kind, merges, output: request.output.clone(), overwrite: request.overwrite }
     }
 
@@ -109,7 +109,7 @@ impl Emit {
         let whole = work.state(Columns::all());
         let is_solved = work.input.reduced > 0;
         let mut per_gaussian =
-            [scored(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
+            [scored_memory(limits), vec![("kept", 40), ("result", of_left(left, work.input.reduced))]].concat();
         let within = if self.kind == OutputKind::Archive { bounds::storing(work) } else { Vec::new() };
         let mut fixed = if within.is_empty() { work.writing() } else { within };
         match self.kind {

@@ -11,10 +11,10 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::model::{Column, Columns, Gaussians, Jacobian, Raw, SequenceInfo};
 use crate::passes::{BLOCK, BlockSlices, InBlocks};
-use crate::reduction::CompressedModel;
 use crate::source::{BlockReader, Count, Deformation, FeatureDecoder, FrameSource, Ids, ReadPlan, Reads};
 
 pub(super) use proxies::solve;
@@ -159,7 +159,7 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
             return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let rows: Vec<u32> = ids.iter().map(|id| id as u32).collect();
-        let blocks = rows.chunks(BLOCK).map(|rows| PreparedBlock::of(self.law(), self.raw.pick(rows))).collect();
+        let blocks = rows.chunks(BLOCK).map(|rows| PreparedBlock::new(self.law(), self.raw.pick(rows))).collect();
         Ok(Box::new(MotionModelReader { model: self, blocks, count: rows.len() }))
     }
 
@@ -200,7 +200,7 @@ struct PreparedBlock<L: MotionModel> {
 }
 
 impl<L: MotionModel> PreparedBlock<L> {
-    fn of(law: &L, raw: Raw) -> PreparedBlock<L> {
+    fn new(law: &L, raw: Raw) -> PreparedBlock<L> {
         PreparedBlock { prepared: law.prepare(&raw), raw }
     }
 
@@ -238,7 +238,7 @@ impl<L: MotionModel> BlockReader for MotionModelReader<'_, L> {
             return block.state(model.law(), time, want, out);
         }
         let mut state = Gaussians::zeros(0, model.info.sh_degree);
-        let parts = BlockSlices::of(out, want, self.count);
+        let parts = BlockSlices::split(out, want, self.count);
         for (block, parts) in self.blocks.iter().zip(parts) {
             block.state(model.law(), time, want, &mut state)?;
             parts.write(&state, want);
@@ -260,11 +260,11 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
     fn state(&self, frame: usize, stored: &Raw, want: Columns, out: &mut Gaussians) -> Result<()> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
-        let parts = BlockSlices::of(out, want, ids.len());
+        let parts = BlockSlices::split(out, want, ids.len());
         ids.par_chunks(BLOCK).zip(parts).try_for_each_init(
             || Gaussians::zeros(0, self.info.sh_degree),
             |state, (ids, parts)| {
-                PreparedBlock::of(self.law(), stored.pick(ids)).state(self.law(), time, want, state)?;
+                PreparedBlock::new(self.law(), stored.pick(ids)).state(self.law(), time, want, state)?;
                 parts.write(state, want);
                 Ok::<_, Error>(())
             },
@@ -275,7 +275,7 @@ impl<L: MotionModel> Deformation for MotionModelFrames<L> {
         let time = self.time_of(frame)?;
         let ids: Vec<u32> = (0..stored.len() as u32).collect();
         let of_block = |ids: &[u32]| {
-            let PreparedBlock { raw, prepared } = PreparedBlock::<L>::of(self.law(), stored.pick(ids));
+            let PreparedBlock { raw, prepared } = PreparedBlock::<L>::new(self.law(), stored.pick(ids));
             self.law.jacobian(time, &raw, &prepared, want)
         };
         let blocks: Vec<Jacobian> = ids.par_chunks(BLOCK).map(of_block).collect::<Result<_>>()?;

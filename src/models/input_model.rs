@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::size::{Size, bytes_below};
 use super::trajectories::{NO_ARCHIVE, OWN_OUTPUT, check_output, reduced_trajectories, write_trajectories};
 use crate::archive::Content;
+use crate::compressed_model::{Cluster, CompressedModel, Proxies, Reference};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::cameras::Clock;
 use crate::files::ply::PlyOptions;
@@ -15,7 +16,6 @@ use crate::model::{Columns, Gaussians};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
 use crate::recipe::MergeParams;
-use crate::reduction::{Cluster, CompressedModel, Proxies, Reference};
 use crate::source::FrameSource;
 
 /// An open input of some kind.
@@ -182,7 +182,7 @@ pub trait InputModel: Send + Sync {
     ///
     /// # Errors
     /// A content of another kind.
-    fn showing<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
+    fn decode_frames<'a>(&'a self, content: &Content) -> Result<Box<dyn FrameSource + 'a>> {
         let _ = content;
         Err(Error::usage(NO_ARCHIVE))
     }
@@ -193,13 +193,13 @@ pub trait InputModel: Send + Sync {
     }
 
     /// Whether every Gaussian's state stands in every frame, so that it may change along time ([`CompressedModel::course`]).
-    fn stands_in_frames(&self) -> bool {
+    fn has_explicit_frames(&self) -> bool {
         false
     }
 
     /// Whether an archive of it is one of its frames: a container within bounds.
     fn archives_frames(&self) -> bool {
-        self.stands_in_frames()
+        self.has_explicit_frames()
     }
 
     /// The frames of what `reduction` leaves, as they will be once it is written.

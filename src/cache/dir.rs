@@ -10,9 +10,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::key::CacheKey;
-use super::part::MOST_PARTS;
-use super::piece::{CacheEntry, ENDING, EntryName, names};
 use super::spill::{Spill, SpillWriter};
+use crate::cache::entry::{CacheEntry, ENDING, EntryName, names};
+use crate::cache::shard::MOST_PARTS;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::remove_leftovers;
 
@@ -35,7 +35,7 @@ impl CacheDir {
             _ if !folder.is_dir() => Err(Error::usage(format!("{}: is no folder", folder.shown()))),
             _ => {
                 remove_leftovers(folder, ENDING);
-                Ok(CacheDir { folder: folder.to_owned(), context: CacheKey::of(&()), about })
+                Ok(CacheDir { folder: folder.to_owned(), context: CacheKey::new(&()), about })
             }
         }
     }

@@ -72,7 +72,7 @@ pub(crate) enum QualityTarget {
 
 impl QualityTarget {
     /// For a result whose pictures are `level` from the original's, where its own flag says `psnr`.
-    pub(crate) fn of(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
+    pub(crate) fn new(psnr: Option<f64>, asked: ArchiveTarget, level: f64) -> QualityTarget {
         match (psnr, asked) {
             (_, ArchiveTarget::Bytes(most)) => QualityTarget::Bytes(most),
             (Some(psnr), _) => QualityTarget::Close(psnr),
@@ -110,7 +110,7 @@ pub(crate) struct ReferenceViews<'a> {
 }
 
 impl ReferenceViews<'_> {
-    pub(crate) fn of<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
+    pub(crate) fn new<'a>(scene: &'a Scene, source: &dyn FrameSource) -> Result<ReferenceViews<'a>> {
         let count = pictures(scene.workload().pixels) as usize;
         let mut looks = ReferenceViews { scene, pictures: spread(&scene.schedule, count, 1), images: Vec::new() };
         looks.images = looks.render(source, |_, image| image)?;

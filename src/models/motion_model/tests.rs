@@ -1,8 +1,8 @@
 use super::*;
+use crate::compressed_model::{Cluster, ParamDelta, Reference};
 use crate::model::Gaussians;
 use crate::passes::{gather, gather_all};
 use crate::recipe::Recipe;
-use crate::reduction::{Cluster, ParamDelta, Reference};
 
 /// x(t) = x + v·t with velocities of a family's own, and opacities that fade by a rate of its own.
 #[derive(Debug)]

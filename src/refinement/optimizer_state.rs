@@ -6,10 +6,10 @@ use serde::Serialize;
 use super::local::{Keeping, Local, Locals};
 use super::loss::{Loss, RenderQuality};
 use super::targets::Targets;
+use crate::compressed_model::{ParamDelta, TrajectoryDelta};
 use crate::error::{Error, Result};
 use crate::model::{Columns, Gaussians, Gradients, Raw, SequenceInfo};
 use crate::passes::States;
-use crate::reduction::{ParamDelta, TrajectoryDelta};
 use crate::refinement::optimizer::{Descent, RateSchedule};
 use crate::render::{RemovalError, Renderer};
 use crate::scene::Scene;
@@ -126,9 +126,9 @@ impl<'a> OptimizerState<'a> {
             manner: StepParams { columns, sh_degree, loss },
         };
         if deformation.is_some() {
-            moving.find()?;
+            moving.reevaluate_states()?;
         } else {
-            let wanted = ReadPlan::of(moving.frames.clone()).holding(scene.limits.frames_held);
+            let wanted = ReadPlan::new(moving.frames.clone()).holding(scene.limits.frames_held);
             let mut states = States::open(result, &wanted)?;
             let mut locals = Keeping::new(&scene.scratch, varying)?;
             for &frame in &moving.frames {
@@ -163,7 +163,7 @@ impl<'a> OptimizerState<'a> {
 
     /// Begins to move along time too, from nothing, at so many knots: each Gaussian in columns that change with time anyway, as
     /// others are stored once, and of harmonics the first. Gives whether anything can.
-    pub(super) fn bend(&mut self, knots: usize) -> bool {
+    pub(super) fn enable_keyframes(&mut self, knots: usize) -> bool {
         let columns = self.manner.columns & self.changing.iter().copied().collect();
         let Some(Local { state, .. }) = self.locals.first().filter(|_| !columns.is_empty()) else { return false };
         self.course = (0..knots).map(|_| Descent::new(state, columns, 0, &self.fixed)).collect();
@@ -195,9 +195,9 @@ impl<'a> OptimizerState<'a> {
     ///
     /// # Errors
     /// A scratch file that cannot be written.
-    pub(super) fn find(&mut self) -> Result<()> {
+    pub(super) fn reevaluate_states(&mut self) -> Result<()> {
         let Some(deformation) = self.deformation else { return Ok(()) };
-        self.settle();
+        self.bake_delta();
         let mut locals = Keeping::new(&self.scene.scratch, self.varying)?;
         for &frame in &self.frames {
             let want = if locals.is_empty() { Columns::all() } else { self.varying };
@@ -228,12 +228,12 @@ impl<'a> OptimizerState<'a> {
         if let Some((stored, before)) = found {
             self.descent.take();
             (self.stored, self.before) = (stored, before);
-            self.find()?;
+            self.reevaluate_states()?;
         }
         self.descent.go_on(descent);
         self.steps = steps;
         if !course.is_empty() {
-            self.bend(course.len());
+            self.enable_keyframes(course.len());
             self.course.iter_mut().zip(course).for_each(|(knot, standing)| knot.go_on(standing));
         }
         Ok(())
@@ -245,11 +245,11 @@ impl<'a> OptimizerState<'a> {
     /// A scratch file that cannot be written.
     pub(super) fn turn_back(&mut self, change: &ParamDelta) -> Result<()> {
         self.descent.restart(&change.since(&self.before));
-        self.find()
+        self.reevaluate_states()
     }
 
     /// What was descended so far counts as what is stored.
-    fn settle(&mut self) {
+    fn bake_delta(&mut self) {
         if !self.descent.has_moved() {
             return;
         }
@@ -272,7 +272,7 @@ impl<'a> OptimizerState<'a> {
             locals.push(&mut now.pick(places))?;
         }
         (self.locals, self.now) = (locals.finish()?, now);
-        self.settle();
+        self.bake_delta();
         if self.deformation.is_some() {
             self.stored = self.stored.pick(places);
         }
@@ -314,7 +314,7 @@ impl<'a> OptimizerState<'a> {
     /// A scratch file that cannot be read or written.
     pub(super) fn step(&mut self, k: usize, schedule: &RateSchedule) -> Result<()> {
         if self.steps == FOUND_EVERY {
-            self.find()?;
+            self.reevaluate_states()?;
         }
         self.steps += 1;
         self.differentiate(k)?;
@@ -370,10 +370,10 @@ impl<'a> OptimizerState<'a> {
         let lost = |(renderer, now): &mut (Renderer, Local), &k: &usize| {
             self.show(self.place(k), now)?;
             let picture = renderer.render(&now.state, self.targets.camera(k), self.scene.background);
-            Ok(self.manner.loss.of(&picture, &self.targets.values(k)?))
+            Ok(self.manner.loss.errors(&picture, &self.targets.values(k)?))
         };
         let losses: Vec<[f64; 2]> = of.par_iter().map_init(|| self.worker(), lost).collect::<Result<_>>()?;
-        Ok(RenderQuality::of(&losses))
+        Ok(RenderQuality::from_errors(&losses))
     }
 
     /// What the pictures numbered `of` would lose with each.
