@@ -67,34 +67,27 @@ fn an_empty_folder_is_no_obstacle_and_one_with_anything_in_it_is() {
 }
 
 #[test]
-fn flags_take_a_truth_value_and_lists_take_blanks() {
+fn boolean_parameters_take_a_value_and_flags_take_none() {
     let workplace = Workplace::new();
-    for value in ["false", "no", "=off"] {
-        let value = if value.starts_with('=') { value.to_owned() } else { format!(" {value}") };
+    for value in [" false", " no", "=off"] {
         workplace.done(&format!("compress {{tiny}} -o out --dry-run --no-refine --quiet --choose-by-views{value}"));
     }
-    let json = workplace.done("info {tiny} --json yes");
-    assert!(json.starts_with('{'), "{json}");
-    let text = workplace.done("info {tiny} --json no");
-    assert!(!text.starts_with('{'), "{text}");
-    let tiny = tiny();
-    let words = ["sweep", tiny.to_str().unwrap(), "-o", "curves", "--quiet", "--max-frames", "2"];
-    let run =
-        workplace.run_words(words.into_iter().chain(["--methods", "opacity, scale", "--fractions", "0.5,", "0.2"]));
-    assert_eq!(run.code, 0, "{}", run.stderr);
-    assert!(run.stdout.contains("scale") && !run.stdout.contains("random"), "{}", run.stdout);
-    let run = workplace.run_words([
-        "compress",
-        tiny.to_str().unwrap(),
-        "-o",
-        "out",
-        "--dry-run",
-        "--quiet",
-        "--no-refine",
-        "--drop-ids",
-        "3 5",
-    ]);
-    assert_eq!(run.code, 0, "{}", run.stderr);
+    assert!(workplace.done("info {tiny} --json").starts_with('{'));
+    assert!(!workplace.done("info {tiny}").starts_with('{'));
+    workplace.refused(2, "info {tiny} --json no", &["unexpected argument", "no"]);
+    workplace.refused(2, "info {tiny} --json=no", &["unexpected value", "--json"]);
+}
+
+#[test]
+fn lists_are_separated_by_commas() {
+    let workplace = Workplace::new();
+    let sweep = "sweep {tiny} -o curves --quiet --max-frames 2 --methods opacity,scale";
+    let curves = workplace.done(&format!("{sweep} --fractions 0.5,0.2"));
+    assert!(curves.contains("scale") && !curves.contains("random"), "{curves}");
+    workplace.refused(2, &format!("{sweep} --fractions 0.5, 0.2"), &["unexpected argument", "0.2"]);
+    let compress = "compress {tiny} -o out --dry-run --quiet --no-refine";
+    workplace.done(&format!("{compress} --drop-ids 3,5 --keep-box -1,-1,-1,-0.9,-0.9,-0.9"));
+    workplace.refused(2, &format!("{compress} --keep-box -1,-1,-1,1,1"), &["six numbers"]);
     workplace.refused(2, "compress {tiny} -o out --drop-ids 10-5", &["runs forwards, such as 5-10", "10-5"]);
 }
 

@@ -140,7 +140,7 @@ pub(super) struct Input {
 pub(super) struct Trained {
     /// Length of a 4D Gaussian Splatting checkpoint's time_duration, or both its ends A,B [default: that in a YAML
     /// beside it, else 10 where frames lie beyond 1, else 1]
-    #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration)]
+    #[arg(long, value_name = "L", hide_short_help = true, value_parser = parse_duration, allow_hyphen_values = true)]
     pub(super) time_duration: Option<f64>,
     /// How its rotations of four dimensions are written: unflipped before 15 September 2024 [default: flipped]
     #[arg(long, value_name = "HOW", hide_short_help = true)]
@@ -482,7 +482,7 @@ pub(super) enum ImageKind {
 pub(super) struct Background {
     /// Colour behind the scene, each from 0 to 1 [default: the cameras' own, else the model's, else
     /// that of the model in whose folder the cameras are, else black]
-    #[arg(long, value_name = "R,G,B", value_parser = parse_colour)]
+    #[arg(long, value_name = "R,G,B", value_parser = parse_colour, allow_hyphen_values = true)]
     pub(super) background: Option<[f32; 3]>,
 }
 

@@ -7,7 +7,6 @@ mod help;
 mod output;
 mod recipe_flags;
 mod signals;
-mod words;
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -90,9 +89,7 @@ pub(crate) fn main() -> ExitCode {
 }
 
 fn parse(words: impl Iterator<Item = OsString>) -> std::result::Result<Cli, clap::Error> {
-    let command = help::command();
-    let words = words::regular(words, &command);
-    command.try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found))
+    help::command().try_get_matches_from(words).and_then(|found| Cli::from_arg_matches(&found))
 }
 
 /// Tells why a run failed and returns its exit code. A reader of standard output that has seen enough is no failure.

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use clap::builder::BoolishValueParser;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use splatsieve::error::{Error, Result, ShowPath, quoted};
@@ -116,7 +117,11 @@ impl Args for RecipeFlags {
                 .hide_short_help(true)
                 .allow_negative_numbers(true);
             if parameter.boolean {
-                arg = arg.num_args(0..=1).require_equals(true).default_missing_value("true").value_name("true|false");
+                arg = arg
+                    .num_args(0..=1)
+                    .default_missing_value("true")
+                    .value_name("true|false")
+                    .value_parser(BoolishValueParser::new());
             }
             command = command.arg(arg);
         }
@@ -134,6 +139,7 @@ impl Args for RecipeFlags {
                 .value_name("EPSILON,D0,RHO,TAU_M")
                 .action(clap::ArgAction::Append)
                 .value_parser(parse_pass)
+                .allow_hyphen_values(true)
                 .help("A merge pass instead of the recipe's; give it once per pass")
                 .help_heading(HEADING)
                 .hide_short_help(true),
@@ -158,7 +164,13 @@ impl FromArgMatches for RecipeFlags {
         self.effort = matches.get_one::<String>("effort").cloned();
         self.set = parameters()
             .into_iter()
-            .filter_map(|p| Some((p.section, p.key.clone(), matches.get_one::<String>(&p.key)?.clone())))
+            .filter_map(|p| {
+                let value = match p.boolean {
+                    true => matches.get_one::<bool>(&p.key)?.to_string(),
+                    false => matches.get_one::<String>(&p.key)?.clone(),
+                };
+                Some((p.section, p.key, value))
+            })
             .collect();
         if matches.get_flag("no_refine") {
             self.set.push(("refine".to_owned(), "refine".to_owned(), "none".to_owned()));
@@ -176,10 +188,9 @@ fn parse_pass(text: &str) -> std::result::Result<MergePass, String> {
     }
 }
 
-/// Numbers with commas or blanks between.
+/// Parses numbers that are separated by commas.
 pub(super) fn numbers<T: std::str::FromStr>(text: &str) -> std::result::Result<Vec<T>, String> {
-    let parts = text.split([',', ' ']).filter(|part| !part.is_empty());
-    parts.map(|part| part.parse().map_err(|_| format!("{} is no number", quoted(part)))).collect()
+    text.split(',').map(|part| part.trim().parse().map_err(|_| format!("{} is no number", quoted(part)))).collect()
 }
 
 #[cfg(test)]
@@ -202,6 +213,31 @@ mod tests {
         expected.score.weigh_motion_by_life = true;
         expected.select.low_priority = splatsieve::recipe::LowPriority::Rescue;
         assert_eq!(recipe, expected);
+    }
+
+    #[test]
+    fn boolean_parameters_take_an_optional_value() {
+        let paper = Recipe::preset("paper").unwrap();
+        assert!(!paper.score.clip_norm);
+        for (args, expected) in [
+            (&["--clip-norm"][..], true),
+            (&["--clip-norm", "true"], true),
+            (&["--clip-norm=yes"], true),
+            (&["--clip-norm", "false"], false),
+            (&["--clip-norm=off"], false),
+            (&["--clip-norm", "--mu", "2"], true),
+        ] {
+            let args = [&["--preset", "paper"], args].concat();
+            assert_eq!(parse(&args).unwrap().score.clip_norm, expected, "{args:?}");
+        }
+        assert!(parse(&["--clip-norm=maybe"]).unwrap_err().to_string().contains("--clip-norm"));
+    }
+
+    #[test]
+    fn negative_numbers_are_values_and_not_options() {
+        assert!(parse(&["--mu", "-1"]).unwrap_err().to_string().contains("score.mu: expected 0 to 1e6, found -1"));
+        assert_eq!(parse(&["--merge-pass", "1,1e9,-1,-0.5"]).unwrap().merge.passes[0].tau_m, -0.5);
+        assert!(parse(&["--merge-pass", "-1,1,0,0"]).unwrap_err().to_string().contains("merge.passes.epsilon"));
     }
 
     #[test]
