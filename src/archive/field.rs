@@ -48,16 +48,13 @@ pub(super) struct TensorEntry {
     pub(super) shape: Vec<usize>,
     pub(super) role: Role,
     /// Its grid; see [`super::step()`].
-    #[serde(default)]
     pub(super) step: i32,
     /// What is added to it: by channel of a plane, by row and then by column of a matrix; none: nothing.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) channels: Vec<i8>,
     /// Its mean, in steps.
-    #[serde(default)]
     pub(super) mean: i64,
     /// How its values are expected from their neighbours.
-    #[serde(default)]
     pub(super) parts: PredictorWeights<NEIGHBOURS>,
 }
 

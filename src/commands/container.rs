@@ -277,7 +277,7 @@ impl InputInfo {
     pub fn text(&self) -> String {
         let input = &self.input;
         let mut out = format!(
-            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes{}, digest {}\n",
+            "{}: {}\n  {} Gaussians, SH degree {}, {}\n  varying: {}\n  {} bytes: {}, digest {}\n",
             Path::new(&input.path).shown(),
             input.kind,
             input.gaussians,
@@ -291,7 +291,7 @@ impl InputInfo {
             },
             if input.varying.is_empty() { "nothing".to_owned() } else { input.varying.join(", ") },
             input.bytes,
-            input.size.map_or(String::new(), |size| format!(": {}", size.parts())),
+            input.size.parts(),
             input.digest,
         );
         for column in &self.columns {

@@ -27,12 +27,10 @@ pub struct TradeOff {
     /// File of the cameras, or the recipe of a virtual rig.
     pub cameras: String,
     /// Times that every point was run.
-    #[serde(default = "once")]
     pub runs: usize,
     /// By method, as listed in `--methods`, then by the fraction asked for, falling.
     pub points: Vec<TradeOffPoint>,
     /// Parameters that were turned.
-    #[serde(default)]
     pub knobs: Vec<EffortCurve>,
     /// Things a person should know.
     pub notes: Vec<String>,
@@ -78,11 +76,6 @@ pub struct Setting {
     /// Method, size and what was measured.
     #[serde(flatten)]
     pub point: TradeOffPoint,
-}
-
-/// Runs of every point where a file does not say.
-fn once() -> usize {
-    1
 }
 
 /// A point's columns in a table.
@@ -230,13 +223,5 @@ mod tests {
             "parameter,value,method,asked,count,fraction,bytes,psnr,ssim,temporal,seconds,peak_memory_bytes\n\
              refine_steps,100,paper,0.5,6,0.75,1099511627776,inf,1,0.0000001,2.5,4096\n"
         );
-    }
-
-    #[test]
-    fn a_file_without_runs_and_knobs_is_one_of_single_runs() {
-        let text = r#"{"tool": "t", "path": "p", "digest": "00", "gaussians": 8, "bytes": 9, "threads": 1, "pictures": 1,
-            "cameras": "c", "points": [], "notes": []}"#;
-        let found: TradeOff = serde_json::from_str(text).unwrap();
-        assert_eq!((found.runs, found.knobs), (1, Vec::new()));
     }
 }

@@ -21,7 +21,6 @@ pub struct StageRecord {
     /// The same as full reads of the input: by bytes where it is stored in tiles, else by states.
     pub full_reads: f64,
     /// Bytes that it read back of scratch files, which are no part of the input.
-    #[serde(default)]
     pub scratch_bytes: u64,
     /// Whether it was found in a work folder: then its times and reads are those of the run that it was found by.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
@@ -29,7 +28,6 @@ pub struct StageRecord {
     /// Wall-clock time.
     pub seconds: f64,
     /// Time of all processors together, where the system tells.
-    #[serde(default)]
     pub processor_seconds: Option<f64>,
     /// Largest resident memory of the process up to the end of this stage, where the system tells.
     pub peak_memory_bytes: Option<u64>,

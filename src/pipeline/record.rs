@@ -56,10 +56,10 @@ pub struct RunOptions {
     /// Training iteration of a model folder.
     pub iteration: Option<u32>,
     /// `--time-duration` of a model.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub time_duration: Option<f64>,
     /// Whether `--rot4d unflipped` was said of it.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub rot4d_unflipped: bool,
     /// File or folder of the cameras; in a file, seen from the folder of the recipe.
     pub cameras: Option<PathBuf>,
@@ -71,10 +71,10 @@ pub struct RunOptions {
     pub size: Option<(u32, u32)>,
     /// Where the times of pictures came from, as `--times` says it; none: their own. A table is seen from the folder of
     /// the recipe.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
     /// Whether frames were linked, where that was not left to them.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub link: Option<Link>,
 }
 
@@ -82,10 +82,8 @@ pub struct RunOptions {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecipeRecord {
     /// Where it comes from.
-    #[serde(default)]
     pub provenance: Option<Provenance>,
     /// What was asked for.
-    #[serde(default)]
     pub run: Option<RunOptions>,
 }
 

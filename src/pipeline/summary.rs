@@ -90,8 +90,7 @@ pub struct InputSummary {
     /// Bytes of everything that a renderer opens of the model, or that arrived of a stream.
     pub bytes: u64,
     /// The same by part.
-    #[serde(default)]
-    pub size: Option<Size>,
+    pub size: Size,
 }
 
 impl InputSummary {
@@ -110,7 +109,7 @@ impl InputSummary {
             sh_degree: info.sh_degree,
             varying: info.varying.iter().map(|column| column.name().to_owned()).collect(),
             bytes: input.bytes()?,
-            size: Some(input.size()?),
+            size: input.size()?,
         })
     }
 }
@@ -202,15 +201,13 @@ pub struct Summary {
     /// From where it was looked at.
     pub cameras: CameraSummary,
     /// Last name of the output in files; its path as given on standard output.
-    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
     /// Gaussians in the output.
     pub gaussians: usize,
     /// Bytes of everything that a renderer opens of the output.
-    pub output_bytes: Option<u64>,
+    pub output_bytes: u64,
     /// The same by part.
-    #[serde(default)]
-    pub output_size: Option<Size>,
+    pub output_size: Size,
     /// Stages 1 and 2.
     pub selection: Counts,
     /// Full reads of the input that the plan named at most; none where nothing was planned.
@@ -227,16 +224,12 @@ pub struct Summary {
     /// Stage 3, unless it was left out.
     pub merge: Option<MergeSummary>,
     /// What its size was found by, if by a quality.
-    #[serde(default)]
     pub goal: Option<GoalSummary>,
     /// What half precision does to the field that is written; none where it was not asked for.
-    #[serde(default)]
     pub field: Option<FieldSummary>,
     /// What fewer bands of spherical harmonics do; none where they were not asked for or cannot be.
-    #[serde(default)]
     pub bands: Option<BandsSummary>,
     /// What refining gained; none where nothing was refined.
-    #[serde(default)]
     pub refined: Option<RefinedSummary>,
     /// What an archive is made of, if one was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -315,9 +308,7 @@ impl Summary {
         if let Some(bands) = self.bands.as_ref().filter(|bands| bands.sh_degree < input.sh_degree) {
             writeln!(out, "bands: SH degree {} of {}: {}", bands.sh_degree, input.sh_degree, bands.why())?;
         }
-        if let Some(sizes) = self.output_size.as_ref().zip(input.size.as_ref()) {
-            writeln!(out, "bytes: {}", sizes.0.parts_of(sizes.1))?;
-        }
+        writeln!(out, "bytes: {}", self.output_size.parts_of(&input.size))?;
         for left in &self.left_out {
             writeln!(out, "  left out: {} ({})", left.what, left.reason())?;
         }
@@ -327,14 +318,11 @@ impl Summary {
     /// Counts, bytes, decibels, notes, and where it lies.
     fn write_result(&self, out: &mut String, detail: Detail) -> std::fmt::Result {
         let input = &self.input;
-        let part = |of: usize, all: usize| 100.0 * of as f64 / all.max(1) as f64;
+        let percent = |part: u64, whole: u64| 100.0 * part as f64 / whole.max(1) as f64;
         let (kept, all) = (self.gaussians, input.gaussians);
-        writeln!(out, "kept    {kept} of {all} Gaussians ({:.1}%)", part(kept, all))?;
-        if let Some(bytes) = self.output_bytes {
-            let [after, before] = [bytes, input.bytes].map(|bytes| ByteSize(bytes).display().si().to_string());
-            let percent = 100.0 * bytes as f64 / input.bytes.max(1) as f64;
-            writeln!(out, "size    {after} of {before} ({percent:.1}%)")?;
-        }
+        writeln!(out, "kept    {kept} of {all} Gaussians ({:.1}%)", percent(kept as u64, all as u64))?;
+        let [after, before] = [self.output_bytes, input.bytes].map(|bytes| ByteSize(bytes).display().si().to_string());
+        writeln!(out, "size    {after} of {before} ({:.1}%)", percent(self.output_bytes, input.bytes))?;
         writeln!(out, "cost    {}", self.cost())?;
         if let Some(archive) = &self.archive {
             write!(out, "        its archive's pictures are {:.2} dB from those of the result before", archive.psnr)?;
@@ -347,9 +335,7 @@ impl Summary {
         let (seconds, peak) = self.taken();
         let memory = peak.map_or(String::new(), |bytes| format!(", at most {} MiB of memory", bytes >> 20));
         writeln!(out, "took    {}{memory}", duration(seconds))?;
-        if !self.output.is_empty() {
-            writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
-        }
+        writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
         let shown = match detail {
             Detail::All => self.notes.len(),
             Detail::Most => self.notes.len().min(NOTES),

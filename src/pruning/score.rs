@@ -41,8 +41,6 @@ pub fn scored_memory(limits: &Limits) -> Vec<MemoryPart> {
 /// The scoring of a run.
 #[derive(Debug, Clone)]
 pub struct ScoreStage {
-    /// Whether the scan reads what does not change again.
-    pub rereads: bool,
     /// Whether motion within rounding is taken as none.
     pub snap_noise: bool,
     /// What becomes of Gaussians with NaN or infinity.
@@ -81,8 +79,6 @@ pub struct Scored {
     pub reference: Reference,
     /// Distance between f32 values at the scene's largest coordinate: the noise floor of a position.
     pub position_ulp: f64,
-    /// Whether what does not change is read again all the same.
-    rereads: bool,
 }
 
 /// What the user knows better, before ids are resolved.
@@ -189,7 +185,6 @@ impl ScoreStage {
                 absent,
                 reference,
                 position_ulp,
-                rereads: self.rereads,
             };
             scored.write_down(scene, median_life, journal);
             progress.advance(info.count as u64);
@@ -339,10 +334,6 @@ impl Scored {
         } else {
             for column in Columns::all().difference(info.varying).iter() {
                 let why = format!("{} is the same in every frame", column.name());
-                if self.rereads {
-                    journal.notes.push(format!("{why}, and was read again as asked for (--reread)"));
-                    continue;
-                }
                 let again = (info.times.len() - 1) as u64 * info.count as u64;
                 let bytes = again * state_bytes(info.sh_degree, column);
                 journal.spare(constant(column), why, Saved::Values { bytes });

@@ -34,13 +34,6 @@ const MOST_STEPS: u32 = 1_000_000;
 /// Most merge passes. Every pass reads all frames.
 const MOST_PASSES: usize = 16;
 
-/// Parameters of earlier versions, by table and key, and why they went: recipes written beside results name all.
-const REMOVED: [(&str, &str, &str); 3] = [
-    ("score", "exact_percentiles", "as percentiles are always exact"),
-    ("refit", "refit_pictures", "as refine.refine = \"colour\" does more; its table goes with it"),
-    ("refit", "refit_ridge", "as refine.refine = \"colour\" does more; its table goes with it"),
-];
-
 /// All hyper-parameters; see `paper.toml` for the meaning of each.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -74,7 +67,6 @@ pub struct ScanParams {
     pub view_stride: NonZeroU32,
     pub frame_stride: NonZeroU32,
     pub look_pictures: usize,
-    pub reread: bool,
     pub non_finite: NonFinite,
 }
 
@@ -399,11 +391,6 @@ impl Recipe {
     /// `preset` (or `fallback`). The tables `[provenance]` and `[run]`, as written beside results, are not looked at.
     pub fn from_toml(text: &str, fallback: &str) -> std::result::Result<Recipe, String> {
         let over: toml::Table = toml::from_str(text).map_err(|e| e.to_string())?;
-        for (section, key, reason) in REMOVED {
-            if over.get(section).is_some_and(|table| table.get(key).is_some()) {
-                return Err(format!("{section}.{key} is no parameter any more, {reason}: delete its line"));
-            }
-        }
         let recipe: Recipe =
             over_preset(over, Some(fallback))?.try_into().map_err(|e: toml::de::Error| e.to_string())?;
         recipe.validate()?;
@@ -608,15 +595,6 @@ mod tests {
         let mut expected = Recipe::preset("paper").unwrap();
         expected.score.mu = 2.0;
         assert_eq!(recipe, expected);
-    }
-
-    #[test]
-    fn a_recipe_of_an_earlier_version_is_told_which_line_to_delete() {
-        for value in ["true", "false"] {
-            let text = format!("preset = \"paper\"\n[score]\nmu = 2.0\nexact_percentiles = {value}\n");
-            let message = Recipe::from_toml(&text, "default").unwrap_err();
-            assert!(message.contains("score.exact_percentiles") && message.contains("delete its line"), "{message}");
-        }
     }
 
     #[test]

@@ -25,4 +25,5 @@ mod tests;
 pub use anisotropy::fill_anisotropy;
 pub use noise::{Snapped, snap, ulp};
 pub use plan::ScanPlan;
+use scan::wanted;
 pub use scan::{BYTES_PER_GAUSSIAN, BlockScan, BlockStatistics, NEEDED};

@@ -14,7 +14,7 @@ use crate::passes::BLOCK;
 use crate::progress::Progress;
 use crate::source::{FrameSource, Ids};
 use crate::statistics::pass::blocks::BlockScans;
-use crate::statistics::{BlockScan, NEEDED, ScanPlan};
+use crate::statistics::{BlockScan, NEEDED, ScanPlan, wanted};
 
 /// What a scan gives.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -113,7 +113,7 @@ impl<'a> RunningScan<'a> {
                 let mut state = Gaussians::zeros(range.len(), info.sh_degree);
                 let mut reader = source.open(Ids::Range(range))?;
                 for (t, cameras) in cameras.iter().enumerate() {
-                    let changed = scan.wanted(first + t, info.varying);
+                    let changed = wanted(first + t, info.varying);
                     // The state is new, though the accumulators know what does not vary.
                     let want = if t == 0 { changed | NEEDED } else { changed };
                     reader.read(t, want, &mut state)?;
@@ -151,7 +151,7 @@ mod tests {
     use super::*;
     use crate::diagnostics::demo_scene::Scene;
     use crate::model::{Columns, SequenceInfo, Split};
-    use crate::recipe::{self, Recipe};
+    use crate::recipe::Recipe;
     use crate::source::BlockReader;
 
     /// A scene of which only positions vary, and what was asked of it.
@@ -184,16 +184,16 @@ mod tests {
     #[test]
     fn what_does_not_vary_is_read_once_and_reading_it_again_changes_no_bit() {
         let scene = Scene::new(1500, 5);
-        let info = SequenceInfo { varying: Columns::POSITION, ..scene.info().clone() };
+        let info = scene.info().clone();
         let schedule = scene.rig().schedule(&info.times, Some(Split::Train)).unwrap();
-        let asked = Asked { scene, info, reads: Mutex::default() };
-        let by = |reread: bool| {
-            let scan_recipe = recipe::ScanParams { reread, ..Recipe::preset("default").unwrap().scan };
-            let plan = ScanPlan::new(&scan_recipe, &asked.info.times, &schedule).unwrap();
+        let mut asked = Asked { scene, info, reads: Mutex::default() };
+        let mut by = |varying: Columns| {
+            asked.info.varying = varying;
+            let plan = ScanPlan::new(&Recipe::preset("default").unwrap().scan, &asked.info.times, &schedule).unwrap();
             let found = scan(&asked, &schedule, &plan).unwrap();
             (format!("{:?}", found.rows), found.alive_per_frame, std::mem::take(&mut *asked.reads.lock().unwrap()))
         };
-        let (skipping, everything) = (by(false), by(true));
+        let (skipping, everything) = (by(Columns::POSITION), by(Columns::all()));
         assert_eq!((&skipping.0, &skipping.1), (&everything.0, &everything.1));
         for (frame, want) in &skipping.2 {
             assert_eq!(*want, if *frame == 0 { Columns::all() } else { Columns::POSITION }, "frame {frame}");

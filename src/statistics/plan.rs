@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::error::{Error, Result};
-use crate::model::{Camera, Columns, Schedule};
+use crate::model::{Camera, Schedule};
 use crate::recipe::{MotionParams, ScanParams};
 
 /// Deviation of a time step from the mean step, as a fraction of it, up to which frames count as
@@ -26,7 +26,6 @@ pub(super) const PAIRS_PER_CARRY: usize = 1 << 12;
 pub struct ScanPlan {
     pub(super) alpha_min: f64,
     pub(super) motion: MotionParams,
-    reread: bool,
     /// Step into frame t in units of the mean step; empty when frames are even.
     pub(super) steps: Vec<f64>,
     pub(super) frames: usize,
@@ -85,7 +84,6 @@ impl ScanPlan {
         ScanPlan {
             alpha_min: scan.alpha_min,
             motion: scan.motion,
-            reread: scan.reread,
             steps: Vec::new(),
             frames: 0,
             pairs: 0,
@@ -96,11 +94,6 @@ impl ScanPlan {
     /// Whether this plan, which knows all frames, can finish a scan begun with `arriving`.
     pub fn finishes(&self, arriving: &ScanPlan) -> bool {
         *arriving == ScanPlan { frames: arriving.frames, pairs: arriving.pairs, ..self.clone() }
-    }
-
-    /// What is to be read of a frame: all of the first, then what is `varying`, unless everything is asked for.
-    pub fn wanted(&self, frame: usize, varying: Columns) -> Columns {
-        if frame == 0 || self.reread { Columns::all() } else { varying }
     }
 
     /// T, the number of frames.

@@ -25,6 +25,11 @@ const CARRY_BITS: u32 = 52;
 /// Columns a scan needs whatever the model; SH may be left out.
 pub const NEEDED: Columns = Columns::all().difference(Columns::SH);
 
+/// Returns the columns to read at `frame`: all of them at the first frame, the `varying` ones after it.
+pub(super) fn wanted(frame: usize, varying: Columns) -> Columns {
+    if frame == 0 { Columns::all() } else { varying }
+}
+
 /// The running statistics of consecutive Gaussians.
 pub struct BlockScan<'a> {
     plan: &'a ScanPlan,
@@ -76,11 +81,6 @@ impl<'a> BlockScan<'a> {
             touched: vec![0; len],
             alive_per_frame: Vec::with_capacity(plan.frames),
         }
-    }
-
-    /// See [`ScanPlan::wanted`].
-    pub fn wanted(&self, frame: usize, varying: Columns) -> Columns {
-        self.plan.wanted(frame, varying)
     }
 
     /// Adds frame `t` with the cameras that see it. `changed` names the columns that may differ from

@@ -328,7 +328,6 @@ def make_recipe(program):
     texts("recipe", whole, {
         "unknown": (first, first + "\nunknown = 1"),
         "twice": (first, first + "\n" + first),
-        "removed": (first, first + "\n[refit]\nrefit_ridge = 1"),
         "text": (first, "alpha_min = 'small'"),
         "negative": (first, "alpha_min = -1"),
         "not_a_number": (first, "alpha_min = nan"),

@@ -134,12 +134,8 @@ fn check_folder(target: &Path) -> Result<()> {
     let shown = target.shown();
     match Owner::read(&target.join(MARKER)) {
         Owner::Listed(_) => Ok(()),
-        Owner::Unlisted => Err(Error::usage(format!(
-            "{shown} is a result of a splatsieve that did not list its files yet, so nobody can tell what else is in \
-             it\n  --force replaces it with all that is in it; or give another output"
-        ))),
         Owner::Unknown => Err(Error::usage(format!(
-            "{shown} is not a result of splatsieve (no {MARKER} of its own), so --overwrite leaves it alone\n  \
+            "{shown} is not a result of splatsieve (no {MARKER} of its own that lists its files), so --overwrite leaves it alone\n  \
              --force replaces it with all that is in it; or give another output"
         ))),
     }

@@ -25,10 +25,8 @@ const MAX_SUMMARY: u64 = 16 << 20;
 /// Ownership that a summary declares.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Owner {
-    /// There is no summary, or it is another program's.
+    /// There is no summary that lists its files, or it is another program's.
     Unknown,
-    /// A result of this program from before summaries listed their files.
-    Unlisted,
     /// A result of this program with these files.
     Listed(BTreeSet<String>),
 }
@@ -37,7 +35,7 @@ pub(super) enum Owner {
 #[derive(Deserialize)]
 struct Declared {
     tool: String,
-    files: Option<BTreeSet<String>>,
+    files: BTreeSet<String>,
 }
 
 impl Owner {
@@ -58,9 +56,7 @@ impl Owner {
             return Owner::Unknown;
         }
         match serde_json::from_slice::<Declared>(&text) {
-            Ok(Declared { tool, files }) if tool.starts_with("splatsieve") => {
-                files.map_or(Owner::Unlisted, Owner::Listed)
-            }
+            Ok(Declared { tool, files }) if tool.starts_with("splatsieve") => Owner::Listed(files),
             _ => Owner::Unknown,
         }
     }

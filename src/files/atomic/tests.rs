@@ -124,12 +124,11 @@ fn overwrite_deletes_only_folders_this_program_wrote() {
     let home = base.path().join("home");
     put(&home.join("thesis.txt"), "years of work");
     assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("not a result of splatsieve"));
-    for foreign in ["{}", "[]", "no json", r#"{"tool": "another"}"#, r#"{"tool": 1}"#] {
+    let unlisted = r#"{"tool": "splatsieve 0.1.0"}"#;
+    for foreign in ["{}", "[]", "no json", r#"{"tool": "another"}"#, r#"{"tool": 1}"#, unlisted] {
         put(&home.join(MARKER), foreign);
         assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("not a result of splatsieve"), "{foreign}");
     }
-    put(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0"}"#);
-    assert!(refusal(&home, Kind::Folder, &[], Replace::Ours).contains("did not list its files"));
     check_target(&home, Kind::Folder, &[], Replace::Any).unwrap();
     put(&home.join(MARKER), r#"{"tool": "splatsieve 0.1.0", "files": ["summary.json"]}"#);
     check_target(&home, Kind::Folder, &[], Replace::Ours).unwrap();

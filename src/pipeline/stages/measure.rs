@@ -81,7 +81,6 @@ impl Measure {
             scan: ScanStage { recipe: recipe.scan.clone() },
             visible: Visible::from_recipe(&recipe.scan, has_cameras),
             score: ScoreStage {
-                rereads: recipe.scan.reread,
                 snap_noise: recipe.scan.snap_noise,
                 non_finite: recipe.scan.non_finite,
                 score: recipe.score.clone(),

@@ -8,7 +8,7 @@ use crate::model::{Camera, Columns, Gaussians, Rows, Schedule};
 use crate::passes::BLOCK;
 use crate::progress::Progress;
 use crate::source::{BlockReader, FrameSource, Ids};
-use crate::statistics::{BlockScan, ScanPlan};
+use crate::statistics::{BlockScan, ScanPlan, wanted};
 
 /// What the scans of all blocks share.
 pub(crate) struct BlockScans<'a> {
@@ -40,7 +40,7 @@ impl<'a> BlockScans<'a> {
 
     /// What may have changed since the frame before.
     pub(crate) fn changed(&self, frame: usize) -> Columns {
-        self.plan.wanted(frame, self.source.info().varying)
+        wanted(frame, self.source.info().varying)
     }
 
     pub(crate) fn begin(&self, block: usize) -> (BlockScan<'a>, Gaussians) {
