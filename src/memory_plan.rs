@@ -486,7 +486,7 @@ impl Plan {
         // Rounded up to what a person would write.
         let least = self.peak().div_ceil(1 << 20);
         let origin = if budget.bytes.is_none() { format!(" ({})", Budget::by_default().1) } else { String::new() };
-        Error::usage(format!(
+        Error::MemoryLimit(format!(
             "--memory {}{origin}: expected at least {least}MiB, which the stage \"{largest}\" takes for {} Gaussians{}\n  \
              give it that, or fewer --threads; --explain shows what takes how much",
             size(self.budget),

@@ -89,7 +89,8 @@ impl Damage {
 /// The bytes of an archive and of its parts.
 pub(super) fn write(sections: &Sections) -> Result<(Vec<u8>, ArchiveSize)> {
     let pack = |bytes: &[u8]| {
-        zstd::bulk::compress(bytes, LEVEL).map_err(|error| Error::usage(format!("cannot compress an archive: {error}")))
+        zstd::bulk::compress(bytes, LEVEL)
+            .map_err(|error| Error::internal(format!("cannot compress an archive: {error}")))
     };
     let (table, blobs) = (pack(&sections.table)?, pack(&sections.blobs)?);
     let stored = [&table, &sections.cloud, &sections.field, &blobs];

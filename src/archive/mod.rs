@@ -100,7 +100,7 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
     let mut bits = BTreeMap::new();
     let (shape, cloud, order) = cloud::encode(&content.cloud, &steps.cloud, &mut bits);
     // The positions that a reader will have.
-    let stored = cloud::decode(&shape, &cloud).ok_or_else(|| Error::usage("a cloud does not come back"))?;
+    let stored = cloud::decode(&shape, &cloud).ok_or_else(|| Error::internal("a cloud does not come back"))?;
     let readers = Readers { position: &stored.position, space: space(content), times: content.times };
     let entry = |(name, tensor): (&String, &Tensor)| {
         let role = content.field.get(name).copied().unwrap_or(Role::Unread);
@@ -126,7 +126,7 @@ pub fn encode(content: &Content, steps: &Steps) -> Result<Encoded> {
         blobs.extend(order.iter().map(|&id| content.beside[id as usize * width + at]));
     }
     content.files.values().for_each(|bytes| blobs.extend(bytes));
-    let table = serde_json::to_vec(&table).map_err(|error| Error::usage(error.to_string()))?;
+    let table = serde_json::to_vec(&table).map_err(|error| Error::internal(error.to_string()))?;
     let (bytes, parts) = file::write(&Sections { table, cloud, field, blobs })?;
     Ok(Encoded { bytes, parts, order, bits })
 }

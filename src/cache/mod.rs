@@ -26,7 +26,7 @@ use serde::de::DeserializeOwned;
 use crate::cache::dir::CacheDir;
 use crate::cache::entry::EntryName;
 use crate::cache::shard::MOST_PARTS;
-pub use crate::cache::shard::Shard;
+pub use crate::cache::shard::{Completion, Shard};
 use crate::error::{Error, Result};
 use crate::model::ranges;
 pub use folder::{Listed, clean, list, text};
@@ -141,11 +141,11 @@ impl Cache {
     /// Ends a run of a part before `stage`, which cannot be divided.
     ///
     /// # Errors
-    /// [`Error::Stopped`] in a run of a part.
+    /// [`Error::ShardDone`] in a run of a part.
     pub fn not_divided(&self, stage: &str) -> Result<()> {
         match self.part {
             None => Ok(()),
-            Some(part) => Err(Error::Stopped(format!(
+            Some(part) => Err(Error::ShardDone(format!(
                 "part {part}: nothing to do; what comes next, {stage}, is not divided: run without --part"
             ))),
         }
@@ -155,7 +155,7 @@ impl Cache {
     /// runs. However often they are cut, the same must come out.
     ///
     /// # Errors
-    /// Those of `compute` and `join`, and of the folder; [`Error::Stopped`] in a run of a part, which has computed it then
+    /// Those of `compute` and `join`, and of the folder; [`Error::ShardDone`] in a run of a part, which has computed it then
     /// if it was not there.
     pub fn divided<T: Serialize + DeserializeOwned, U: Serialize + DeserializeOwned>(
         &self,
@@ -220,7 +220,7 @@ impl Cache {
     /// All of `stage`, with which a run of its only part ends.
     fn complete<T>(&self, stage: &str, whole: T) -> Result<T> {
         match self.part {
-            Some(Shard::WHOLE) => Err(Error::Stopped(format!("{stage}: part {} is done; it is all", Shard::WHOLE))),
+            Some(Shard::WHOLE) => Err(Error::ShardDone(format!("{stage}: part {} is done; it is all", Shard::WHOLE))),
             _ => Ok(whole),
         }
     }
@@ -269,7 +269,7 @@ impl Cache {
             false => format!("{stage}: part {part} {done}; missing: {}", missing(&there, of)),
         };
         self.take_notes().iter().for_each(|note| said += &format!("\n  note: {note}"));
-        Err(Error::Stopped(said))
+        Err(Error::ShardDone(said))
     }
 
     /// Says that there are parts of `stage` that are none of this run's.

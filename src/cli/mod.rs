@@ -1,5 +1,4 @@
-//! Arguments and exit codes: 0 done, 1 failed, 2 misused, 128 + signal ended by one. Data on stdout, everything
-//! else on stderr.
+//! Arguments, streams and exit codes. Data goes to stdout, everything else to stderr; [`Error`] has the table of exit codes.
 
 mod args;
 mod cut_short;
@@ -20,7 +19,7 @@ use args::{
     SplitArg, Sweep, Trained, Verb, View,
 };
 use output::{print, print_as};
-use splatsieve::cache;
+use splatsieve::cache::{self, Completion};
 use splatsieve::commands::container::Storing;
 use splatsieve::commands::render::{RenderOptions, RenderSelection};
 use splatsieve::commands::video::{FilmPath, VideoOptions, places, video};
@@ -82,8 +81,6 @@ pub(crate) fn main() -> ExitCode {
             }
             ExitCode::SUCCESS
         }
-        // The part of the work that was asked for is done.
-        Err(Error::Stopped(what)) => print(&format!("{what}\n")).map_or_else(ended_by, |()| ExitCode::SUCCESS),
         Err(error) => ended_by(error),
     }
 }
@@ -99,11 +96,15 @@ fn ended_by(error: Error) -> ExitCode {
     }
     let error = as_named(error);
     tell(&format!("splatsieve: {error}"));
-    ExitCode::from(code_of(&error))
+    ExitCode::from(error.kind().exit_code())
 }
 
-fn code_of(error: &Error) -> u8 {
-    if matches!(error, Error::Usage(_)) { 2 } else { 1 }
+/// Returns the result of a whole run. Prints what a run of one part did, and returns `None`.
+fn whole<T>(completion: Completion<T>) -> Result<Option<T>> {
+    match completion {
+        Completion::Whole(found) => Ok(Some(found)),
+        Completion::Shard(done) => print(&format!("{done}\n")).map(|()| None),
+    }
 }
 
 fn run(cli: Cli) -> Result<()> {
@@ -127,7 +128,7 @@ fn run(cli: Cli) -> Result<()> {
                 return print_as(json, &if json { foreseen.json() } else { foreseen.text() });
             }
             let page = view_output.map(|output| view_of_result(&request, output)).transpose()?;
-            let summary = compress(&request)?;
+            let Some(summary) = whole(compress(&request)?)? else { return Ok(()) };
             let printed = print_as(json, &if json { summary.json() } else { summary.text(detail) });
             // The page was asked for, whether or not somebody reads the summary. That is what stdout is for.
             if let Some(page) = page {
@@ -155,7 +156,7 @@ fn run(cli: Cli) -> Result<()> {
                 return film(args, output);
             }
             let options = render_options(args)?;
-            let rendered = render::render(&options)?;
+            let Some(rendered) = whole(render::render(&options)?)? else { return Ok(()) };
             notes(&rendered.notes);
             let plural = if rendered.pictures == 1 { "" } else { "s" };
             print(&format!("{}: {} picture{plural}\n", options.output.shown(), rendered.pictures))
@@ -165,7 +166,7 @@ fn run(cli: Cli) -> Result<()> {
             let mut options =
                 EvaluateOptions { csv: args.csv, overwrite: args.earlier.replace(), ..evaluate_options(args.models) };
             options.original.work = work_of(args.kept);
-            let found = evaluation::evaluate(&options)?;
+            let Some(found) = whole(evaluation::evaluate(&options)?)? else { return Ok(()) };
             notes(&found.work_notes);
             print_as(as_json, &if as_json { json(&found) } else { found.text() })
         }
@@ -183,13 +184,14 @@ fn run(cli: Cli) -> Result<()> {
             let page = args.output.join(report::PAGE);
             let mut evaluate = evaluate_options(args.models);
             evaluate.original.work = work_of(args.kept);
-            let found = report::report(&ReportOptions {
+            let options = ReportOptions {
                 evaluate,
                 sweep: args.sweep,
                 precision: args.precision,
                 output: args.output,
                 overwrite: args.earlier.replace(),
-            })?;
+            };
+            let Some(found) = whole(report::report(&options)?)? else { return Ok(()) };
             notes(&found.work_notes);
             notes(&found.notes);
             print(&format!("{}\n{}\n", found.verdict, page.shown()))
@@ -219,6 +221,7 @@ fn run(cli: Cli) -> Result<()> {
             let mut input = input_options(args.input, Some(args.cameras), Some(&args.output));
             input.work = work_of(args.kept);
             let packed = container::pack(&input, &args.output, &storing, args.earlier.replace())?;
+            let Some(packed) = whole(packed)? else { return Ok(()) };
             notes(&packed.notes);
             print(&format!(
                 "{}: {} Gaussians x {} frames in {} bytes\n{}",
@@ -646,15 +649,4 @@ fn json(value: &impl serde::Serialize) -> String {
     let mut text = serde_json::to_string_pretty(value).expect("plain data");
     text.push('\n');
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_was_asked_wrongly_is_2_and_whatever_else_fails_is_1() {
-        assert_eq!(code_of(&Error::usage("no such frame")), 2);
-        assert_eq!(code_of(&Error::Unsound("motion far away".to_owned())), 1);
-    }
 }

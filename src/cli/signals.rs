@@ -11,6 +11,7 @@ pub(super) fn install() {
     use signal_hook::iterator::Signals;
     use signal_hook::low_level::exit;
 
+    use splatsieve::error::ErrorKind;
     use splatsieve::files::atomic::withdraw_all;
 
     let heeded = [SIGINT, SIGTERM, SIGHUP].into_iter().filter(|&signal| !is_ignored(signal));
@@ -19,7 +20,7 @@ pub(super) fn install() {
     let end = move || {
         if let Some(signal) = signals.forever().next() {
             let _withdrawn = withdraw_all();
-            exit(128 + signal);
+            exit(ErrorKind::Interrupted { signal: signal as u8 }.exit_code().into());
         }
     };
     let _ = std::thread::Builder::new().name("signals".to_owned()).spawn(end);

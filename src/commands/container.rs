@@ -10,7 +10,7 @@ use gseq::{Compression, Reader, RecoverReport, VerifyReport};
 use serde::Serialize;
 
 use crate::TOOL;
-use crate::cache::SpillWriter;
+use crate::cache::{Completion, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::container::Container;
@@ -79,7 +79,11 @@ impl Storing {
 ///
 /// # Errors
 /// What is wrong with the input; a bound of the extent of a stream, which is known at its end alone.
-pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
+pub fn pack(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Completion<Packed>> {
+    Completion::from_result(pack_whole(input, output, storing, overwrite))
+}
+
+fn pack_whole(input: &InputOptions, output: &Path, storing: &Storing, overwrite: Replace) -> Result<Packed> {
     check_container_name(output, "pack")?;
     check_target(output, Kind::File, &[&input.path], overwrite)?;
     let opened = match input.is_stream().then(|| open_stream(input)).transpose()? {

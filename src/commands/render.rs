@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use crate::TOOL;
-use crate::cache::{Spill, SpillWriter};
+use crate::cache::{Completion, Spill, SpillWriter};
 use crate::error::{Error, Result, ShowPath};
 use crate::files::atomic::{Kind, MARKER, Replace, StagedFile, StagedFolder, check_target};
 use crate::files::image::write::{ImageFormat, image_bytes, write_image};
@@ -72,7 +72,11 @@ pub struct Rendered {
 ///
 /// # Errors
 /// Whatever is wrong with input, cameras, choice or output. Nothing is left behind then.
-pub fn render(options: &RenderOptions) -> Result<Rendered> {
+pub fn render(options: &RenderOptions) -> Result<Completion<Rendered>> {
+    Completion::from_result(render_whole(options))
+}
+
+fn render_whole(options: &RenderOptions) -> Result<Rendered> {
     let output = options.output.as_path();
     let (kind, format) = match options.wanted {
         RenderSelection::All(format) => {

@@ -8,7 +8,7 @@ use crate::evaluation::baseline::prune_by;
 use crate::evaluation::cost::{Cost, Repeats};
 use crate::evaluation::found::Evaluation;
 use crate::evaluation::method::MethodKind;
-use crate::evaluation::{EvaluateOptions, evaluate};
+use crate::evaluation::{EvaluateOptions, evaluate_whole};
 use crate::files::atomic::Replace;
 use crate::model::Split;
 use crate::pipeline::{Request, Target, compress};
@@ -67,7 +67,7 @@ impl WholeRun<'_> {
     /// # Errors
     /// Those of `evaluate`.
     pub(crate) fn compared(&self, result: &Path) -> Result<Evaluation> {
-        evaluate(&EvaluateOptions {
+        evaluate_whole(&EvaluateOptions {
             original: trained(self.input),
             compressed: result.to_owned(),
             ground_truth: None,

@@ -20,7 +20,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::TOOL;
-use crate::cache::CacheKey;
+use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result, ShowPath};
 use crate::evaluation::found::{Both, Comparison, Evaluation, ImageScore, PictureScores, TruthComparison};
 use crate::files::atomic::{Kind, Replace, StagedFile, check_target};
@@ -68,7 +68,15 @@ pub struct EvaluateOptions {
 ///
 /// # Errors
 /// Whatever is wrong with inputs, cameras, pictures or output; models whose frames are not the same.
-pub fn evaluate(options: &EvaluateOptions) -> Result<Evaluation> {
+pub fn evaluate(options: &EvaluateOptions) -> Result<Completion<Evaluation>> {
+    Completion::from_result(evaluate_whole(options))
+}
+
+/// [`evaluate`] of a whole run, without parts.
+///
+/// # Errors
+/// Those of [`evaluate`].
+pub(crate) fn evaluate_whole(options: &EvaluateOptions) -> Result<Evaluation> {
     if let Some(csv) = &options.csv {
         check_target(csv, Kind::File, &options.inputs(), options.overwrite)?;
     }

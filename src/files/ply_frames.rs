@@ -118,7 +118,10 @@ impl PlyFrames {
     /// A frame beyond the last; a file that no longer is what it was when the frames were opened.
     pub fn frame(&self, frame: usize) -> Result<Ply> {
         let Some(path) = self.paths.get(frame) else {
-            return Err(Error::usage(format!("frame {frame} was asked for, of {} counted from 0", self.paths.len())));
+            return Err(Error::internal(format!(
+                "frame {frame} was asked for, of {} counted from 0",
+                self.paths.len()
+            )));
         };
         let ply = Ply::open_again(path, self.memory, self.texts[frame].as_ref())?;
         check_properties(&ply, &self.properties, &self.paths[0])?;

@@ -152,7 +152,7 @@ pub fn pack_stream(
         put(&mut held)?;
     }
     writer.finish()?;
-    reader.join().map_err(|_| Error::usage("the thread that reads standard input failed"))
+    reader.join().map_err(|_| Error::internal("the thread that reads standard input failed"))
 }
 
 /// Frames that are held together, which the container's tiles are made of: as many as fit [`HELD_BYTES`], from 1

@@ -63,7 +63,7 @@ impl<W: Write> StreamWriter<W> {
             let (len, width) = (self.header.count, column.width(self.header.sh_degree));
             if (values.len(), values.width()) != (len, width) {
                 let (name, found) = (column.name(), (values.len(), values.width()));
-                return Err(Error::usage(format!("{name}: {} x {} values, not {len} x {width}", found.0, found.1)));
+                return Err(Error::internal(format!("{name}: {} x {} values, not {len} x {width}", found.0, found.1)));
             }
             if cfg!(target_endian = "little") {
                 self.put(bytemuck::cast_slice(values.planes()))?;

@@ -102,7 +102,7 @@ impl RowTable<'_> {
             None => Ok(()),
             Some((name, values)) => {
                 let (len, rows) = (values.len(), self.rows.len());
-                Err(Error::usage(format!("column {name} has {len} values for {rows} Gaussians")))
+                Err(Error::internal(format!("column {name} has {len} values for {rows} Gaussians")))
             }
         }
     }

@@ -20,6 +20,7 @@ pub use record::{RecipeRecord, RunOptions};
 pub use request::{Goal, Only, Quality, Request, Target};
 
 use crate::TOOL;
+use crate::cache::Completion;
 use crate::compressed_model::CompressedModel;
 use crate::error::{Error, Result};
 use crate::files::names::name_of;
@@ -44,7 +45,11 @@ use summary::{CameraSummary, InputSummary, Summary};
 ///
 /// # Errors
 /// Whatever is wrong with input, cameras, recipe or output. Nothing is left behind then.
-pub fn compress(request: &Request) -> Result<Summary> {
+pub fn compress(request: &Request) -> Result<Completion<Summary>> {
+    Completion::from_result(compress_whole(request))
+}
+
+fn compress_whole(request: &Request) -> Result<Summary> {
     let mut journal = Journal::default();
     let plan = |outlook, work: &Workload| {
         let job = Job::within(request, outlook, work)?;

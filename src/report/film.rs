@@ -111,7 +111,7 @@ pub fn films(side: &ModelPair, shown: &[ShownImage]) -> Result<Vec<FilmPanel>> {
 
 /// A picture as a JPEG inside a URI.
 fn data_uri(image: &Image) -> Result<String> {
-    let bytes =
-        jpeg_bytes(image, QUALITY).map_err(|e: io::Error| Error::usage(format!("a picture cannot be shown: {e}")))?;
+    let bytes = jpeg_bytes(image, QUALITY)
+        .map_err(|e: io::Error| Error::internal(format!("a picture cannot be shown: {e}")))?;
     Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(bytes)))
 }

@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 
-use crate::cache::CacheKey;
+use crate::cache::{CacheKey, Completion};
 use crate::error::{Error, Result};
 use crate::evaluation;
 use crate::evaluation::{EvaluateOptions, ModelPair, RenderedViews};
@@ -73,7 +73,11 @@ pub struct ReportOptions {
 ///
 /// # Errors
 /// Whatever is wrong with inputs, cameras, pictures, sweep or output. Nothing is left behind then.
-pub fn report(options: &ReportOptions) -> Result<ReportData> {
+pub fn report(options: &ReportOptions) -> Result<Completion<ReportData>> {
+    Completion::from_result(report_whole(options))
+}
+
+fn report_whole(options: &ReportOptions) -> Result<ReportData> {
     let mut inputs = options.evaluate.inputs();
     inputs.extend(options.sweep.as_deref());
     inputs.extend(options.precision.as_deref());

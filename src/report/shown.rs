@@ -122,7 +122,7 @@ pub fn show(choice: &Choice, taken: &RenderedViews) -> Result<ShownImage> {
 /// A picture without pixels.
 pub fn data_uri(image: &Image) -> Result<String> {
     let bytes = image_bytes(image, ImageFormat::Png)
-        .map_err(|e: io::Error| Error::usage(format!("a picture cannot be shown: {e}")))?;
+        .map_err(|e: io::Error| Error::internal(format!("a picture cannot be shown: {e}")))?;
     Ok(format!("data:image/png;base64,{}", STANDARD.encode(bytes)))
 }
 

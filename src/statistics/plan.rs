@@ -55,7 +55,7 @@ impl ScanPlan {
             )));
         }
         if schedule.frames() != times.len() {
-            return Err(Error::usage(format!(
+            return Err(Error::internal(format!(
                 "the cameras are scheduled for {} frames, the sequence has {}",
                 schedule.frames(),
                 times.len()

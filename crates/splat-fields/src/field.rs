@@ -201,14 +201,14 @@ impl Field {
         out: &mut Deltas,
     ) -> Result<()> {
         if !time.is_finite() {
-            return Err(Error::usage(format!("a deformation field has no state at time {time}")));
+            return Err(Error::internal(format!("a deformation field has no state at time {time}")));
         }
         let want = want & self.config.active;
         if let Some(head) = self.heads.iter().find(|head| {
             head.column.is_some_and(|c| want.contains(c) && out.delta.column(c).width() != head.output.outputs)
         }) {
             let name = head.column.map_or("mask", Columns::name);
-            return Err(Error::usage(format!("the field deforms {} values of {name}", head.output.outputs)));
+            return Err(Error::internal(format!("the field deforms {} values of {name}", head.output.outputs)));
         }
         out.begin(prepared.rows, want, self.config.apply_rotation);
         let masked = !want.difference(Columns::ROTATION).is_empty();
@@ -223,7 +223,7 @@ impl Field {
         if let (None, PreparedInput::Planes(_)) | (Some(_), PreparedInput::Position(_)) =
             (&self.planes, &prepared.input)
         {
-            return Err(Error::usage("a block prepared by another field was given"));
+            return Err(Error::internal("a block prepared by another field was given"));
         }
         let time = time as f32;
         let lines = self.planes.as_ref().map_or(Vec::new(), |planes| planes.lines(time));

@@ -38,7 +38,7 @@ impl Field {
     /// A time that is not finite.
     pub fn jacobian(&self, raw: &Gaussians, time: f64, want: Columns) -> Result<Jacobian> {
         if !time.is_finite() {
-            return Err(Error::usage(format!("a deformation field has no state at time {time}")));
+            return Err(Error::internal(format!("a deformation field has no state at time {time}")));
         }
         let want = self.config.active & want;
         let mut found = Jacobian::default();

@@ -364,7 +364,7 @@ impl Network {
 fn finite(time: f64) -> Result<f32> {
     match time.is_finite() {
         true => Ok(time as f32),
-        false => Err(Error::usage(format!("a deformation network has no state at time {time}"))),
+        false => Err(Error::internal(format!("a deformation network has no state at time {time}"))),
     }
 }
 

@@ -105,7 +105,7 @@ impl FrameSource for Scene {
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         if let Some(beyond) = ids.iter().find(|&id| id >= self.info.count) {
-            return Err(Error::usage(format!("demo scene: no Gaussian {beyond}, it has {}", self.info.count)));
+            return Err(Error::internal(format!("demo scene: no Gaussian {beyond}, it has {}", self.info.count)));
         }
         let parts = ids.iter().map(|id| self.layout.part(id)).collect();
         Ok(Box::new(Reader { times: &self.info.times, parts }))
@@ -120,7 +120,7 @@ struct Reader<'a> {
 impl BlockReader for Reader<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let Some(&time) = self.times.get(frame) else {
-            return Err(Error::usage(format!("demo scene: no frame {frame}, it has {}", self.times.len())));
+            return Err(Error::internal(format!("demo scene: no frame {frame}, it has {}", self.times.len())));
         };
         out.resize(self.parts.len());
         let moving = want.intersects(Columns::POSITION | Columns::ROTATION | Columns::OPACITY);

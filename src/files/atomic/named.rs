@@ -83,7 +83,7 @@ pub(super) fn name_files(path: &Path, files: &[String]) -> Result<()> {
     let found: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
     // As text, for the other entries keep their order.
     let Some(entries) = text.trim_end().strip_suffix('}').filter(|_| found.is_object()) else {
-        return Err(Error::usage(format!(
+        return Err(Error::internal(format!(
             "{}: expected a JSON object to list files in, found {}",
             path.shown(),
             quoted(&text)

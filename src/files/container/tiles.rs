@@ -301,7 +301,7 @@ impl<'a> TileReader<'a> {
     fn check(&self, frame: usize) -> Result<()> {
         match frame < self.source.info.times.len() {
             true => Ok(()),
-            false => Err(Error::usage(format!("{}: there is no frame {frame}", self.source.path.shown()))),
+            false => Err(Error::internal(format!("{}: there is no frame {frame}", self.source.path.shown()))),
         }
     }
 }

@@ -345,7 +345,7 @@ pub(crate) fn check_ids(path: &Path, ids: &Ids<'_>, count: usize) -> Result<()> 
     match beyond {
         None => Ok(()),
         Some(id) => {
-            Err(Error::usage(format!("{}: Gaussian {id} was asked for, of {count} counted from 0", path.shown())))
+            Err(Error::internal(format!("{}: Gaussian {id} was asked for, of {count} counted from 0", path.shown())))
         }
     }
 }

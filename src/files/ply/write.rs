@@ -81,7 +81,7 @@ pub(crate) fn write_rows_like(
     template.check_unshrunk()?;
     if let Some(source) = sources.iter().find(|&&source| source as usize >= template.count()) {
         let (path, count) = (template.path().shown(), template.count());
-        return Err(Error::usage(format!("{path}: Gaussian {source} is to be kept, of {count} from 0")));
+        return Err(Error::internal(format!("{path}: Gaussian {source} is to be kept, of {count} from 0")));
     }
     let mut left: Vec<Range<usize>> = Vec::new();
     for property in template.properties().iter().filter(|property| name(&property.name).is_some()) {
@@ -113,7 +113,7 @@ pub(crate) fn write_rows_like(
 pub fn write_inria(gaussians: &Gaussians, comments: &[String], path: &Path) -> Result<()> {
     let width = gaussians.sh.width();
     if !(0..=HIGHEST_DEGREE).any(|degree| 3 * sh_coefficients(degree) == width) {
-        return Err(Error::usage(format!("{width} SH planes belong to no degree from 0 to 3")));
+        return Err(Error::internal(format!("{width} SH planes belong to no degree from 0 to 3")));
     }
     let rest = width - 3;
     let mut planes: Vec<&[f32]> = Vec::new();
@@ -230,17 +230,23 @@ fn check_rows(template: &Ply, rows: &[OutRow], proxies: &Gaussians, change: &Par
         let changes = change.0.column(column).len();
         if changes != rows.len() {
             let message = format!("{}: {changes} changes of {} rows", column.name(), rows.len());
-            return Err(Error::usage(message));
+            return Err(Error::internal(message));
         }
     }
     let planes = template.layout().planes(Columns::SH).len();
     if !proxies.is_empty() && proxies.sh.width() != planes {
         let width = proxies.sh.width();
-        return Err(Error::usage(format!("proxies have {width} SH planes, {} has {planes}", template.path().shown())));
+        return Err(Error::internal(format!(
+            "proxies have {width} SH planes, {} has {planes}",
+            template.path().shown()
+        )));
     }
     for row in rows {
         if let Some(proxy) = row.proxy.filter(|&proxy| proxy as usize >= proxies.len()) {
-            return Err(Error::usage(format!("proxy {proxy} is to be written, of {} counted from 0", proxies.len())));
+            return Err(Error::internal(format!(
+                "proxy {proxy} is to be written, of {} counted from 0",
+                proxies.len()
+            )));
         }
     }
     Ok(())

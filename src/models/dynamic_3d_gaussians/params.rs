@@ -138,7 +138,7 @@ impl FrameSource for Params {
 
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         if let Some(id) = ids.iter().find(|&id| id >= self.info.count) {
-            return Err(Error::usage(format!("Gaussian {id} was asked for, of {}", self.info.count)));
+            return Err(Error::internal(format!("Gaussian {id} was asked for, of {}", self.info.count)));
         }
         Ok(Box::new(TrajectoryBlock { params: self, ids: ids.iter().collect() }))
     }
@@ -159,7 +159,7 @@ impl BlockReader for TrajectoryBlock<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         let Params { info, means, rotations, colours, log_scales, opacities, states, .. } = self.params;
         if frame >= info.times.len() {
-            return Err(Error::usage(format!("frame {frame} was asked for, of {}", info.times.len())));
+            return Err(Error::internal(format!("frame {frame} was asked for, of {}", info.times.len())));
         }
         means.check()?;
         states.add(self.ids.len() as u64);

@@ -220,7 +220,7 @@ impl InputModel for ModelFolder {
                 }
             }
             OutputKind::Ply => self.write_cloud(reduction, path)?,
-            OutputKind::Archive => return Err(Error::usage("an archive is made of a content")),
+            OutputKind::Archive => return Err(Error::internal("an archive is made of a content")),
             _ => notes.extend(write_sequence(&*self.reduced(reduction)?, kind, path, limits.frames_held)?),
         }
         Ok(notes)

@@ -121,7 +121,7 @@ impl<L: MotionModel> MotionModelFrames<L> {
 
     fn time_of(&self, frame: usize) -> Result<f64> {
         let times = &self.info.times;
-        let missing = || Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len()));
+        let missing = || Error::internal(format!("frame {frame} was asked for; the sequence has {}", times.len()));
         times.get(frame).copied().ok_or_else(missing)
     }
 }
@@ -156,7 +156,7 @@ impl<L: MotionModel> FrameSource for MotionModelFrames<L> {
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         let count = self.info.count;
         if let Some(id) = ids.iter().find(|&id| id >= count) {
-            return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
+            return Err(Error::internal(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let rows: Vec<u32> = ids.iter().map(|id| id as u32).collect();
         let blocks = rows.chunks(BLOCK).map(|rows| PreparedBlock::new(self.law(), self.raw.pick(rows))).collect();

@@ -209,7 +209,9 @@ impl Control {
                     colour: of(Columns::SH, &of_nodes.colour),
                 };
             }
-            (PreparedNodes::Shares(_), None) => return Err(Error::usage("a block prepared by another law was given")),
+            (PreparedNodes::Shares(_), None) => {
+                return Err(Error::internal("a block prepared by another law was given"));
+            }
         }
         Ok(motion)
     }

@@ -195,7 +195,7 @@ impl ModelFolder {
 
     fn time_of(&self, frame: usize) -> Result<f64> {
         let times = &self.info.times;
-        let missing = || Error::usage(format!("frame {frame} was asked for; the sequence has {}", times.len()));
+        let missing = || Error::internal(format!("frame {frame} was asked for; the sequence has {}", times.len()));
         times.get(frame).copied().ok_or_else(missing)
     }
 
@@ -217,7 +217,7 @@ impl FrameSource for ModelFolder {
     fn open(&self, ids: Ids<'_>) -> Result<Box<dyn BlockReader + '_>> {
         let count = self.info.count;
         if let Some(id) = ids.iter().find(|&id| id >= count) {
-            return Err(Error::usage(format!("Gaussian {id} was asked for; the model has {count}")));
+            return Err(Error::internal(format!("Gaussian {id} was asked for; the model has {count}")));
         }
         let mut raw = Gaussians::zeros(ids.len(), self.info.sh_degree);
         for column in Columns::all().iter() {
