@@ -6,7 +6,7 @@
 //!
 //! | folders | what is in them |
 //! |---|---|
-//! | crates [`gseq`], `splat-core`, `splat-render`, `splat-fields` | the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
+//! | crates `splat-platform`, [`gseq`], `splat-core`, `splat-render`, `splat-fields` | what differs between systems; the container; Gaussians, cameras and errors ([`model`], [`error`]); the rasterizer and image metrics ([`render`], [`metrics`]); deformation fields ([`deform`]) |
 //! | [`limits`], [`machine`], [`recipe`], [`compressed_model`], [`source`] | memory limits, parameters of a run, what is left of a model, and how frames are read |
 //! | [`archive`], [`fit`] | the codec of `.gsz` archives; curves fitted to the states of a Gaussian |
 //! | [`files`], [`cache`] | file formats, reader beside writer; atomic outputs; results that stages keep |

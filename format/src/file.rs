@@ -22,7 +22,6 @@ use crate::error::{Error, Fault, Result};
 pub(crate) const PIECE: usize = 1 << 16;
 
 /// Bytes about a page that is touched which the system may map with it, as Linux does.
-#[cfg(unix)]
 const AROUND: u64 = 1 << 16;
 
 pub(crate) struct MappedFile {
@@ -56,15 +55,9 @@ impl MappedFile {
         self.map.len() as u64
     }
 
-    /// Fills `out` from `offset`. Never touches the map on Unix, where a file may shrink under it;
-    /// elsewhere the system forbids that.
+    /// Fills `out` from `offset`. Never touches the map, under which a file may shrink.
     pub(crate) fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<()> {
-        #[cfg(unix)]
-        let read = std::os::unix::fs::FileExt::read_exact_at(&self.file, out, offset);
-        #[cfg(not(unix))]
-        let read =
-            self.in_place(offset, out.len() as u64).map(|bytes| out.copy_from_slice(bytes)).map_err(io::Error::other);
-        read.map_err(|error| match error.kind() {
+        splat_platform::read_exact_at(&self.file, out, offset).map_err(|error| match error.kind() {
             io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),
             _ => Error::io("read", &self.path)(error),
         })
@@ -95,19 +88,13 @@ impl MappedFile {
         }
     }
 
-    /// Tells the system that the bytes of `range` will be read soon.
-    #[cfg(unix)]
+    /// Tells the system that the bytes of `range` will be read soon. Where the system does not listen, reading just waits
+    /// for the disk.
     pub(crate) fn expect(&self, range: std::ops::Range<u64>) {
         if !range.is_empty() {
-            let len = (range.end - range.start) as usize;
-            // Advice: where it is not taken, reading just waits for the disk.
-            _ = self.map.advise_range(memmap2::Advice::WillNeed, range.start as usize, len);
+            splat_platform::expect_pages(&self.map, range.start as usize..range.end as usize);
         }
     }
-
-    /// Elsewhere the system is left to guess.
-    #[cfg(not(unix))]
-    pub(crate) fn expect(&self, _range: std::ops::Range<u64>) {}
 
     /// Brings the bytes of `range` from the disk, and waits for them. Nothing of them stays in this process.
     pub(crate) fn fetch(&self, range: std::ops::Range<u64>, piece: &mut Vec<u8>) -> Result<()> {
@@ -115,40 +102,19 @@ impl MappedFile {
     }
 
     /// Whether reading the byte at `offset` would not wait for the disk; none where the system does not tell.
-    #[cfg(target_os = "linux")]
     pub(crate) fn is_cached(&self, offset: u64) -> Option<bool> {
-        use rustix::io::{Errno, ReadWriteFlags, preadv2};
-        let mut byte = [0];
-        match preadv2(&self.file, &mut [io::IoSliceMut::new(&mut byte)], offset, ReadWriteFlags::NOWAIT) {
-            Ok(read) => Some(read == 1),
-            Err(Errno::AGAIN) => Some(false),
-            Err(_) => None,
-        }
-    }
-
-    /// Elsewhere nobody knows.
-    #[cfg(not(target_os = "linux"))]
-    pub(crate) fn is_cached(&self, _offset: u64) -> Option<bool> {
-        None
+        splat_platform::is_cached(&self.file, offset)
     }
 
     /// Gives the pages of `range`, and those that came with them, back to the system: they no longer count as this
     /// process's memory. Whoever still reads them in place reads them from the file again.
-    #[cfg(unix)]
     pub(crate) fn release(&self, range: std::ops::Range<u64>) {
         let (start, end) = (range.start.saturating_sub(AROUND), range.end.saturating_add(AROUND).min(self.len()));
         if !range.is_empty() && start < end {
-            let (start, len) = (start as usize, (end - start) as usize);
-            // SAFETY: the advice drops what was written to private pages. The map is read-only and backed by the file,
-            // so every page that is dropped comes back with the file's bytes: slices of it stay valid. The range lies
-            // within the map. A refusal leaves the pages where they are.
-            _ = unsafe { self.map.unchecked_advise_range(memmap2::UncheckedAdvice::DontNeed, start, len) };
+            // SAFETY: the map is that of a file, and the range lies within it.
+            unsafe { splat_platform::release_pages(&self.map, start as usize..end as usize) };
         }
     }
-
-    /// Elsewhere the system takes pages back when it needs them.
-    #[cfg(not(unix))]
-    pub(crate) fn release(&self, _range: std::ops::Range<u64>) {}
 
     fn too_short(&self, offset: u64, len: u64) -> Error {
         let now = self.file.metadata().map_or(0, |metadata| metadata.len());

@@ -364,11 +364,8 @@ fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Makes a rename last through a power failure. Elsewhere than on Unix folders cannot be synced.
+/// Makes a rename last through a power failure, where the system can.
 fn sync_folder(path: &Path) -> Result<()> {
-    if cfg!(unix) {
-        let folder = folder_of(path);
-        File::open(folder).and_then(|folder| folder.sync_all()).map_err(Error::io("sync", folder))?;
-    }
-    Ok(())
+    let folder = folder_of(path);
+    splat_platform::sync_folder(folder).map_err(Error::io("sync", folder))
 }

@@ -2,11 +2,11 @@
 
 use std::fs::File;
 use std::io::{self, Write as _};
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::Serialize;
+use splat_platform::read_exact_at;
 
 use crate::cache::entry::EntryWriter;
 use crate::error::{Error, Result};
@@ -44,7 +44,7 @@ impl Spill {
     /// A failed read; the end of the file.
     pub fn read(&self, start: u64, bytes: &mut [u8]) -> Result<()> {
         READ_BACK.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        self.file.read_exact_at(bytes, self.start + start).map_err(Error::io("read back values from", &self.at))
+        read_exact_at(&self.file, bytes, self.start + start).map_err(Error::io("read back values from", &self.at))
     }
 
     /// Reads into `bytes` what [`SpillWriter::write_record`] wrote at `start`; gives where the next one is.

@@ -1,7 +1,6 @@
 //! Arguments, streams and exit codes. Data goes to stdout, everything else to stderr; [`Error`] has the table of exit codes.
 
 mod args;
-mod cut_short;
 mod help;
 mod output;
 mod recipe_flags;
@@ -66,7 +65,6 @@ pub(crate) fn main() -> ExitCode {
     };
     // Before anything is begun.
     signals::install();
-    cut_short::install();
     Progress::set_mode(if cli.quiet { Mode::Quiet } else { Mode::Auto });
     let explains = cli.verb.explains();
     let result = run(cli);

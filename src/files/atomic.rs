@@ -10,7 +10,6 @@
 //! output to a character device or FIFO is written into it.
 
 mod destination;
-mod handle;
 mod leftovers;
 mod named;
 mod publish;
@@ -18,7 +17,7 @@ mod stream;
 mod warnings;
 mod workspace;
 
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result, ShowPath};
@@ -314,16 +313,16 @@ pub fn as_named(error: Error) -> Error {
     }
 }
 
-/// Writes a file or the list of names of a folder through to the disk.
+/// Writes a file through to the disk.
 fn sync(path: &Path) -> Result<()> {
-    File::open(path).and_then(|file| file.sync_all()).map_err(Error::io("sync", path))
+    splat_platform::sync_file(path).map_err(Error::io("sync", path))
 }
 
 fn sync_tree(folder: &Path) -> Result<()> {
     for path in entries(folder)?.iter().map(|entry| folder.join(entry)) {
         if path.is_dir() { sync_tree(&path)? } else { sync(&path)? }
     }
-    sync(folder)
+    splat_platform::sync_folder(folder).map_err(Error::io("sync", folder))
 }
 
 #[cfg(test)]

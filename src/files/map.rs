@@ -3,12 +3,13 @@
 //! In: a path. Out: its bytes as a slice. Memory: mapped pages count as memory of this process until they are released,
 //! so readers report what they touched ([`FileMap::touched`]) and at most some 2 MiB of a map stay resident.
 
-use std::fs::{self, File, Metadata};
+use std::fs::File;
 use std::ops::{Deref, Range};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use memmap2::{Mmap, MmapOptions};
+use splat_platform::{FileIdentity, FileStatus, release_pages};
 
 use super::open::open_file;
 use crate::error::{Error, Result};
@@ -23,7 +24,7 @@ const AROUND: usize = 1 << 16;
 pub(crate) struct FileMap {
     path: PathBuf,
     /// None for a scratch file, which nobody else can reach.
-    identity: Option<Identity>,
+    identity: Option<FileIdentity>,
     map: Mmap,
     /// Bytes touched since the pages were last released, and the end of the last touched range.
     resident: AtomicUsize,
@@ -37,7 +38,7 @@ impl FileMap {
     /// A file that is not regular, or cannot be opened or mapped.
     pub(crate) fn open(path: &Path) -> Result<FileMap> {
         let file = open_file(path)?;
-        let identity = Identity::of(&file.metadata().map_err(Error::io("read the size of", path))?);
+        let identity = FileStatus::from_file(&file).map_err(Error::io("read the size of", path))?.identity;
         // SAFETY: the map is read-only and private to this value. The bytes must not change while it
         // lives: the user promises not to write to a model that is being read, and this program never
         // writes in place (outputs are renamed over, which leaves a mapped file's pages alone).
@@ -59,7 +60,7 @@ impl FileMap {
         Ok(FileMap::new(path, None, map))
     }
 
-    fn new(path: &Path, identity: Option<Identity>, map: Mmap) -> FileMap {
+    fn new(path: &Path, identity: Option<FileIdentity>, map: Mmap) -> FileMap {
         let (resident, last_end) = (AtomicUsize::new(0), AtomicUsize::new(0));
         FileMap { path: path.to_owned(), identity, map, resident, last_end }
     }
@@ -68,12 +69,12 @@ impl FileMap {
     /// that is read. A file that was replaced or removed meanwhile is fine: the map keeps the old one.
     pub(crate) fn check(&self) -> Result<()> {
         let Some(identity) = &self.identity else { return Ok(()) };
-        match fs::metadata(&self.path) {
-            Ok(now) if Identity::of(&now) == *identity && now.len() < self.map.len() as u64 => Err(Error::input(
+        match FileStatus::from_path(&self.path) {
+            Ok(now) if now.identity == *identity && now.length < self.map.len() as u64 => Err(Error::input(
                 &self.path,
                 "end of file",
                 format!("{} bytes, as when it was opened", self.map.len()),
-                format!("{} bytes", now.len()),
+                format!("{} bytes", now.length),
             )
             .hint("the file was cut short while it was being read; start again when nothing writes to it")),
             _ => Ok(()),
@@ -106,17 +107,10 @@ impl FileMap {
     }
 
     /// Gives the pages of the map back to the system.
-    #[cfg(unix)]
     fn release(&self) {
-        // SAFETY: the advice drops what was written to private pages. The map is read-only and backed by the file, so
-        // every dropped page comes back with the file's bytes: slices of it stay valid. A refusal leaves the pages
-        // where they are.
-        _ = unsafe { self.map.unchecked_advise(memmap2::UncheckedAdvice::DontNeed) };
+        // SAFETY: the map is that of a file; a scratch file keeps its bytes, too.
+        unsafe { release_pages(&self.map, 0..self.map.len()) };
     }
-
-    /// Elsewhere the system takes pages back when it needs them.
-    #[cfg(not(unix))]
-    fn release(&self) {}
 }
 
 impl Deref for FileMap {
@@ -126,33 +120,10 @@ impl Deref for FileMap {
     }
 }
 
-/// What tells a file from another one that took its name: device and inode.
-#[cfg(unix)]
-#[derive(Debug, PartialEq)]
-struct Identity(u64, u64);
-
-#[cfg(unix)]
-impl Identity {
-    fn of(metadata: &Metadata) -> Identity {
-        use std::os::unix::fs::MetadataExt;
-        Identity(metadata.dev(), metadata.ino())
-    }
-}
-
-/// Elsewhere a mapped file can be neither removed nor cut, so that any file of that name is it.
-#[cfg(not(unix))]
-#[derive(Debug, PartialEq)]
-struct Identity;
-
-#[cfg(not(unix))]
-impl Identity {
-    fn of(_: &Metadata) -> Identity {
-        Identity
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

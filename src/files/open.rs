@@ -3,9 +3,11 @@
 //! Opening a named pipe waits for its writer, a device such as `/dev/zero` never ends, and reading one may have side
 //! effects. Every reader of a file that a user names opens it here.
 
-use std::fs::{self, File, FileType, OpenOptions};
+use std::fs::{self, File, FileType};
 use std::io::{self, Read};
 use std::path::Path;
+
+use splat_platform::{FileKind, open_without_waiting};
 
 use crate::error::{Error, Result};
 
@@ -17,15 +19,8 @@ pub(crate) fn open_file(path: &Path) -> Result<File> {
     // Checked before opening, because opening a device may have side effects, and after it, because the file may have
     // been replaced between the two.
     check_regular(path, fs::metadata(path).map_err(Error::io("open", path))?.file_type())?;
-    let mut options = OpenOptions::new();
-    options.read(true);
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::OpenOptionsExt;
-        // A named pipe that takes the place of the file must not be waited for. Regular files ignore the flag.
-        options.custom_flags(libc::O_NONBLOCK);
-    }
-    let file = options.open(path).map_err(Error::io("open", path))?;
+    // A named pipe that takes the place of the file must not be waited for.
+    let file = open_without_waiting(path).map_err(Error::io("open", path))?;
     check_regular(path, file.metadata().map_err(Error::io("open", path))?.file_type())?;
     Ok(file)
 }
@@ -55,31 +50,17 @@ pub(crate) fn read_small(path: &Path, most_bytes: u64, what: &str) -> Result<Vec
 }
 
 /// Refuses a file of another kind than a regular one.
-fn check_regular(path: &Path, kind: FileType) -> Result<()> {
-    if kind.is_file() {
-        return Ok(());
-    }
-    if kind.is_dir() {
-        return Err(Error::io("open", path)(io::ErrorKind::IsADirectory.into()));
-    }
-    Err(Error::input(path, "", "a regular file", name_of(kind))
+fn check_regular(path: &Path, found: FileType) -> Result<()> {
+    let kind = match FileKind::from_type(found) {
+        FileKind::File => return Ok(()),
+        FileKind::Folder => return Err(Error::io("open", path)(io::ErrorKind::IsADirectory.into())),
+        FileKind::Fifo => "a named pipe",
+        FileKind::Socket => "a socket",
+        FileKind::CharacterDevice | FileKind::BlockDevice => "a device",
+        FileKind::Link | FileKind::Other => "another kind of file",
+    };
+    Err(Error::input(path, "", "a regular file", kind)
         .hint("copy its content into a file and give that; a frame stream is read from standard input, given as -"))
-}
-
-#[cfg(unix)]
-fn name_of(kind: FileType) -> &'static str {
-    use std::os::unix::fs::FileTypeExt;
-    match kind {
-        kind if kind.is_fifo() => "a named pipe",
-        kind if kind.is_socket() => "a socket",
-        kind if kind.is_char_device() || kind.is_block_device() => "a device",
-        _ => "another kind of file",
-    }
-}
-
-#[cfg(not(unix))]
-fn name_of(_: FileType) -> &'static str {
-    "another kind of file"
 }
 
 #[cfg(test)]

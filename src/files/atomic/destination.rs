@@ -1,8 +1,9 @@
 //! Kinds of outputs, what may be replaced, and what lies at an output path.
 
 use std::fs;
-use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
+
+use splat_platform::{FileKind, is_system_folder};
 
 use super::named::{MARKER, Owner, entries, is_our_file, parts};
 use crate::error::{Error, Result, ShowPath};
@@ -59,27 +60,21 @@ pub(super) fn destination(target: &Path) -> Result<Destination> {
         Err(_) if is_link => return refuse("a link to nothing, which is not replaced"),
         Err(error) => return Err(Error::io("examine", target)(error)),
     };
-    if found.is_char_device() || found.is_fifo() {
-        return Ok(Destination::Stream);
-    }
-    if found.is_file() {
+    match FileKind::from_type(found) {
+        FileKind::CharacterDevice | FileKind::Fifo => Ok(Destination::Stream),
         // Standard output that is redirected to a file: replacing the link would replace a file of the system.
-        return match is_link && leads_through_system_link(target) {
-            true => refuse("a link of the system, which is not replaced"),
-            false => Ok(Destination::File),
-        };
+        FileKind::File if is_link && leads_through_system_link(target) => {
+            refuse("a link of the system, which is not replaced")
+        }
+        FileKind::File => Ok(Destination::File),
+        FileKind::Folder if is_link => Ok(Destination::FolderLink),
+        FileKind::Folder => Ok(Destination::Folder),
+        FileKind::Socket => refuse("a socket, which cannot be written"),
+        FileKind::BlockDevice | FileKind::Link | FileKind::Other => refuse("a block device, which is not replaced"),
     }
-    if found.is_dir() {
-        return Ok(if is_link { Destination::FolderLink } else { Destination::Folder });
-    }
-    refuse(if found.is_socket() {
-        "a socket, which cannot be written"
-    } else {
-        "a block device, which is not replaced"
-    })
 }
 
-/// Whether `target` or a link that it leads to lies in `/dev` or `/proc`, as `/dev/stdout` does.
+/// Whether `target` or a link that it leads to lies in a folder of the system, as `/dev/stdout` does.
 fn leads_through_system_link(target: &Path) -> bool {
     let mut link = target.to_owned();
     // Linux follows at most 40 links.
@@ -87,7 +82,7 @@ fn leads_through_system_link(target: &Path) -> bool {
         let Ok((parent, name)) = parts(&link) else { return false };
         let Ok(parent) = fs::canonicalize(parent) else { return false };
         let Ok(leads_to) = fs::read_link(parent.join(name)) else { return false };
-        if (parent.starts_with("/dev") && !parent.starts_with("/dev/shm")) || parent.starts_with("/proc") {
+        if is_system_folder(&parent) {
             return true;
         }
         link = parent.join(leads_to);

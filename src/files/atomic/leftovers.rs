@@ -6,9 +6,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
+use splat_platform::FolderHandle;
 
 use super::destination::{Kind, Replace, check_replace};
-use super::handle::Handle;
 use super::named::{MARKER, carry_foreign, parts};
 use super::warnings::warn;
 use super::workspace::{
@@ -45,7 +45,7 @@ impl PublishLock {
             if let Some(workspace) = made {
                 return Ok(PublishLock { _workspace: workspace });
             }
-            let folder = Handle::open(&parent).map_err(Error::io("open", &parent))?;
+            let folder = FolderHandle::open(&parent).map_err(Error::io("open", &parent))?;
             match Leftover::take(&folder, &name) {
                 Ok(leftover) => leftover.remove(&folder),
                 Err(_) if start.elapsed() > LONGEST_WAIT => {
@@ -79,7 +79,7 @@ pub(super) struct Journal {
 /// Never fails: what cannot be repaired stays, with a warning.
 pub(super) fn tidy(target: &Path) {
     let Ok((path, name)) = parts(target) else { return };
-    let Ok(parent) = Handle::open(&path) else { return };
+    let Ok(parent) = FolderHandle::open(&path) else { return };
     let entries = parent.entries().unwrap_or_default();
     let left = |name: &OsStr| entries.iter().filter(|entry| is_workspace(entry, name)).collect::<Vec<_>>();
     if left(name).iter().any(|entry| parent.open_folder(entry).is_ok_and(|folder| is_unfinished(&folder))) {
@@ -100,7 +100,7 @@ pub(super) fn tidy(target: &Path) {
 
 /// Removes what killed runs left in `folder` of files whose names end with `ending`.
 pub fn remove_leftovers(folder: &Path, ending: &str) {
-    let Ok(parent) = Handle::open(folder) else { return };
+    let Ok(parent) = FolderHandle::open(folder) else { return };
     for entry in parent.entries().unwrap_or_default() {
         let is_ours = target_name(&entry).is_some_and(|name| name.ends_with(ending));
         let leftover = if is_ours { Leftover::take(&parent, &entry).ok() } else { None };
@@ -116,7 +116,7 @@ pub fn remove_leftovers(folder: &Path, ending: &str) {
 /// must not complete it over that result.
 pub(super) fn repair(target: &Path, supersedes: bool) {
     let Ok((path, name)) = parts(target) else { return };
-    let Ok(parent) = Handle::open(&path) else { return };
+    let Ok(parent) = FolderHandle::open(&path) else { return };
     for entry in parent.entries().unwrap_or_default().iter().filter(|entry| is_workspace(entry, name)) {
         if !parent.open_folder(entry).is_ok_and(|folder| is_unfinished(&folder)) {
             continue;
@@ -131,7 +131,7 @@ pub(super) fn repair(target: &Path, supersedes: bool) {
 
 /// Takes an unfinished workspace while this run holds the [`PublishLock`]. No run that goes on has one then, except after
 /// a failure and just before its end, so a lock on it is another run looking at it for a moment.
-fn take_unfinished(parent: &Handle, name: &OsStr) -> Option<Leftover> {
+fn take_unfinished(parent: &FolderHandle, name: &OsStr) -> Option<Leftover> {
     let start = Instant::now();
     loop {
         match Leftover::take(parent, name) {
@@ -147,7 +147,7 @@ fn take_unfinished(parent: &Handle, name: &OsStr) -> Option<Leftover> {
 /// Files of a journal get their names. An earlier folder gets its name back if no other entry has it; otherwise entries
 /// that its summary does not list are moved into the new folder. If that is refused, for example because a folder belongs
 /// to another user, the earlier folder is kept beside the result under a visible name.
-pub(super) fn settle(folder: &Handle, parent: &Handle, target: &Path) -> Result<()> {
+pub(super) fn settle(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let (_, name) = parts(target)?;
     if folder.has(JOURNAL) {
         complete(folder, parent, target)?;
@@ -191,7 +191,7 @@ pub(super) fn settle(folder: &Handle, parent: &Handle, target: &Path) -> Result<
 }
 
 /// Gives the remaining files of a journal their names.
-fn complete(folder: &Handle, parent: &Handle, target: &Path) -> Result<()> {
+fn complete(folder: &FolderHandle, parent: &FolderHandle, target: &Path) -> Result<()> {
     let failed = |error| Error::io("complete the interrupted output of", target)(error);
     let (_, name) = parts(target)?;
     let mut text = Vec::new();

@@ -7,12 +7,12 @@ use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::io::{self, Read as _};
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
-use super::handle::Handle;
-use crate::error::{Error, Result, ShowPath, quoted};
 use serde::Deserialize;
+use splat_platform::{FolderHandle, open_without_waiting};
+
+use crate::error::{Error, Result, ShowPath, quoted};
 
 /// The file by which a folder is known as this program's: a JSON object whose `tool` names it. Its `files` are the
 /// result's own; [`super::StagedFolder::commit`] and [`super::commit_files`] enter them.
@@ -42,8 +42,7 @@ impl Owner {
     /// Reads the summary at `path`; a link to a summary counts as one.
     pub(super) fn read(path: &Path) -> Owner {
         // Opening a FIFO would wait for its writer.
-        let opened = File::options().read(true).custom_flags(libc::O_NONBLOCK).open(path);
-        opened.map_or(Owner::Unknown, Owner::read_file)
+        open_without_waiting(path).map_or(Owner::Unknown, Owner::read_file)
     }
 
     /// Reads the summary in `file`.
@@ -117,7 +116,7 @@ pub(super) fn files_below(folder: &Path) -> Result<Vec<String>> {
 ///
 /// Entries that cannot be moved stay, and the first failure is returned. May be repeated after it was interrupted at
 /// any point: every entry is always in exactly one of both folders.
-pub(super) fn carry_foreign(old: &Handle, new: &Path) -> io::Result<()> {
+pub(super) fn carry_foreign(old: &FolderHandle, new: &Path) -> io::Result<()> {
     let listed = match old.open_file(MARKER, false).map(Owner::read_file) {
         Ok(Owner::Listed(listed)) => listed,
         _ => BTreeSet::new(),
@@ -136,7 +135,7 @@ pub(super) fn carry_foreign(old: &Handle, new: &Path) -> io::Result<()> {
 /// folders that hold no listed file and do not exist in `new`. Folders that cannot be read are skipped; the first failure
 /// is returned.
 fn find_foreign(
-    folder: &Handle,
+    folder: &FolderHandle,
     new: &Path,
     inside: &Path,
     listed: &BTreeSet<String>,

@@ -1,11 +1,12 @@
 //! Publication: finished outputs get their names, one run at a time for each name.
 
 use std::ffi::OsString;
-use std::fs::{self, File};
+use std::fs;
 use std::path::Path;
 
+use splat_platform::{FolderHandle, sync_file, sync_folder};
+
 use super::destination::{Kind, Replace, check_replace};
-use super::handle::Handle;
 use super::leftovers::{Journal, PublishLock, repair, settle};
 use super::named::{parts, present};
 use super::warnings::warn;
@@ -52,7 +53,7 @@ fn write_journal(workspace: &Workspace, files: &[(String, &Path)], replace: Repl
     let text = serde_json::to_vec(&journal).expect("plain data");
     // Under another name until it is complete.
     let (begun, path) = (workspace.folder.join("journal-begun"), workspace.folder.join(JOURNAL));
-    let written = fs::write(&begun, text).and_then(|()| File::open(&begun)?.sync_all());
+    let written = fs::write(&begun, text).and_then(|()| sync_file(&begun));
     let written = written.and_then(|()| fs::rename(&begun, &path)).and_then(|()| workspace.sync());
     written.map_err(|error| {
         let _ = fs::remove_file(&path);
@@ -82,7 +83,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
         return Err(Error::io("write", target)(error));
     }
     let (parent, _) = parts(target)?;
-    let handles = Handle::open(&workspace.folder).and_then(|folder| Ok((folder, Handle::open(&parent)?)));
+    let handles = FolderHandle::open(&workspace.folder).and_then(|folder| Ok((folder, FolderHandle::open(&parent)?)));
     let settled =
         handles.map_err(Error::io("open", &parent)).and_then(|(folder, parent)| settle(&folder, &parent, target));
     if let Err(error) = settled {
@@ -101,7 +102,7 @@ pub(super) fn publish_folder(workspace: &Workspace, target: &Path, replace: Repl
 /// Writes the name of a published output through to the disk. A failure is a warning: the output is in place.
 fn sync_parent(target: &Path) {
     let Ok((parent, _)) = parts(target) else { return };
-    if let Err(error) = File::open(&parent).and_then(|folder| folder.sync_all()) {
+    if let Err(error) = sync_folder(&parent) {
         warn(format!(
             "{} is complete and in place, but its name could not be written through to the disk ({error}): a power failure \
              may lose it",

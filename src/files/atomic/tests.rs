@@ -1,3 +1,5 @@
+use std::fs::File;
+
 use super::*;
 
 fn put(path: &Path, text: &str) {
@@ -179,7 +181,7 @@ fn leftovers_of_killed_runs_go_and_those_of_running_ones_stay() {
     // A run of which this process knows nothing but its lock, as of one in another container.
     let runs = left_behind(base.path(), "alive");
     let lock = File::open(runs.join("lock")).unwrap();
-    fs4::FileExt::lock(&lock).unwrap();
+    lock.lock().unwrap();
     put(&runs.join("content"), "half");
     // Somebody else's, whatever they are called.
     // A folder without the line in its lock is foreign.

@@ -11,16 +11,14 @@
 
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, Read as _, Write as _};
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use fs4::{FileExt, TryLockError};
+use splat_platform::{FileIdentity, FolderHandle, create_private_folder, private_permissions};
 
-use super::handle::{Handle, Identity};
 use super::named::{parts, present};
 use crate::error::{Error, Result};
 
@@ -47,9 +45,9 @@ const UNFINISHED: [&str; 3] = [REPLACED, REPLACED_WHOLE, JOURNAL];
 
 /// Workspaces of this process. A thread that publishes a result holds the guard, so that a signal is handled either before
 /// the result has its name or after.
-static LIVE: Mutex<BTreeMap<PathBuf, Identity>> = Mutex::new(BTreeMap::new());
+static LIVE: Mutex<BTreeMap<PathBuf, FileIdentity>> = Mutex::new(BTreeMap::new());
 
-pub(super) fn live() -> MutexGuard<'static, BTreeMap<PathBuf, Identity>> {
+pub(super) fn live() -> MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>> {
     // The map is consistent even if a thread panicked beside it.
     LIVE.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -58,7 +56,7 @@ pub(super) fn live() -> MutexGuard<'static, BTreeMap<PathBuf, Identity>> {
 #[derive(Debug)]
 pub(super) struct Workspace {
     pub(super) folder: PathBuf,
-    identity: Identity,
+    identity: FileIdentity,
     /// `None` on a file system without locks.
     lock: Option<File>,
 }
@@ -73,13 +71,13 @@ impl Workspace {
         loop {
             // Held until the folder is listed, so that a signal handler knows of it.
             let mut live = live();
-            let made = tempfile::Builder::new()
-                .prefix(&prefix)
-                .suffix(ENDING)
-                // Private, by which [`Leftover::take`] knows it even before the line is in its lock file.
-                .permissions(fs::Permissions::from_mode(0o700))
-                .tempdir_in(&parent);
-            let made = made.map_err(Error::io("create a folder in", &parent))?;
+            let mut builder = tempfile::Builder::new();
+            builder.prefix(&prefix).suffix(ENDING);
+            // Private, by which [`Leftover::take`] knows it even before the line is in its lock file.
+            if let Some(private) = private_permissions() {
+                builder.permissions(private);
+            }
+            let made = builder.tempdir_in(&parent).map_err(Error::io("create a folder in", &parent))?;
             let claimed = claim(made.path()).map_err(Error::io("create a lock in", made.path()))?;
             if let Some(workspace) = claimed {
                 let _ = made.keep();
@@ -93,8 +91,8 @@ impl Workspace {
     pub(super) fn with_name(parent: &Path, name: &OsStr) -> io::Result<Option<Workspace>> {
         let folder = parent.join(name);
         let mut live = live();
-        match rustix::fs::mkdir(&folder, rustix::fs::Mode::RWXU) {
-            Err(rustix::io::Errno::EXIST) => return Ok(None),
+        match create_private_folder(&folder) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return Ok(None),
             made => made?,
         }
         let claimed = claim(&folder);
@@ -124,7 +122,7 @@ impl Workspace {
         if let Some(lock) = &self.lock {
             lock.sync_all()?;
         }
-        Handle::open(&self.folder)?.sync()
+        FolderHandle::open(&self.folder)?.sync()
     }
 }
 
@@ -148,7 +146,7 @@ pub(super) fn publishing_name(name: &OsStr) -> OsString {
 }
 
 /// Whether a workspace holds an earlier folder or a journal, which must be dealt with before it is removed.
-pub(super) fn is_unfinished(folder: &Handle) -> bool {
+pub(super) fn is_unfinished(folder: &FolderHandle) -> bool {
     UNFINISHED.iter().any(|name| folder.has(name))
 }
 
@@ -197,7 +195,9 @@ pub(super) fn named_in(path: &Path) -> Option<(PathBuf, bool)> {
 
 /// While this value exists, the process neither publishes nor removes an output; see [`withdraw_all`].
 #[must_use = "runs go on as soon as this is dropped"]
-pub struct Withdrawn(#[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, Identity>>);
+pub struct Withdrawn(
+    #[allow(dead_code, reason = "held, not read")] MutexGuard<'static, BTreeMap<PathBuf, FileIdentity>>,
+);
 
 /// Removes everything that this process has begun and not published, for a process that is about to end.
 ///
@@ -228,7 +228,7 @@ fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
         io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists => Ok(None),
         _ => Err(error),
     };
-    let handle = match Handle::open(folder) {
+    let handle = match FolderHandle::open(folder) {
         Ok(handle) => handle,
         Err(error) => return lost(error),
     };
@@ -236,7 +236,7 @@ fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
         Ok(file) => file,
         Err(error) => return lost(error),
     };
-    let lock = match FileExt::try_lock(&file) {
+    let lock = match file.try_lock() {
         Err(TryLockError::WouldBlock) => return Ok(None),
         // Whoever removes a workspace unlinks its lock file before releasing the lock. A lock file that still has its name
         // stays, and its folder with it.
@@ -252,7 +252,7 @@ fn claim(folder: &Path) -> io::Result<Option<Workspace>> {
 /// Workspace whose run has ended, with its lock.
 pub(super) struct Leftover {
     name: OsString,
-    pub(super) folder: Handle,
+    pub(super) folder: FolderHandle,
     lock: File,
 }
 
@@ -267,14 +267,12 @@ pub(super) enum Refusal {
 
 impl Leftover {
     /// Takes the workspace `name` in `parent` if this program created it for this user and its run has ended.
-    pub(super) fn take(parent: &Handle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
+    pub(super) fn take(parent: &FolderHandle, name: &OsStr) -> std::result::Result<Leftover, Refusal> {
         let foreign = |_: io::Error| Refusal::Foreign;
         let folder = parent.open_folder(name).map_err(foreign)?;
         let status = folder.status().map_err(foreign)?;
-        // SAFETY: the call takes no arguments and cannot fail.
-        let is_own = status.owner == unsafe { libc::geteuid() };
         // A network file system may release this process's own lock when the lock file is opened a second time.
-        if !is_own || live().values().any(|&identity| identity == status.identity) {
+        if !status.is_own || live().values().any(|&identity| identity == status.identity) {
             return Err(Refusal::Foreign);
         }
         let mut lock = match folder.open_file(LOCK, true) {
@@ -287,7 +285,7 @@ impl Leftover {
                 return Err(Refusal::Foreign);
             }
         };
-        match FileExt::try_lock(&lock) {
+        match lock.try_lock() {
             Ok(()) => (),
             Err(TryLockError::WouldBlock) => return Err(Refusal::Busy),
             Err(TryLockError::Error(_)) => return Err(Refusal::Foreign),
@@ -302,16 +300,16 @@ impl Leftover {
     }
 
     /// Removes the workspace. What cannot be removed stays and does no harm.
-    pub(super) fn remove(self, parent: &Handle) {
+    pub(super) fn remove(self, parent: &FolderHandle) {
         empty(&self.folder, Some(self.lock));
         let _ = parent.remove_empty(&self.name);
     }
 }
 
 /// Removes the workspace at `folder` if it is still the one with this identity.
-fn dismantle(folder: &Path, identity: Identity, lock: Option<File>) {
+fn dismantle(folder: &Path, identity: FileIdentity, lock: Option<File>) {
     let Ok((parent, name)) = parts(folder) else { return };
-    let Ok(parent) = Handle::open(&parent) else { return };
+    let Ok(parent) = FolderHandle::open(&parent) else { return };
     let Ok(handle) = parent.open_folder(name) else { return };
     if handle.status().is_ok_and(|status| status.identity == identity) {
         empty(&handle, lock);
@@ -321,7 +319,7 @@ fn dismantle(folder: &Path, identity: Identity, lock: Option<File>) {
 
 /// Removes everything in a workspace, its lock file last and before the lock is released: a run that gets the lock
 /// afterwards sees that its file is gone.
-fn empty(folder: &Handle, lock: Option<File>) {
+fn empty(folder: &FolderHandle, lock: Option<File>) {
     for entry in folder.entries().unwrap_or_default().iter().filter(|entry| *entry != LOCK) {
         let _ = folder.remove(entry);
     }

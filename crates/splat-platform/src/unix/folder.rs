@@ -5,44 +5,33 @@ use std::fs::File;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStringExt;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use rustix::fs::{AtFlags, CWD, Dir, FileType, Mode, OFlags};
 
-/// Device and inode: equal for two paths exactly if both name the same file or folder.
-pub(super) type Identity = (u64, u64);
+use crate::{FileIdentity, FolderStatus};
 
 /// An open folder. Names are relative to it and links are never followed.
 #[derive(Debug)]
-pub(super) struct Handle(OwnedFd);
+pub struct FolderHandle(OwnedFd);
 
-/// Owner, permissions and identity of a folder.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Status {
-    pub(super) identity: Identity,
-    /// User id of the owner.
-    pub(super) owner: u32,
-    /// Whether group and others may neither read nor write.
-    pub(super) is_private: bool,
-}
-
-impl Handle {
+impl FolderHandle {
     /// Opens the folder at `path`, or the folder that a link at `path` leads to.
-    pub(super) fn open(path: &Path) -> io::Result<Handle> {
+    pub fn open(path: &Path) -> io::Result<FolderHandle> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
-        Ok(Handle(rustix::fs::open(path, flags, Mode::empty())?))
+        Ok(FolderHandle(rustix::fs::open(path, flags, Mode::empty())?))
     }
 
     /// Opens the folder `name` in this folder. A link is an error.
-    pub(super) fn open_folder(&self, name: impl AsRef<OsStr>) -> io::Result<Handle> {
+    pub fn open_folder(&self, name: impl AsRef<OsStr>) -> io::Result<FolderHandle> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
-        Ok(Handle(rustix::fs::openat(&self.0, name.as_ref(), flags, Mode::empty())?))
+        Ok(FolderHandle(rustix::fs::openat(&self.0, name.as_ref(), flags, Mode::empty())?))
     }
 
     /// Opens the regular file `name` for reading and, if asked for, writing. Anything else is an error; a FIFO does
     /// not block.
-    pub(super) fn open_file(&self, name: &str, writes: bool) -> io::Result<File> {
+    pub fn open_file(&self, name: &str, writes: bool) -> io::Result<File> {
         let access = if writes { OFlags::RDWR } else { OFlags::RDONLY };
         let flags = access | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
         let file = File::from(rustix::fs::openat(&self.0, name, flags, Mode::empty())?);
@@ -53,26 +42,34 @@ impl Handle {
     }
 
     /// Creates the file `name`; an entry of that name is an error.
-    pub(super) fn create_file(&self, name: &str) -> io::Result<File> {
+    pub fn create_file(&self, name: &str) -> io::Result<File> {
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::CLOEXEC;
         Ok(File::from(rustix::fs::openat(&self.0, name, flags, Mode::RUSR | Mode::WUSR)?))
     }
 
     /// Whether the entry `name` is the open file `file`.
-    pub(super) fn names_file(&self, name: &str, file: &File) -> bool {
+    pub fn names_file(&self, name: &str, file: &File) -> bool {
         // Opening the file once more could release a lock on it, on network file systems.
         let named = rustix::fs::statat(&self.0, name, AtFlags::SYMLINK_NOFOLLOW);
         let open = rustix::fs::fstat(file);
         named.is_ok_and(|named| open.is_ok_and(|open| (named.st_dev, named.st_ino) == (open.st_dev, open.st_ino)))
     }
 
-    pub(super) fn status(&self) -> io::Result<Status> {
+    /// Identity, owner and permissions of this folder.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub fn status(&self) -> io::Result<FolderStatus> {
         let found = File::from(self.0.try_clone()?).metadata()?;
-        Ok(Status { identity: (found.dev(), found.ino()), owner: found.uid(), is_private: found.mode() & 0o077 == 0 })
+        Ok(FolderStatus {
+            identity: FileIdentity::from_metadata(&found),
+            is_own: found.uid() == rustix::process::geteuid().as_raw(),
+            is_private: found.mode() & 0o077 == 0,
+        })
     }
 
     /// Names of all entries, sorted.
-    pub(super) fn entries(&self) -> io::Result<Vec<OsString>> {
+    pub fn entries(&self) -> io::Result<Vec<OsString>> {
         let mut names = Vec::new();
         for entry in Dir::read_from(&self.0)? {
             let name = entry?.file_name().to_bytes().to_owned();
@@ -85,18 +82,18 @@ impl Handle {
     }
 
     /// Whether an entry has this name, a link to nothing included.
-    pub(super) fn has(&self, name: impl AsRef<OsStr>) -> bool {
+    pub fn has(&self, name: impl AsRef<OsStr>) -> bool {
         rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW).is_ok()
     }
 
     /// Whether the entry is a folder and not a link to one.
-    pub(super) fn has_folder(&self, name: impl AsRef<OsStr>) -> bool {
+    pub fn has_folder(&self, name: impl AsRef<OsStr>) -> bool {
         let found = rustix::fs::statat(&self.0, name.as_ref(), AtFlags::SYMLINK_NOFOLLOW);
         found.is_ok_and(|found| FileType::from_raw_mode(found.st_mode) == FileType::Directory)
     }
 
     /// Renames the entry `from` to `name` in `to`.
-    pub(super) fn rename(&self, from: impl AsRef<OsStr>, to: &Handle, name: impl AsRef<OsStr>) -> io::Result<()> {
+    pub fn rename(&self, from: impl AsRef<OsStr>, to: &FolderHandle, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::renameat(&self.0, from.as_ref(), &to.0, name.as_ref())?)
     }
 
@@ -104,7 +101,7 @@ impl Handle {
     ///
     /// The system moves a folder to another parent only if the folder itself is writable. A read-only folder of this
     /// user is made writable for the moment of its move.
-    pub(super) fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
+    pub fn move_to(&self, from: &Path, to: &Path) -> io::Result<()> {
         let moved = || rustix::fs::renameat(&self.0, from, CWD, to);
         let refused = match moved() {
             Err(error) if is_denied(error) && self.has_folder(from) => error,
@@ -121,7 +118,7 @@ impl Handle {
     /// Removes the entry `name`, a folder with everything in it. A link is removed, its target is not.
     ///
     /// Read-only folders of this user are made writable first.
-    pub(super) fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
+    pub fn remove(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         let name = name.as_ref();
         if !self.has_folder(name) {
             return Ok(rustix::fs::unlinkat(&self.0, name, AtFlags::empty())?);
@@ -141,12 +138,12 @@ impl Handle {
     }
 
     /// Removes the empty folder `name`; anything else is an error and stays.
-    pub(super) fn remove_empty(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
+    pub fn remove_empty(&self, name: impl AsRef<OsStr>) -> io::Result<()> {
         Ok(rustix::fs::unlinkat(&self.0, name.as_ref(), AtFlags::REMOVEDIR)?)
     }
 
     /// Writes the folder's list of names through to the disk.
-    pub(super) fn sync(&self) -> io::Result<()> {
+    pub fn sync(&self) -> io::Result<()> {
         Ok(rustix::fs::fsync(&self.0)?)
     }
 }

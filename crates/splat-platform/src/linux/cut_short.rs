@@ -2,11 +2,19 @@
 //!
 //! Readers compare lengths before they touch a map, but the file may shrink between the two. The kernel then sends SIGBUS
 //! to the thread that touches the missing page. Nothing can be read on, so the handler says which file it was and ends the
-//! process with code 1. It withdraws nothing: what was begun under a temporary name is removed by the next run.
+//! process with code 1. It removes no files: what was begun under a temporary name is removed by the next run.
 
-/// Installs the handler for this process.
-#[cfg(target_os = "linux")]
-pub(super) fn install() {
+use std::sync::OnceLock;
+
+use crate::CutShortMessage;
+
+/// Text of the handler, set before the handler is installed.
+static MESSAGE: OnceLock<CutShortMessage> = OnceLock::new();
+
+/// From now on touching a page of a mapped file that has been cut short writes `message` with the path of the file to
+/// standard error and ends the process with code 1. The first message stays.
+pub fn report_cut_short_maps(message: CutShortMessage) {
+    MESSAGE.get_or_init(|| message);
     let mut action: libc::sigaction = unsafe {
         // SAFETY: all fields of `sigaction` are integers, or pointers that may be null.
         std::mem::zeroed()
@@ -18,35 +26,29 @@ pub(super) fn install() {
     unsafe { libc::sigaction(libc::SIGBUS, &action, std::ptr::null_mut()) };
 }
 
-/// Other systems do not tell a process which file a page is of.
-#[cfg(not(target_os = "linux"))]
-pub(super) fn install() {}
-
-#[cfg(target_os = "linux")]
 extern "C" fn handler(signal: i32, info: *mut libc::siginfo_t, _: *mut libc::c_void) {
     // SAFETY: the kernel passes a valid `siginfo_t` to a handler installed with SA_SIGINFO, and for SIGBUS with this code
-    // it holds the address. sigaction, raise, write and _exit are async-signal-safe.
+    // it holds the address. signal, raise, write and _exit are async-signal-safe, and so is reading MESSAGE, one atomic
+    // load.
     unsafe {
-        if (*info).si_code != libc::BUS_ADRERR {
+        let message = MESSAGE.get().filter(|_| (*info).si_code == libc::BUS_ADRERR);
+        let Some(message) = message else {
             libc::signal(signal, libc::SIG_DFL);
             libc::raise(signal);
             return;
-        }
+        };
         let mut path = [0; PATH_BYTES];
         let length = path_of((*info).si_addr() as usize, &mut path);
-        write(b"splatsieve: ");
-        write(if length == 0 { b"an input file" } else { &path[..length] });
-        write(b", end of file: expected the bytes that were there when it was opened, found fewer\n");
-        write(b"  the file was cut short while it was being read; start again when nothing writes to it\n");
+        write(message.before.as_bytes());
+        write(if length == 0 { message.unknown_path.as_bytes() } else { &path[..length] });
+        write(message.after.as_bytes());
         libc::_exit(1);
     }
 }
 
 /// Longest path that the message shows.
-#[cfg(target_os = "linux")]
 const PATH_BYTES: usize = 1024;
 
-#[cfg(target_os = "linux")]
 fn write(bytes: &[u8]) {
     // SAFETY: the pointer and length are those of a slice. A short write loses a part of the message.
     unsafe { libc::write(libc::STDERR_FILENO, bytes.as_ptr().cast(), bytes.len()) };
@@ -55,7 +57,6 @@ fn write(bytes: &[u8]) {
 /// Writes the path of the file that is mapped at `address` to `path` and returns its length; 0 if it is not known.
 ///
 /// Reads `/proc/self/maps` with open and read alone, which are async-signal-safe, and allocates nothing.
-#[cfg(target_os = "linux")]
 fn path_of(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
     // SAFETY: the name ends with a zero byte.
     let file = unsafe { libc::open(c"/proc/self/maps".as_ptr(), libc::O_RDONLY | libc::O_CLOEXEC) };
@@ -84,7 +85,6 @@ fn path_of(address: usize, path: &mut [u8; PATH_BYTES]) -> usize {
 }
 
 /// A line of `/proc/self/maps`, `START-END MODE OFFSET DEVICE INODE PATH`, read byte by byte.
-#[cfg(target_os = "linux")]
 struct MapsLine {
     range: [usize; 2],
     /// Number of separators before the path that have passed: one dash and five runs of blanks.
@@ -94,7 +94,6 @@ struct MapsLine {
     length: usize,
 }
 
-#[cfg(target_os = "linux")]
 impl MapsLine {
     fn new() -> MapsLine {
         MapsLine { range: [0; 2], field: 0, after_blank: false, length: 0 }
@@ -126,7 +125,6 @@ impl MapsLine {
     }
 }
 
-#[cfg(target_os = "linux")]
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,0 +1,209 @@
+//! Memory that this process may take, and has taken.
+//!
+//! Read from files below a root folder, `/` outside tests: `/proc` and the control groups.
+
+use std::fs;
+use std::path::{Component, Path, PathBuf};
+
+use crate::{LimitSource, MemoryLimit, MemoryLimits};
+
+/// Physical memory of the machine, the limits of the control group of this process and of the groups around it, and the
+/// limits that `ulimit` sets for the process. Empty where the system tells nothing.
+pub fn memory_limits() -> MemoryLimits {
+    limits_under(Path::new("/"))
+}
+
+fn limits_under(root: &Path) -> MemoryLimits {
+    let read = |path: &Path| fs::read_to_string(root.join(path.strip_prefix("/").unwrap_or(path))).ok();
+    let mut around = Vec::from_iter(machine_limit(&read));
+    add_groups(&read, &mut around);
+    MemoryLimits { around, own: process_limits(&read) }
+}
+
+fn machine_limit(read: &impl Fn(&Path) -> Option<String>) -> Option<MemoryLimit> {
+    let info = read(Path::new("/proc/meminfo"))?;
+    let total = info.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let kibibytes: u64 = total.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(MemoryLimit { bytes: kibibytes.saturating_mul(1024), source: LimitSource::Machine })
+}
+
+/// Adds the limits of the control group of this process and of every group around it that is in sight: all of them hold.
+fn add_groups(read: &impl Fn(&Path) -> Option<String>, limits: &mut Vec<MemoryLimit>) {
+    let (Some(memberships), Some(mounts)) =
+        (read(Path::new("/proc/self/cgroup")), read(Path::new("/proc/self/mountinfo")))
+    else {
+        return;
+    };
+    for membership in memberships.lines() {
+        // Number, controllers (none in version 2), path.
+        let mut fields = membership.splitn(3, ':').skip(1);
+        let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else { continue };
+        let (kind, files): (&str, &[&str]) = match controllers {
+            "" => ("cgroup2", &["memory.max", "memory.high"]),
+            some if some.split(',').any(|controller| controller == "memory") => ("cgroup", &["memory.limit_in_bytes"]),
+            _ => continue,
+        };
+        for mount in
+            mounts.lines().filter_map(Mount::from_line).filter(|mount| mount.kind == kind && mount.limits_memory)
+        {
+            for folder in mount.folder_of(path).ancestors().take_while(|folder| folder.starts_with(&mount.point)) {
+                for file in files.iter().map(|file| folder.join(file)) {
+                    let bytes = read(&file).and_then(|text| text.trim().parse().ok());
+                    limits.extend(bytes.map(|bytes| MemoryLimit { bytes, source: LimitSource::ControlGroup(file) }));
+                }
+            }
+        }
+    }
+}
+
+/// Mount of a tree of control groups, or of a part of one.
+struct Mount {
+    /// The part's path in the tree.
+    root: PathBuf,
+    point: PathBuf,
+    /// The type of file system.
+    kind: String,
+    /// Whether groups of this tree limit memory. Some trees of version 1 do not.
+    limits_memory: bool,
+}
+
+impl Mount {
+    /// Parses a line of mountinfo: numbers, device, root, point, options, then after a dash type, source, options.
+    fn from_line(line: &str) -> Option<Mount> {
+        let (before, behind) = line.split_once(" - ")?;
+        let mut before = before.split(' ').skip(3);
+        let mut behind = behind.split(' ');
+        let path = |text: &str| PathBuf::from(text.replace("\\040", " "));
+        let (root, point, kind) = (path(before.next()?), path(before.next()?), behind.next()?.to_owned());
+        let options = behind.nth(1).unwrap_or("");
+        let limits_memory = kind == "cgroup2" || options.split(',').any(|option| option == "memory");
+        Some(Mount { root, point, kind, limits_memory })
+    }
+
+    /// Returns the folder of the group `path`, or the mount point if the group is not in the mounted part.
+    fn folder_of(&self, path: &str) -> PathBuf {
+        let inside = Path::new(path).strip_prefix(&self.root).unwrap_or(Path::new(""));
+        // Relative to the root of a namespace that this process is outside of.
+        if inside.components().any(|component| component == Component::ParentDir) {
+            return self.point.clone();
+        }
+        self.point.join(inside)
+    }
+}
+
+fn process_limits(read: &impl Fn(&Path) -> Option<String>) -> Vec<MemoryLimit> {
+    let text = read(Path::new("/proc/self/limits")).unwrap_or_default();
+    let soft = |name: &str, source| {
+        let soft = text.lines().find_map(|line| line.strip_prefix(name)?.split_whitespace().next())?;
+        Some(MemoryLimit { bytes: soft.parse().ok()?, source })
+    };
+    let limits = [soft("Max address space", LimitSource::AddressSpace), soft("Max data size", LimitSource::DataSize)];
+    limits.into_iter().flatten().collect()
+}
+
+/// Largest resident memory of this process so far in bytes, mapped pages included (`VmHWM`). `None` if the system does not
+/// tell.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let status = fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+/// Makes [`peak_memory_bytes`] start again from the present resident memory. Returns whether the system did so.
+pub fn reset_peak_memory() -> bool {
+    fs::write("/proc/self/clear_refs", "5").is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::UNLIMITED_BYTES;
+
+    const GIB: u64 = 1 << 30;
+    const V2: &str = "30 23 0:26 / /sys/fs/cgroup rw,nosuid shared:4 - cgroup2 cgroup2 rw,nsdelegate\n";
+    const NO_LIMITS: &str = "Limit                     Soft Limit           Hard Limit           Units\n\
+        Max data size             unlimited            unlimited            bytes\n\
+        Max address space         unlimited            unlimited            bytes\n";
+
+    /// Lowest limit of a machine of 64 GiB with these files.
+    fn limit(files: &[(&str, &str)]) -> (u64, LimitSource) {
+        let root = tempfile::tempdir().unwrap();
+        let machine =
+            [("proc/meminfo", "MemFree: 1 kB\nMemTotal:       67108864 kB\n"), ("proc/self/limits", NO_LIMITS)];
+        for (name, text) in machine.iter().chain(files) {
+            let path = root.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        let MemoryLimits { around, own } = limits_under(root.path());
+        let stated = around.into_iter().chain(own).filter(|limit| (1..UNLIMITED_BYTES).contains(&limit.bytes));
+        stated.min_by_key(|limit| limit.bytes).map(|limit| (limit.bytes, limit.source)).unwrap()
+    }
+
+    fn group(file: &str) -> LimitSource {
+        LimitSource::ControlGroup(file.into())
+    }
+
+    #[test]
+    fn without_anything_else_the_machine_is_the_limit_and_without_that_nothing() {
+        assert_eq!(limit(&[]), (64 * GIB, LimitSource::Machine));
+        assert_eq!(limits_under(Path::new("/no/such/root")), MemoryLimits::default());
+    }
+
+    #[test]
+    fn every_group_around_the_process_counts_and_the_tightest_is_named() {
+        let nested = |job: &str, step: &str, high: &str| {
+            limit(&[
+                ("proc/self/cgroup", "0::/slurm/job_7/step_0\n"),
+                ("proc/self/mountinfo", V2),
+                ("sys/fs/cgroup/slurm/memory.max", "max\n"),
+                ("sys/fs/cgroup/slurm/job_7/memory.max", job),
+                ("sys/fs/cgroup/slurm/job_7/step_0/memory.max", step),
+                ("sys/fs/cgroup/slurm/job_7/step_0/memory.high", high),
+            ])
+        };
+        let of = |bytes: u64, file: &str| (bytes, group(&format!("/sys/fs/cgroup/slurm/job_7/{file}")));
+        assert_eq!(nested("4294967296", "max", "max"), of(4 * GIB, "memory.max"));
+        assert_eq!(nested("4294967296", "2147483648\n", "max"), of(2 * GIB, "step_0/memory.max"));
+        assert_eq!(nested("max", "2147483648\n", "1073741824"), of(GIB, "step_0/memory.high"));
+        assert_eq!(nested("max", "max", "0").0, 64 * GIB);
+        assert_eq!(nested("max", "137438953472", "max").0, 64 * GIB, "a limit above the machine's memory is none");
+    }
+
+    #[test]
+    fn groups_of_version_1_and_of_both_versions_are_followed() {
+        let mounts = "40 35 0:35 / /sys/fs/cgroup/unified rw - cgroup2 cgroup2 rw\n\
+            41 35 0:36 / /sys/fs/cgroup/cpu,cpuacct rw - cgroup cgroup rw,cpu,cpuacct\n\
+            42 35 0:37 / /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n";
+        let found = limit(&[
+            ("proc/self/cgroup", "9:memory:/batch/job\n4:cpu,cpuacct:/batch/job\n0::/batch\n"),
+            ("proc/self/mountinfo", mounts),
+            ("sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712"),
+            ("sys/fs/cgroup/memory/batch/memory.limit_in_bytes", "3221225472"),
+            ("sys/fs/cgroup/memory/batch/job/memory.limit_in_bytes", "9223372036854771712"),
+            ("sys/fs/cgroup/cpu,cpuacct/batch/job/memory.limit_in_bytes", "1"),
+        ]);
+        let file = "/sys/fs/cgroup/memory/batch/memory.limit_in_bytes";
+        assert_eq!(found, (3 * GIB, group(file)));
+    }
+
+    #[test]
+    fn a_container_that_sees_a_part_of_the_tree_finds_its_limit() {
+        let v1 = "42 35 0:37 /docker/abc /sys/fs/cgroup/memory ro - cgroup cgroup rw,memory\n";
+        for (group, mounts, file) in [
+            ("0::/\n", V2, "sys/fs/cgroup/memory.max"),
+            ("0::/../../elsewhere\n", V2, "sys/fs/cgroup/memory.max"),
+            ("9:memory:/docker/abc\n", v1, "sys/fs/cgroup/memory/memory.limit_in_bytes"),
+            ("9:memory:/docker/abc/inner\n", v1, "sys/fs/cgroup/memory/inner/memory.limit_in_bytes"),
+        ] {
+            let files = [("proc/self/cgroup", group), ("proc/self/mountinfo", mounts), (file, "1073741824\n")];
+            assert_eq!(limit(&files).0, GIB, "{group}");
+        }
+    }
+
+    #[test]
+    fn a_limit_of_the_process_itself_holds() {
+        let limits = NO_LIMITS.replace("space         unlimited ", "space         1073741824");
+        assert_eq!(limit(&[("proc/self/limits", &limits)]), (GIB, LimitSource::AddressSpace));
+    }
+}

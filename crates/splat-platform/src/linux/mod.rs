@@ -1,0 +1,22 @@
+//! Memory of Linux, the page cache, and mapped files that are cut short.
+
+mod cut_short;
+mod memory;
+
+use std::fs::File;
+use std::io::IoSliceMut;
+
+use rustix::io::{Errno, ReadWriteFlags, preadv2};
+
+pub use cut_short::report_cut_short_maps;
+pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
+
+/// Whether reading the byte at `offset` would not wait for the disk. `None` if the system does not tell.
+pub fn is_cached(file: &File, offset: u64) -> Option<bool> {
+    let mut byte = [0];
+    match preadv2(file, &mut [IoSliceMut::new(&mut byte)], offset, ReadWriteFlags::NOWAIT) {
+        Ok(read) => Some(read == 1),
+        Err(Errno::AGAIN) => Some(false),
+        Err(_) => None,
+    }
+}

@@ -1,0 +1,50 @@
+//! Memory of macOS, and what macOS does not offer. Type-checked only.
+
+use std::fs::File;
+use std::mem::{MaybeUninit, size_of};
+
+use rustix::process::{Resource, getrlimit};
+
+use crate::{CutShortMessage, LimitSource, MemoryLimit, MemoryLimits};
+
+/// Whether reading the byte at `offset` would not wait for the disk: not known on macOS.
+pub fn is_cached(_file: &File, _offset: u64) -> Option<bool> {
+    None
+}
+
+/// Without effect on macOS, which does not tell a process which file a page belongs to: SIGBUS ends the process.
+pub fn report_cut_short_maps(_message: CutShortMessage) {}
+
+/// Physical memory of the machine and the limits that `ulimit` sets for the process.
+pub fn memory_limits() -> MemoryLimits {
+    let machine = machine_bytes().map(|bytes| MemoryLimit { bytes, source: LimitSource::Machine });
+    let own = [(Resource::As, LimitSource::AddressSpace), (Resource::Data, LimitSource::DataSize)];
+    let own = own.into_iter().filter_map(|(resource, source)| {
+        let bytes = getrlimit(resource).current?;
+        Some(MemoryLimit { bytes, source })
+    });
+    MemoryLimits { around: machine.into_iter().collect(), own: own.collect() }
+}
+
+fn machine_bytes() -> Option<u64> {
+    let mut bytes = 0u64;
+    let mut size = size_of::<u64>();
+    // SAFETY: the name ends with a zero byte; the pointer and the size are those of `bytes`, and nothing is set.
+    let code = unsafe {
+        libc::sysctlbyname(c"hw.memsize".as_ptr(), (&raw mut bytes).cast(), &raw mut size, std::ptr::null_mut(), 0)
+    };
+    (code == 0 && size == size_of::<u64>()).then_some(bytes)
+}
+
+/// Largest resident memory of this process so far in bytes, mapped pages included.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let mut usage = MaybeUninit::<libc::rusage>::uninit();
+    // SAFETY: the call writes to `usage`, which has the size and alignment it expects, and says whether it did.
+    let usage = unsafe { (libc::getrusage(libc::RUSAGE_SELF, usage.as_mut_ptr()) == 0).then(|| usage.assume_init()) }?;
+    u64::try_from(usage.ru_maxrss).ok()
+}
+
+/// Makes [`peak_memory_bytes`] start again from the present memory: not possible on macOS, returns false.
+pub fn reset_peak_memory() -> bool {
+    false
+}

@@ -1,0 +1,158 @@
+//! Files and folders of Linux and macOS.
+
+mod folder;
+mod signals;
+
+use std::fs::{DirBuilder, File, FileType, Metadata, OpenOptions, Permissions};
+use std::io;
+use std::ops::Range;
+use std::os::fd::AsFd as _;
+use std::os::unix::fs::{DirBuilderExt as _, FileExt as _, FileTypeExt as _, MetadataExt as _};
+use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
+use std::path::Path;
+
+use memmap2::{Advice, Mmap, UncheckedAdvice};
+use rustix::fs::OFlags;
+
+use crate::{FileIdentity, FileKind, FileStatus};
+pub use folder::FolderHandle;
+pub use signals::end_on_signals;
+
+/// Permissions of a folder that only its owner may enter, read or write.
+const PRIVATE: u32 = 0o700;
+
+/// Fills `bytes` from byte `offset` of `file`. Threads may read one file at the same time.
+///
+/// # Errors
+/// A failed read; a file that ends before.
+pub fn read_exact_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
+    file.read_exact_at(bytes, offset)
+}
+
+impl FileIdentity {
+    fn from_metadata(found: &Metadata) -> FileIdentity {
+        FileIdentity { volume: found.dev(), number: found.ino() }
+    }
+}
+
+impl FileStatus {
+    fn from_metadata(found: &Metadata) -> FileStatus {
+        FileStatus { identity: FileIdentity::from_metadata(found), length: found.len() }
+    }
+
+    /// Status of an open file.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub fn from_file(file: &File) -> io::Result<FileStatus> {
+        Ok(FileStatus::from_metadata(&file.metadata()?))
+    }
+
+    /// Status of the file at `path`, or of the file that a link at `path` leads to.
+    ///
+    /// # Errors
+    /// Nothing there; the system refuses.
+    pub fn from_path(path: &Path) -> io::Result<FileStatus> {
+        Ok(FileStatus::from_metadata(&std::fs::metadata(path)?))
+    }
+}
+
+/// Kind of an entry that is no file, folder or link.
+pub(crate) fn special_kind(found: FileType) -> FileKind {
+    match found {
+        found if found.is_fifo() => FileKind::Fifo,
+        found if found.is_socket() => FileKind::Socket,
+        found if found.is_char_device() => FileKind::CharacterDevice,
+        found if found.is_block_device() => FileKind::BlockDevice,
+        _ => FileKind::Other,
+    }
+}
+
+/// Opens `path` for reading. A named pipe without a writer is opened, too, instead of waiting for the writer; reading a
+/// regular file is the same as ever.
+///
+/// # Errors
+/// Nothing there; the system refuses.
+pub fn open_without_waiting(path: &Path) -> io::Result<File> {
+    OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(path)
+}
+
+/// Opens the character device or FIFO `path` for writing. Returns `None` for a FIFO that no program has opened for
+/// reading. Writes to the opened file wait until there is room.
+///
+/// # Errors
+/// Nothing there; the system refuses.
+pub fn open_stream(path: &Path) -> io::Result<Option<File>> {
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    let opened = OpenOptions::new().write(true).custom_flags(flags.bits() as i32).open(path);
+    let is_fifo = || std::fs::metadata(path).is_ok_and(|found| found.file_type().is_fifo());
+    if opened.as_ref().is_err_and(|error| error.raw_os_error() == Some(libc::ENXIO)) && is_fifo() {
+        return Ok(None);
+    }
+    let file = opened?;
+    let flags = rustix::fs::fcntl_getfl(&file)?;
+    rustix::fs::fcntl_setfl(&file, flags - OFlags::NONBLOCK)?;
+    Ok(Some(file))
+}
+
+/// Whether `file` is the same file, device or pipe as standard output.
+///
+/// # Errors
+/// The status of `file` cannot be read.
+pub fn is_standard_output(file: &File) -> io::Result<bool> {
+    let found = FileStatus::from_file(file)?;
+    let out = io::stdout().as_fd().try_clone_to_owned().and_then(|out| FileStatus::from_file(&File::from(out)));
+    Ok(out.is_ok_and(|out| out.identity == found.identity))
+}
+
+/// Whether `folder` is, or lies in, a folder whose links belong to the system, as `/dev/stdout` does. `folder` is a path
+/// without links. Files in the shared memory `/dev/shm` belong to users.
+pub fn is_system_folder(folder: &Path) -> bool {
+    (folder.starts_with("/dev") && !folder.starts_with("/dev/shm")) || folder.starts_with("/proc")
+}
+
+/// Creates the folder `path`, which only its owner may enter, read or write.
+///
+/// # Errors
+/// An entry of that name; the system refuses.
+pub fn create_private_folder(path: &Path) -> io::Result<()> {
+    DirBuilder::new().mode(PRIVATE).create(path)
+}
+
+/// Permissions of a private folder, for whoever creates one with another function than [`create_private_folder`]. `None`
+/// where the parent decides about permissions.
+pub fn private_permissions() -> Option<Permissions> {
+    Some(Permissions::from_mode(PRIVATE))
+}
+
+/// Writes the content of the file `path` through to the disk.
+///
+/// # Errors
+/// Nothing there; a failed write.
+pub fn sync_file(path: &Path) -> io::Result<()> {
+    File::open(path)?.sync_all()
+}
+
+/// Writes the names in the folder `path` through to the disk, so that a finished rename lasts through a power failure.
+///
+/// # Errors
+/// Nothing there; a failed write.
+pub fn sync_folder(path: &Path) -> io::Result<()> {
+    sync_file(path)
+}
+
+/// Tells the system that the bytes `range` of `map` will be read soon. Without effect if the system refuses.
+pub fn expect_pages(map: &Mmap, range: Range<usize>) {
+    _ = map.advise_range(Advice::WillNeed, range.start, range.len());
+}
+
+/// Gives the pages of the bytes `range` of `map` back to the system, so that they no longer count as memory of this
+/// process. Reading them again reads the file. Without effect if the system refuses.
+///
+/// # Safety
+/// `map` is backed by a file and not by anonymous memory: the content of other pages would be lost.
+pub unsafe fn release_pages(map: &Mmap, range: Range<usize>) {
+    // SAFETY: the advice drops what was written to private pages. The map is read-only and, as the caller confirms,
+    // backed by a file, so every dropped page comes back with the file's bytes and slices of the map stay valid.
+    _ = unsafe { map.unchecked_advise_range(UncheckedAdvice::DontNeed, range.start, range.len()) };
+}

@@ -1,0 +1,66 @@
+//! Memory that this process may take, and has taken.
+
+use std::mem::{size_of, zeroed};
+
+use windows_sys::Win32::System::JobObjects::{
+    JOB_OBJECT_LIMIT_JOB_MEMORY, JOB_OBJECT_LIMIT_PROCESS_MEMORY, JOBOBJECT_EXTENDED_LIMIT_INFORMATION,
+    JobObjectExtendedLimitInformation, QueryInformationJobObject,
+};
+use windows_sys::Win32::System::ProcessStatus::{K32GetProcessMemoryInfo, PROCESS_MEMORY_COUNTERS};
+use windows_sys::Win32::System::SystemInformation::{GlobalMemoryStatusEx, MEMORYSTATUSEX};
+use windows_sys::Win32::System::Threading::GetCurrentProcess;
+
+use crate::{LimitSource, MemoryLimit, MemoryLimits};
+
+/// Physical memory of the machine and the limits of the job object of this process.
+pub fn memory_limits() -> MemoryLimits {
+    let machine = machine_bytes().map(|bytes| MemoryLimit { bytes, source: LimitSource::Machine });
+    let job = job_bytes().into_iter().map(|bytes| MemoryLimit { bytes, source: LimitSource::JobObject });
+    MemoryLimits { around: machine.into_iter().chain(job).collect(), own: Vec::new() }
+}
+
+fn machine_bytes() -> Option<u64> {
+    // SAFETY: all fields are integers.
+    let mut status: MEMORYSTATUSEX = unsafe { zeroed() };
+    status.dwLength = size_of::<MEMORYSTATUSEX>() as u32;
+    // SAFETY: `status` is initialized and states its own size.
+    (unsafe { GlobalMemoryStatusEx(&mut status) } != 0).then_some(status.ullTotalPhys)
+}
+
+fn job_bytes() -> Vec<u64> {
+    // SAFETY: all fields are integers.
+    let mut limits: JOBOBJECT_EXTENDED_LIMIT_INFORMATION = unsafe { zeroed() };
+    let size = size_of::<JOBOBJECT_EXTENDED_LIMIT_INFORMATION>() as u32;
+    // SAFETY: no handle stands for the job of this process; the pointer and the size are those of `limits`.
+    let found = unsafe {
+        QueryInformationJobObject(
+            std::ptr::null_mut(),
+            JobObjectExtendedLimitInformation,
+            (&raw mut limits).cast(),
+            size,
+            std::ptr::null_mut(),
+        )
+    };
+    // Without a job the call fails.
+    let flags = if found == 0 { 0 } else { limits.BasicLimitInformation.LimitFlags };
+    let stated = [
+        (JOB_OBJECT_LIMIT_PROCESS_MEMORY, limits.ProcessMemoryLimit),
+        (JOB_OBJECT_LIMIT_JOB_MEMORY, limits.JobMemoryLimit),
+    ];
+    stated.into_iter().filter(|(flag, _)| flags & flag != 0).map(|(_, bytes)| bytes as u64).collect()
+}
+
+/// Largest working set of this process so far in bytes, mapped pages included.
+pub fn peak_memory_bytes() -> Option<u64> {
+    // SAFETY: all fields are integers.
+    let mut counters: PROCESS_MEMORY_COUNTERS = unsafe { zeroed() };
+    let size = size_of::<PROCESS_MEMORY_COUNTERS>() as u32;
+    // SAFETY: the handle of the own process is always valid; the pointer and the size are those of `counters`.
+    let found = unsafe { K32GetProcessMemoryInfo(GetCurrentProcess(), &mut counters, size) };
+    (found != 0).then_some(counters.PeakWorkingSetSize as u64)
+}
+
+/// Makes [`peak_memory_bytes`] start again from the present memory: not possible on Windows, returns false.
+pub fn reset_peak_memory() -> bool {
+    false
+}
