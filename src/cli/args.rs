@@ -42,7 +42,7 @@ pub(super) enum Verb {
     /// Write a smaller model that the same renderer opens
     Compress(Box<Compress>),
     /// Write the statistics and scores of every Gaussian as .npz or .csv
-    Score(Score),
+    Score(ScoreArgs),
     /// Render an input as its cameras see it, into PNG or float32 NPY files
     Render(Render),
     /// Compare the pictures of two models: PSNR, SSIM, FLIP and the error of what moves
@@ -50,17 +50,17 @@ pub(super) enum Verb {
     /// Trade-off curves: quality, size, time and memory of every method at every kept fraction
     Sweep(Sweep),
     /// Work-precision diagrams: what every knob of a run costs, and what error it leaves
-    Precision(Precision),
+    Precision(PrecisionArgs),
     /// Write a page that shows what compression cost: pictures, curves, failure modes
-    Report(Report),
+    Report(ReportArgs),
     /// Write a page that plays a scene in any browser: one model, or the original and the compressed one side by side
-    View(View),
+    View(ViewArgs),
     /// Write an input as another kind of file: for a viewer, a player, another program
     Convert(Convert),
     /// Pack any input into a .gseq container
     Pack(Pack),
     /// Say what an input holds
-    Info(Info),
+    Info(InfoArgs),
     /// Check every byte of a .gseq container
     Verify(Verify),
     /// Write the model in an archive; of other inputs the frames, as PLY files or a stream
@@ -68,7 +68,7 @@ pub(super) enum Verb {
     /// Save the complete frames of a .gseq container that was cut short
     Recover(Recover),
     /// Say what is in a work folder, or remove it
-    Work(Work),
+    Work(WorkArgs),
     /// Generate a small dynamic scene, compress it, say what happened
     Demo(Demo),
     /// Check the numbers of this program on this machine; takes no files
@@ -86,14 +86,14 @@ impl Verb {
     pub(super) fn explains(&self) -> bool {
         match self {
             Verb::Compress(args) => args.input.memory.explain,
-            Verb::Score(Score { input, .. })
+            Verb::Score(ScoreArgs { input, .. })
             | Verb::Render(Render { input, .. })
-            | Verb::View(View { input, .. })
+            | Verb::View(ViewArgs { input, .. })
             | Verb::Convert(Convert { input, .. })
             | Verb::Pack(Pack { input, .. })
-            | Verb::Info(Info { input, .. })
+            | Verb::Info(InfoArgs { input, .. })
             | Verb::Unpack(Unpack { input, .. }) => input.memory.explain,
-            Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(Report { models, .. }) => models.memory.explain,
+            Verb::Evaluate(Evaluate { models, .. }) | Verb::Report(ReportArgs { models, .. }) => models.memory.explain,
             Verb::Demo(Demo { memory, .. }) => memory.explain,
             Verb::Sweep(_)
             | Verb::Precision(_)
@@ -170,7 +170,7 @@ fn parse_duration(text: &str) -> Result<f64, String> {
 
 /// Where results of stages stay, so that a run goes on where another was cut short, and several runs share the work.
 #[derive(Debug, Args)]
-pub(super) struct Kept {
+pub(super) struct CacheArgs {
     /// Keep what stages find in this folder: a run that was cut short goes on from there
     #[arg(long, help_heading = IN_PARTS, value_name = "FOLDER")]
     pub(super) work: Option<PathBuf>,
@@ -294,7 +294,7 @@ pub(super) struct Compress {
     pub(super) output: PathBuf,
     /// What to write [default: by the output's name; a folder is of the input's own kind]
     #[arg(long = "as", value_enum, value_name = "KIND")]
-    pub(super) kind: Option<OutputKind>,
+    pub(super) kind: Option<OutputKindArg>,
     /// How close the pictures of an archive (NAME.gsz) are to be to those of the result before its values were put on
     /// grids, or within bounds: mean PSNR, such as 45dB [default: 9 dB above the result's own, which costs half a
     /// decibel; 50dB where that is closer]
@@ -309,12 +309,12 @@ pub(super) struct Compress {
     #[arg(long, help_heading = WHAT_STAYS, hide_short_help = true)]
     pub(super) merge_only: bool,
     #[command(flatten)]
-    pub(super) overrides: Overrides,
+    pub(super) overrides: OverrideArgs,
     /// Say what would be done, what it would take and what would be written, in seconds; write nothing
     #[arg(long)]
     pub(super) dry_run: bool,
     #[command(flatten)]
-    pub(super) kept: Kept,
+    pub(super) kept: CacheArgs,
     /// List the stages that --part divides, in order, with the units that parts are made of, and do nothing else
     #[arg(long, conflicts_with = "part", help_heading = IN_PARTS, hide_short_help = true)]
     pub(super) list_stages: bool,
@@ -369,7 +369,7 @@ pub(super) struct OutputSize {
 
 /// What the user knows better.
 #[derive(Debug, Args)]
-pub(super) struct Overrides {
+pub(super) struct OverrideArgs {
     /// Keep every Gaussian inside this box (at the reference frame), unmerged
     #[arg(long, help_heading = WHAT_STAYS, value_name = "X0,Y0,Z0,X1,Y1,Z1", hide_short_help = true, value_parser = parse_box, allow_hyphen_values = true)]
     pub(super) keep_box: Option<[f64; 6]>,
@@ -383,7 +383,7 @@ pub(super) struct Overrides {
 
 /// Kinds of output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum OutputKind {
+pub(super) enum OutputKindArg {
     /// 4DGaussians model folder
     Model,
     /// Container
@@ -405,7 +405,7 @@ pub(super) enum OutputKind {
 
 /// `score`
 #[derive(Debug, Args)]
-pub(super) struct Score {
+pub(super) struct ScoreArgs {
     #[command(flatten)]
     pub(super) input: Input,
     #[command(flatten)]
@@ -463,7 +463,7 @@ pub(super) struct Render {
     #[arg(short, long, value_name = "PATH", required_unless_present = "video", conflicts_with = "video")]
     pub(super) output: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) kept: Kept,
+    pub(super) kept: CacheArgs,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
@@ -488,7 +488,7 @@ pub(super) struct Background {
 
 /// Two models, and the pictures to compare them on.
 #[derive(Debug, Args)]
-pub(super) struct SideBySide {
+pub(super) struct CompareArgs {
     /// The model before compression: whatever `compress` reads
     pub(super) original: PathBuf,
     /// The model after it, of any kind
@@ -526,9 +526,9 @@ pub(super) struct SideBySide {
 
 /// `report`
 #[derive(Debug, Args)]
-pub(super) struct Report {
+pub(super) struct ReportArgs {
     #[command(flatten)]
-    pub(super) models: SideBySide,
+    pub(super) models: CompareArgs,
     /// The sweep.json that `sweep` wrote, for its curves
     #[arg(long, value_name = "FILE")]
     pub(super) sweep: Option<PathBuf>,
@@ -539,7 +539,7 @@ pub(super) struct Report {
     #[arg(short, long, value_name = "FOLDER")]
     pub(super) output: PathBuf,
     #[command(flatten)]
-    pub(super) kept: Kept,
+    pub(super) kept: CacheArgs,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
@@ -548,12 +548,12 @@ pub(super) struct Report {
 #[derive(Debug, Args)]
 pub(super) struct Evaluate {
     #[command(flatten)]
-    pub(super) models: SideBySide,
+    pub(super) models: CompareArgs,
     /// Write the scores of every picture
     #[arg(long, value_name = "FILE")]
     pub(super) csv: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) kept: Kept,
+    pub(super) kept: CacheArgs,
     #[command(flatten)]
     pub(super) earlier: Earlier,
     /// Print JSON
@@ -603,7 +603,7 @@ pub(super) struct Sweep {
 
 /// `precision`
 #[derive(Debug, Args)]
-pub(super) struct Precision {
+pub(super) struct PrecisionArgs {
     #[command(flatten)]
     pub(super) input: Input,
     #[command(flatten)]
@@ -637,7 +637,7 @@ pub(super) struct Precision {
 
 /// `view`
 #[derive(Debug, Args)]
-pub(super) struct View {
+pub(super) struct ViewArgs {
     #[command(flatten)]
     pub(super) input: Input,
     /// The model after compression, of any kind, to show beside it
@@ -697,7 +697,7 @@ pub(super) struct Pack {
     #[arg(long, value_name = "1-19", value_parser = clap::value_parser!(i32).range(1..=19))]
     pub(super) level: Option<i32>,
     #[command(flatten)]
-    pub(super) kept: Kept,
+    pub(super) kept: CacheArgs,
     #[command(flatten)]
     pub(super) earlier: Earlier,
 }
@@ -714,7 +714,7 @@ pub(super) struct Convert {
     pub(super) cameras: Cameras,
     /// Kind of result, whatever it is called
     #[arg(long = "as", value_name = "KIND", value_enum)]
-    pub(super) kind: Option<OutputKind>,
+    pub(super) kind: Option<OutputKindArg>,
     /// Print what was written as JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -724,7 +724,7 @@ pub(super) struct Convert {
 
 /// `info`
 #[derive(Debug, Args)]
-pub(super) struct Info {
+pub(super) struct InfoArgs {
     #[command(flatten)]
     pub(super) input: Input,
     /// Print JSON
@@ -761,7 +761,7 @@ pub(super) struct Unpack {
 
 /// `work`
 #[derive(Debug, Args)]
-pub(super) struct Work {
+pub(super) struct WorkArgs {
     /// The folder
     pub(super) folder: PathBuf,
     /// Remove everything that stages have kept in it, and the folder if nothing else is in it

@@ -14,8 +14,8 @@ use clap::FromArgMatches;
 use gseq::Compression;
 
 use args::{
-    CameraFile, Cameras, Cli, Compress, ImageKind, Input, Kept, Memory, OutputSize, Render, Rot4d, SideBySide,
-    SplitArg, Sweep, Trained, Verb, View,
+    CacheArgs, CameraFile, Cameras, Cli, CompareArgs, Compress, ImageKind, Input, Memory, OutputSize, Render, Rot4d,
+    SplitArg, Sweep, Trained, Verb, ViewArgs,
 };
 use output::{print, print_as};
 use splatsieve::cache::{self, Completion};
@@ -329,16 +329,16 @@ fn run(cli: Cli) -> Result<()> {
     }
 }
 
-fn kind_of(asked: args::OutputKind) -> OutputKind {
+fn kind_of(asked: args::OutputKindArg) -> OutputKind {
     match asked {
-        args::OutputKind::Model => OutputKind::Model,
-        args::OutputKind::Gseq => OutputKind::Gseq,
-        args::OutputKind::PlySequence => OutputKind::PlySequence,
-        args::OutputKind::Ply => OutputKind::Ply,
-        args::OutputKind::Archive => OutputKind::Archive,
-        args::OutputKind::Splatv => OutputKind::Splatv,
-        args::OutputKind::FourDgs => OutputKind::FourDgs,
-        args::OutputKind::Spz => OutputKind::Spz,
+        args::OutputKindArg::Model => OutputKind::Model,
+        args::OutputKindArg::Gseq => OutputKind::Gseq,
+        args::OutputKindArg::PlySequence => OutputKind::PlySequence,
+        args::OutputKindArg::Ply => OutputKind::Ply,
+        args::OutputKindArg::Archive => OutputKind::Archive,
+        args::OutputKindArg::Splatv => OutputKind::Splatv,
+        args::OutputKindArg::FourDgs => OutputKind::FourDgs,
+        args::OutputKindArg::Spz => OutputKind::Spz,
     }
 }
 
@@ -478,7 +478,7 @@ fn film(args: Render, output: PathBuf) -> Result<()> {
     print(&format!("{path}: {} frames of {width}x{height}, {fps} a second\n{places}", filmed.frames))
 }
 
-fn evaluate_options(args: SideBySide) -> EvaluateOptions {
+fn evaluate_options(args: CompareArgs) -> EvaluateOptions {
     let mut original = InputOptions { path: args.original, iteration: args.iteration, ..InputOptions::default() };
     original.allow_gaps = args.allow_gaps;
     original.link = args.link.map_or(Link::Auto, Link::from);
@@ -498,7 +498,7 @@ fn evaluate_options(args: SideBySide) -> EvaluateOptions {
     }
 }
 
-fn view_options(args: View) -> ViewOptions {
+fn view_options(args: ViewArgs) -> ViewOptions {
     let mut original = input_options(args.input, None, Some(&args.output));
     args.cameras.apply_to(&mut original);
     ViewOptions {
@@ -569,7 +569,7 @@ fn sweep_options(args: Sweep) -> SweepOptions {
     }
 }
 
-fn precision_options(args: args::Precision) -> Result<PrecisionOptions> {
+fn precision_options(args: args::PrecisionArgs) -> Result<PrecisionOptions> {
     let mut input = input_options(args.input, None, Some(&args.output));
     args.cameras.apply_to(&mut input);
     let named = |name: &String| Turned::ALL.into_iter().find(|knob| knob.name() == name);
@@ -595,7 +595,7 @@ fn part_of(split: SplitArg) -> PictureSet {
     }
 }
 
-fn work_of(kept: Kept) -> Option<cache::CacheRequest> {
+fn work_of(kept: CacheArgs) -> Option<cache::CacheRequest> {
     kept.work.map(|folder| cache::CacheRequest { folder, part: kept.part })
 }
 
