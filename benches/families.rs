@@ -5,7 +5,7 @@
 //! sines. With trained models at hand, whole states of Deformable-3D-Gaussians (a covariance is decomposed beside), with
 //! screws, and of SC-GS, with each Gaussian 64 times, as the network's outputs for nodes, made anew at every time, are shared by
 //! all Gaussians; of SpacetimeGaussians and FreeTimeGS,
-//! which are polynomials and a window; of native 4D Gaussians, which are slices of covariances, without colours and with.
+//! which are polynomials and a window; of native 4D Gaussians, which are slices of covariances, without colors and with.
 //! `open`: what a block of these takes once for all frames. `scripts/torch_speed.py` has the same figures of PyTorch.
 //! Time is that of a processor: what else the machine does does not count. Invert the throughput to get the time per Gaussian
 //! and frame.

@@ -1,14 +1,14 @@
 //! What does merging cost, on one thread?
 //!
-//! `neighbours`: the nearest neighbours within ε, per Gaussian, `voxels` being the index of the program, built and asked:
-//! in trained models with the ε of the presets, among Gaussians strewn evenly, with some or many neighbours each, and in
+//! `neighbours`: the nearest neighbors within ε, per Gaussian, `voxels` being the index of the program, built and asked:
+//! in trained models with the ε of the presets, among Gaussians strewn evenly, with some or many neighbors each, and in
 //! clusters, and in crowds: all in one voxel, and all at one point. Rivals: one `tree` over all points, asked in voxel
 //! order too, which is what the program had; `all_pairs`, on few Gaussians, where that still has a chance; and a
 //! `plain_hash`, whose voxels list their points, looked up for each point anew.
 //! `pairs`: the motion of a pair, per pair and frame, positions in memory.
 //! `measure`: the same from a packed container, per pair and frame: at once, and in eight partitions, whose cost over
 //! the first is what gathering and reading again costs.
-//! `merge`: a whole pass without motion, per survivor: neighbours, gates, clusters, proxies.
+//! `merge`: a whole pass without motion, per survivor: neighbors, gates, clusters, proxies.
 //!
 //! `cargo bench --bench merge`
 
@@ -45,7 +45,7 @@ fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// `n` similar Gaussians, strewn evenly over the unit cube, and a reach that finds a few neighbours each.
+/// `n` similar Gaussians, strewn evenly over the unit cube, and a reach that finds a few neighbors each.
 fn strewn(n: usize) -> (Gaussians, f64) {
     let mut states = Gaussians::zeros(n, 0);
     let spacing = (n as f64).powf(-1.0 / 3.0);
@@ -59,7 +59,7 @@ fn strewn(n: usize) -> (Gaussians, f64) {
     (states, 1.2 * spacing)
 }
 
-/// Number of neighbours found in all, from positions and ε.
+/// Number of neighbors found in all, from positions and ε.
 type Find = fn(&Column, f64) -> usize;
 
 fn points(position: &Column) -> Vec<TreePoint> {
@@ -195,7 +195,7 @@ fn neighbours(criterion: &mut Criterion) {
     }
 }
 
-/// Each with its nearest neighbours of higher index.
+/// Each with its nearest neighbors of higher index.
 fn pairs_of(position: &Column) -> Vec<(u32, u32)> {
     let index = PointIndex::new(points(position), f64::INFINITY);
     let mut search = index.search();

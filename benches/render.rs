@@ -42,7 +42,7 @@ use splatsieve::source::{FrameSource, Ids};
 const PICTURES: usize = 21;
 
 /// Operations of the blend on one vector of pixels, loads and stores apart: 6 from place to exponent, 20 for 2 to its
-/// power, 10 from there to weight and transmittance, 6 for the colour.
+/// power, 10 from there to weight and transmittance, 6 for the color.
 const OPERATIONS: f64 = 42.0;
 /// Pixels of a vector, at the widest.
 const LANES: f64 = 16.0;
@@ -209,7 +209,7 @@ fn split(state: &Gaussians) -> Gaussians {
         let narrower = 3f32.ln() / 2.0;
         children.log_scale.set_row(child, [scale[0] - narrower, scale[1] - narrower, scale[2]]);
         let [logit] = children.opacity_logit.row(child);
-        // What nine add up to in the middle, of what one has at its centre.
+        // What nine add up to in the middle, of what one has at its center.
         let overlap = (1.0 + 2.0 * (-1.5f32).exp()).powi(2);
         let alpha = 1.0 - (1.0 / (1.0 + logit.exp())).powf(1.0 / overlap);
         children.opacity_logit.set_row(child, [(alpha / (1.0 - alpha)).ln()]);

@@ -1,4 +1,4 @@
-//! What does a value cost on its way into the percentiles that normalise a score, on one thread?
+//! What does a value cost on its way into the percentiles that normalize a score, on one thread?
 //!
 //! `sketch` counts N values and looks twice more at those in the buckets of P1 and of P99, as the program does; `count`
 //! is the first of the three looks alone. The rivals sort a copy of the values, and select both ranks in it without

@@ -43,7 +43,7 @@ pub struct Budget {
     pub tell: Verbosity,
 }
 
-/// Resident before any Gaussian is: the program (12.5 MiB of it where it is not optimised), its libraries (3.6), its threads'
+/// Resident before any Gaussian is: the program (12.5 MiB of it where it is not optimized), its libraries (3.6), its threads'
 /// stacks and heaps, messages.
 const PROGRAM: u64 = 18 << 20;
 /// Tiles of a container are held if they take at most one part in so many of the budget: the file system's cache holds

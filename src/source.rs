@@ -175,7 +175,7 @@ pub trait FrameSource: Send + Sync {
         None
     }
 
-    /// How its pictures get their colours, where Gaussians have features in the place of colours; the colours of its states
+    /// How its pictures get their colors, where Gaussians have features in the place of colors; the colors of its states
     /// are then near to what they look like.
     fn decoder(&self) -> Option<&dyn FeatureDecoder> {
         None
@@ -214,7 +214,7 @@ pub trait Deformation: Sync {
     fn jacobian(&self, frame: usize, stored: &Raw, want: Columns) -> Result<Jacobian>;
 }
 
-/// Features in the place of colours: they are blended without a background, and what comes of that decides, pixel by pixel.
+/// Features in the place of colors: they are blended without a background, and what comes of that decides, pixel by pixel.
 pub trait FeatureDecoder: Sync {
     /// Writes the features of all Gaussians at `frame` into `out`: as many planes as there are features.
     ///

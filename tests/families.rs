@@ -20,7 +20,7 @@ fn open(path: &Path) -> Box<dyn InputModel> {
     if input.source().info().times.is_empty() { input.with_times(vec![0.0, 0.25, 1.0]).unwrap() } else { input }
 }
 
-/// Every third Gaussian of `input`, two of them merged with a neighbour.
+/// Every third Gaussian of `input`, two of them merged with a neighbor.
 fn reduction(input: &dyn InputModel) -> CompressedModel {
     let rule = Recipe::preset("default").unwrap().merge;
     let kept: Vec<u32> = (0..input.source().info().count as u32).step_by(3).collect();

@@ -239,7 +239,7 @@ fn trembling(count: usize, t: usize) -> Gaussians {
     out.pick(&order)
 }
 
-/// What the documentation of `steady` says of one track, in f64: the means of rotation, scales, opacity logit and colours, and
+/// What the documentation of `steady` says of one track, in f64: the means of rotation, scales, opacity logit and colors, and
 /// by how much each changes, over its bound.
 fn steadiness(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
     let values = |column: &dyn Fn(&Gaussians) -> Vec<f32>| -> Vec<Vec<f64>> {

@@ -1,7 +1,7 @@
 //! Sequences that are all length or all width, as files and as streams of which nobody knows how long they will be
 //! (EXTREMES 42): a budget holds for as many frames as there is room for, and what there is no room for is refused by name.
 //!
-//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimised one.
+//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimized one.
 
 mod scene;
 

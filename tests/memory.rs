@@ -23,7 +23,7 @@ fn random(k: usize) -> f32 {
     (hash_id(k as u64) >> 40) as f32 / (1 << 24) as f32
 }
 
-/// Gaussians in a box, of which every value but the colours' differs in every frame: 63 MB of it.
+/// Gaussians in a box, of which every value but the colors' differs in every frame: 63 MB of it.
 struct Restless(SequenceInfo);
 
 impl Restless {
@@ -53,7 +53,7 @@ struct Block(Vec<usize>);
 impl BlockReader for Block {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
         for column in want.iter() {
-            // Middle and size of what the values wander in; neighbours in id are neighbours in space.
+            // Middle and size of what the values wander in; neighbors in id are neighbors in space.
             let (middle, wander, shake) = match column {
                 Columns::POSITION => (0.0, 2.0, 1e-3),
                 Columns::LOG_SCALE => (-3.5, 0.2, 1e-3),

@@ -25,7 +25,7 @@ static ALLOCATOR: memory::Counting = memory::Counting;
 const COUNT: usize = 20_000;
 const FRAMES_HELD: usize = 2;
 
-/// Most bytes allocated at once while the six nearest neighbours of every Gaussian are measured, beyond what was
+/// Most bytes allocated at once while the six nearest neighbors of every Gaussian are measured, beyond what was
 /// before; and the number of pairs.
 fn peak(folder: &Path, frames: usize, partitions: usize) -> (usize, usize) {
     let path = folder.join(format!("{frames}.gseq"));

@@ -1,4 +1,4 @@
-//! Clusters and proxies of whole models against method.md, section 5 written down plainly: neighbours by looking
+//! Clusters and proxies of whole models against method.md, section 5 written down plainly: neighbors by looking
 //! at all pairs, gates by their formulas, leaders one after the other.
 
 mod scene;
@@ -217,7 +217,7 @@ fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
 }
 
 /// Holds a merged state against the definitions over its members, weights w: μ = Σ w x, or the leader's place; covariance
-/// Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colours Σ w c; opacity by its rule, an area being a quarter of an ellipsoid's surface.
+/// Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colors Σ w c; opacity by its rule, an area being a quarter of an ellipsoid's surface.
 fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &MergeParams) {
     let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
     let mean = match merge.placement {

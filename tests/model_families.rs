@@ -43,7 +43,7 @@ impl Off {
             let state = state(source, frame as usize);
             off.add(&state, |name, width| {
                 let name = if expected.contains_key(name) { name } else { "features" };
-                // No colours where they are harmonics that nothing changes.
+                // No colors where they are harmonics that nothing changes.
                 let Some(all) = expected.get(name) else { return &[] };
                 let rows = state.len() * width;
                 // What does not change with time is there once.
@@ -211,7 +211,7 @@ fn states_and_features_of_spacetime_gaussians_are_those_of_its_own_code() {
         let state = state(scene.source(), frame as usize);
         let count = state.len();
         let features = &expected["features"][9 * count * row..][..9 * count];
-        // The colour that the first features have by themselves.
+        // The color that the first features have by themselves.
         let colours: Vec<f64> =
             features.chunks(9).flat_map(|f| [f[0], f[1], f[2]].map(|x| 1.0 / (1.0 + (-x).exp()))).collect();
         off.add(&state, |name, width| match name {
@@ -376,7 +376,7 @@ fn states_of_free_time_gs_are_those_of_its_own_code() {
     let mut off = Off::default();
     for (row, &frame) in expected["frames"].iter().enumerate() {
         let state = state(scene.source(), frame as usize);
-        // Colours do not change, and are not recorded.
+        // Colors do not change, and are not recorded.
         let colour = |i: usize, c: usize| 0.5 + SH_C0 * f64::from(state.sh.plane(c)[i]);
         let colours: Vec<f64> = (0..state.len()).flat_map(|i| [0, 1, 2].map(|c| colour(i, c))).collect();
         off.add(&state, |name, width| match name {
@@ -421,7 +421,7 @@ fn models_of_nodes_go_through_every_verb() {
     through_every_verb(&[("scgs", "deform2", "SC-GS", 1500.0)]);
 }
 
-/// A network for every Gaussian takes half an hour unless it is optimised: run by name, with `SPLATSIEVE_PROGRAM`.
+/// A network for every Gaussian takes half an hour unless it is optimized: run by name, with `SPLATSIEVE_PROGRAM`.
 #[test]
 #[ignore = "slow: half an hour unless optimised"]
 fn slow_networks_go_through_every_verb() {

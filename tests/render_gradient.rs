@@ -89,7 +89,7 @@ fn one_gaussian_is_its_closed_form() {
     let (gaussians, camera) = (single(depth as f32, scale as f32, opacity as f32), plain_camera(size));
     let seen = (50.0 * scale / depth).powi(2);
     let (variance, middle) = (seen + 0.3, f64::from(size) / 2.0 - 0.5);
-    // The loss is the total of a channel; its colour before a background makes the contrast.
+    // The loss is the total of a channel; its color before a background makes the contrast.
     for (channel, contrast) in [(0, 1.0 - 0.1), (1, 0.5 - 0.9), (2, 0.0 - 0.4)] {
         let mut weights: [f32; 3] = [0.0; 3];
         weights[channel] = 1.0;

@@ -56,7 +56,7 @@ fn random_scenes_match_the_oracle() {
         let doubtful = expected.doubtful.iter().filter(|&&doubtful| doubtful).count();
         assert!(doubtful * 20 < expected.doubtful.len(), "seed {seed}: {doubtful} pixels say nothing");
         for (i, (got, rgb)) in got.data.chunks_exact(3).zip(&expected.rgb).enumerate() {
-            // A decision that f32 takes the other way changes a pixel by an alpha of 1/255 of a colour.
+            // A decision that f32 takes the other way changes a pixel by an alpha of 1/255 of a color.
             let tolerance = if expected.doubtful[i] { 4.0 / 255.0 } else { 4e-6 };
             for c in 0..3 {
                 let error = (f64::from(got[c]) - rgb[c]).abs();
@@ -69,7 +69,7 @@ fn random_scenes_match_the_oracle() {
 #[test]
 fn an_opaque_gaussian_is_cut_at_the_tiles_of_three_sigma() {
     // Above opacity 0.36, alpha is still 1/255 beyond 3σ: there the square of tiles decides.
-    // Centred on pixel 32, a radius of 16 stops short of pixel 48.
+    // Centered on pixel 32, a radius of 16 stops short of pixel 48.
     let camera = Camera { cx: 32.5, ..plain_camera(64) };
     let mut cut = 0;
     for step in 0..60 {
@@ -191,7 +191,7 @@ fn what_is_nearer_than_0_2_or_behind_is_not_drawn() {
         let image = render(&single(depth, 0.5, 0.9), &plain_camera(32), [0.5; 3]);
         assert!(image.data.iter().all(|&v| v == 0.5), "something is drawn at depth {depth}");
     }
-    // The camera inside a Gaussian whose centre is past the near plane: drawn.
+    // The camera inside a Gaussian whose center is past the near plane: drawn.
     let image = render(&single(0.25, 300.0, 0.9), &plain_camera(32), [0.5; 3]);
     assert!((pixel(&image, 0, 31)[0] - 0.95).abs() < 1e-4, "got {:?}", pixel(&image, 0, 31));
 }

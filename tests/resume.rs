@@ -1,6 +1,6 @@
 //! Runs that are cut short, and go on from their work folder: the same bytes, and nothing done twice that was done.
 //!
-//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimised one.
+//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimized one.
 
 mod scene;
 

@@ -8,7 +8,7 @@ use std::process::Command;
 #[ignore = "needs Slurm"]
 fn slurm_runs_parts_and_scenes_to_the_same_bytes() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    // The optimised program where its path is given: the debug one takes several times as long.
+    // The optimized program where its path is given: the debug one takes several times as long.
     let program = std::env::var_os("SPLATSIEVE_PROGRAM")
         .map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from);
     let data = std::env::var_os("SPLATSIEVE_DATA").map_or_else(|| root.join("../shared/data"), PathBuf::from);

@@ -28,7 +28,7 @@ fn trained(folder: &Path, name: &str) -> HeldFrames {
     let times = (0..TIMES).map(|t| t as f64 / TIMES as f64).collect();
     let model = ModelFolder::open(&folder.join(name), None).unwrap().with_times(times).unwrap();
     let info = model.info();
-    // Runs of 64 keep what neighbours in the file have in common.
+    // Runs of 64 keep what neighbors in the file have in common.
     let runs = GAUSSIANS / 64;
     let ids = (0..GAUSSIANS).map(|i| ((i / 64) * (info.count - 64) / runs + i % 64) as u32).collect::<Vec<_>>();
     let mut reader = model.open(Ids::List(&ids)).unwrap();

@@ -80,7 +80,7 @@ fn value(multiple: u32, step: f64) -> u32 {
 }
 
 /// Step of values that are at most `max_error` off: twice that, less what rounding the largest of them to f32 may add. Larger
-/// ones, whose neighbours in f32 are further apart than half of it, may become exceptions.
+/// ones, whose neighbors in f32 are further apart than half of it, may become exceptions.
 fn step(values: &[f32], max_error: f64) -> f64 {
     let spacing = |value: f32| f64::from(value.next_up()) - f64::from(value);
     let sizes = values.iter().map(|value| value.abs()).filter(|size| size.is_finite());
@@ -407,7 +407,7 @@ mod tests {
         assert!(encode(&[1.0], 1, 1e-3, 1).unwrap().is_none(), "one value");
         let odd: Vec<f32> = (0..640).map(|i| if i % 15 == 0 { f32::NAN } else { 1.0 }).collect();
         assert!(encode(&odd, 64, 1e-3, 1).unwrap().is_none(), "too many exceptions");
-        // Neighbours in f32 are further apart than the bound.
+        // Neighbors in f32 are further apart than the bound.
         let far: Vec<f32> = (0..640).map(|i| 3e7 + 8.0 * i as f32).collect();
         assert!(encode(&far, 64, 1e-3, 1).unwrap().is_none(), "no multiple is near");
     }

@@ -54,7 +54,7 @@ pub(super) struct TensorEntry {
     pub(super) channels: Vec<i8>,
     /// Its mean, in steps.
     pub(super) mean: i64,
-    /// How its values are expected from their neighbours.
+    /// How its values are expected from their neighbors.
     pub(super) parts: PredictorWeights<NEIGHBOURS>,
 }
 
@@ -260,7 +260,7 @@ pub(super) fn decode(
     (decoder.is_finished() && exact.is_empty()).then_some(tensors)
 }
 
-/// What a tensor comes back as where its grid is that of `steps`, its neighbours aside.
+/// What a tensor comes back as where its grid is that of `steps`, its neighbors aside.
 pub fn rounded(tensor: &Tensor, role: Role, steps: &TensorSteps, position: &Column, space: Option<Box3>) -> Tensor {
     let entry = TensorEntry::new("", tensor, role, Some(steps));
     let readers = Readers { position, space, times: [-1.0, 1.0] };

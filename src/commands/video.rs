@@ -88,7 +88,7 @@ pub fn video(options: &VideoOptions) -> Result<Filmed> {
     let beside = options.beside.as_deref().map(|path| open_compressed(path, &scene, &options.input)).transpose()?;
     let models = 1 + u64::from(beside.is_some());
     scene.keep_to(options.input.memory, |work, limits: &Limits| -> Vec<ResourceEstimate> {
-        // Two pictures, and the frame that they make up, with its bytes and, of a GIF, those that colours are chosen from.
+        // Two pictures, and the frame that they make up, with its bytes and, of a GIF, those that colors are chosen from.
         let mut need = pictures::need(work, limits, NAME, models, models * 12);
         need.fixed.push(("frame", models * work.pixels * (12 + 3 + 5)));
         vec![need]

@@ -123,7 +123,7 @@ pub struct ObservedOrder {
     pub expected: Option<f64>,
 }
 
-/// Root mean square error of the pictures judged by, colours from 0 to 1, against the whole model's own.
+/// Root mean square error of the pictures judged by, colors from 0 to 1, against the whole model's own.
 pub const PICTURES: &str = "pictures";
 /// What a setting adds to [`PICTURES`] in squares, as a part of what the finest setting has: the model's own.
 pub const ADDED: &str = "added";

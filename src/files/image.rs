@@ -1,6 +1,6 @@
 //! A photographed or rendered picture from a PNG file.
 //!
-//! In: a PNG of any colour type and depth, and the size it must have. Out: an [`Image`] in [0, 1], with
+//! In: a PNG of any color type and depth, and the size it must have. Out: an [`Image`] in [0, 1], with
 //! transparency over a background. Memory: the decoded rows beside the result; the size is checked
 //! before either is allocated.
 pub mod write;
@@ -16,7 +16,7 @@ use crate::render::Image;
 
 /// Reads the PNG at `path`, which must be `width` × `height` pixels.
 ///
-/// Grey is repeated into the three channels. Where the picture has transparency, it is laid over
+/// Gray is repeated into the three channels. Where the picture has transparency, it is laid over
 /// `background`: c·a + background·(1 − a), as the D-NeRF loaders do.
 ///
 /// # Errors

@@ -174,7 +174,7 @@ fn frames_of(folder: &Path) -> Result<(Vec<PathBuf>, Vec<PathBuf>)> {
     Ok(found.into_iter().partition(|path| path.is_file()))
 }
 
-/// The name of the first frame that is missing, with its neighbours', where names differ in one number alone: of those
+/// The name of the first frame that is missing, with its neighbors', where names differ in one number alone: of those
 /// that follow each other by the least step it is the one that would be next.
 fn first_gap(frames: &[PathBuf]) -> Option<(String, String, String)> {
     let parts = |path: &PathBuf| -> Option<(String, u64, String, usize)> {

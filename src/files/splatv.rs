@@ -27,11 +27,11 @@ const MOST_TEXT: usize = 1 << 20;
 /// Words of a Gaussian.
 pub const WORDS: usize = 16;
 
-/// A Gaussian whose position is a cubic of the time since its centre, whose quaternion is linear in it, and whose opacity is
-/// multiplied by exp(−((t − centre)/width)²).
+/// A Gaussian whose position is a cubic of the time since its center, whose quaternion is linear in it, and whose opacity is
+/// multiplied by exp(−((t − center)/width)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SplatvGaussian {
-    /// Where it is at its centre, scene units.
+    /// Where it is at its center, scene units.
     pub position: [f32; 3],
     /// Coefficients of dt, dt², dt³, each of x, y, z.
     pub motion: [f32; 9],
@@ -41,7 +41,7 @@ pub struct SplatvGaussian {
     pub omega: [f32; 4],
     /// Standard deviations, scene units.
     pub scale: [f32; 3],
-    /// Colour from all sides, in [0, 1]; in f64, for bytes are cut, not rounded, so that the last digit can tell.
+    /// Color from all sides, in [0, 1]; in f64, for bytes are cut, not rounded, so that the last digit can tell.
     pub rgb: [f64; 3],
     /// In [0, 1].
     pub opacity: f64,

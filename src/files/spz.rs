@@ -5,7 +5,7 @@
 //! |---|---|---|
 //! | positions | 9 | 24-bit signed, in units of 2^−(fractional bits); axes right, up, back |
 //! | opacities | 1 | 255·α |
-//! | colours | 3 | 255·(.15·f_dc + ½) |
+//! | colors | 3 | 255·(.15·f_dc + ½) |
 //! | scales | 3 | 16·(ln s + 10) |
 //! | rotations | 4 | which of x, y, z, w is largest, 2 bits, and of the others sign and 9 bits of 511·√2·value |
 //! | harmonics | 3·((d + 1)² − 1) | 128·c + 128, to the nearest of 5 bits in the first band and of 4 in the others |
@@ -171,7 +171,7 @@ mod tests {
     use crate::model::Columns;
     use crate::passes::gather_all;
 
-    /// Position, opacity, colour, scales, rotation wxyz and harmonics of a Gaussian.
+    /// Position, opacity, color, scales, rotation wxyz and harmonics of a Gaussian.
     type Row = (Vec<f64>, f64, Vec<f64>, Vec<f64>, [f64; 4], Vec<f64>);
 
     /// What bytes can hold of a state, read as the format says.
@@ -262,7 +262,7 @@ mod tests {
         assert!(write_spz(&state, &again).unwrap_err().to_string().contains("Gaussian 7"));
     }
 
-    /// A colour seen from a direction is the same in both systems of axes: what turned signs are for.
+    /// A color seen from a direction is the same in both systems of axes: what turned signs are for.
     #[test]
     fn harmonics_turn_with_the_axes() {
         let basis = |[x, y, z]: [f64; 3]| -> [f64; 15] {

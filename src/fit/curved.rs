@@ -1,8 +1,8 @@
 //! Cubic motion and linear rotation under soft windows of time: what the players of SpacetimeGaussians know.
 //!
-//! A window is exp(−((t − centre)/width)²). A Gaussian that never changes its opacity and moves as a cubic does takes one
+//! A window is exp(−((t − center)/width)²). A Gaussian that never changes its opacity and moves as a cubic does takes one
 //! of no end; one that fades once takes one; whatever else it does, curves take it over from one another, 3, 5, 9 … of
-//! them, their centres evenly over its life, each window three quarters of their distance wide: the sum of such windows is
+//! them, their centers evenly over its life, each window three quarters of their distance wide: the sum of such windows is
 //! 1 within 2·exp(−(3π/4)²), .8%. Optical depths −ln(1 − α) add up where Gaussians overlap, so that it is these that are
 //! shared out: by multiplicative updates that keep them positive (Richardson 1972, Lucy 1974).
 
@@ -12,7 +12,7 @@ use super::{FittedTrack, Misfit, SEEN, Tolerance};
 /// A Gaussian on its way.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CubicTrack {
-    /// Centre of its window, and the instant that the polynomials count from.
+    /// Center of its window, and the instant that the polynomials count from.
     pub centre: f64,
     /// Width of its window; infinite where it has no end.
     pub width: f64,
@@ -22,7 +22,7 @@ pub struct CubicTrack {
     pub rotation: [[f64; 4]; 2],
     /// Natural logarithms of scene units.
     pub log_scale: [f64; 3],
-    /// At the centre, in [0, 1].
+    /// At the center, in [0, 1].
     pub opacity: f64,
     /// Harmonic coefficients.
     pub sh: Vec<f32>,

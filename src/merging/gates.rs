@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat, DVec3};
 use crate::model::{Gaussians, SH_C0};
 use crate::recipe;
 
-/// ε in the denominator of the cosines of base colours and of steps, as in the paper (section 3.5.1).
+/// ε in the denominator of the cosines of base colors and of steps, as in the paper (section 3.5.1).
 pub(super) const COSINE_EPSILON: f64 = 1e-8;
 /// Share of the trace added to the diagonal of the averaged covariance, so that coplanar pancakes
 /// have a finite distance.
@@ -99,7 +99,7 @@ fn alike_in_size(a: [f64; 3], b: [f64; 3], max_log_ratio: f64) -> bool {
 }
 
 /// (a·b)/(‖a‖‖b‖ + ε), in [−1, 1]; 1 for equal vectors of any length, so that duplicates of exactly
-/// medium grey, whose coefficients are zero, are alike.
+/// medium gray, whose coefficients are zero, are alike.
 fn cosine(a: DVec3, b: DVec3) -> f64 {
     if a == b { 1.0 } else { a.dot(b) / (a.length() * b.length() + COSINE_EPSILON) }
 }
@@ -220,7 +220,7 @@ mod tests {
             let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
             let regular = sigma + DMat3::from_diagonal(DVec3::splat(REGULARIZATION * trace));
             let delta = DVec3::from(delta);
-            // The inverse by cofactors loses about cond(Σ) ≤ 1e6 ulp; normalised, as determinants overflow.
+            // The inverse by cofactors loses about cond(Σ) ≤ 1e6 ulp; normalized, as determinants overflow.
             let expected = (delta.dot((regular * trace.recip()).inverse() * delta) / trace).sqrt();
             let got = mahalanobis(delta, &sigma);
             prop_assert!((got / expected - 1.0).abs() < 1e-8, "got {got:e}, expected {expected:e}");

@@ -42,7 +42,7 @@ use proxy::Importance;
 use tree::TreePoint;
 
 /// Memory per survivor beside its state while a pass is made: groups 12 before and 12 after, place of the state 4,
-/// rank 4, and the largest of the neighbour index, 46, who coincides with whom, 24, and the clustering, 24.
+/// rank 4, and the largest of the neighbor index, 46, who coincides with whom, 24, and the clustering, 24.
 pub const BYTES_PER_SURVIVOR: usize = 12 + 12 + 4 + 4 + 46;
 
 /// Memory per candidate pair of those handed on together, beside what measuring takes: the pair, the same pair as one
@@ -52,7 +52,7 @@ pub const BYTES_PER_PAIR: usize = 2 * size_of::<(u32, u32)>() + 2 * KNOWN_BYTES 
 /// Memory per pair that passed all tests of a pass: the pair, with some room for the list to grow.
 pub const BYTES_PER_PASSING: usize = size_of::<(u32, u32)>() + size_of::<u32>();
 
-/// Nodes whose neighbours one task looks up.
+/// Nodes whose neighbors one task looks up.
 const CHUNK: usize = 1024;
 
 /// The Gaussians to merge: some rows of a table of states.
@@ -103,7 +103,7 @@ pub struct Merged {
 /// What one pass did.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PassCounts {
-    /// Nodes with more neighbours within ε than were looked at.
+    /// Nodes with more neighbors within ε than were looked at.
     pub truncated: usize,
     /// Pairs that passed tests 1 and 2.
     pub candidates: usize,
@@ -252,7 +252,7 @@ impl<'a> MergeNodes<'a> {
 /// Hands on the pairs (leader, member) of nodes that coincide, alike in all that `gates` look at, and pass them: of each
 /// such crowd the first in rank with all others, whatever their number. By leader, `most` (at least 1) at a time.
 ///
-/// The nearest neighbours of a crowd are some of itself, the same ones for all: without this it would stay many, and
+/// The nearest neighbors of a crowd are some of itself, the same ones for all: without this it would stay many, and
 /// hide who is near.
 fn each_coincident<E>(
     nodes: &MergeNodes<'_>,
@@ -281,12 +281,12 @@ fn each_coincident<E>(
 }
 
 /// Hands on the pairs of nodes (leader, member) that pass tests 1 and 2 of `pass`, `unit` being the length of one unit
-/// of the recipe: the member is among the leader's nearest neighbours and ranks behind it. By leader in voxel order,
+/// of the recipe: the member is among the leader's nearest neighbors and ranks behind it. By leader in voxel order,
 /// then by distance; `most` (at least 1) at a time, and whether that is a part of them. Gives the number of nodes with
-/// more neighbours within ε than were looked at.
+/// more neighbors within ε than were looked at.
 ///
 /// A node that is not mergeable or not finite leads nobody, joins nobody and takes no place among the nearest
-/// neighbours of others.
+/// neighbors of others.
 fn each_candidate<E>(
     nodes: &MergeNodes<'_>,
     rank: &[u32],

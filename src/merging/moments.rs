@@ -30,7 +30,7 @@ pub struct WeightedGaussian {
 /// Mean and covariance R S Sᵀ Rᵀ of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ellipsoid {
-    /// Centre.
+    /// Center.
     pub mean: DVec3,
     /// Unit, w ≥ 0.
     pub rotation: DQuat,

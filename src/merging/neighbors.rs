@@ -1,4 +1,4 @@
-//! The nearest neighbours of every Gaussian, by a hash of voxels as wide as they may be apart.
+//! The nearest neighbors of every Gaussian, by a hash of voxels as wide as they may be apart.
 //!
 //! In: positions. Out: for a Gaussian the at most K nearest others within ε, nearest first, ties by
 //! index. The answer is defined by (distance, index) alone, so it does not depend on voxels, hashes, threads or any
@@ -6,7 +6,7 @@
 //!
 //! Points stand in the order of their voxels, and a table tells where each voxel starts. What is within ε of a point is
 //! in its own voxel or in one of the 26 around it: those are looked up once for all points of a voxel, and skipped where
-//! they are farther than the worst neighbour kept. A voxel of very many points has a [`Tree`] over them, so that a crowd
+//! they are farther than the worst neighbor kept. A voxel of very many points has a [`Tree`] over them, so that a crowd
 //! in one voxel, or an ε that reaches everywhere, costs what a tree costs.
 //! Memory: 16 bytes per point, and 13 bytes for each slot of the table, of which there are at most 16 for 7 voxels: at
 //! most 46 bytes per point, 40 while points are sorted.
@@ -29,7 +29,7 @@ const SPARSE: usize = 64;
 /// Part of a voxel's side by which places may be wrong: they are up to 2²¹ sides, rounded to 53 bits a few times.
 const MARGIN: f64 = 1.0 / (1 << 20) as f64;
 
-/// Finite points, to be asked for the neighbours of each within ε.
+/// Finite points, to be asked for the neighbors of each within ε.
 #[derive(Debug)]
 pub struct PointIndex {
     epsilon: f64,
@@ -83,12 +83,12 @@ impl PointIndex {
         PointIndex { epsilon, voxels, points, trees, table }
     }
 
-    /// All points, those of a voxel together: the fastest order to ask for their neighbours in.
+    /// All points, those of a voxel together: the fastest order to ask for their neighbors in.
     pub fn points(&self) -> &[TreePoint] {
         &self.points
     }
 
-    /// What asks for neighbours: one for each thread, to be used again.
+    /// What asks for neighbors: one for each thread, to be used again.
     pub fn search(&self) -> NeighborSearch<'_> {
         NeighborSearch { index: self, entered: None, around: Vec::new(), nearest: Nearest::default() }
     }
@@ -106,7 +106,7 @@ fn hash(number: u64) -> u64 {
     (hash_id(number >> 3) & !7 | corner) ^ corner << 60
 }
 
-/// Asks an index for neighbours, and remembers what surrounds the voxel asked about last.
+/// Asks an index for neighbors, and remembers what surrounds the voxel asked about last.
 #[derive(Debug)]
 pub struct NeighborSearch<'a> {
     index: &'a PointIndex,
@@ -121,7 +121,7 @@ impl NeighborSearch<'_> {
     /// ε, nearest first, equal distances by index; and whether there were more than `k`.
     ///
     /// Squared distances are summed in f64 and compared with ε². Edges: a point that is not finite
-    /// has no neighbours.
+    /// has no neighbors.
     pub fn nearest(&mut self, query: u32, at: [f32; 3], k: usize) -> (impl ExactSizeIterator<Item = u32>, bool) {
         let index = self.index;
         // One more than k tells whether the list was cut.
@@ -281,7 +281,7 @@ mod tests {
         }
     }
 
-    // Neighbours exactly ε away, on the borders of voxels, wherever the grid begins and however wide ε is.
+    // Neighbors exactly ε away, on the borders of voxels, wherever the grid begins and however wide ε is.
     #[test]
     fn what_is_exactly_epsilon_away_is_found() {
         for unit in [1.0f32, 0.1, 3e-7, 7e9] {
@@ -324,7 +324,7 @@ mod tests {
         assert_eq!((found.collect::<Vec<_>>(), truncated), (vec![2], false));
     }
 
-    /// Seconds for all neighbours of `points`, and how many lists were cut.
+    /// Seconds for all neighbors of `points`, and how many lists were cut.
     fn timed(points: &[[f32; 3]], k: usize, epsilon: f64) -> (f64, usize) {
         let start = Instant::now();
         let index = PointIndex::new(named(points), epsilon);

@@ -96,12 +96,12 @@ pub fn weights(members: &[u32], importance: &Importance<'_>, states: &Gaussians)
 /// The proxy of `members` — rows of `states` with weights that sum to 1, `leader` among them.
 ///
 /// Mean and covariance are the mixture's; with [`Placement::Leader`] the proxy sits at the leader and
-/// takes the second moments about it. Base colour is the weighted average, higher bands that or the
+/// takes the second moments about it. Base color is the weighted average, higher bands that or the
 /// heaviest member's (ties to the first). Opacity: [`ProxyOpacity`], an area being the mean over all
 /// directions of the ellipsoid's shadow. Exact duplicates give the leader's own position, axes,
-/// scales and colour. A zero quaternion is the identity.
+/// scales and color. A zero quaternion is the identity.
 ///
-/// Colours are left out unless `want` names them: they lie far apart, and most sequences have the same at every frame.
+/// Colors are left out unless `want` names them: they lie far apart, and most sequences have the same at every frame.
 pub fn merge_state(
     members: &[(u32, f64)],
     states: &Gaussians,
@@ -228,7 +228,7 @@ fn merged_sh(members: &[(u32, f64)], states: &Gaussians, leader: u32, high: ShHi
         .fold((leader, f64::NEG_INFINITY), |best, &(i, weight)| if weight > best.1 { (i, weight) } else { best })
         .0;
     let average = |plane: &[f32]| {
-        // Differences from the leader: equal colours stay equal to the last bit.
+        // Differences from the leader: equal colors stay equal to the last bit.
         let base = f64::from(plane[leader as usize]);
         base + members.iter().map(|&(i, weight)| weight * (f64::from(plane[i as usize]) - base)).sum::<f64>()
     };

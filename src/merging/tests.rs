@@ -208,7 +208,7 @@ fn exact_duplicates_merge_to_one() {
 #[test]
 fn a_crowd_of_any_number_at_one_place_is_one_before_it_meets_its_neighbours() {
     for count in [34, 100, 5000] {
-        // Two crowds of different colours at one place, of which the others are near; one other alone.
+        // Two crowds of different colors at one place, of which the others are near; one other alone.
         let mut scene = Scene::strewn(2 * count + 1);
         let places: Vec<u32> = (0..=2 * count as u32).map(|i| if i == 0 { 0 } else { 1 + i % 2 }).collect();
         scene.states = scene.states.pick(&places);

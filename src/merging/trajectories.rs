@@ -231,7 +231,7 @@ mod tests {
     fn played_trajectories_are_those_of_the_source_whatever_varies_and_however_many_frames_are_taken_together() {
         let folder = tempfile::tempdir().unwrap();
         let ids: Vec<u32> = (0..2500).map(|k| (k * 1171 + 5) % 3000).collect();
-        // Neighbours, gaps narrow and wide, both ends.
+        // Neighbors, gaps narrow and wide, both ends.
         let places: Vec<u32> = (0..5).chain([9, 40, 300]).chain(1000..2400).chain([2499]).collect();
         let of_places: Vec<u32> = places.iter().map(|&place| ids[place as usize]).collect();
         for varying in [NEEDED, Columns::POSITION, Columns::OPACITY, Columns::empty()] {

@@ -106,7 +106,7 @@ pub trait InputModel: Send + Sync {
         None
     }
 
-    /// Colour behind the scene that it was trained with, where it names one.
+    /// Color behind the scene that it was trained with, where it names one.
     fn background(&self) -> Option<[f32; 3]> {
         None
     }
@@ -367,7 +367,7 @@ pub struct OpenOptions {
 /// What the files of some families do not say of how their models were trained.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Conventions {
-    /// Length of `time_duration`, after which colours repeat; none: the family's guess, with a note.
+    /// Length of `time_duration`, after which colors repeat; none: the family's guess, with a note.
     pub time_duration: Option<f64>,
     /// Whether rotations of four dimensions are those of before 15 September 2024, without the reversal of axes.
     pub rot4d_unflipped: bool,

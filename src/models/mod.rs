@@ -39,7 +39,7 @@ use crate::error::{Error, Result, ShowPath};
 use crate::files::open::open_file;
 use crate::models::input_model::{FoundInput, ModelFormat};
 
-/// Every family that lies in files; the first that recognises a path opens it.
+/// Every family that lies in files; the first that recognizes a path opens it.
 const MODEL_FORMATS: [ModelFormat; 14] = [
     spacetime_gaussians::ENTRY,
     spacetime_gaussians::SPLATV,
@@ -57,7 +57,7 @@ const MODEL_FORMATS: [ModelFormat; 14] = [
     archive::ENTRY,
 ];
 
-/// Colour behind the scene that a model was trained with in whose folder `cameras` is, or which it is: white where the
+/// Color behind the scene that a model was trained with in whose folder `cameras` is, or which it is: white where the
 /// `cfg_args` there says so, as those of 3DGS and of what derives from it do; none where it does not, or cannot be read.
 pub fn trained_background(cameras: &Path) -> Option<[f32; 3]> {
     let folder = if cameras.is_dir() { cameras } else { cameras.parent()? };

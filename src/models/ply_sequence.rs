@@ -76,7 +76,7 @@ enum FrameOrder {
     Lost(String),
 }
 
-/// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighbouring frames, of five that
+/// Whether order tells which Gaussian is which: it does where it holds in most pairs of neighboring frames, of five that
 /// are evenly spread.
 fn order(frames: &PlyFrames) -> Result<FrameOrder> {
     if let Some(other) = frames.other_count() {

@@ -15,7 +15,7 @@ use crate::render::Image;
 
 /// Program that encodes what this one does not.
 const ENCODER: &str = "ffmpeg";
-/// How well colours of a GIF are chosen: 1 is best, 30 fastest; 10 is what its author took.
+/// How well colors of a GIF are chosen: 1 is best, 30 fastest; 10 is what its author took.
 const GIF_SPEED: i32 = 10;
 /// Bytes kept of what the encoder says.
 const SAID: u64 = 1 << 16;
@@ -25,7 +25,7 @@ const SAID: u64 = 1 << 16;
 pub enum FilmFormat {
     /// Animated PNG: every bit of every frame.
     Apng,
-    /// Animated GIF: 256 colours a frame, delays of whole hundredths of a second.
+    /// Animated GIF: 256 colors a frame, delays of whole hundredths of a second.
     Gif,
     /// Encoded by the program at this path.
     Encoded(PathBuf, Codec),
@@ -216,7 +216,7 @@ impl FrameEncoder {
         let mut command = Command::new(program);
         command.args(["-hide_banner", "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
         command.args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "pipe:0", "-an"]);
-        // Players want colours at half the resolution, and for that even sizes.
+        // Players want colors at half the resolution, and for that even sizes.
         command.args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]);
         command.args(match codec {
             Codec::Mp4 => &["-c:v", "libx264", "-crf", "18", "-movflags", "+faststart", "-f", "mp4"][..],

@@ -1,7 +1,7 @@
 //! A sequence as a `.4dgs`: pieces of straight motion in windows of time, written and checked by the crate `fourdgs`.
 //!
 //! Frames follow one another at 30 a second, whatever the source's clock; a piece lasts until the frame after its last one.
-//! Base colours are cut to [0, 1], harmonics above degree 0 become bytes over [−4, 4], as the format has them. Memory: all pieces, about 600 bytes each
+//! Base colors are cut to [0, 1], harmonics above degree 0 become bytes over [−4, 4], as the format has them. Memory: all pieces, about 600 bytes each
 //! while they are encoded.
 
 use std::path::Path;

@@ -48,7 +48,7 @@ impl<'a> FrameReaders<'a> {
         Gaussians::zeros(self.count, self.sh_degree())
     }
 
-    /// No room for colours that nobody reads.
+    /// No room for colors that nobody reads.
     fn sh_degree(&self) -> usize {
         if self.columns.contains(Columns::SH) { self.info.sh_degree } else { 0 }
     }

@@ -95,7 +95,7 @@ pub struct ViewStates<'a, const S: usize> {
     pub camera: &'a Camera,
     /// What it shows.
     pub states: [&'a Gaussians; S],
-    /// Of subjects with features in the place of colours, what decodes them, and the features.
+    /// Of subjects with features in the place of colors, what decodes them, and the features.
     decoded: [Option<(&'a dyn FeatureDecoder, &'a Column)>; S],
 }
 
@@ -300,7 +300,7 @@ mod tests {
         }
     }
 
-    /// A scene whose Gaussians have features, and whose colours are the rays that pixels are seen along.
+    /// A scene whose Gaussians have features, and whose colors are the rays that pixels are seen along.
     struct Rays(Scene);
 
     impl FrameSource for Rays {

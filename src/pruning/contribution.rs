@@ -15,7 +15,7 @@ use crate::progress::Progress;
 use crate::render::{Contribution, Renderer};
 use crate::source::{FrameSource, Ids};
 
-/// What contributions depend on: all but colour.
+/// What contributions depend on: all but color.
 const GEOMETRY: Columns = Columns::all().difference(Columns::SH);
 
 /// What was seen of N Gaussians.

@@ -45,7 +45,7 @@ pub struct ScoreStage {
     pub snap_noise: bool,
     /// What becomes of Gaussians with NaN or infinity.
     pub non_finite: NonFinite,
-    /// Normalisation and weights.
+    /// Normalization and weights.
     pub score: recipe::ScoreParams,
     /// Stages 1 and 2 of the selection.
     pub select: recipe::Select,
@@ -65,7 +65,7 @@ pub struct Scored {
     frames: usize,
     /// See [`frames_to_see`].
     pub frames_to_see: usize,
-    /// How the terms of the scores were normalised.
+    /// How the terms of the scores were normalized.
     pub terms: Vec<Term>,
     /// Counts of odd Gaussians.
     pub flags: FlagSummary,

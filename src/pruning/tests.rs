@@ -6,7 +6,7 @@ use super::*;
 use crate::model::hash_id;
 use crate::recipe::Recipe;
 
-/// Scores in which S is the sum of the normalised parts.
+/// Scores in which S is the sum of the normalized parts.
 fn scores(parts: &[(f64, f64)]) -> Scores {
     let (static_norm, dynamic_norm): (Vec<f64>, Vec<f64>) = parts.iter().copied().unzip();
     let score = parts.iter().map(|(s, d)| s + d).collect();

@@ -40,7 +40,7 @@ const MOST_PASSES: usize = 16;
 pub struct Recipe {
     /// The pass over all frames.
     pub scan: ScanParams,
-    /// Normalisation and weights.
+    /// Normalization and weights.
     pub score: ScoreParams,
     /// Stages 1 and 2.
     pub select: Select,
@@ -50,7 +50,7 @@ pub struct Recipe {
     pub refine: RefineParams,
     /// What deforms it.
     pub field: FieldParams,
-    /// How its colours change with direction.
+    /// How its colors change with direction.
     pub bands: ShDegreeParams,
 }
 

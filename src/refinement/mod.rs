@@ -114,7 +114,7 @@ impl RefineStage {
         (!refine.columns.is_empty() && refine.steps > 0).then_some(refine)
     }
 
-    /// The same, but that colours' change with direction stays.
+    /// The same, but that colors' change with direction stays.
     pub fn without_bands(self) -> RefineStage {
         RefineStage { sh_degree: 0, ..self }
     }
@@ -950,7 +950,7 @@ mod tests {
             });
             assert_eq!((alike.course.0.len(), along.course.0.len()), (0, 4));
             assert!(along.change == alike.change, "{name}");
-            // Some tracks are of two Gaussians of this scene, which have colours of their own.
+            // Some tracks are of two Gaussians of this scene, which have colors of their own.
             assert!(link == Link::Apart || !along.course.columns().contains(Columns::SH), "{name}");
             let [before, after] = [&alike, &along].map(|reduction| held_out(&scene, &made.rig(), reduction));
             // What moves is a small part of these pictures, and the rest does not begin to.

@@ -1,9 +1,9 @@
 //! Charts: from data to SVG, as text to be put into a page.
 //!
-//! Data in: numbers and names. Data out: one `<svg>` element that takes its colours from [`STYLE`] and
+//! Data in: numbers and names. Data out: one `<svg>` element that takes its colors from [`STYLE`] and
 //! its text from the page around it. Nothing is drawn for values that are not finite. Series differ by
-//! shape and dash as well as by colour, and the colours are those of Okabe and Ito ("Color Universal
-//! Design", 2008), which colour-blind people tell apart.
+//! shape and dash as well as by color, and the colors are those of Okabe and Ito ("Color Universal
+//! Design", 2008), which color-blind people tell apart.
 
 use std::fmt::{self, Write as _};
 
@@ -21,7 +21,7 @@ const BOTTOM: f64 = 46.0;
 /// Height of a line of the legend, and about how wide one of its letters is on a narrow page, where they are largest.
 const LINE: f64 = 18.0;
 const LETTER: f64 = 8.2;
-/// Colours, shapes and dashes that [`STYLE`] and this file know.
+/// Colors, shapes and dashes that [`STYLE`] and this file know.
 const LOOKS: usize = 9;
 
 /// A direction of a plot.
@@ -44,7 +44,7 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
     /// Whether a line joins the points.
     pub joined: bool,
-    /// Whether it is the other one of a pair with the series before it: in the same colour, dashed and hollow.
+    /// Whether it is the other one of a pair with the series before it: in the same color, dashed and hollow.
     pub paired: bool,
     /// What stands beside the points where there is room, as many as they are, or nothing.
     pub labels: Vec<String>,

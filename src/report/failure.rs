@@ -2,11 +2,11 @@
 //!
 //! In: what kinds of Gaussian there are ([`mod@super::traits`]), and both models' pictures. Out: per kind
 //! how much larger the error is where it is seen, where that is worst, and a verdict. Where a kind is
-//! seen is known exactly: the original is rendered once more with colours that say the kind, which gives
+//! seen is known exactly: the original is rendered once more with colors that say the kind, which gives
 //! for every pixel the share w of it that such Gaussians have.
 //!
 //! The failure cases are those of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting Models",
-//! section 4.5. Memory: per thread one more picture, and the original's state without its colours.
+//! section 4.5. Memory: per thread one more picture, and the original's state without its colors.
 
 use serde::{Deserialize, Serialize};
 
@@ -125,7 +125,7 @@ pub struct KindMembers {
 pub fn shares_of_pixels(state: &Gaussians, traits: &[Traits], camera: &Camera) -> Image {
     let mut sh = Column::zeros(3, state.len());
     for (i, traits) in traits.iter().enumerate() {
-        // Colour is 0.5 + SH_C0 · coefficient.
+        // Color is 0.5 + SH_C0 · coefficient.
         sh.set_row(i, traits.map(|of| ((f64::from(u8::from(of)) - 0.5) / SH_C0) as f32));
     }
     let marked = Gaussians {

@@ -136,7 +136,7 @@ fn turned(knob: &EffortCurve, found: &TradeOff) -> Chart {
 /// Label of an axis of [`error`].
 const ERROR: &str = "root mean square error";
 
-/// Of colours from 0 to 1, as the mean PSNR has it.
+/// Of colors from 0 to 1, as the mean PSNR has it.
 fn error(point: &TradeOffPoint) -> f64 {
     10f64.powf(-point.psnr / 20.0)
 }

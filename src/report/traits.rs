@@ -3,7 +3,7 @@
 //! In: the original's frames and its rows of statistics. Out: for every Gaussian a [`Traits`] set.
 //! The kinds are the failure cases of "Temporally-Aware Pruning for Compact 4D Gaussian Splatting
 //! Models", section 4.5; the paper gives no measures for them, those here are this project's.
-//! Memory: where colours vary one frame of them and 88 bytes per Gaussian; per fast one at most 190.
+//! Memory: where colors vary one frame of them and 88 bytes per Gaussian; per fast one at most 190.
 
 use rayon::prelude::*;
 
@@ -20,12 +20,12 @@ use crate::source::{BlockReader, FrameSource, Ids, ReadPlan};
 /// D from which a Gaussian is fast: this part of the scene extent per frame. On a picture as wide as the
 /// scene and 500 pixels across, a pixel per frame.
 pub const FAST: f64 = 2e-3;
-/// Root mean square change of the distance to half of its neighbours, as part of that distance, from which
+/// Root mean square change of the distance to half of its neighbors, as part of that distance, from which
 /// motion is not rigid.
 pub const NON_RIGID: f64 = 0.05;
-/// Distances below this part of the extent count as it: nobody sees neighbours so near change places.
+/// Distances below this part of the extent count as it: nobody sees neighbors so near change places.
 const NEAREST: f64 = 1e-3;
-/// Neighbours whose distance is followed.
+/// Neighbors whose distance is followed.
 pub const NEIGHBOURS: usize = 8;
 /// Longest over second scale from which a Gaussian is thin.
 pub const THIN: f64 = 5.0;
@@ -33,19 +33,19 @@ pub const THIN: f64 = 5.0;
 pub const STILL: f64 = 5e-4;
 /// Standard deviation over its life of a still Gaussian's opacity from which its appearance changes.
 pub const OPACITY_CHANGE: f64 = 0.05;
-/// The same of its base colour, root mean square over the channels: five of 255 steps.
+/// The same of its base color, root mean square over the channels: five of 255 steps.
 pub const COLOUR_CHANGE: f64 = 0.02;
-/// Frames at which distances and colours are sampled, evenly.
+/// Frames at which distances and colors are sampled, evenly.
 pub const SAMPLES: usize = 24;
 
 /// Kinds of Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GaussianKind {
-    /// Fast, and moving otherwise than its neighbours.
+    /// Fast, and moving otherwise than its neighbors.
     Motion,
     /// Much longer than wide.
     Thin,
-    /// Still, and changing in opacity or colour.
+    /// Still, and changing in opacity or color.
     Appearance,
 }
 
@@ -127,9 +127,9 @@ fn samples(frames: usize) -> Vec<usize> {
 }
 
 /// How much the surroundings of the Gaussians `ids` change shape: for each the lower median, over its
-/// nearest visible neighbours at the reference frame, of the root mean square change of distance as part
+/// nearest visible neighbors at the reference frame, of the root mean square change of distance as part
 /// of that distance (of `nearest`, if that is more). A rigid motion, rotations included, changes none; the
-/// median leaves out neighbours that belong to another thing.
+/// median leaves out neighbors that belong to another thing.
 fn bending(
     source: &dyn FrameSource,
     reference: &Gaussians,
@@ -185,13 +185,13 @@ fn bending(
         .collect())
 }
 
-/// Standard deviation of every Gaussian's base colour over the sampled frames it lives in; empty where
-/// colours are constant.
+/// Standard deviation of every Gaussian's base color over the sampled frames it lives in; empty where
+/// colors are constant.
 fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Columns::SH) {
         return Ok(Vec::new());
     }
-    // From the first living frame's colour: sums of small differences lose no digits.
+    // From the first living frame's color: sums of small differences lose no digits.
     let mut first: Vec<Option<[f64; 3]>> = vec![None; all.len()];
     let mut sums = vec![(0u32, [0.0f64; 3], [0.0f64; 3]); all.len()];
     let columns = Columns::SH | Columns::OPACITY;

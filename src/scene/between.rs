@@ -13,7 +13,7 @@ const WIDEST: f64 = -0.6;
 
 /// `count` cameras, each on the way from one of `cameras` to another that stands no more than a third of a turn away, as
 /// seen from where the optical axes meet, or else to the nearest one: turned evenly, that point at its place in the
-/// pictures, and as far from it as its way along says. Ways between neighbours alone leave the middle of a rig empty. None
+/// pictures, and as far from it as its way along says. Ways between neighbors alone leave the middle of a rig empty. None
 /// where all cameras stand at one place. The same for the same cameras.
 pub fn between(cameras: &[Camera], count: usize) -> Vec<Camera> {
     let focus = meeting_point(cameras);

@@ -41,7 +41,7 @@ pub struct Scene {
     /// Whether the cameras were given or found, or surround a still scene: what they see is then the scene. Else they are a
     /// virtual rig, which may see only what is in front of it.
     pub has_cameras: bool,
-    /// Colour behind the scene, red, green, blue in [0, 1]: the cameras' own, else the one that the input was trained
+    /// Color behind the scene, red, green, blue in [0, 1]: the cameras' own, else the one that the input was trained
     /// with, else the model in whose folder the cameras are, else black.
     pub background: [f32; 3],
     /// What passes over it keep in memory at a time.

@@ -91,10 +91,10 @@ pub fn thin(pictures: Vec<Picture>, count: usize) -> Vec<Picture> {
     pictures.into_iter().filter(|picture| kept.binary_search(&picture.frame).is_ok()).collect()
 }
 
-/// Colour behind a scene: the one asked for, else the scene's own.
+/// Color behind a scene: the one asked for, else the scene's own.
 ///
 /// # Errors
-/// A colour that is not from 0 to 1.
+/// A color that is not from 0 to 1.
 pub fn background(asked: Option<[f32; 3]>, scene: &Scene) -> Result<[f32; 3]> {
     match asked {
         Some(rgb) if rgb.iter().any(|c| !(0.0..=1.0).contains(c)) => {

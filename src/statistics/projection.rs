@@ -10,7 +10,7 @@
 //! det Σ is never formed as Σ_xx Σ_yy − Σ_xy², which has no correct digit left for a long needle:
 //! det(MMᵀ + d·I) = Σ(2×2 minors of M)² + d·tr(MMᵀ) + d² has positive terms only (Cauchy–Binet).
 //!
-//! The inner loop runs over planes without branches, so that it vectorises; no fused multiply-add is
+//! The inner loop runs over planes without branches, so that it vectorizes; no fused multiply-add is
 //! used, so every instruction set gives the same bits.
 
 use std::f64::consts::FRAC_PI_4;

@@ -142,7 +142,7 @@ fn sinusoid_over_100_000_steps_has_its_analytic_motion() {
         let divisor = steps + usize::from(motion == MotionParams::Literal);
         close("D", rows.d[0], half * (2.0 * steps as f64 / divisor as f64).sqrt(), 1e-6, 0.0);
         // Second difference 4 sin²(ω/2)·|sin ωt|; the mean of |sin| over 1000 samples is cot(ω/2)/500. Frame 0,
-        // where it vanishes, is no centre.
+        // where it vanishes, is no center.
         let mean = 4.0 * half * half / (500.0 * (omega / 2.0).tan());
         close("kappa", rows.kappa[0], mean * steps as f64 / (steps - 1) as f64, 1e-3, 0.0);
         close("kappa", rows.kappa[0], mean, 0.0, 1e-6);
@@ -200,7 +200,7 @@ fn alternating_life_has_no_interior_triples() {
     let alive = |t: usize| if t.is_multiple_of(2) { ALIVE } else { DEAD };
     let rows = lone(9, |t| (t * t) as f32, alive, MotionParams::Runs).rows;
     assert_eq!((rows.d[0], rows.kappa[0], rows.life[0]), (0.0, 0.0, 5));
-    // To the letter, neighbours of a centre need not live: centres 2, 4 and 6 turn by 2 each.
+    // To the letter, neighbors of a center need not live: centers 2, 4 and 6 turn by 2 each.
     assert_eq!(lone(9, |t| (t * t) as f32, alive, MotionParams::Literal).rows.kappa[0], 2.0);
 }
 
@@ -211,7 +211,7 @@ fn turn_about_the_last_life_frame_is_discarded() {
         let x = |t: usize| if t <= last { t as f32 } else { 50.0 };
         assert_eq!(lone(10, x, |t| if t <= last { ALIVE } else { DEAD }, motion).rows.kappa[0], 0.0);
     }
-    // With a later life frame the centre was interior, and the jump counts.
+    // With a later life frame the center was interior, and the jump counts.
     let rows = lone(10, |t| if t <= 6 { t as f32 } else { 50.0 }, |t| if t == 7 { DEAD } else { ALIVE }, BOTH[0]).rows;
     close("kappa", rows.kappa[0], (43.0 + 0.0) / 7.0, 1e-12, 0.0);
 }

@@ -140,7 +140,7 @@ fn floor(x: f64) -> i64 {
 }
 
 /// What a cell is called, from its level and its place along each axis: two that share it would cost time and change
-/// nothing. The eight cells of a cube differ in the last bits alone, so that they are neighbours in the table.
+/// nothing. The eight cells of a cube differ in the last bits alone, so that they are neighbors in the table.
 #[derive(Clone, Copy)]
 struct CellKey {
     cube: u64,

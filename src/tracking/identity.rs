@@ -19,7 +19,7 @@ pub struct OrderDifference {
     pub moved: f64,
     /// The same of strangers: each with the one that stands half of all further.
     pub apart: f64,
-    /// Difference in size, shape, opacity and base colour: A of the [module](super).
+    /// Difference in size, shape, opacity and base color: A of the [module](super).
     pub unlike: f64,
     /// The same of strangers.
     pub strangers: f64,

@@ -6,10 +6,10 @@
 //! Time: linear in the number of Gaussians, however they lie.
 //!
 //! A Gaussian is compared by its position x, its size s, the root mean square of its three scales, its shape Ŝ, the
-//! covariance over its trace, its opacity α and its base colour c. A track, last seen n frames ago, is expected at
+//! covariance over its trace, its opacity α and its base color c. A track, last seen n frames ago, is expected at
 //! p = x + n·v, with v its velocity per frame: its first step, then half of the old one and half of the last step.
 //!
-//! 1. What is repeated to the bit (position, rotation, scales, opacity, base colour) is the same, the k-th of equal tracks
+//! 1. What is repeated to the bit (position, rotation, scales, opacity, base color) is the same, the k-th of equal tracks
 //!    the k-th of equal Gaussians.
 //! 2. The cost that Gaussian b goes on with track a is
 //!    |x_b − p_a|² / (r·u)² + q·A, with u = s_a + min(½·n·|v_a|, 3·s_a) and
@@ -21,7 +21,7 @@
 //! 3. First with r = ¼ and q = 4, tracks of the frame before alone; of what is left with r = 1 and q = 1, all tracks; then
 //!    with r = 4 and q = 4. A track of the frame before that is missed while a Gaussian is where it is expected and looks
 //!    like it, |x_b − p_a|² / (¼·min(s_a, s_b))² + A ≤ 1 without opacities, was succeeded by that: from then on it goes on by
-//!    rule 1 alone, and not as a neighbour that begins anew in these frames.
+//!    rule 1 alone, and not as a neighbor that begins anew in these frames.
 //! 4. A link is wrong with the larger chance of two. By rivals: R⁵ / (1 + R⁵), where R is what it and a rival cost, over
 //!    what they would cost the other way round, the largest of all that its track named instead and all that named its
 //!    Gaussian; ½ where that makes no difference, and about what is found in trained models whose links are known. Twins
@@ -41,7 +41,7 @@
 //!    [blended](blend).
 //!
 //! Tracks are numbered by their births, those of one frame by its order. What is not a number is never compared: it goes on
-//! if it is repeated only. Colours are compared without harmonics, which turn with the Gaussian.
+//! if it is repeated only. Colors are compared without harmonics, which turn with the Gaussian.
 //!
 //! Gaussians are found by cells of a grid for every octave of sizes. In a cell of more than 64 only 64 are looked at,
 //! those of the nearest brightness, so that thousands at one place cost no more than elsewhere.

@@ -584,7 +584,7 @@ fn slow_lives(
 }
 
 /// Frames of a cloud whose Gaussians live for `shortest` to `shortest` + 4 frames at a time, and fade over `overlap` of them;
-/// every life has colours of its own, and there is a seventh that nothing follows on.
+/// every life has colors of its own, and there is a seventh that nothing follows on.
 fn fading(
     cloud: &Gaussians,
     frames: usize,

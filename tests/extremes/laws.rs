@@ -69,7 +69,7 @@ impl World {
     }
 }
 
-/// A coordinate: on a grid, a neighbour of 1, subnormal, huge either way, or a zero of either sign.
+/// A coordinate: on a grid, a neighbor of 1, subnormal, huge either way, or a zero of either sign.
 fn coordinate() -> impl Strategy<Value = f32> {
     prop_oneof![
         8 => (-2048i32..2048).prop_map(|k| k as f32 / 1024.0),

@@ -37,7 +37,7 @@
 //! | 32 | a crowd in one voxel | `merging::a_crowd_in_one_voxel_is_cut_and_said_to_be` |
 //! | 33 | sorted chain | `merging::a_sorted_chain_merges_as_the_sequential_rule_says` |
 //! | 34 | partitions 1, 7, 64 | `tests/merging.rs: partitions_of_the_pairs_change_no_byte` |
-//! | 35 | black beside grey | `merging::what_looks_otherwise_never_merges` |
+//! | 35 | black beside gray | `merging::what_looks_otherwise_never_merges` |
 //! | 36 | ΣC·Vis = 0 | `merging::what_nobody_sees_merges_by_opacity_times_area` |
 //! | 37 | threads, memory, tiles | `tests/compress.rs: threads_change_no_byte`, `tests/memory.rs: the_least_that_is_named_works_…`; selfcheck "1 and 2 threads" |
 //! | 38 | opposite, 10 v | `merging::what_moves_or_lives_otherwise_never_merges` |
@@ -69,7 +69,7 @@ use splatsieve::files::frame_stream::StreamHeader;
 use splatsieve::model::{Columns, Gaussians};
 use splatsieve::outputs::frame_stream::StreamWriter;
 
-/// `n` grey balls of radius 0.05 strewn over a unit square by the golden ratio, opacity 0.73.
+/// `n` gray balls of radius 0.05 strewn over a unit square by the golden ratio, opacity 0.73.
 fn balls(n: usize) -> Gaussians {
     let mut balls = Gaussians::zeros(n, 0);
     for i in 0..n {

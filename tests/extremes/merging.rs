@@ -316,7 +316,7 @@ fn what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing()
         assert!(map[20] >= 0, "{more}: the background went");
         assert_eq!(map.iter().filter(|&&place| place == map[20]).count(), 1, "{more}: it swallowed others");
     }
-    // Detail of its colour at its centre: only by its size does the giant differ.
+    // Detail of its color at its center: only by its size does the giant differ.
     for i in 50..60 {
         cloud.position.set_row(i, [0.5 + 1e-3 * (i - 50) as f32, 0.5, 60.0]);
         cloud.sh.set_row(i, cloud.sh.row::<3>(20));
@@ -344,7 +344,7 @@ fn a_crowd_in_one_voxel_is_cut_and_said_to_be() {
     let summary = workplace.summary(&format!("crowd.ply -o out.ply {MERGE} --length-unit scene"));
     let pass = &summary["merge"]["passes"][0];
     assert_eq!(pass["truncated"], N, "{pass}");
-    // As many pairs at most as neighbours that are looked at.
+    // As many pairs at most as neighbors that are looked at.
     assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
 }
 
@@ -365,7 +365,7 @@ fn a_sorted_chain_merges_as_the_sequential_rule_says() {
     let camera =
         CAMERA.replace("[0.5, 0.5, -3]", "[2, 0, -400]").replace("\"fx\": 60, \"fy\": 60", "\"fx\": 900, \"fy\": 900");
     fs::write(workplace.path("cameras.json"), camera).unwrap();
-    // Neighbours lie within reach, and who comes next but one does not.
+    // Neighbors lie within reach, and who comes next but one does not.
     let flags = "--length-unit scene --merge-pass 0.0011,1e9,-1,-1 --cameras cameras.json";
     let summary = workplace.summary(&format!("chain.ply -o out.ply {MERGE} {flags}"));
     workplace.done("score chain.ply --coverage projected --cameras cameras.json -o rows.npz");

@@ -120,7 +120,7 @@ impl Model {
         Some(archive.by_name(name).unwrap()?.into_vec().unwrap())
     }
 
-    /// `[count, 16, 3]` from the model's PLY: 62 floats per Gaussian, the colours after position and normal,
+    /// `[count, 16, 3]` from the model's PLY: 62 floats per Gaussian, the colors after position and normal,
     /// `f_rest` channel by channel.
     fn canonical_sh(&self, count: usize) -> Vec<f32> {
         let iteration = fs::read_dir(self.folder.join("point_cloud")).unwrap().next().unwrap().unwrap().path();

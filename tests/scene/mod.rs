@@ -23,7 +23,7 @@ pub(crate) fn tiny() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tiny_model")
 }
 
-/// The program: the one that was built with this test, or another one that `SPLATSIEVE_PROGRAM` names, an optimised one.
+/// The program: the one that was built with this test, or another one that `SPLATSIEVE_PROGRAM` names, an optimized one.
 pub(crate) fn program() -> PathBuf {
     std::env::var_os("SPLATSIEVE_PROGRAM").map_or_else(|| assert_cmd::cargo::cargo_bin("splatsieve"), PathBuf::from)
 }
@@ -56,7 +56,7 @@ pub(crate) fn shared(name: &str) -> PathBuf {
     folder
 }
 
-/// Copies the model at `from` to the new folder `to`, but that nothing deforms its colours.
+/// Copies the model at `from` to the new folder `to`, but that nothing deforms its colors.
 pub(crate) fn without_sh_head(from: &Path, to: &Path) {
     for (name, bytes) in files(from) {
         let path = to.join(&name);

@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A pinhole camera in OpenCV axes (x right, y down, z forward); pixel centres at half integers.
+/// A pinhole camera in OpenCV axes (x right, y down, z forward); pixel centers at half integers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Picture width in pixels.

@@ -1,4 +1,4 @@
-//! A fixed hash of ids: breaks ties without favouring a place in the file, and replaces random numbers.
+//! A fixed hash of ids: breaks ties without favoring a place in the file, and replaces random numbers.
 
 /// SplitMix64's finaliser (Steele, Lea and Flood 2014) of `id + 1` golden gammas. A bijection on u64, so two ids
 /// never tie; the same everywhere and always.

@@ -29,7 +29,7 @@ pub use robust_box::RobustBox;
 pub use rows::{Flags, Rows, Statistic, Values};
 pub use schedule::{Picture, Schedule};
 
-/// Zeroth spherical-harmonic basis constant: colour = 0.5 + SH_C0 · f_dc.
+/// Zeroth spherical-harmonic basis constant: color = 0.5 + SH_C0 · f_dc.
 pub const SH_C0: f64 = 0.282_094_791_773_878_14;
 
 /// Opacity in [0, 1] of a stored logit, in f64.
@@ -42,12 +42,12 @@ pub fn logit(opacity: f64) -> f64 {
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// The colour that a coefficient of degree 0 is from all sides, in f64.
+/// The color that a coefficient of degree 0 is from all sides, in f64.
 pub fn colour(harmonic: f32) -> f64 {
     0.5 + SH_C0 * f64::from(harmonic)
 }
 
-/// The coefficient of degree 0 of a colour.
+/// The coefficient of degree 0 of a color.
 pub fn harmonic(colour: f64) -> f32 {
     ((colour - 0.5) / SH_C0) as f32
 }

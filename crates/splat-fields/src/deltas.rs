@@ -5,7 +5,7 @@ use splat_core::{Column, Columns, Gaussians, Jacobian};
 /// Changes of a block of Gaussians at one time.
 ///
 /// For an active column state = raw·mask + delta, except the rotation, which is never masked and is
-/// raw + delta, or raw ⊗ delta normalised when the field multiplies rotations. An inactive column is
+/// raw + delta, or raw ⊗ delta normalized when the field multiplies rotations. An inactive column is
 /// raw itself, unmasked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Deltas {

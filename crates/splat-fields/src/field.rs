@@ -4,7 +4,7 @@
 //! Gaussian. Memory: the tensors, [`Field::bytes_per_gaussian`] per prepared Gaussian, and about
 //! 4·LANES·(features + trunk + heads) bytes of scratch per reader.
 //! Source: Wu et al., "4D Gaussian Splatting for Real-Time Dynamic Scene Rendering", 2024, and the
-//! behaviour of its public renderer.
+//! behavior of its public renderer.
 
 use std::path::Path;
 

@@ -131,7 +131,7 @@ impl FeaturePlane {
     }
 }
 
-/// The tap of normalised coordinate `u` on `size` texels: align_corners, border padding.
+/// The tap of normalized coordinate `u` on `size` texels: align_corners, border padding.
 /// A NaN coordinate gives a NaN fraction, hence NaN features.
 pub fn tap(u: f32, size: usize) -> Tap {
     let last = (size - 1) as f32;

@@ -7,7 +7,7 @@
 use super::linear::{CacheLine, LANES};
 use super::planes::{FeaturePlane, Planes, SPATIAL, TimeLines, tap, texels};
 
-/// Texels per unit of normalised coordinate `u` on `size` of them; 0 where [`tap`] clips it.
+/// Texels per unit of normalized coordinate `u` on `size` of them; 0 where [`tap`] clips it.
 fn texels_per_unit(u: f32, size: usize) -> f32 {
     if u.abs() <= 1.0 { (size - 1) as f32 / 2.0 } else { 0.0 }
 }
@@ -51,7 +51,7 @@ impl<'a> Patch<'a> {
         }
     }
 
-    /// Channels from `first` on of the bilinear sample, and of its derivatives by both normalised coordinates.
+    /// Channels from `first` on of the bilinear sample, and of its derivatives by both normalized coordinates.
     #[inline(always)]
     fn sloped(&self, first: usize) -> [[f32; CHUNK]; 3] {
         let [ll, hl] = [chunk(self.corners[0], first), chunk(self.corners[1], first)];
@@ -76,7 +76,7 @@ struct Section<'a> {
 }
 
 impl Section<'_> {
-    /// Channels from `first` on of the sample, and of its derivative by the normalised coordinate.
+    /// Channels from `first` on of the sample, and of its derivative by the normalized coordinate.
     #[inline(always)]
     fn sloped(&self, first: usize) -> [[f32; CHUNK]; 2] {
         let [low, high] = [chunk(self.ends[0], first), chunk(self.ends[1], first)];

@@ -9,7 +9,7 @@ use super::lanes::{Aligned, LANES, Lanes, Portable, Sums};
 use super::project::Splat;
 
 const SIDE: usize = TILE as usize;
-/// Groups of eight pixels in a tile: group `row + 16 · column` covers eight neighbours of one row.
+/// Groups of eight pixels in a tile: group `row + 16 · column` covers eight neighbors of one row.
 pub(super) const GROUPS: usize = SIDE * SIDE / LANES;
 
 /// Bits of the groups of even rows.
@@ -91,7 +91,7 @@ pub(super) struct Fragment<V: Lanes> {
     pub(super) left: V,
     /// Offset from the splat's middle of this row, pixels: dx − slope·dy of [`Splat`].
     pub(super) across: V,
-    /// Offset of the row from the splat's centre, pixels: dy of [`Splat`].
+    /// Offset of the row from the splat's center, pixels: dy of [`Splat`].
     pub(super) down: V,
 }
 
@@ -114,7 +114,7 @@ pub(super) trait BlendSink {
     fn end<V: Lanes>(&mut self, drop: Self::Drop<V>, pair: usize);
 }
 
-/// Accumulates colour: three planes.
+/// Accumulates color: three planes.
 pub(super) struct Colour {
     pub(super) planes: [TilePlane; 3],
 }
@@ -264,7 +264,7 @@ struct Crossing {
     pair: usize,
     /// Bits of the groups where it may be visible.
     groups: u32,
-    /// Centre, pixels below the tile's corner.
+    /// Center, pixels below the tile's corner.
     v: f32,
     middles: TileLine,
     levels: TileLine,

@@ -1,6 +1,6 @@
-//! Colour of Gaussians seen from a point: real spherical harmonics up to degree 3.
+//! Color of Gaussians seen from a point: real spherical harmonics up to degree 3.
 //!
-//! Data in: SH planes of a block and the camera's centre. Data out: rgb, unclamped above. The basis is
+//! Data in: SH planes of a block and the camera's center. Data out: rgb, unclamped above. The basis is
 //! the field's (signs of Kerbl et al. 2023; constants as in Sloan, "Stupid Spherical Harmonics Tricks", 2008).
 
 use std::ops::Range;
@@ -11,7 +11,7 @@ use splat_core::{Gaussians, HIGHEST_DEGREE, SH_C0, sh_coefficients};
 /// Red, green and blue of one block.
 pub(super) type Colours = [[f32; BLOCK]; 3];
 
-/// Writes the colours of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`
+/// Writes the colors of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`
 /// clamped at 0 (NaN becomes 0). Coefficients beyond degree 3, or short of a whole degree, are not read.
 #[inline(always)]
 pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colours) {

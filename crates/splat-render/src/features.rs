@@ -1,13 +1,13 @@
-//! Features of Gaussians in the place of colours, blended as colours are.
+//! Features of Gaussians in the place of colors, blended as colors are.
 //!
 //! In: a state, planes of features of any sign. Out: per pixel what is blended of each. A blend is linear, so three features
-//! at a time are pictures of colours: moved and scaled to 0 … 1, for colours are cut at 0, and back by the opacity that a picture
+//! at a time are pictures of colors: moved and scaled to 0 … 1, for colors are cut at 0, and back by the opacity that a picture
 //! of ones has.
 
 use super::render;
 use splat_core::{Camera, Column, Gaussians, harmonic};
 
-/// Σ w·f over the Gaussians of each pixel, w the weights with which colours are blended: `[height, width, planes]` of the
+/// Σ w·f over the Gaussians of each pixel, w the weights with which colors are blended: `[height, width, planes]` of the
 /// planes of `features`. Accuracy: about 1e-6 of the span of a feature's values. What is not finite counts as the least that is.
 ///
 /// # Panics

@@ -31,7 +31,7 @@ pub(super) struct CameraTerms {
     pub(super) rotation: [[f64; 3]; 3],
     translation: [f64; 3],
     pub(super) focal: [f64; 2],
-    /// Where the optical axis lands when pixel centres are integers.
+    /// Where the optical axis lands when pixel centers are integers.
     principal: [f64; 2],
     pub(super) slope_limit: [f64; 2],
     pub(super) center: [f64; 3],
@@ -64,14 +64,14 @@ impl CameraTerms {
 
 /// The footprint of one Gaussian in one picture.
 ///
-/// With pixel offset (dx, dy) from the centre, the exponent of its alpha is, in powers of two,
+/// With pixel offset (dx, dy) from the center, the exponent of its alpha is, in powers of two,
 /// `−narrow·(dx − slope·dy)² − fall·dy²`: the quadratic form of the inverse covariance with the square
 /// completed over x, which neither cancels nor goes positive.
 /// Alone in its line of the cache, for splats are read in another order than they lie.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Splat {
-    /// Centre in pixels, pixel centres at integers.
+    /// Center in pixels, pixel centers at integers.
     pub(super) u: f64,
     pub(super) v: f64,
     pub(super) narrow: f32,
@@ -116,7 +116,7 @@ impl Splats {
     }
 }
 
-/// Appends the visible Gaussians of `ids` to `out`; with `coloured`, their colours too (else black).
+/// Appends the visible Gaussians of `ids` to `out`; with `coloured`, their colors too (else black).
 ///
 /// A Gaussian with a value that is not finite is not visible.
 pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, coloured: bool, out: &mut Splats) {
@@ -383,7 +383,7 @@ pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 /// Columns of the rotation of a wxyz quaternion of any length; the identity for a zero one.
 #[inline(always)]
 fn rotation_matrix([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
-    // 2/|q|² in place of normalising; the floor keeps 0 · s = 0 for a zero quaternion.
+    // 2/|q|² in place of normalizing; the floor keeps 0 · s = 0 for a zero quaternion.
     let norm = w * w + x * x + y * y + z * z;
     let s = 2.0 / if norm < f64::MIN_POSITIVE { f64::MIN_POSITIVE } else { norm };
     [

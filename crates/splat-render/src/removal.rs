@@ -1,6 +1,6 @@
 //! What a picture would lose with each of its Gaussians.
 //!
-//! A Gaussian of colour c and weight w = alpha · transmittance hides what lies behind it, of colour b:
+//! A Gaussian of color c and weight w = alpha · transmittance hides what lies behind it, of color b:
 //! without it the pixel changes by exactly w·(c − b), so one that looks like what it hides is worth
 //! nothing however much it covers. Of N removals at once the changes add up, with b changing too; hence
 //! the floor under c − b, and ranking in rounds.
@@ -21,7 +21,7 @@ pub struct RemovalError {
     /// `[N]`, in units of 2⁻³⁶ ([`RemovalError::UNIT`]); a picture's part is summed per 16×16 tile in f32,
     /// in a fixed order. A sum that would pass 2⁶⁴ stays there.
     pub sum: Vec<u64>,
-    /// Least difference of colour that a Gaussian counts as having from what it hides, as a norm over RGB.
+    /// Least difference of color that a Gaussian counts as having from what it hides, as a norm over RGB.
     pub contrast_floor: f32,
 }
 
@@ -81,7 +81,7 @@ impl RemovalError {
 
 /// Sums squared changes over the pixels of a tile.
 pub(super) struct Removal<'a> {
-    /// Colours of the pixels; of what is drawn so far, each takes its part away.
+    /// Colors of the pixels; of what is drawn so far, each takes its part away.
     pub(super) rest: [TilePlane; 3],
     pub(super) contrast_floor: f32,
     /// One per pair of the tile.
@@ -89,7 +89,7 @@ pub(super) struct Removal<'a> {
 }
 
 impl BlendSink for Removal<'_> {
-    /// Colour and sum.
+    /// Color and sum.
     type Drop<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {
@@ -132,7 +132,7 @@ mod tests {
 
     const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.9];
 
-    /// Translucent Gaussians of many colours before each other.
+    /// Translucent Gaussians of many colors before each other.
     fn cloud(count: usize) -> Gaussians {
         let mut scene = Gaussians::zeros(count, 0);
         for i in 0..count {

@@ -51,7 +51,7 @@ impl Image {
 /// Renders `gaussians` before `background` as `camera` sees them, on all threads of the pool.
 ///
 /// A camera without pixels gives an empty image; no Gaussians give the background. Scales are taken
-/// within e^±80. A zero quaternion is the identity; a NaN colour counts as 0.
+/// within e^±80. A zero quaternion is the identity; a NaN color counts as 0.
 ///
 /// # Panics
 /// If the columns of `gaussians` differ in length.
@@ -59,7 +59,7 @@ pub fn render(gaussians: &Gaussians, camera: &Camera, background: [f32; 3]) -> I
     Renderer::on_all_threads().render(gaussians, camera, background)
 }
 
-/// Adds what `camera` sees of each Gaussian to `seen`, on all threads of the pool; reads no colour.
+/// Adds what `camera` sees of each Gaussian to `seen`, on all threads of the pool; reads no color.
 ///
 /// Only every `stride`-th pixel each way is looked at (those whose coordinates leave `stride / 2` when
 /// divided by it), with footprints at full resolution; the sums are over the looked-at pixels, so a
@@ -273,7 +273,7 @@ pub(super) fn fill_pairs<T: Copy + Default + Send>(
     }
 }
 
-/// The colours of one tile's sampled pixels.
+/// The colors of one tile's sampled pixels.
 fn paint(
     blend: Blend,
     splats: &[Splat],

@@ -11,11 +11,11 @@ use crate::model::SH_C0;
 /// A kind of thing in the demo scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DemoBody {
-    /// Floor and three walls with a chequered texture. Still; inside a tile all of one colour, so
-    /// neighbours can merge.
+    /// Floor and three walls with a chequered texture. Still; inside a tile all of one color, so
+    /// neighbors can merge.
     Wall,
     /// Near-duplicates of wall Gaussians: a tenth of a size beside one, a little smaller, of the same
-    /// colour. Still; the first to merge.
+    /// color. Still; the first to merge.
     Double,
     /// Opaque Gaussians behind the back wall that no camera sees. Still; the first to prune by
     /// visibility, and not by opacity or size.
@@ -25,7 +25,7 @@ pub enum DemoBody {
     /// An egg that circles and spins as one body: strong motion that is rigid, so merging within it
     /// keeps the motion.
     Egg,
-    /// A cloth, held at its left edge and waving at the right: neighbours move differently.
+    /// A cloth, held at its left edge and waving at the right: neighbors move differently.
     Cloth,
     /// A cloud whose opacity goes from full to nothing or the reverse. Still: only the variance of the
     /// opacity and the life span tell it from a wall.
@@ -250,7 +250,7 @@ fn still(position: DVec3, rotation: DQuat, scale: [f64; 3], opacity_logit: f64, 
     DemoGaussian { position, rotation, opacity_logit, motion: DemoMotion::Still, log_scale, sh }
 }
 
-/// Coefficients for a colour in [0, 1], with a tint of its own and a slight change with direction.
+/// Coefficients for a color in [0, 1], with a tint of its own and a slight change with direction.
 fn color(rgb: [f64; 3], dice: GaussianRandom) -> [f32; 12] {
     std::array::from_fn(|at| match at {
         0..3 => ((rgb[at] + 0.02 * dice.signed(TINT) - 0.5) / SH_C0) as f32,

@@ -25,7 +25,7 @@ pub(super) struct Judge {
 /// How close something comes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct JudgedQuality {
-    /// Root mean square error over all pixels, channels and pictures, of colours from 0 to 1.
+    /// Root mean square error over all pixels, channels and pictures, of colors from 0 to 1.
     pub(super) error: f64,
     /// Mean PSNR, dB.
     pub(super) psnr: f64,

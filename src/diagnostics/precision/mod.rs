@@ -1,6 +1,6 @@
 //! Work-precision diagrams: what every knob of a run costs in time and memory, and what error it leaves, on a given model.
 //!
-//! Errors of three sources are kept apart. *Discretisation*: pictures, pixels, frames, rounds and buckets are samples; the
+//! Errors of three sources are kept apart. *Discretization*: pictures, pixels, frames, rounds and buckets are samples; the
 //! error of each is measured against the finest of its kind, at an equal number of kept Gaussians. *Rounding*: sums in f32
 //! and in f64 against longer ones; threads and memory, which must change nothing. *Model*: fewer Gaussians stand for more,
 //! merged or refined.

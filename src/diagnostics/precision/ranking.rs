@@ -264,7 +264,7 @@ fn off(count: usize, expected: usize) -> f64 {
     (count as f64 / expected.max(1) as f64 - 1.0).abs()
 }
 
-/// The worst relative error of a percentile that scores are normalised by; those of scores of scores aside, whose values
+/// The worst relative error of a percentile that scores are normalized by; those of scores of scores aside, whose values
 /// differ themselves.
 fn worst(scores: &Scores, exact: &Scores) -> f64 {
     let pairs = scores.terms.iter().zip(&exact.terms);

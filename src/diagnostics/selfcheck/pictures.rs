@@ -68,7 +68,7 @@ pub(super) fn weights() -> Case {
     })
 }
 
-/// Σ‖picture − picture without it‖², both in f64; a colour behind is what is left of a difference of f32.
+/// Σ‖picture − picture without it‖², both in f64; a color behind is what is left of a difference of f32.
 pub(super) fn removal() -> Case {
     Case::new("removal errors", "pictures without one: f64 (px)", 5e-6, || {
         let (scene, camera) = sure_scene();
@@ -89,7 +89,7 @@ pub(super) fn removal() -> Case {
     })
 }
 
-/// Against K·P(cos θ)·cos mφ by recurrence; a colour of 1 is off by some 1e-7 in f32.
+/// Against K·P(cos θ)·cos mφ by recurrence; a color of 1 is off by some 1e-7 in f32.
 pub(super) fn harmonics() -> Case {
     Case::new("harmonics", "16 Y of a direction: Legendre, f64", 3e-7, || {
         let mut worst = LargestError::default();

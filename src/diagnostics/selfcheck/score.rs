@@ -1,4 +1,4 @@
-//! Percentiles, by which values are normalised and scenes measured.
+//! Percentiles, by which values are normalized and scenes measured.
 
 use super::case::{Case, LargestError};
 use super::made::clouds::Random;

@@ -161,7 +161,7 @@ pub(super) fn needle_on_screen() -> Case {
             near: Camera::NEAR,
             fx: focal,
             fy: focal,
-            // Pixel centres are whole numbers, so the picture's middle is half a pixel off its size's.
+            // Pixel centers are whole numbers, so the picture's middle is half a pixel off its size's.
             cx: f64::from(size) / 2.0,
             cy: f64::from(size) / 2.0,
             rotation: DMat3::IDENTITY,

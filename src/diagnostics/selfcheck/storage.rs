@@ -153,7 +153,7 @@ struct MemoryFrames {
 
 impl MemoryFrames {
     /// 1100 Gaussians, more than a block, at 70 frames, more than two: positions wander, opacities jump, rotations are
-    /// at their first value again in the last frame of a block, scales and colours stay.
+    /// at their first value again in the last frame of a block, scales and colors stay.
     fn new() -> MemoryFrames {
         let (count, times) = (1100, 70);
         let mut random = Random(14);

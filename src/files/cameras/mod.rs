@@ -93,7 +93,7 @@ pub enum Clock {
     Given,
 }
 
-/// Reads the cameras of `path`: a file, or a folder holding one, recognised by its name and content.
+/// Reads the cameras of `path`: a file, or a folder holding one, recognized by its name and content.
 ///
 /// # Errors
 /// [`Error::Input`] naming the file and the picture ("frame 12" counts from 0 in file order) when a

@@ -329,7 +329,7 @@ fn nerfies_cameras_are_those_of_the_loader_that_models_are_trained_with() {
     write("dataset.json", json!({"ids": ids, "val_ids": [], "train_ids": []}));
     let rig = load(folder.path(), &CameraOptions::default()).unwrap();
     let camera = &rig.cameras[0];
-    // Half the size; world to camera row by row; scale and centre of the scene are not applied.
+    // Half the size; world to camera row by row; scale and center of the scene are not applied.
     assert_eq!(
         (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy),
         (40, 30, 50.0, 50.0, 20.0, 15.0)

@@ -7,7 +7,7 @@ use crate::model::{Camera, Rig, Shot, Split};
 
 /// Cameras of the rig: as many scoring views as the static models of the README have.
 const CAMERAS: u32 = 12;
-/// Distance from the centre in extents. At 60° the picture then spans 2.3 extents, so that a scene of
+/// Distance from the center in extents. At 60° the picture then spans 2.3 extents, so that a scene of
 /// equal sides is seen whole from every corner.
 const DISTANCE: f64 = 2.0;
 const FIELD_OF_VIEW_DEGREES: f64 = 60.0;
@@ -19,7 +19,7 @@ const SIDE_PX: u32 = 512;
 /// every frame, all for training; [`crate::model::RobustBox`] gives the two numbers.
 ///
 /// Camera k of n looks from latitude asin(1 − (2k + 1)/n) and longitude k·π(3 − √5); z is up in the
-/// pictures. An extent that is zero or not finite counts as 1, a centre that is not finite as 0.
+/// pictures. An extent that is zero or not finite counts as 1, a center that is not finite as 0.
 pub fn virtual_rig(center: DVec3, extent: f64) -> Rig {
     let center = if center.is_finite() { center } else { DVec3::ZERO };
     let extent = if extent.is_finite() && extent > 0.0 { extent } else { 1.0 };

@@ -15,7 +15,7 @@ const FRAMES: usize = 2 * FRAME_BLOCK + 5;
 
 /// Every way of storing a tile: positions are noise in the first block of Gaussians (no zstd shrinks it) and curves
 /// in the others; opacities move in the second frame block alone; rotations stand still in the last block of
-/// Gaussians; scales and colours never change.
+/// Gaussians; scales and colors never change.
 struct Made(SequenceInfo);
 
 impl Made {

@@ -24,7 +24,7 @@ pub enum ImageFormat {
 }
 
 impl ImageFormat {
-    /// The end of a file's name, which is also how its format is recognised.
+    /// The end of a file's name, which is also how its format is recognized.
     pub fn extension(self) -> &'static str {
         match self {
             ImageFormat::Png => "png",

@@ -1,8 +1,8 @@
-//! `params.npz` of Dynamic3DGaussians: where every Gaussian is at every frame, how it is turned and coloured; its size and
+//! `params.npz` of Dynamic3DGaussians: where every Gaussian is at every frame, how it is turned and colored; its size and
 //! opacity once for all.
 //!
 //! Arrays, of T frames and N Gaussians: `means3D` [T, N, 3], scene units; `unnorm_rotations` [T, N, 4], wxyz of any length;
-//! `rgb_colors` [T, N, 3], a colour from all sides; `log_scales` [N, 3]; `logit_opacities` [N, 1]; `seg_colors` [N, 3], red
+//! `rgb_colors` [T, N, 3], a color from all sides; `log_scales` [N, 3]; `logit_opacities` [N, 1]; `seg_colors` [N, 3], red
 //! above ½ in the foreground. Further ones are no matter of a picture. Source: `load_scene_data` of the authors' visualiser.
 
 use std::path::{Path, PathBuf};

@@ -1,6 +1,6 @@
-//! Proxies of a model whose Gaussians move, turn and change their colour freely, but keep their size and opacity.
+//! Proxies of a model whose Gaussians move, turn and change their color freely, but keep their size and opacity.
 //!
-//! A proxy's path, turn and colour are the moment match of its members at every frame; its size and opacity are their
+//! A proxy's path, turn and color are the moment match of its members at every frame; its size and opacity are their
 //! means along time.
 
 use super::params::Params;

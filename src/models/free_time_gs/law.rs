@@ -14,7 +14,7 @@ use crate::models::motion_model::window::{faded, odds, slope};
 use crate::models::motion_model::{MotionModel, MotionModelFrames, copy_stored};
 use crate::recipe::MergeParams;
 
-/// Planes of [`Raw::own`]: centre in time, logarithm of the standard deviation, velocity.
+/// Planes of [`Raw::own`]: center in time, logarithm of the standard deviation, velocity.
 pub(super) const TIME: usize = 0;
 pub(super) const DURATION: usize = 1;
 pub(super) const VELOCITY: usize = 2;

@@ -3,7 +3,7 @@
 //! In: `ckpts/ckpt_K.pt` of a result's folder, or the file: `{"step", "splats": state dict, "optimizers": {name: Adam state}}`.
 //! `splats` has `means` [N, 3], `scales` [N, 3] log, `quats` [N, 4] wxyz of any length, `opacities` [N] logit, `sh0` [N, 1, 3],
 //! `shN` [N, K, 3]; of FreeTimeGS also `times` [N, 1], `durations` [N, 1] log, `velocities` [N, 3]. Out: the same checkpoint with
-//! fewer rows. Cameras are those of the trainer's parser: it normalises the world, and does not store how.
+//! fewer rows. Cameras are those of the trainer's parser: it normalizes the world, and does not store how.
 
 mod law;
 

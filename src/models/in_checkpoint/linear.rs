@@ -1,6 +1,6 @@
 //! Proxies of Gaussians that move along straight lines and fade with the distance in time.
 //!
-//! Paths blend exactly: members re-centred to the proxy's time, then their weighted means, so that the proxy is at the weighted
+//! Paths blend exactly: members re-centered to the proxy's time, then their weighted means, so that the proxy is at the weighted
 //! mean of its members at every time. Windows blend by their moments; each counts by its weight and by how long it lasts. Shape
 //! and opacity follow from the moment matches of the members at frames (least squares). Source: method.md, section 5.6, for
 //! the match at a frame.
@@ -20,7 +20,7 @@ const SEEN: f64 = 1e-4;
 /// Opacities of proxies lie between these: their logits stay small.
 const OPACITIES: [f64; 2] = [1e-3, 1.0 - 1e-4];
 
-/// A straight path with a window: x(t) = position + velocity·(t − centre), exp(−½((t − centre)/deviation)²).
+/// A straight path with a window: x(t) = position + velocity·(t − center), exp(−½((t − center)/deviation)²).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(in crate::models) struct LinearPath {
     pub(in crate::models) position: [f64; 3],
@@ -52,7 +52,7 @@ impl LinearPath {
 #[derive(Debug, Clone)]
 pub(in crate::models) struct Matched {
     pub(in crate::models) line: LinearPath,
-    /// Opacity at the centre of its window, as a logit, and covariance (xx xy xz yy yz zz); none where no frame shows it.
+    /// Opacity at the center of its window, as a logit, and covariance (xx xy xz yy yz zz); none where no frame shows it.
     pub(in crate::models) seen: Option<(f32, [f64; 6])>,
 }
 

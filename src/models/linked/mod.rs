@@ -3,7 +3,7 @@
 //! Every frame is read twice: to link it, then to pack its tracks. Lives that are one become one track, where pictures with
 //! them stay within 40 dB of those without: of the close ones alone where that is not so of all that are alike. A track
 //! that is not there in a frame is held as it was, or as it will be first, with an opacity of nothing, so that it is seen
-//! nowhere and costs next to nothing. Then colours, scales, rotations and opacities that hardly change along a track are at
+//! nowhere and costs next to nothing. Then colors, scales, rotations and opacities that hardly change along a track are at
 //! every frame what they are in the mean ([`steady`]), where pictures with them stay within 40 dB of those without.
 //!
 //! Memory: [`Sizes`](memory::Sizes); of frames two while they are linked, one for every thread and a few to look at while

@@ -1,8 +1,8 @@
-//! What does not change along a track: colours, scales, rotations and opacities that differ by little from frame to frame,
-//! as where lives of other colours were joined, are at every frame what they are in the mean.
+//! What does not change along a track: colors, scales, rotations and opacities that differ by little from frame to frame,
+//! as where lives of other colors were joined, are at every frame what they are in the mean.
 //!
 //! Of a track whose row at frame t has opacity αₜ and values vₜ, v̄ = Σ αₜ·vₜ / Σ αₜ, and a column is steady where the root
-//! mean square of what it differs by, weighted by αₜ too, is at most a [bound](Bound): of colours over all directions,
+//! mean square of what it differs by, weighted by αₜ too, is at most a [bound](Bound): of colors over all directions,
 //! √(Σₖ (vₜₖ − v̄ₖ)² / 4π) for coefficients k of the harmonics, in the channel that differs most; of scales |ln sₜ − ln s̄| on
 //! the axis that differs most; of rotations 2·|qₜ − q̄| for unit quaternions of one sign; of opacities |αₜ − ᾱ| of all frames
 //! alike.
@@ -25,7 +25,7 @@ pub(super) const BATCH: usize = 1 << 16;
 /// How little changes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bound {
-    /// Of colours from 0 to 1.
+    /// Of colors from 0 to 1.
     pub(super) colour: f64,
     /// Of natural logs of scales, of radians, and of opacities.
     pub(super) other: f64,
@@ -71,7 +71,7 @@ impl Steady {
         Ok(Steady { columns, means: means.finish()?, sh_degree })
     }
 
-    /// Parts of the tracks that hold each of their columns: colours, scales, rotations, opacities.
+    /// Parts of the tracks that hold each of their columns: colors, scales, rotations, opacities.
     pub(super) fn parts(&self) -> [f64; 4] {
         [Columns::SH, Columns::LOG_SCALE, Columns::ROTATION, Columns::OPACITY].map(|column| {
             let held = self.columns.iter().filter(|columns| columns.contains(column)).count();

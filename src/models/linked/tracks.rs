@@ -299,7 +299,7 @@ impl LinkedTracks {
         Ok(states)
     }
 
-    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbours, so that where a
+    /// Writes all tracks at all frames to the container `path`. Tracks that begin together are neighbors, so that where a
     /// block of them is not there yet, or no longer, nothing is written.
     pub(super) fn pack(&self, path: &Path) -> Result<()> {
         let mut held = self.first();

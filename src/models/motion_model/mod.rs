@@ -50,18 +50,18 @@ pub(super) trait MotionModel: Debug + Send + Sync {
         Ok(Jacobian::default())
     }
 
-    /// How pixels get their colours, where Gaussians have features in the place of these.
+    /// How pixels get their colors, where Gaussians have features in the place of these.
     fn shading(&self) -> Option<&dyn Shading> {
         None
     }
 }
 
-/// Features in the place of colours.
+/// Features in the place of colors.
 pub(super) trait Shading: Sync {
     /// Those of `raw` at `time`, a plane for each.
     fn features(&self, time: f64, raw: &Raw) -> Column;
 
-    /// The colour of a pixel that has blended `features`, seen from `centre` along the unit `ray`.
+    /// The color of a pixel that has blended `features`, seen from `centre` along the unit `ray`.
     fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 

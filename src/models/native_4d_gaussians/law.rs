@@ -88,7 +88,7 @@ impl Native {
         -0.5 / (variance + self.prefilter.max(0.0))
     }
 
-    /// What is left at `time` of a Gaussian with that centre and Σ_tt.
+    /// What is left at `time` of a Gaussian with that center and Σ_tt.
     pub(super) fn marginal(&self, time: f64, centre: f64, variance: f64) -> f64 {
         let m = (self.rate(variance) * (time - centre).powi(2)).exp();
         if m > CUT { m } else { 0.0 }

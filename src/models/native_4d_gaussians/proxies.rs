@@ -1,7 +1,7 @@
 //! Proxies of Gaussians of four dimensions: a slice for all times and a window make one again.
 //!
 //! From the match of the slices (a line, Σ, a window of deviation s): Σ₄ = [[Σ + vvᵀs², vs²], [vᵀs², s²]], whose axes are two
-//! quaternions. Harmonics refer to the proxy's own centre: what its members show at frames is fitted by 1, cos and cos of the
+//! quaternions. Harmonics refer to the proxy's own center: what its members show at frames is fitted by 1, cos and cos of the
 //! double (least squares, with a ridge on the waves).
 
 use super::law::{Native, ROTATION_R, SCALING_T, TERM, TERMS, TIME};

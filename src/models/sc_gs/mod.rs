@@ -3,7 +3,7 @@
 //! State at t: what the network says of each node is summed with the shares that a Gaussian has in the nodes nearest to it
 //! ([`Nodes`]) and multiplied by its mask, σ of its last feature (1 without one). x = xyz + warp; scale = exp(scale) + d_scaling, of
 //! which only the square counts; rotation = rot + d_rotation, of the raw rot, made unit afterwards. Where the network predicts
-//! them, opacity = σ(opacity) + d_opacity, and a colour is added to harmonics of degree 0. With `deform_type='mlp'` there are
+//! them, opacity = σ(opacity) + d_opacity, and a color is added to harmonics of degree 0. With `deform_type='mlp'` there are
 //! neither nodes nor mask, and the network sees each Gaussian. Source: Huang et al., "SC-GS: Sparse-Controlled Gaussian
 //! Splatting for Editable Dynamic Scenes", 2024, and its public code.
 
@@ -101,7 +101,7 @@ impl Control {
             }
         }
         let prefix = if has_nodes { "network." } else { "" };
-        // Other ways to a colour have layers within, and a frame of a node has a head.
+        // Other ways to a color have layers within, and a frame of a node has a head.
         for inner in ["gaussian_color.0.weight", "gaussian_color.layers.0.weight", "local_rotation.weight"] {
             let name = format!("{prefix}{inner}");
             if parts.tensors.contains_key(&name) {

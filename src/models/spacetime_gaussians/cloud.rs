@@ -70,7 +70,7 @@ impl Cloud {
         self.own.len() == FULL_WIDTH
     }
 
-    /// The parameters of all Gaussians; `act` makes colours of the full model's first features.
+    /// The parameters of all Gaussians; `act` makes colors of the full model's first features.
     ///
     /// # Errors
     /// A value that is no finite number; a file cut short since it was opened.
@@ -130,7 +130,7 @@ impl Cloud {
         let (proxies, by) = (reduction.proxies.raw.as_ref(), &reduction.change.0);
         let places = |column: Columns| layout.planes(column).iter().enumerate();
         let columns: Vec<Columns> = Columns::all().iter().filter(|&of| of != Columns::SH || !self.is_full()).collect();
-        // A colour stands as it is, not as a harmonic.
+        // A color stands as it is, not as a harmonic.
         let unit = |column: Columns| if column == Columns::SH { SH_C0 } else { 1.0 };
         let zero = |column: Columns| if column == Columns::SH { 0.5 } else { 0.0 };
         write_rows_like(
@@ -179,7 +179,7 @@ fn names(is_full: bool) -> Vec<String> {
     names
 }
 
-/// Turns what stands for a colour into a harmonic: with `act`, that of the first features, else the colour itself, which
+/// Turns what stands for a color into a harmonic: with `act`, that of the first features, else the color itself, which
 /// stands where a harmonic would.
 fn paint(raw: &mut Raw, act: Option<Act>) {
     for c in 0..3 {

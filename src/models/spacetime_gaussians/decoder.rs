@@ -1,6 +1,6 @@
-//! What makes colours of the nine features that the full model blends.
+//! What makes colors of the nine features that the full model blends.
 //!
-//! Of a pixel's features F, camera centre o and unit ray d: act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])). W₁ is `mlp1.weight`
+//! Of a pixel's features F, camera center o and unit ray d: act(F₀₋₂ + W₂·relu(W₁·[F₃₋₅, F₆₋₈, o, d])). W₁ is `mlp1.weight`
 //! [6, 12, 1, 1], W₂ `mlp2.weight` [3, 6, 1, 1] of `point_cloud.pt`; neither has a bias. Source: `helper_model.py` of the
 //! authors' code.
 
@@ -11,11 +11,11 @@ use crate::error::{Error, Result, quoted};
 
 /// Features that are blended.
 pub(super) const FEATURES: usize = 9;
-/// Inputs of the network: features 3 to 8, camera centre, ray.
+/// Inputs of the network: features 3 to 8, camera center, ray.
 const INPUTS: usize = 12;
 const HIDDEN: usize = 6;
 
-/// What is done to a colour last.
+/// What is done to a color last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Act {
     /// The logistic function.
@@ -37,7 +37,7 @@ impl Act {
         }
     }
 
-    /// Of a colour before it.
+    /// Of a color before it.
     pub(super) fn apply(self, x: f64) -> f64 {
         match self {
             Act::Sigmoid => 1.0 / (1.0 + (-x).exp()),
@@ -92,7 +92,7 @@ impl ColorDecoder {
         })
     }
 
-    /// The colour of a pixel whose [`FEATURES`] are `features`, seen from `centre` along the unit `ray`.
+    /// The color of a pixel whose [`FEATURES`] are `features`, seen from `centre` along the unit `ray`.
     pub(super) fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
         let mut inputs = [0.0; INPUTS];
         let all = features[3..].iter().chain(&centre).chain(&ray);

@@ -1,6 +1,6 @@
 //! How the state of a Gaussian follows from what a model stores of it: [`SpacetimeMotion`] and its window.
 //!
-//! [`Raw::gaussians`] has position, quaternion, log scales and opacity logit as they are stored, and the colour as harmonics of
+//! [`Raw::gaussians`] has position, quaternion, log scales and opacity logit as they are stored, and the color as harmonics of
 //! degree 0; [`Raw::own`] has the planes named here.
 
 use super::decoder::{self, ColorDecoder};
@@ -10,7 +10,7 @@ use crate::model::{Column, Columns, Gaussians, Jacobian, Raw};
 use crate::models::motion_model::window::{faded, odds, slope};
 use crate::models::motion_model::{MotionModel, Shading, copy_stored};
 
-/// Plane of the centre of the window.
+/// Plane of the center of the window.
 pub(super) const CENTRE: usize = 0;
 /// Plane of the natural log of its width.
 pub(super) const LOG_WIDTH: usize = 1;
@@ -20,7 +20,7 @@ pub(super) const MOTION: usize = 2;
 pub(super) const OMEGA: usize = 11;
 /// Planes of [`Raw::own`] that every variant has.
 pub(super) const WIDTH: usize = 15;
-/// First of six planes of the full model: features that do not change, of which three are a colour before it is acted upon.
+/// First of six planes of the full model: features that do not change, of which three are a color before it is acted upon.
 pub(super) const FEATURES: usize = 15;
 /// First of three planes of the full model: features per unit of time.
 pub(super) const FEATURES_IN_TIME: usize = 21;
@@ -55,10 +55,10 @@ impl SpacetimeMotion {
     }
 }
 
-/// The law of both variants; colours of the full one are the cheap ones of [`Raw::gaussians`].
+/// The law of both variants; colors of the full one are the cheap ones of [`Raw::gaussians`].
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Spacetime {
-    /// Whether colours are features that a network reads.
+    /// Whether colors are features that a network reads.
     pub(super) is_full: bool,
     /// That network, where it is known.
     pub(super) decoder: Option<ColorDecoder>,
@@ -72,7 +72,7 @@ pub(super) struct PreparedGaussian {
     odds: Vec<f64>,
 }
 
-/// Logarithm of a window so long since its centre.
+/// Logarithm of a window so long since its center.
 #[inline(always)]
 fn exponent(dt: f64, inverse_squared: f64) -> f64 {
     -dt * dt * inverse_squared
@@ -92,7 +92,7 @@ impl MotionModel for Spacetime {
         Columns::POSITION | Columns::ROTATION | Columns::OPACITY
     }
 
-    /// A network reads the features of the full model: no colour leads to them.
+    /// A network reads the features of the full model: no color leads to them.
     fn movable(&self) -> Columns {
         if self.is_full { Columns::all().difference(Columns::SH) } else { Columns::all() }
     }
@@ -157,7 +157,7 @@ impl MotionModel for Spacetime {
 }
 
 impl Shading for Spacetime {
-    /// Six that do not change, and three that grow with the time since the centre.
+    /// Six that do not change, and three that grow with the time since the center.
     fn features(&self, time: f64, raw: &Raw) -> Column {
         let mut found = Column::zeros(decoder::FEATURES, raw.len());
         let centres = raw.own.plane(CENTRE);

@@ -2,7 +2,7 @@
 //!
 //! The result has the same layout with fewer Gaussians: rows of the PLY byte for byte, but for what merging and refining
 //! changed of them, in the family's own parameters; everything else is copied. Of the full model a renderer blends nine features
-//! and asks a network for the colour of each pixel; what is looked at here is the colour that the first three have by themselves.
+//! and asks a network for the color of each pixel; what is looked at here is the color that the first three have by themselves.
 
 mod cloud;
 mod common;
@@ -202,7 +202,7 @@ impl SpacetimeGaussians {
     }
 }
 
-/// How many Gaussians have a colour that the authors' renderer adds and that others cut.
+/// How many Gaussians have a color that the authors' renderer adds and that others cut.
 fn dark(raw: &Raw) -> Option<String> {
     let is_dark = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| colour(harmonic) < 0.0);
     let count = (0..raw.len()).filter(|&row| is_dark(row)).count();

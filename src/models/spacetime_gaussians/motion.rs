@@ -1,6 +1,6 @@
 //! How a Gaussian moves: a cubic path, a quaternion that is linear in time, a window.
 //!
-//! With dt = t − centre: x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; q = rotation + dt·omega, of any length; the opacity is multiplied
+//! With dt = t − center: x = p₀ + p₁·dt + p₂·dt² + p₃·dt³; q = rotation + dt·omega, of any length; the opacity is multiplied
 //! by exp(−(dt/e^log_width)²). Source: Li et al., "Spacetime Gaussian Feature Splatting", 2024, and its public code, which has no
 //! factor ½ in that exponent. All in f64.
 
@@ -15,7 +15,7 @@ pub(super) struct SpacetimeMotion {
     pub(super) log_width: f64,
     /// Coefficients of 1, dt, dt², dt³.
     pub(super) path: [[f64; 3]; 4],
-    /// wxyz at the centre, of any length.
+    /// wxyz at the center, of any length.
     pub(super) rotation: [f64; 4],
     /// Its change per unit of time.
     pub(super) omega: [f64; 4],
@@ -74,7 +74,7 @@ pub(super) fn dot<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Centre and log width of the window of several, by weights and theirs: the second moments in time of their sum.
+/// Center and log width of the window of several, by weights and theirs: the second moments in time of their sum.
 pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     // Areas in time count; the longest has 1, so that none overflows.
     let longest = members.iter().fold(f64::NEG_INFINITY, |most, (_, motion)| most.max(motion.log_width));
@@ -91,7 +91,7 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     (centre, longest + 0.5 * squared.ln())
 }
 
-/// The weighted mean of motions that are told from one centre: at every time its state is the weighted mean of theirs,
+/// The weighted mean of motions that are told from one center: at every time its state is the weighted mean of theirs,
 /// quaternions in the sign of the heaviest one's.
 pub(super) fn mean(members: &[(f64, SpacetimeMotion)]) -> Option<SpacetimeMotion> {
     let heaviest = members.iter().copied().reduce(|a, b| if b.0 > a.0 { b } else { a })?.1;
@@ -119,7 +119,7 @@ pub(super) struct TargetState {
     pub(super) rotation: [f64; 4],
 }
 
-/// The motion that is nearest to the `wanted` states in least squares, told from `about`'s centre; `about` where nothing says
+/// The motion that is nearest to the `wanted` states in least squares, told from `about`'s center; `about` where nothing says
 /// anything else. A ridge holds what the times do not determine.
 ///
 /// Lengths of time are in units of the window: coefficients then weigh alike, so that one ridge serves all.

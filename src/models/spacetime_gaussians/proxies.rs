@@ -1,6 +1,6 @@
 //! Proxies in the family's own parameters.
 //!
-//! Members are told from the centre of the proxy's window, exactly; weighted means of their coefficients then give the
+//! Members are told from the center of the proxy's window, exactly; weighted means of their coefficients then give the
 //! weighted mean of their states at every time. Where their windows differ, so that who is there changes with time, the path
 //! is the one nearest to the weighted mean of those that are. Size and shape: second moments over the window, in axes that turn
 //! with the proxy. Opacity: the amplitude of the window nearest to the opacity of the members' moment match.
@@ -20,7 +20,7 @@ use crate::models::motion_model::{MotionModel, MotionModelFrames};
 use crate::recipe::MergeParams;
 use crate::source::FrameSource;
 
-/// Windows differ where one is wider by this factor than another, or off its proxy's centre by half its width.
+/// Windows differ where one is wider by this factor than another, or off its proxy's center by half its width.
 const MOST_WIDER: f64 = 1.5;
 /// Part of its full height below which a window holds nothing that counts.
 const OPEN: f64 = 0.05;
@@ -29,7 +29,7 @@ const SAMPLED_TIMES: usize = 12;
 /// Opacities of proxies stay within [this, 1 − this].
 const OPACITY_MARGIN: f64 = 1e-6;
 
-/// A row for each of `clusters`; `act` makes colours of the full model's first features.
+/// A row for each of `clusters`; `act` makes colors of the full model's first features.
 ///
 /// # Errors
 /// States that cannot be evaluated.
@@ -75,7 +75,7 @@ impl ClusterMembers<'_> {
         Ok(state)
     }
 
-    /// Times of frames at which `of` is open, evenly spread if they are many; its centre where there are none.
+    /// Times of frames at which `of` is open, evenly spread if they are many; its center where there are none.
     fn times(&self, of: &SpacetimeMotion) -> Vec<f64> {
         let times = &self.model.info().times;
         let open: Vec<f64> = times.iter().copied().filter(|&time| of.window(time) >= OPEN).collect();

@@ -103,7 +103,7 @@ fn row(raw: &Raw, i: usize) -> SplatvGaussian {
     }
 }
 
-/// Writes `raw` to `path`, in the colours that `known` has of it, with the cameras that the file `cameras` lists as 3DGS does,
+/// Writes `raw` to `path`, in the colors that `known` has of it, with the cameras that the file `cameras` lists as 3DGS does,
 /// else one that sees most of it.
 pub(super) fn write(
     raw: &Raw,

@@ -329,7 +329,7 @@ fn a_lite_model_as_a_splatv_moves_as_it_did_and_what_stays_of_that_keeps_its_wor
         (read.kind(), read.source().info().count, read.own_output()),
         ("splaTV model", COUNT, OutputKind::Splatv)
     );
-    // Colours and opacities are bytes there, and colours below 0 or above 1 none.
+    // Colors and opacities are bytes there, and colors below 0 or above 1 none.
     for (found, expected) in states(read.source()).iter().zip(states(model.source())) {
         let pairs = |column: Columns| {
             found.column(column).planes().iter().zip(expected.column(column).planes()).collect::<Vec<_>>()

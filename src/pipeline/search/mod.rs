@@ -41,7 +41,7 @@ const FIRST: f64 = 0.2;
 const FEWEST: f64 = 0.02;
 /// Sizes that are tried at most.
 const MOST_TRIED: usize = 8;
-/// Neighbouring sizes whose ratio is this or less are not told apart.
+/// Neighboring sizes whose ratio is this or less are not told apart.
 const SAME_SIZE: f64 = 1.04;
 /// What a halving of the number of Gaussians costs, about: dB, and the factor of a loss. Guesses follow from it.
 const HALVING: (f64, f64) = (4.5, 3.0);

@@ -44,7 +44,7 @@ pub(crate) const PAIRS: &str = "pairs";
 /// Fewest pairs that are measured in parts.
 const DIVIDED: usize = 20_000;
 
-/// Memory of a Gaussian that may survive: its id, its state with base colours only, whether that is finite, and its class.
+/// Memory of a Gaussian that may survive: its id, its state with base colors only, whether that is finite, and its class.
 /// Twice the ids while merging is tried on some of them.
 const BYTES_PER_SURVIVOR: usize = 2 * size_of::<u32>() + size_of::<[f32; 14]>() + size_of::<(bool, Option<u8>)>();
 
@@ -55,7 +55,7 @@ const TRIALS: f64 = 16.0;
 /// Gaussians whose whole state is in memory at a time, while what merging does not read of it is dropped.
 const GATHERED: usize = 16 * BLOCK;
 
-/// Seconds that a Gaussian takes: neighbours, tests and what comes of them (`benches/merge.rs`).
+/// Seconds that a Gaussian takes: neighbors, tests and what comes of them (`benches/merge.rs`).
 const MERGING: f64 = 1e-5;
 /// Part of the Gaussians whose pairs are followed along the frames, about.
 const FOLLOWED: f64 = 0.3;
@@ -96,8 +96,8 @@ impl MergeStage {
     /// What is known of pairs that are measured together and of all that may survive, and the proxies.
     pub fn need(&self, work: &Workload, limits: &Limits) -> ResourceEstimate {
         let pairs = (merging::BYTES_PER_PAIR + motion_pass::BYTES_PER_PAIR) as u64;
-        // Of the colours the first band; of proxies at most one for every two, before a pass and after it, then with
-        // all colours.
+        // Of the colors the first band; of proxies at most one for every two, before a pass and after it, then with
+        // all colors.
         let proxies = state_bytes(0, Columns::all()).max(work.state(Columns::all()).div_ceil(2));
         let per_gaussian = vec![
             // C and Vis are read back.

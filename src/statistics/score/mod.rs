@@ -1,6 +1,6 @@
-//! Robust normalisation and scores (method.md, sections 2 and 3).
+//! Robust normalization and scores (method.md, sections 2 and 3).
 //!
-//! In: rows of statistics. Out: S, its static and dynamic parts, and these normalised. Memory: six
+//! In: rows of statistics. Out: S, its static and dynamic parts, and these normalized. Memory: six
 //! f64 per Gaussian at most, and one sketch at a time. Source: "Temporally-Aware Pruning for Compact
 //! 4D Gaussian Splatting Models", section 3.2.
 
@@ -28,7 +28,7 @@ pub struct Scores {
     pub static_norm: Vec<f64>,
     /// norm(S_dynamic), for stage 2.
     pub dynamic_norm: Vec<f64>,
-    /// What every term was normalised by, those of S_static, then those of S_dynamic, then these two; terms of weight 0
+    /// What every term was normalized by, those of S_static, then those of S_dynamic, then these two; terms of weight 0
     /// were not computed and are missing.
     pub terms: Vec<Term>,
 }
@@ -38,10 +38,10 @@ impl Scores {
     pub const BYTES_PER_GAUSSIAN: usize = 5 * size_of::<f64>();
 }
 
-/// How a term was normalised.
+/// How a term was normalized.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Term {
-    /// What is normalised.
+    /// What is normalized.
     pub of: Graded,
     /// Its percentiles.
     pub norm: Norm,
@@ -134,7 +134,7 @@ pub fn score_by(looks: PercentilePasses, rows: &Rows, frames: usize, recipe: &re
     Scores { static_score, dynamic_score, score, static_norm, dynamic_norm, terms }
 }
 
-/// Adds up normalised terms.
+/// Adds up normalized terms.
 struct Summation<'a> {
     counts: &'a [bool],
     recipe: &'a recipe::ScoreParams,

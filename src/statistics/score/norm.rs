@@ -1,4 +1,4 @@
-//! Robust min-max normalisation between the 1st and the 99th percentile.
+//! Robust min-max normalization between the 1st and the 99th percentile.
 
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ pub enum PercentilePasses {
 }
 
 impl Norm {
-    /// The normalisation of a set of values; NaN and infinities are passed over.
+    /// The normalization of a set of values; NaN and infinities are passed over.
     pub fn from_values<I: Iterator<Item = f64>>(
         values: impl Fn() -> I,
         recipe: &recipe::ScoreParams,

@@ -95,7 +95,7 @@ fn add_blocks(
     }
 }
 
-/// Of the Gaussians of a block: unit vectors toward them from the centre of view, and one over their distances.
+/// Of the Gaussians of a block: unit vectors toward them from the center of view, and one over their distances.
 struct Directions {
     unit: [[f32; BLOCK]; 3],
     per_distance: [f32; BLOCK],
@@ -150,7 +150,7 @@ impl GradientBlock {
         }
     }
 
-    /// Harmonics: Y_k times what the colour takes.
+    /// Harmonics: Y_k times what the color takes.
     #[inline(always)]
     fn add_harmonics(
         &self,
@@ -174,7 +174,7 @@ impl GradientBlock {
         }
     }
 
-    /// Position, through the colour's change with the direction of view.
+    /// Position, through the color's change with the direction of view.
     #[inline(always)]
     fn add_direction(
         &self,
@@ -184,7 +184,7 @@ impl GradientBlock {
         out: &mut GradientSpan<'_>,
     ) {
         let n = ids.len().min(BLOCK);
-        // By value of Y_k: what the colour takes times the coefficients.
+        // By value of Y_k: what the color takes times the coefficients.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for (k, by_value) in by_value.iter_mut().enumerate().take(colour::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);

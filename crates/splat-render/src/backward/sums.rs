@@ -2,7 +2,7 @@
 
 /// What one splat takes from pixels, f32 sums of a tile in a fixed order or f64 sums of those.
 ///
-/// With p = alpha · ∂L/∂alpha and a pixel's offset (x, y), pixels: y along v from the splat's centre, x along u from the
+/// With p = alpha · ∂L/∂alpha and a pixel's offset (x, y), pixels: y along v from the splat's center, x along u from the
 /// middle of the row.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SplatSums<T> {

@@ -1,6 +1,6 @@
 //! The second walk over a tile: from what pixels take to what splats take.
 //!
-//! Front to back again, so that no list of what was blended has to be kept: of a pixel's rest of colour each splat
+//! Front to back again, so that no list of what was blended has to be kept: of a pixel's rest of color each splat
 //! takes its own part away, and what is left is what lies behind it (method.md, section 8.1). Data in: the tile's
 //! splats, ∂L/∂ pixel, and the pixels. Data out: nine sums per pair of a splat and the tile.
 
@@ -18,7 +18,7 @@ const UNCUT: f32 = f32::from_bits(MAX_ALPHA.to_bits() - 1);
 pub(super) struct Pull {
     /// ∂L/∂ pixel, by channel.
     pixel: [TilePlane; 3],
-    /// Inner product of that with the pixel's colour.
+    /// Inner product of that with the pixel's color.
     rest: TilePlane,
 }
 
@@ -43,7 +43,7 @@ impl Pull {
     }
 }
 
-/// Sums what splats take; of their colours alone unless `SHAPE`.
+/// Sums what splats take; of their colors alone unless `SHAPE`.
 pub(super) struct Pulled<'a, const SHAPE: bool> {
     pub(super) pull: Pull,
     /// One per pair of the tile.

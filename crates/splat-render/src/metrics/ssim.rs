@@ -18,7 +18,7 @@ const C2: f64 = 0.03 * 0.03;
 
 /// Mean over pixels and channels of
 /// (2 μₐ μ_b + C₁)(2 σ_ab + C₂) / ((μₐ² + μ_b² + C₁)(σₐ² + σ_b² + C₂)),
-/// moments under a normalised 11×11 Gaussian window of σ = 1.5 px; beyond the border lie zeros.
+/// moments under a normalized 11×11 Gaussian window of σ = 1.5 px; beyond the border lie zeros.
 ///
 /// At most 1, which is equality; 1 for two empty images. NaN in either image gives NaN.
 ///

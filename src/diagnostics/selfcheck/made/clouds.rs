@@ -70,7 +70,7 @@ pub fn scene(seed: u64, count: usize, degree: usize) -> Gaussians {
     scene
 }
 
-/// One Gaussian on the axis of [`plain_camera`], `depth` away, of the colour 1, ½, 0.
+/// One Gaussian on the axis of [`plain_camera`], `depth` away, of the color 1, ½, 0.
 pub fn single(depth: f32, scale: f32, opacity: f32) -> Gaussians {
     let mut one = Gaussians::zeros(1, 0);
     one.position.set_row(0, [0.0, 0.0, depth]);

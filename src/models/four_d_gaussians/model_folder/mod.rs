@@ -137,7 +137,7 @@ impl ModelFolder {
         self.memory
     }
 
-    /// The same field and frames with other Gaussians; of another SH degree only where no head deforms colour.
+    /// The same field and frames with other Gaussians; of another SH degree only where no head deforms color.
     pub fn with_canonical(&self, canonical: Gaussians) -> Self {
         let (count, sh_degree) = (canonical.len(), canonical.sh_degree());
         let info = SequenceInfo { count, sh_degree, ..self.info.clone() };
