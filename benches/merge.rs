@@ -1,6 +1,6 @@
 //! What does merging cost, on one thread?
 //!
-//! `neighbours`: the nearest neighbors within ε, per Gaussian, `voxels` being the index of the program, built and asked:
+//! `neighbors`: the nearest neighbors within ε, per Gaussian, `voxels` being the index of the program, built and asked:
 //! in trained models with the ε of the presets, among Gaussians strewn evenly, with some or many neighbors each, and in
 //! clusters, and in crowds: all in one voxel, and all at one point. Rivals: one `tree` over all points, asked in voxel
 //! order too, which is what the program had; `all_pairs`, on few Gaussians, where that still has a chance; and a
@@ -152,7 +152,7 @@ fn extent(position: &Column) -> f64 {
     (0..3).map(side).fold(0.0, f64::max)
 }
 
-fn neighbours(criterion: &mut Criterion) {
+fn neighbors(criterion: &mut Criterion) {
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let mut cases: Vec<(String, Column, f64)> = Vec::new();
     if let Some(folder) = models::found() {
@@ -285,5 +285,5 @@ fn whole(criterion: &mut Criterion) {
     });
 }
 
-criterion_group!(all, neighbours, motion, whole);
+criterion_group!(all, neighbors, motion, whole);
 criterion_main!(all);

@@ -99,7 +99,7 @@ fn measure(criterion: &mut Criterion, group: &str, name: &str, state: &Gaussians
 
 /// Prints what the parts of a picture with so many blend events cost, and what they cannot go below.
 fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, events: f64) {
-    let grey = Gaussians { sh: Gaussians::zeros(state.len(), 0).sh, ..state.clone() };
+    let gray = Gaussians { sh: Gaussians::zeros(state.len(), 0).sh, ..state.clone() };
     let empty = Camera { width: 0, height: 0, ..camera.clone() };
     let mut seen = Contribution::new(state.len());
     let mut times = [const { Vec::new() }; 4];
@@ -109,7 +109,7 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
             match lacking {
                 0 => drop(black_box(renderer.render(state, camera, [0.0; 3]))),
                 // No harmonics to read.
-                1 => drop(black_box(renderer.render(&grey, camera, [0.0; 3]))),
+                1 => drop(black_box(renderer.render(&gray, camera, [0.0; 3]))),
                 // No pixel that is looked at.
                 2 => renderer.contribution(state, camera, NonZeroU32::MAX, &mut seen),
                 // No tile.
@@ -118,8 +118,8 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
             times.push(start.elapsed().as_secs_f64());
         }
     }
-    let [whole, grey, unseen, projected] = times.map(median);
-    let blend = grey - unseen;
+    let [whole, gray, unseen, projected] = times.map(median);
+    let blend = gray - unseen;
     let least = events / LANES * OPERATIONS / 2.0 / clock();
     let pixels = f64::from(camera.width) * f64::from(camera.height);
     let bytes = 4.0 * (11 + state.sh.width()) as f64 * state.len() as f64 + 12.0 * pixels;
@@ -127,7 +127,7 @@ fn print_parts(renderer: &mut Renderer, state: &Gaussians, camera: &Camera, even
         "  project {:.1} ms, sort and bin {:.1}, harmonics {:.1}, blend {:.1}: {:.2} ns an event",
         1e3 * projected,
         1e3 * (unseen - projected),
-        1e3 * (whole - grey),
+        1e3 * (whole - gray),
         1e3 * blend,
         1e9 * blend / events,
     );

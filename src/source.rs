@@ -222,8 +222,8 @@ pub trait FeatureDecoder: Sync {
     /// A frame that the sequence does not have.
     fn features(&self, frame: usize, out: &mut Column) -> Result<()>;
 
-    /// Red, green and blue of a pixel that has blended `features`, seen from `centre` along the unit `ray`.
-    fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3];
+    /// Red, green and blue of a pixel that has blended `features`, seen from `center` along the unit `ray`.
+    fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
 /// A source on a disk, whose bytes can be brought ahead of their use, from a thread that does nothing else.

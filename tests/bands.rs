@@ -102,7 +102,7 @@ fn bands_that_matter_stay_and_are_said_to() {
 }
 
 #[test]
-fn bands_that_an_sh_head_adds_to_stay_and_so_does_colour_without_any() {
+fn bands_that_an_sh_head_adds_to_stay_and_so_does_color_without_any() {
     let workplace = Workplace::new();
     let quickly = QUICKLY.replacen("model", "{tiny}", 1);
     let summary = workplace.summary(&format!("{quickly} --target-ratio 0.5 --bands-margin 0 -o small"));

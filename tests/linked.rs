@@ -265,21 +265,21 @@ fn steadiness(frames: &[Gaussians], track: usize) -> [(Vec<f64>, f64); 4] {
     let length = |turn: &Vec<f64>| turn.iter().map(|q| q * q).sum::<f64>().sqrt();
     let units: Vec<Vec<f64>> = turns.iter().map(|turn| turn.iter().map(|q| q / length(turn)).collect()).collect();
     let scales = values(&|frame| frame.log_scale.row::<3>(track).to_vec());
-    let colours = values(&|frame| frame.sh.row::<12>(track).to_vec());
+    let colors = values(&|frame| frame.sh.row::<12>(track).to_vec());
     let logits = values(&|frame| vec![frame.opacity_logit.plane(0)[track]]);
     let mean_alpha = weight / frames.len() as f64;
     let of_alpha = alphas.iter().map(|a| (a - mean_alpha).powi(2)).sum::<f64>() / frames.len() as f64;
     let most = |parts: [f64; 3]| parts.into_iter().fold(0.0, f64::max);
     let of_scales = most([0, 1, 2].map(|c| rms(&scales, &|by| by[c] * by[c])));
-    let of_colours = most([0, 1, 2].map(|channel| {
-        rms(&colours, &|by| by.iter().skip(channel).step_by(3).map(|v| v * v).sum::<f64>() / (4.0 * PI))
+    let of_colors = most([0, 1, 2].map(|channel| {
+        rms(&colors, &|by| by.iter().skip(channel).step_by(3).map(|v| v * v).sum::<f64>() / (4.0 * PI))
     }));
     let of_turns = 2.0 * rms(&units, &|by| by.iter().map(|q| q * q).sum());
     [
         (mean(&turns), of_turns / 0.02),
         (mean(&scales), of_scales / 0.02),
         (mean(&logits), of_alpha.sqrt() / 0.02),
-        (mean(&colours), of_colours / 0.04),
+        (mean(&colors), of_colors / 0.04),
     ]
 }
 

@@ -31,7 +31,7 @@ struct Off {
     /// Relative, beyond [`CANCELLED`].
     scale: f64,
     opacity: f64,
-    colour: f64,
+    color: f64,
 }
 
 impl Off {
@@ -57,7 +57,7 @@ impl Off {
     fn add<'a>(&mut self, state: &Gaussians, expected: impl Fn(&'static str, usize) -> &'a [f64]) {
         let [xyz, rotation, scales] =
             [("xyz", 3), ("rotation", 4), ("scales", 3)].map(|(name, width)| expected(name, width));
-        let (opacity, colour) = (expected("opacity", 1), expected("colour", 3));
+        let (opacity, color) = (expected("opacity", 1), expected("colour", 3));
         let raise = |most: &mut f64, found: f64, wanted: f64| *most = most.max((found - wanted).abs());
         for i in 0..state.len() {
             let q = state.rotation.row::<4>(i).map(f64::from);
@@ -69,8 +69,8 @@ impl Off {
                 raise(&mut self.position, f64::from(state.position.plane(c)[i]), xyz[3 * i + c]);
                 let (found, wanted) = (f64::from(state.log_scale.plane(c)[i]).exp(), scales[3 * i + c]);
                 self.scale = self.scale.max(((found - wanted).abs() - CANCELLED).max(0.0) / wanted);
-                if let Some(&wanted) = colour.get(3 * i + c) {
-                    raise(&mut self.colour, 0.5 + SH_C0 * f64::from(state.sh.plane(c)[i]), wanted);
+                if let Some(&wanted) = color.get(3 * i + c) {
+                    raise(&mut self.color, 0.5 + SH_C0 * f64::from(state.sh.plane(c)[i]), wanted);
                 }
             }
             raise(&mut self.opacity, 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp()), opacity[i]);
@@ -83,7 +83,7 @@ impl Off {
             && self.rotation <= 5e-7
             && self.scale <= 1e-6
             && self.opacity <= 5e-7
-            && self.colour <= 1e-6
+            && self.color <= 1e-6
     }
 }
 
@@ -212,10 +212,10 @@ fn states_and_features_of_spacetime_gaussians_are_those_of_its_own_code() {
         let count = state.len();
         let features = &expected["features"][9 * count * row..][..9 * count];
         // The color that the first features have by themselves.
-        let colours: Vec<f64> =
+        let colors: Vec<f64> =
             features.chunks(9).flat_map(|f| [f[0], f[1], f[2]].map(|x| 1.0 / (1.0 + (-x).exp()))).collect();
         off.add(&state, |name, width| match name {
-            "colour" => &colours,
+            "colour" => &colors,
             "scales" => &expected[name],
             _ => &expected[name][row * width * count..][..width * count],
         });
@@ -231,7 +231,7 @@ fn states_and_features_of_spacetime_gaussians_are_those_of_its_own_code() {
 
 #[test]
 #[ignore = "needs the trained models"]
-fn decoders_of_spacetime_gaussians_give_the_colours_of_its_own_code() {
+fn decoders_of_spacetime_gaussians_give_the_colors_of_its_own_code() {
     let place = Workplace::new();
     let full = family("stg_full");
     let expected = arrays(&full.join("decoder.npz"));
@@ -250,8 +250,8 @@ fn decoders_of_spacetime_gaussians_give_the_colours_of_its_own_code() {
         let mut furthest = 0.0f64;
         for ((features, rays), expected) in rows {
             let rays = single(rays);
-            let [centre, ray] = [0, 3].map(|at| [rays[at], rays[at + 1], rays[at + 2]]);
-            let found = decoder.colour(&single(features), centre, ray);
+            let [center, ray] = [0, 3].map(|at| [rays[at], rays[at + 1], rays[at + 2]]);
+            let found = decoder.color(&single(features), center, ray);
             furthest = found.iter().zip(expected).fold(furthest, |most, (&a, b)| most.max((f64::from(a) - b).abs()));
         }
         assert!(furthest < 1e-6, "{act}: {furthest}");
@@ -377,10 +377,10 @@ fn states_of_free_time_gs_are_those_of_its_own_code() {
     for (row, &frame) in expected["frames"].iter().enumerate() {
         let state = state(scene.source(), frame as usize);
         // Colors do not change, and are not recorded.
-        let colour = |i: usize, c: usize| 0.5 + SH_C0 * f64::from(state.sh.plane(c)[i]);
-        let colours: Vec<f64> = (0..state.len()).flat_map(|i| [0, 1, 2].map(|c| colour(i, c))).collect();
+        let color = |i: usize, c: usize| 0.5 + SH_C0 * f64::from(state.sh.plane(c)[i]);
+        let colors: Vec<f64> = (0..state.len()).flat_map(|i| [0, 1, 2].map(|c| color(i, c))).collect();
         off.add(&state, |name, width| match name {
-            "colour" => &colours,
+            "colour" => &colors,
             "xyz" | "opacity" => &expected[name][row * width * state.len()..][..width * state.len()],
             _ => &expected[name],
         });

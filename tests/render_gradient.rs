@@ -114,8 +114,8 @@ fn one_gaussian_is_its_closed_form() {
         let row = |column| found.column(column);
         close("logit", row(Columns::OPACITY).plane(0)[0], (1.0 - opacity) * contrast * alphas);
         // Blue is cut off at 0.
-        let colour = if channel == 2 { 0.0 } else { splatsieve::model::SH_C0 * alphas };
-        (0..3).for_each(|c| close("sh", row(Columns::SH).plane(c)[0], if c == channel { colour } else { 0.0 }));
+        let color = if channel == 2 { 0.0 } else { splatsieve::model::SH_C0 * alphas };
+        (0..3).for_each(|c| close("sh", row(Columns::SH).plane(c)[0], if c == channel { color } else { 0.0 }));
         let widths = squares.map(|square| contrast * square * seen / variance.powi(2));
         close("scale x", row(Columns::LOG_SCALE).plane(0)[0], widths[0]);
         close("scale y", row(Columns::LOG_SCALE).plane(1)[0], widths[1]);
@@ -254,7 +254,7 @@ fn one_gaussian_over_the_whole_picture_is_its_alpha() {
 }
 
 #[test]
-fn an_alpha_that_is_cut_moves_nothing_but_colour() {
+fn an_alpha_that_is_cut_moves_nothing_but_color() {
     let mut wall = single(2.0, 1.0, 0.999);
     wall.log_scale.set_row(0, [5.0f32; 3]);
     let camera = plain_camera(40);

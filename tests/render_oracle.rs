@@ -35,8 +35,8 @@ fn one_gaussian_is_its_closed_form() {
             let square = (x as f64 - middle).powi(2) + (y as f64 - middle).powi(2);
             let alpha = opacity * (-0.5 * square / variance).exp();
             let alpha = if alpha < 1.0 / 255.0 { 0.0 } else { alpha };
-            for (c, colour) in [1.0, 0.5, 0.0].into_iter().enumerate() {
-                let expected = alpha * colour + (1.0 - alpha) * 0.25;
+            for (c, color) in [1.0, 0.5, 0.0].into_iter().enumerate() {
+                let expected = alpha * color + (1.0 - alpha) * 0.25;
                 let got = f64::from(pixel(&image, x, y)[c]);
                 assert!((got - expected).abs() < 1e-6, "pixel {x},{y} channel {c}: got {got}, expected {expected}");
             }

@@ -174,9 +174,9 @@ fn a_sweep_draws_every_chart_with_words_that_can_be_read_and_asks_for_nothing() 
     assert_eq!(page.value("document.querySelectorAll('figure svg').length"), json!(8));
     assert_eq!(page.value(UNREADABLE), json!([]));
     // The pair: one color, and the one that is not refined hollow.
-    let colour = |class: &str| format!("getComputedStyle(document.querySelector('svg .line.{class}')).stroke");
-    assert_eq!(page.value(&colour("s0.hollow")), page.value(&colour("s0")));
-    assert_ne!(page.value(&colour("s1")), page.value(&colour("s0")));
+    let color = |class: &str| format!("getComputedStyle(document.querySelector('svg .line.{class}')).stroke");
+    assert_eq!(page.value(&color("s0.hollow")), page.value(&color("s0")));
+    assert_ne!(page.value(&color("s1")), page.value(&color("s0")));
 }
 
 #[test]

@@ -216,7 +216,7 @@ impl Samples {
         let mut squares = vec![vec![0.0f64; width]; 6];
         for sample in 0..count * TIMES {
             let (i, k) = (sample / TIMES, sample % TIMES);
-            let [x, y, z] = space.normalised(position.row(i * position.len() / count));
+            let [x, y, z] = space.normalized(position.row(i * position.len() / count));
             // Not the same times for all.
             let part = (k as f32 + (i as f32 * 0.618).fract()) / TIMES as f32;
             let at = [x, y, z, first + part * (last - first)];

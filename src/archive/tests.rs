@@ -116,7 +116,7 @@ proptest! {
         for (name, axes) in [("a.plane.xy", [0, 1]), ("a.plane.yz", [1, 2])] {
             let [rows, columns] = [7usize, 9];
             for i in 0..count {
-                let u = space.normalised(back.cloud.position.row(i));
+                let u = space.normalized(back.cloud.position.row(i));
                 let (p, q) = (tap(u[axes[0]], columns), tap(u[axes[1]], rows));
                 for (row, b) in [(q.low, 1.0 - q.fraction), (q.high, q.fraction)] {
                     for (column, a) in [(p.low, 1.0 - p.fraction), (p.high, p.fraction)] {

@@ -31,7 +31,7 @@ fn class(part: f32) -> u8 {
 pub(super) fn of_plane(position: &Column, space: &Box3, axes: [usize; 2], size: [usize; 2]) -> Vec<u8> {
     let mut parts = vec![0.0f32; size[0] * size[1]];
     for i in 0..position.len() {
-        let u = space.normalised(position.row(i));
+        let u = space.normalized(position.row(i));
         let (a, b) = (tap(u[axes[0]], size[0]), tap(u[axes[1]], size[1]));
         for (row, in_b) in [(b.low, 1.0 - b.fraction), (b.high, b.fraction)] {
             for (column, in_a) in [(a.low, 1.0 - a.fraction), (a.high, a.fraction)] {
@@ -47,7 +47,7 @@ pub(super) fn of_plane(position: &Column, space: &Box3, axes: [usize; 2], size: 
 pub(super) fn of_line(position: &Column, space: &Box3, axis: usize, size: usize) -> Vec<u8> {
     let mut parts = vec![0.0f32; size];
     for i in 0..position.len() {
-        let a = tap(space.normalised(position.row(i))[axis], size);
+        let a = tap(space.normalized(position.row(i))[axis], size);
         for (column, weight) in [(a.low, 1.0 - a.fraction), (a.high, a.fraction)] {
             parts[column as usize] += weight * weight;
         }

@@ -13,7 +13,7 @@
 //! The size of the scene is the median distance of its Gaussians from their median: one that is far away does not change it.
 
 use crate::error::{Error, Result};
-use crate::model::{Column, Gaussians, colour, opacity};
+use crate::model::{Column, Gaussians, color, opacity};
 
 /// Part of a Gaussian's own middle scale by which its position may be off.
 const OF_SCALE: f64 = 0.5;
@@ -48,7 +48,7 @@ impl Drawn {
             position: state.position.row::<3>(row).map(f64::from),
             scale: state.log_scale.row::<3>(row).map(|scale| f64::from(scale).exp()),
             opacity: opacity(state.opacity_logit.row::<1>(row)[0]),
-            color: state.sh.row::<3>(row).map(colour),
+            color: state.sh.row::<3>(row).map(color),
         }
     }
 

@@ -35,7 +35,7 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
         return Err(Error::input(path, "", format!("{width} x {height} pixels, as its camera has"), found)
             .hint("give pictures of the cameras' size, or the cameras of these pictures"));
     }
-    let (colour, depth) = reader.output_color_type();
+    let (color, depth) = reader.output_color_type();
     // None only where the size overflows, which the cameras' limits exclude.
     let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(0)];
     reader.next_frame(&mut bytes).map_err(malformed(path))?;
@@ -48,8 +48,8 @@ pub fn read_png(path: &Path, (width, height): (u32, u32), background: [f32; 3]) 
     let over = |rgb: [f32; 3], alpha: f32| -> [f32; 3] {
         std::array::from_fn(|c| rgb[c] * alpha + background[c] * (1.0 - alpha))
     };
-    let data = match colour {
-        ColorType::Grayscale => values.iter().flat_map(|&grey| [grey; 3]).collect(),
+    let data = match color {
+        ColorType::Grayscale => values.iter().flat_map(|&gray| [gray; 3]).collect(),
         ColorType::GrayscaleAlpha => values.chunks_exact(2).flat_map(|p| over([p[0]; 3], p[1])).collect(),
         ColorType::Rgba => values.chunks_exact(4).flat_map(|p| over([p[0], p[1], p[2]], p[3])).collect(),
         // A palette arrives expanded.
@@ -78,10 +78,10 @@ mod tests {
     use super::*;
 
     /// A PNG of 2 × 1 pixels.
-    fn written(colour: ColorType, depth: BitDepth, bytes: &[u8], palette: Option<&[u8]>) -> tempfile::NamedTempFile {
+    fn written(color: ColorType, depth: BitDepth, bytes: &[u8], palette: Option<&[u8]>) -> tempfile::NamedTempFile {
         let file = tempfile::NamedTempFile::new().unwrap();
         let mut encoder = png::Encoder::new(file.reopen().unwrap(), 2, 1);
-        encoder.set_color(colour);
+        encoder.set_color(color);
         encoder.set_depth(depth);
         if let Some(palette) = palette {
             encoder.set_palette(palette.to_vec());
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn every_colour_type_gives_the_same_picture() {
+    fn every_color_type_gives_the_same_picture() {
         let expected = [1.0, 0.0, 0.0, 0.2, 0.2, 0.2].map(|v: f32| v);
         let wide: Vec<u8> = [65535u16, 0, 0, 13107, 13107, 13107].iter().flat_map(|v| v.to_be_bytes()).collect();
         let pictures = [
@@ -106,8 +106,8 @@ mod tests {
             let got = read_png(file.path(), (2, 1), [0.5; 3]).unwrap();
             assert_eq!(got.data, expected, "picture {i}");
         }
-        let grey = written(ColorType::Grayscale, BitDepth::Eight, &[255, 51], None);
-        assert_eq!(read_png(grey.path(), (2, 1), [0.5; 3]).unwrap().data, [1.0, 1.0, 1.0, 0.2, 0.2, 0.2]);
+        let gray = written(ColorType::Grayscale, BitDepth::Eight, &[255, 51], None);
+        assert_eq!(read_png(gray.path(), (2, 1), [0.5; 3]).unwrap().data, [1.0, 1.0, 1.0, 0.2, 0.2, 0.2]);
     }
 
     #[test]
@@ -117,8 +117,8 @@ mod tests {
         for (got, expected) in got.data.iter().zip([0.0, 0.5, 1.0, 0.2, 0.4, 0.8]) {
             assert!((got - expected).abs() < 1e-6, "got {got}, expected {expected}");
         }
-        let grey = written(ColorType::GrayscaleAlpha, BitDepth::Eight, &[255, 0, 255, 255], None);
-        assert_eq!(read_png(grey.path(), (2, 1), [0.25; 3]).unwrap().data, [0.25, 0.25, 0.25, 1.0, 1.0, 1.0]);
+        let gray = written(ColorType::GrayscaleAlpha, BitDepth::Eight, &[255, 0, 255, 255], None);
+        assert_eq!(read_png(gray.path(), (2, 1), [0.25; 3]).unwrap().data, [0.25, 0.25, 0.25, 1.0, 1.0, 1.0]);
     }
 
     #[test]

@@ -46,7 +46,7 @@ pub struct SplatvGaussian {
     /// In [0, 1].
     pub opacity: f64,
     /// Unit of time.
-    pub centre: f32,
+    pub center: f32,
     /// √2 × the standard deviation in time.
     pub width: f32,
 }
@@ -65,7 +65,7 @@ impl SplatvGaussian {
             opacity: byte(3),
             motion: std::array::from_fn(|k| halves(8, k)),
             omega: std::array::from_fn(|k| halves(13, k)),
-            centre: half(15, 0),
+            center: half(15, 0),
             width: half(15, 1),
         }
     }

@@ -20,7 +20,7 @@ use flate2::{Compression, GzBuilder};
 
 use super::accuracy::{Accuracy, Drawn};
 use crate::error::{Error, Result, ShowPath};
-use crate::model::{Gaussians, colour, opacity};
+use crate::model::{Gaussians, color, opacity};
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
@@ -100,7 +100,7 @@ fn measured(state: &Gaussians, unit: f64) -> Result<f64> {
     let mut accuracy = Accuracy::new(&state.position);
     for row in 0..state.len() {
         let wanted = Drawn::of_state(state, row);
-        let color = |dc: f32| colour(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
+        let color = |dc: f32| color(((f64::from(color_byte(dc)) / 255.0 - 0.5) / 0.15) as f32);
         let found = Drawn {
             position: wanted.position.map(|x| f64::from(fixed(x, unit)) * unit),
             scale: state.log_scale.row::<3>(row).map(|scale| (f64::from(scale_byte(scale)) / 16.0 - 10.0).exp()),
@@ -225,7 +225,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.spz");
         let off = write_spz(&state, &path).unwrap();
-        for (row, (place, visible, colour, scales, q, sh)) in read(&path).into_iter().enumerate() {
+        for (row, (place, visible, color, scales, q, sh)) in read(&path).into_iter().enumerate() {
             let near = |found: &[f64], expected: &[f64], within: f64, what: &str| {
                 for (a, b) in found.iter().zip(expected) {
                     assert!((a - b).abs() <= within, "{what} of {row}: {a}, expected {b}");
@@ -235,7 +235,7 @@ mod tests {
             near(&place, &[x, -y, -z], 1.01 * off, "position");
             near(&[visible], &[opacity(state.opacity_logit.row::<1>(row)[0])], 0.5 / 255.0, "opacity");
             let dc = state.sh.row::<3>(row).map(f64::from);
-            near(&colour, &dc, 0.51 / 255.0 / 0.15, "colour");
+            near(&color, &dc, 0.51 / 255.0 / 0.15, "colour");
             near(
                 &scales,
                 &state.log_scale.row::<3>(row).map(|s| f64::from(s).clamp(-10.0, 5.93)),

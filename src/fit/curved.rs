@@ -13,7 +13,7 @@ use super::{FittedTrack, Misfit, SEEN, Tolerance};
 #[derive(Debug, Clone, PartialEq)]
 pub struct CubicTrack {
     /// Center of its window, and the instant that the polynomials count from.
-    pub centre: f64,
+    pub center: f64,
     /// Width of its window; infinite where it has no end.
     pub width: f64,
     /// Coefficients of dt⁰ to dt³, scene units.
@@ -31,13 +31,13 @@ pub struct CubicTrack {
 impl CubicTrack {
     /// Where it is at `time`.
     pub fn place(&self, time: f64) -> [f64; 3] {
-        let dt = time - self.centre;
+        let dt = time - self.center;
         std::array::from_fn(|c| self.position.iter().rev().fold(0.0, |sum, row| sum * dt + row[c]))
     }
 
     /// How opaque it is at `time`.
     pub fn visible(&self, time: f64) -> f64 {
-        self.opacity * window(time, self.centre, self.width)
+        self.opacity * window(time, self.center, self.width)
     }
 }
 
@@ -77,8 +77,8 @@ pub fn curved(track: &FittedTrack, tolerance: &Tolerance, misfit: &mut Misfit) -
     curves.into_iter().filter(|curve| curve.opacity >= SEEN).collect()
 }
 
-fn window(time: f64, centre: f64, width: f64) -> f64 {
-    (-((time - centre) / width).powi(2)).exp()
+fn window(time: f64, center: f64, width: f64) -> f64 {
+    (-((time - center) / width).powi(2)).exp()
 }
 
 fn depth(opacity: f64) -> f64 {
@@ -87,10 +87,10 @@ fn depth(opacity: f64) -> f64 {
 
 /// One curve without an end.
 fn endless(track: &FittedTrack) -> CubicTrack {
-    let centre = track.times[0].midpoint(track.times[track.len() - 1]);
+    let center = track.times[0].midpoint(track.times[track.len() - 1]);
     let seen = (0..track.len()).filter(|&frame| track.is_seen(frame));
     let (sum, count) = seen.fold((0.0, 0.0), |(sum, count), frame| (sum + track.opacity[frame], count + 1.0));
-    let curve = moving(track, centre, f64::INFINITY, |_| 1.0);
+    let curve = moving(track, center, f64::INFINITY, |_| 1.0);
     CubicTrack { opacity: sum / f64::max(count, 1.0), ..curve }
 }
 
@@ -100,18 +100,18 @@ fn once(track: &FittedTrack) -> CubicTrack {
         (0..track.len()).map(|frame| track.opacity[frame] * of(track.times[frame])).sum()
     };
     let whole = moment(&|_| 1.0);
-    let centre = moment(&|t| t) / whole;
-    let variance = moment(&|t| (t - centre).powi(2)) / whole;
+    let center = moment(&|t| t) / whole;
+    let variance = moment(&|t| (t - center).powi(2)) / whole;
     let step = (track.times[track.len() - 1] - track.times[0]) / track.len().max(2) as f64;
     // exp(−(dt/w)²) has variance w²/2; frames a step apart cannot tell less than half of one.
     let width = (2.0 * variance).sqrt().max(0.5 * step).max(1e-9);
-    let windows = |frame: usize| window(track.times[frame], centre, width);
+    let windows = |frame: usize| window(track.times[frame], center, width);
     let (mut right, mut normal) = (0.0, 0.0);
     for frame in 0..track.len() {
         right += windows(frame) * track.opacity[frame];
         normal += windows(frame).powi(2);
     }
-    let curve = moving(track, centre, width, |frame| window(track.times[frame], centre, width));
+    let curve = moving(track, center, width, |frame| window(track.times[frame], center, width));
     CubicTrack { opacity: (right / normal.max(1e-300)).min(OPAQUE), ..curve }
 }
 
@@ -119,18 +119,18 @@ fn once(track: &FittedTrack) -> CubicTrack {
 fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Vec<CubicTrack> {
     let apart = ((end - start) / count as f64).max(1e-9);
     let width = 0.75 * apart;
-    let centres: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
+    let centers: Vec<f64> = (0..=count).map(|k| start + k as f64 * apart).collect();
     let wanted: Vec<f64> = track.opacity.iter().map(|&opacity| depth(opacity)).collect();
     // Of each curve the frames that it is a matter of.
-    let shares: Vec<Vec<(usize, f64)>> = centres
+    let shares: Vec<Vec<(usize, f64)>> = centers
         .iter()
-        .map(|&centre| {
-            let share = |frame: usize| (frame, window(track.times[frame], centre, width));
+        .map(|&center| {
+            let share = |frame: usize| (frame, window(track.times[frame], center, width));
             (0..track.len()).map(share).filter(|(_, share)| *share > LIGHT).collect()
         })
         .collect();
     let most = wanted.iter().copied().fold(0.0, f64::max);
-    let mut depths = vec![most / 2.0; centres.len()];
+    let mut depths = vec![most / 2.0; centers.len()];
     let mut shown = vec![0.0; track.len()];
     for _ in 0..UPDATES {
         // Opacities, not depths, follow windows: what a curve adds is the depth of its share.
@@ -152,19 +152,19 @@ fn handing_over(track: &FittedTrack, [start, end]: [f64; 2], count: usize) -> Ve
         }
     }
     let curve = |(k, depth): (usize, f64)| {
-        let curve = moving(track, centres[k], width, |frame| window(track.times[frame], centres[k], width));
+        let curve = moving(track, centers[k], width, |frame| window(track.times[frame], centers[k], width));
         CubicTrack { opacity: 1.0 - (-depth).exp(), ..curve }
     };
     depths.into_iter().enumerate().map(curve).collect()
 }
 
 /// A curve that moves and turns as `track` does where `weight` is, by least squares; its opacity is still to be said.
-fn moving(track: &FittedTrack, centre: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
+fn moving(track: &FittedTrack, center: f64, width: f64, weight: impl Fn(usize) -> f64) -> CubicTrack {
     let weight = |frame: usize| if track.is_seen(frame) { weight(frame) * track.opacity[frame] } else { 0.0 };
     let heavy: Vec<(usize, f64)> =
         (0..track.len()).map(|frame| (frame, weight(frame))).filter(|(_, weight)| *weight > LIGHT * SEEN).collect();
-    let reach = heavy.iter().map(|&(frame, _)| (track.times[frame] - centre).abs()).fold(1e-9, f64::max);
-    let scaled = |frame: usize| (track.times[frame] - centre) / reach;
+    let reach = heavy.iter().map(|&(frame, _)| (track.times[frame] - center).abs()).fold(1e-9, f64::max);
+    let scaled = |frame: usize| (track.times[frame] - center) / reach;
     let position: [[f64; 3]; 4] =
         polynomial(heavy.iter().map(|&(frame, weight)| (scaled(frame), track.position[frame], weight)), RIDGE);
     let rotation: [[f64; 4]; 2] =
@@ -176,7 +176,7 @@ fn moving(track: &FittedTrack, centre: f64, width: f64, weight: impl Fn(usize) -
     let width_of_sh = track.sh(0).len();
     let unscaled = |k: usize| reach.powi(k as i32);
     CubicTrack {
-        centre,
+        center,
         width,
         position: std::array::from_fn(|k| position[k].map(|value| value / unscaled(k))),
         rotation: std::array::from_fn(|k| rotation[k].map(|value| value / unscaled(k))),
@@ -199,7 +199,7 @@ fn misfit_of(track: &FittedTrack, curves: &[CubicTrack], tolerance: &Tolerance) 
             if curve.visible(time) < SEEN {
                 continue;
             }
-            let dt = time - curve.centre;
+            let dt = time - curve.center;
             let rotation = std::array::from_fn(|c| curve.rotation[0][c] + dt * curve.rotation[1][c]);
             let scale = (0..3).map(|c| (curve.log_scale[c] - track.log_scale[frame][c]).abs()).fold(0.0, f64::max);
             let sh = curve.sh.iter().zip(track.sh(frame)).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
@@ -251,7 +251,7 @@ mod tests {
         let fading = track(60, cubic, |t| 0.9 * window(t, 0.4, 0.15));
         let one = curved(&fading, &Tolerance::default(), &mut misfit);
         assert_eq!(one.len(), 1);
-        assert!((one[0].centre - 0.4).abs() < 1e-3 && (one[0].width - 0.15).abs() < 2e-3, "{:?}", one[0]);
+        assert!((one[0].center - 0.4).abs() < 1e-3 && (one[0].width - 0.15).abs() < 2e-3, "{:?}", one[0]);
         assert!((one[0].opacity - 0.9).abs() < 0.01 && misfit.opacity < 0.01);
     }
 

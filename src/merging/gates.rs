@@ -154,13 +154,13 @@ mod tests {
     }
 
     #[test]
-    fn black_beside_grey_of_the_same_direction_is_not_merged() {
+    fn black_beside_gray_of_the_same_direction_is_not_merged() {
         let edit = |states: &mut Gaussians| {
             states.sh.set_row(0, [-1.7; 3]);
             states.sh.set_row(1, [-0.2; 3]);
         };
-        let [black, grey] = two(edit);
-        assert!(cosine(black.dc, grey.dc) > 0.99);
+        let [black, gray] = two(edit);
+        assert!(cosine(black.dc, gray.dc) > 0.99);
         assert!(!passes(edit));
         // Below black there is only black: the renderer clamps.
         assert!(passes(|states| {
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn duplicates_of_any_colour_scale_and_rotation_pass() {
+    fn duplicates_of_any_color_scale_and_rotation_pass() {
         assert!(passes(|_| {}));
         assert!(passes(|states| (0..2).for_each(|i| states.sh.set_row(i, [0.0; 3]))));
         assert!(passes(|states| (0..2).for_each(|i| states.rotation.set_row(i, [0.0; 4]))));

@@ -230,7 +230,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn neighbours_equal_brute_force(
+        fn neighbors_equal_brute_force(
             points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..120),
             k in 1usize..9,
             epsilon in 0.0..1.5f64,
@@ -240,7 +240,7 @@ mod tests {
 
         // A coarse lattice: many points coincide, most distances tie.
         #[test]
-        fn neighbours_equal_brute_force_among_duplicates_and_ties(
+        fn neighbors_equal_brute_force_among_duplicates_and_ties(
             cells in prop::collection::vec(prop::array::uniform3(0u8..3), 0..150),
             k in 1usize..9,
             epsilon in prop::sample::select(vec![0.0, 1.0, 2.0, 4.0]),
@@ -255,23 +255,23 @@ mod tests {
 
         // Clusters far narrower and far wider than ε: voxels with and without trees, and borders between them.
         #[test]
-        fn neighbours_equal_brute_force_among_clusters_far_from_the_origin(
-            centres in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 1..5),
+        fn neighbors_equal_brute_force_among_clusters_far_from_the_origin(
+            centers in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 1..5),
             within in prop::collection::vec((0usize..5, prop::array::uniform3(-1.0..1.0f32)), 0..500),
             width in prop::sample::select(vec![1e-3f32, 0.03, 1.0]),
             offset in prop::sample::select(vec![0.0f32, -3.0, 1e4, -1e7, 1e30]),
             k in 1usize..40,
             epsilon in prop::sample::select(vec![1e-30, 1e-3, 0.02, 0.25, 2.0, 1e6, f64::INFINITY]),
         ) {
-            let centre = |c: usize| centres[c % centres.len()];
-            let place = |(c, d): &(usize, [f32; 3])| std::array::from_fn(|x| offset + centre(*c)[x] + width * d[x]);
+            let center = |c: usize| centers[c % centers.len()];
+            let place = |(c, d): &(usize, [f32; 3])| std::array::from_fn(|x| offset + center(*c)[x] + width * d[x]);
             let points: Vec<[f32; 3]> = within.iter().map(place).collect();
             prop_assert_eq!(indexed(&points, k, epsilon), brute_force(&points, k, epsilon));
         }
 
         // One point at the edge of what f32 holds makes voxels wider than everything else.
         #[test]
-        fn neighbours_equal_brute_force_beside_a_point_at_the_end_of_the_world(
+        fn neighbors_equal_brute_force_beside_a_point_at_the_end_of_the_world(
             points in prop::collection::vec(prop::array::uniform3(-1.0..1.0f32), 0..150),
             k in 1usize..9,
             epsilon in 0.0..1.5f64,
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn points_that_are_not_finite_have_no_neighbours_and_are_none() {
+    fn points_that_are_not_finite_have_no_neighbors_and_are_none() {
         let points = [[0.0; 3], [f32::NAN, 0.0, 0.0], [0.0; 3], [f32::INFINITY; 3]];
         let found = indexed(&points, 4, f64::MAX.sqrt());
         assert_eq!(found.iter().map(|(list, _)| list.clone()).collect::<Vec<_>>(), [vec![2], vec![], vec![0], vec![]]);

@@ -142,7 +142,7 @@ fn pairs_measured_in_parts_merge_to_the_same_bits() {
 }
 
 #[test]
-fn static_neighbours_merge_and_movers_apart_do_not() {
+fn static_neighbors_merge_and_movers_apart_do_not() {
     let scene = Scene::strewn(2000);
     let still = scene.merge(&scene.recipe(), None);
     assert!(joins(&still) > 300, "{:?}", still.passes);
@@ -206,7 +206,7 @@ fn exact_duplicates_merge_to_one() {
 }
 
 #[test]
-fn a_crowd_of_any_number_at_one_place_is_one_before_it_meets_its_neighbours() {
+fn a_crowd_of_any_number_at_one_place_is_one_before_it_meets_its_neighbors() {
     for count in [34, 100, 5000] {
         // Two crowds of different colors at one place, of which the others are near; one other alone.
         let mut scene = Scene::strewn(2 * count + 1);

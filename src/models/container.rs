@@ -12,7 +12,7 @@ use crate::source::FrameSource;
 /// A container.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a .gseq",
-    recognises: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
+    recognizes: |found| found.is_file_of(&gseq::MAGIC, "gseq"),
     open: |path, options| {
         let container = Container::open_within(path, options.memory)?;
         options.refuse_for(path)?;

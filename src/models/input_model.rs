@@ -77,7 +77,7 @@ pub trait InputModel: Send + Sync {
 
     /// What its time counts, where cameras say when its frames are.
     fn clock(&self) -> Clock {
-        Clock::Normalised
+        Clock::Normalized
     }
 
     /// How long it lasts in its own time, where nothing says when its frames are.
@@ -317,7 +317,7 @@ pub(super) struct ModelFormat {
     /// What to give, for the message that nothing fits; empty: nothing that would be read.
     pub(super) expected: &'static str,
     /// Whether a path is of this family, told by what is there.
-    pub(super) recognises: fn(&FoundInput) -> bool,
+    pub(super) recognizes: fn(&FoundInput) -> bool,
     /// Opens it; without frames where [`Timing::Continuous`].
     pub(super) open: fn(&Path, &OpenOptions) -> Result<Box<dyn InputModel>>,
 }

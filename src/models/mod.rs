@@ -80,7 +80,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn InputModel>> {
         refuse_inside_a_model(path)?;
     }
     let found = FoundInput { path, is_folder, head, memory: options.memory };
-    match MODEL_FORMATS.iter().find(|entry| (entry.recognises)(&found)) {
+    match MODEL_FORMATS.iter().find(|entry| (entry.recognizes)(&found)) {
         Some(entry) => (entry.open)(path, options),
         None => {
             let expected = MODEL_FORMATS.iter().map(|entry| entry.expected).filter(|expected| !expected.is_empty());

@@ -31,7 +31,7 @@ use crate::tracking::{OrderDifference, identity};
 /// A folder with one PLY per frame.
 pub(super) const FOLDER: ModelFormat = ModelFormat {
     expected: "a folder of PLY files",
-    recognises: |found| found.is_folder,
+    recognizes: |found| found.is_folder,
     open: |path, options| {
         let by = if options.allow_gaps { PlyFrames::open_with_gaps } else { PlyFrames::open };
         open_frames(by(path, &options.ply())?, path, options)
@@ -41,7 +41,7 @@ pub(super) const FOLDER: ModelFormat = ModelFormat {
 /// One PLY.
 pub(super) const FILE: ModelFormat = ModelFormat {
     expected: "a .ply",
-    recognises: |found| found.is_file_of(b"ply", "ply"),
+    recognizes: |found| found.is_file_of(b"ply", "ply"),
     open: |path, options| open_frames(PlyFrames::single(path, &options.ply())?, path, options),
 };
 

@@ -10,7 +10,7 @@ use crate::files::accuracy::Accuracy;
 use crate::files::splatv::SplatvGaussian;
 use crate::files::splatv::write::{measure, seen_whole, words, write};
 use crate::fit::{CubicTrack, Misfit, Tolerance, curved};
-use crate::model::{Columns, colour};
+use crate::model::{Columns, color};
 use crate::passes::{gather_all, tracks};
 use crate::progress::Progress;
 use crate::source::FrameSource;
@@ -69,9 +69,9 @@ fn row(curve: &CubicTrack) -> SplatvGaussian {
         rotation: curve.rotation[0].map(narrow),
         omega: curve.rotation[1].map(narrow),
         scale: curve.log_scale.map(|scale| narrow(scale.exp())),
-        rgb: std::array::from_fn(|c| colour(curve.sh[c])),
+        rgb: std::array::from_fn(|c| color(curve.sh[c])),
         opacity: curve.opacity,
-        centre: narrow(curve.centre),
+        center: narrow(curve.center),
         // A half has no infinity that players know.
         width: narrow(curve.width.min(f64::from(half::f16::MAX.to_f32()))),
     }
@@ -109,7 +109,7 @@ mod tests {
             let shown: Vec<([f64; 3], f64)> = rows
                 .iter()
                 .map(|row| {
-                    let dt = time - f64::from(row.centre);
+                    let dt = time - f64::from(row.center);
                     let place = std::array::from_fn(|c| {
                         let m = |k: usize| f64::from(row.motion[3 * k + c]);
                         f64::from(row.position[c]) + dt * (m(0) + dt * (m(1) + dt * m(2)))

@@ -13,7 +13,7 @@ use crate::TOOL;
 use crate::error::{Error, Result, ShowPath};
 use crate::files::accuracy::{Accuracy, Drawn};
 use crate::fit::{LinearPiece, Misfit, Tolerance, straight};
-use crate::model::{Column, colour};
+use crate::model::{Column, color};
 use crate::passes::tracks;
 use crate::progress::Progress;
 use crate::source::FrameSource;
@@ -110,7 +110,7 @@ fn add(set: &mut GaussianSet, piece: &LinearPiece, starts: &[f64]) {
     set.scales.extend(piece.log_scale.map(|scale| narrow(scale.exp())));
     let [w, x, y, z] = piece.rotation.map(narrow);
     set.rotations.extend([x, y, z, w]);
-    set.colors.extend((0..3).map(|c| narrow(colour(piece.sh[c]).clamp(0.0, 1.0))));
+    set.colors.extend((0..3).map(|c| narrow(color(piece.sh[c]).clamp(0.0, 1.0))));
     set.colors.push(narrow(piece.opacity));
     set.mu_t.push(narrow(piece.at));
     set.sigma_t.push(f32::INFINITY);

@@ -125,14 +125,14 @@ impl<const S: usize> ViewStates<'_, S> {
         };
         let mut image = Image { width: camera.width, height: camera.height, data: Vec::new() };
         let values = blend_features(state, features, camera);
-        let (centre, to_world) = (camera.center().to_array().map(|x| x as f32), camera.rotation.transpose());
-        let colour = |(pixel, values): (usize, &[f32])| {
+        let (center, to_world) = (camera.center().to_array().map(|x| x as f32), camera.rotation.transpose());
+        let color = |(pixel, values): (usize, &[f32])| {
             let [x, y] = [pixel % camera.width as usize, pixel / camera.width as usize].map(|at| at as f64 + 0.5);
             let ray = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0).normalize();
-            decoder.colour(values, centre, (to_world * ray).to_array().map(|x| x as f32))
+            decoder.color(values, center, (to_world * ray).to_array().map(|x| x as f32))
         };
-        let colours = values.par_chunks_exact(features.width().max(1)).enumerate().map(colour);
-        image.data = colours.collect::<Vec<[f32; 3]>>().into_flattened();
+        let colors = values.par_chunks_exact(features.width().max(1)).enumerate().map(color);
+        image.data = colors.collect::<Vec<[f32; 3]>>().into_flattened();
         image
     }
 }
@@ -324,9 +324,9 @@ mod tests {
             Ok(())
         }
 
-        fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+        fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
             assert!(features[0].abs() < 1e-6 && features[1] >= 0.0, "{features:?}");
-            std::array::from_fn(|c| centre[c] + ray[c])
+            std::array::from_fn(|c| center[c] + ray[c])
         }
     }
 
@@ -341,8 +341,8 @@ mod tests {
             for view in views {
                 let (image, camera) = (view.render(0, [1.0; 3]), view.camera);
                 assert_eq!(image.data.len(), 3 * (camera.width * camera.height) as usize);
-                for (at, colour) in image.data.as_chunks::<3>().0.iter().enumerate() {
-                    let seen = DVec3::from(colour.map(f64::from));
+                for (at, color) in image.data.as_chunks::<3>().0.iter().enumerate() {
+                    let seen = DVec3::from(color.map(f64::from));
                     assert!(((seen - camera.center()).length() - 1.0).abs() < 1e-5);
                     // Where the camera sees that point is the middle of the pixel.
                     let point = camera.rotation * seen + camera.translation;

@@ -210,7 +210,7 @@ fn reduce(
     if let Some(Archived::Content(encoded)) = &archived {
         follow(&mut map, &encoded.order);
     }
-    let summarise = |journal: Journal, output: Size| Summary {
+    let summarize = |journal: Journal, output: Size| Summary {
         schema: summary::SCHEMA,
         files: Vec::new(),
         tool: TOOL.to_owned(),
@@ -236,7 +236,7 @@ fn reduce(
         input,
     };
     scene.work.not_divided("writing")?;
-    let mut summary = job.emit.run(scene, &reduction, (&map, archived.as_ref()), &recipe, journal, summarise)?;
+    let mut summary = job.emit.run(scene, &reduction, (&map, archived.as_ref()), &recipe, journal, summarize)?;
     // The file has names alone, for it is published; whoever asked for the run sees the paths as they were given.
     summary.input.path = scene.path.to_string_lossy().into_owned();
     summary.output = request.output.to_string_lossy().into_owned();

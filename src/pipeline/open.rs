@@ -46,8 +46,8 @@ pub fn open_to_measure<S: Stages>(
 ) -> Result<(Scene, S, Option<Measured>)> {
     let start = Clock::start();
     let mut scene = if options.is_stream() {
-        let normalised = cameras::Clock::Normalised;
-        let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalised, None)?;
+        let normalized = cameras::Clock::Normalized;
+        let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), normalized, None)?;
         let stream = open_stream(options)?;
         if !is_linked(stream.header(), options) {
             let found = receive_measured(stream, rig, options, plan, journal)?;

@@ -309,13 +309,13 @@ impl Scored {
 
     /// Percentiles of every term.
     pub fn term_summaries(&self) -> Vec<TermSummary> {
-        let summarise = |term: &Term| TermSummary {
+        let summarize = |term: &Term| TermSummary {
             name: term.of.name().to_owned(),
             p1: term.norm.p1,
             p99: term.norm.p99,
             active: term.norm.is_active(),
         };
-        self.terms.iter().map(summarise).collect()
+        self.terms.iter().map(summarize).collect()
     }
 
     /// Writes down what the scene did not need in scan and score, how many Gaussians are odd, and what may be done about short

@@ -269,7 +269,7 @@ pub enum Precision {
     Half,
 }
 
-/// Groups of stored values, by names that a person gives them: `colour,opacity,scale,rotation,position`, any of them, or
+/// Groups of stored values, by names that a person gives them: `color,opacity,scale,rotation,position`, any of them, or
 /// `none`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]

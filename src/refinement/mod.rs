@@ -980,7 +980,7 @@ mod tests {
     }
 
     #[test]
-    fn without_bands_colours_change_with_direction_as_they_did() {
+    fn without_bands_colors_change_with_direction_as_they_did() {
         let folder = tempfile::tempdir().unwrap();
         let scene = scene(folder.path());
         let recipe = Recipe::preset("default").unwrap();

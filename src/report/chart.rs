@@ -212,11 +212,11 @@ impl Plot {
 
     /// The look of every series.
     fn looks(&self) -> Vec<SeriesStyle> {
-        let mut colours = 0;
+        let mut colors = 0;
         let look = |series: &Series| {
-            let hollow = series.paired && colours > 0;
-            colours += usize::from(!hollow);
-            SeriesStyle { hollow, ..SeriesStyle::from_number(colours - 1) }
+            let hollow = series.paired && colors > 0;
+            colors += usize::from(!hollow);
+            SeriesStyle { hollow, ..SeriesStyle::from_number(colors - 1) }
         };
         self.series.iter().map(look).collect()
     }
@@ -490,7 +490,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pair_has_one_colour_and_labels_stay_with_their_points() {
+    fn a_pair_has_one_color_and_labels_stay_with_their_points() {
         let series = |paired: bool| Series {
             name: "a".into(),
             points: vec![(1.0, 1.0), (f64::NAN, 2.0), (3.0, 3.0)],

@@ -292,7 +292,7 @@ fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
         };
         out += &format!(
             "<article class=\"{class}\"><h3>{} <em>{word}</em></h3>\n<p>{}.</p>\n<table>\n",
-            capitalised(mode.name),
+            capitalized(mode.name),
             escape(&mode.happens_to)
         );
         let mut row = |name: &str, value: Option<String>| {
@@ -334,7 +334,7 @@ fn failure_modes(modes: &[FailureMode], close: &[Close]) -> String {
     out + "</div>\n"
 }
 
-fn capitalised(text: &str) -> String {
+fn capitalized(text: &str) -> String {
     let mut letters = text.chars();
     letters.next().map_or(String::new(), |first| first.to_uppercase().chain(letters).collect())
 }

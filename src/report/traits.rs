@@ -92,11 +92,11 @@ pub fn traits(source: &dyn FrameSource, scored: &Scored, alpha_min: f64) -> Resu
     for (&id, bent) in fast.iter().zip(bending(source, &reference, &fast, visible, &frames, NEAREST * extent)?) {
         found[id as usize][GaussianKind::Motion as usize] = bent >= NON_RIGID;
     }
-    let recoloured = colour_change(source, &all, &frames, alpha_min)?;
+    let recolored = color_change(source, &all, &frames, alpha_min)?;
     for i in (0..rows.len()).filter(|&i| visible(i)) {
         found[i][GaussianKind::Thin as usize] = is_thin(reference.log_scale.row(i));
         found[i][GaussianKind::Appearance as usize] = rows.d[i] <= STILL * extent
-            && (rows.v[i].sqrt() >= OPACITY_CHANGE || recoloured.get(i).is_some_and(|&c| c >= COLOUR_CHANGE));
+            && (rows.v[i].sqrt() >= OPACITY_CHANGE || recolored.get(i).is_some_and(|&c| c >= COLOUR_CHANGE));
     }
     Ok(found)
 }
@@ -187,7 +187,7 @@ fn bending(
 
 /// Standard deviation of every Gaussian's base color over the sampled frames it lives in; empty where
 /// colors are constant.
-fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
+fn color_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_min: f64) -> Result<Vec<f64>> {
     if !source.info().varying.contains(Columns::SH) {
         return Ok(Vec::new());
     }
@@ -203,11 +203,11 @@ fn colour_change(source: &dyn FrameSource, all: &[u32], frames: &[usize], alpha_
             if opacity(now.opacity_logit.row::<1>(i)[0]) < alpha_min {
                 continue;
             }
-            let colour = now.sh.row::<3>(i).map(|c| SH_C0 * f64::from(c));
-            let start = first[i].get_or_insert(colour);
+            let color = now.sh.row::<3>(i).map(|c| SH_C0 * f64::from(c));
+            let start = first[i].get_or_insert(color);
             *n += 1;
             for c in 0..3 {
-                let away = colour[c] - start[c];
+                let away = color[c] - start[c];
                 sum[c] += away;
                 squares[c] += away * away;
             }
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_count_while_a_gaussian_lives() {
+    fn colors_count_while_a_gaussian_lives() {
         // 0 flashes, 1 is constant, 2 flashes only while dead.
         let source = Made(info(3, 8), |id, frame, out: &mut Gaussians, row| {
             let flash = frame % 2 == 1;
@@ -290,11 +290,11 @@ mod tests {
             let away = if flash && id != 1 { 0.1 } else { 0.0 };
             out.sh.set_row(row, [((0.2 + away) / SH_C0) as f32; 3]);
         });
-        let found = colour_change(&source, &[0, 1, 2], &samples(8), 0.01).unwrap();
+        let found = color_change(&source, &[0, 1, 2], &samples(8), 0.01).unwrap();
         assert!((found[0] - 0.05).abs() < 1e-6, "half of the time 0.1 away: got {}", found[0]);
         assert_eq!(found[1..], [0.0, 0.0]);
         let still = Made(SequenceInfo { varying: Columns::POSITION, ..info(3, 8) }, source.1);
-        assert!(colour_change(&still, &[0, 1, 2], &samples(8), 0.01).unwrap().is_empty(), "nothing is read");
+        assert!(color_change(&still, &[0, 1, 2], &samples(8), 0.01).unwrap().is_empty(), "nothing is read");
     }
 
     #[test]

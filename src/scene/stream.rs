@@ -45,7 +45,7 @@ pub fn open_stream(options: &InputOptions) -> Result<FrameStream<Stdin>> {
 /// # Errors
 /// What is wrong with the stream; a budget that does not hold the frames that are packed together.
 pub(super) fn open_arriving(options: &InputOptions) -> Result<Opened> {
-    let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalised, None)?;
+    let rig = load_cameras(options, options.cameras.as_deref(), options.times.clone(), Clock::Normalized, None)?;
     let stream = open_stream(options)?;
     if is_linked(stream.header(), options) {
         return link_stream(stream, options, rig);

@@ -146,8 +146,8 @@ impl MotionSums {
             let alive = opacity[i] >= alpha_min;
             let (step2, turn) = differences::<true>([row(x, i), row(previous, i), row(before, i)], [1.0; 2]);
             // The previous frame is a center if it lives and is not the first that does.
-            let centre = (history[i] & ALIVE != 0) & (history[i] & BORN_BEFORE != 0);
-            let waiting = if centre { turn } else { pending[i] };
+            let center = (history[i] & ALIVE != 0) & (history[i] & BORN_BEFORE != 0);
+            let waiting = if center { turn } else { pending[i] };
             // Once life goes on, the center in waiting was not its last frame.
             sum_turn[i] += if alive { waiting } else { 0.0 };
             pending[i] = if alive { 0.0 } else { waiting };

@@ -27,7 +27,7 @@ pub(super) struct ComparedAppearance {
     shape: [f32; 6],
     opacity: f32,
     /// Red, green, blue; 0 to 1 for what a screen shows.
-    colour: [f32; 3],
+    color: [f32; 3],
     /// Hash of the bits of everything that enters.
     pub(super) bits: u64,
 }
@@ -54,7 +54,7 @@ impl ComparedAppearance {
             ln_size: size.ln(),
             shape: shape(rotation, variance.map(|v| v / trace)),
             opacity: 1.0 / (1.0 + (-logit[0]).exp()),
-            colour: dc.map(|dc| 0.5 + SH_C0 as f32 * dc),
+            color: dc.map(|dc| 0.5 + SH_C0 as f32 * dc),
             bits,
         }
     }
@@ -66,7 +66,7 @@ impl ComparedAppearance {
 
     /// What tells those of a crowded cell apart.
     pub(super) fn brightness(&self) -> f32 {
-        self.colour.iter().sum()
+        self.color.iter().sum()
     }
 
     /// A of the [module](super), symmetric.
@@ -94,7 +94,7 @@ impl ComparedAppearance {
         let size = (self.ln_size - other.ln_size) / SIZE_UNIT;
         size * size
             + squared(&self.shape, &other.shape) / (SHAPE_UNIT * SHAPE_UNIT)
-            + squared(&self.colour, &other.colour) / (COLOUR_UNIT * COLOUR_UNIT)
+            + squared(&self.color, &other.color) / (COLOUR_UNIT * COLOUR_UNIT)
     }
 }
 

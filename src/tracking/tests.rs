@@ -77,7 +77,7 @@ struct Seen {
     size: f64,
     shape: [[f64; 3]; 3],
     opacity: f64,
-    colour: [f64; 3],
+    color: [f64; 3],
     bits: Vec<u32>,
 }
 
@@ -99,7 +99,7 @@ fn seen(state: &Gaussians, i: usize) -> Seen {
         size: rms_size(state, i),
         shape: columns,
         opacity: opacity(state.opacity_logit.plane(0)[i]),
-        colour: state.sh.row::<3>(i).map(|dc| 0.5 + SH_C0 * f64::from(dc)),
+        color: state.sh.row::<3>(i).map(|dc| 0.5 + SH_C0 * f64::from(dc)),
         bits: [
             bits(&state.position.row::<3>(i)),
             bits(&state.rotation.row::<4>(i)),
@@ -114,9 +114,9 @@ fn seen(state: &Gaussians, i: usize) -> Seen {
 /// How different both look, opacities aside.
 fn unlike(a: &Seen, b: &Seen) -> f64 {
     let shape: f64 = (0..9).map(|k| (b.shape[k / 3][k % 3] - a.shape[k / 3][k % 3]).powi(2)).sum();
-    let colour: f64 = (0..3).map(|c| (b.colour[c] - a.colour[c]).powi(2)).sum();
+    let color: f64 = (0..3).map(|c| (b.color[c] - a.color[c]).powi(2)).sum();
     let size = (b.size / a.size).ln() / 2f64.sqrt().ln();
-    size * size + shape / 0.25f64.powi(2) + colour / 0.1f64.powi(2)
+    size * size + shape / 0.25f64.powi(2) + color / 0.1f64.powi(2)
 }
 
 fn is_near_duplicate(a: &Seen, b: &Seen) -> bool {

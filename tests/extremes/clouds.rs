@@ -80,7 +80,7 @@ fn identical_gaussians_are_pruned_to_the_exact_count_by_hash() {
 
 /// Row 7.
 #[test]
-fn static_neighbours_merge_and_the_dynamic_arm_is_off() {
+fn static_neighbors_merge_and_the_dynamic_arm_is_off() {
     let workplace = Workplace::new();
     let mut cloud = balls(40).pick(&(0..80).map(|i| i / 2).collect::<Vec<_>>());
     // Beside each other, not at one place.

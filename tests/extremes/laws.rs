@@ -114,7 +114,7 @@ fn world() -> impl Strategy<Value = World> {
             let mut states = vec![Gaussians::zeros(count, 0); frames];
             for i in 0..count {
                 let of = all[i].1.2.unwrap_or(i);
-                let ((place, turn, size, grey), (step, moves, _)) = all[of];
+                let ((place, turn, size, gray), (step, moves, _)) = all[of];
                 for (t, state) in states.iter_mut().enumerate() {
                     // On the grid, so that most steps are exact.
                     let by = |c: usize| if moves { (step[c] * (t * t % 5) as i32) as f32 / 256.0 } else { 0.0 };
@@ -122,7 +122,7 @@ fn world() -> impl Strategy<Value = World> {
                     state.rotation.set_row(i, turn);
                     state.log_scale.set_row(i, size);
                     state.opacity_logit.set_row(i, [logits[t][if moves { of } else { 0 }.min(of)]]);
-                    state.sh.set_row(i, [grey; 3]);
+                    state.sh.set_row(i, [gray; 3]);
                 }
             }
             // Something is in view of every camera.

@@ -9,7 +9,7 @@
 //! | 4 | two frames | `motion::two_frames_have_one_step_and_no_curvature` |
 //! | 5 | sinusoids, T = 100,000 | `motion::sinusoids_over_100_000_frames_have_their_analytic_motion` |
 //! | 6 | all identical | `clouds::identical_gaussians_are_pruned_to_the_exact_count_by_hash` |
-//! | 7 | all static | `clouds::static_neighbours_merge_and_the_dynamic_arm_is_off` |
+//! | 7 | all static | `clouds::static_neighbors_merge_and_the_dynamic_arm_is_off` |
 //! | 8 | 1% movers | `clouds::movers_around_one_percent_are_kept_whatever_their_number` |
 //! | 9 | opacities 0 | `clouds::invisible_gaussians_are_all_prunable_without_nan` |
 //! | 10 | opacities 1 | `clouds::solid_gaussians_have_no_variance_and_finite_logits` |

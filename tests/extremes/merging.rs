@@ -88,13 +88,13 @@ fn duplicates_that_differ_in_the_sign_of_0_merge_to_one() {
 /// Row 35: coefficients of one direction, of which one is black.
 #[test]
 fn what_looks_otherwise_never_merges() {
-    let coloured = |dc: [[f32; 3]; 2]| left(1, |_, cloud| (0..2).for_each(|i| cloud.sh.set_row(i, dc[i])));
-    assert_eq!(coloured([[-1.772; 3]; 2]), 1);
-    for grey in [-1.2, -0.9, -0.5, -0.1] {
-        assert_eq!(coloured([[-1.772; 3], [grey; 3]]), 2, "black beside a grey of {grey}");
+    let colored = |dc: [[f32; 3]; 2]| left(1, |_, cloud| (0..2).for_each(|i| cloud.sh.set_row(i, dc[i])));
+    assert_eq!(colored([[-1.772; 3]; 2]), 1);
+    for gray in [-1.2, -0.9, -0.5, -0.1] {
+        assert_eq!(colored([[-1.772; 3], [gray; 3]]), 2, "black beside a grey of {gray}");
     }
     // Black however much less than nothing.
-    assert_eq!(coloured([[-1.78; 3], [-2.5; 3]]), 1);
+    assert_eq!(colored([[-1.78; 3], [-2.5; 3]]), 1);
 }
 
 /// The one Gaussian that two make, with `edit` made to both: scales, the axes as columns, and its row.

@@ -43,13 +43,13 @@ pub fn logit(opacity: f64) -> f64 {
 }
 
 /// The color that a coefficient of degree 0 is from all sides, in f64.
-pub fn colour(harmonic: f32) -> f64 {
+pub fn color(harmonic: f32) -> f64 {
     0.5 + SH_C0 * f64::from(harmonic)
 }
 
 /// The coefficient of degree 0 of a color.
-pub fn harmonic(colour: f64) -> f32 {
-    ((colour - 0.5) / SH_C0) as f32
+pub fn harmonic(color: f64) -> f32 {
+    ((color - 0.5) / SH_C0) as f32
 }
 
 /// Number of spherical-harmonic coefficients per channel of degree `d`: (d + 1)².

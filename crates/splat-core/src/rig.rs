@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn every_picture_of_a_synchronised_rig_lands_on_its_frame() {
+    fn every_picture_of_a_synchronized_rig_lands_on_its_frame() {
         let times = [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0];
         let shots: Vec<_> = times.iter().flat_map(|&t| (0..3).map(move |v| (v, Some(t), Split::Train))).collect();
         let rig = rig(&shots);

@@ -65,7 +65,7 @@ pub struct PredictedMotion {
     /// `[1]` what is added to opacities.
     pub opacity: Column,
     /// `[3]` what is added to harmonics of degree 0.
-    pub colour: Column,
+    pub color: Column,
 }
 
 /// Activations of one group.
@@ -84,7 +84,7 @@ impl PredictedMotion {
             Columns::ROTATION => &mut self.rotation,
             Columns::LOG_SCALE => &mut self.scaling,
             Columns::OPACITY => &mut self.opacity,
-            _ => &mut self.colour,
+            _ => &mut self.color,
         }
     }
 }

@@ -62,7 +62,7 @@ impl Box3 {
 
     /// Where `p` lies, −1 to 1 inside the box.
     #[inline(always)]
-    pub fn normalised(&self, p: [f32; 3]) -> [f32; 3] {
+    pub fn normalized(&self, p: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| (p[axis] - self.origin[axis]) * self.factor[axis] - 1.0)
     }
 }
@@ -203,7 +203,7 @@ impl Planes {
             PreparedPlanes { product: vec![1.0; rows * width], taps: Vec::with_capacity(rows * 3 * self.levels.len()) };
         let mut sample = vec![0.0; width];
         for (i, row) in prepared.product.chunks_exact_mut(width).enumerate() {
-            let u = self.space.normalised(position.row(i));
+            let u = self.space.normalized(position.row(i));
             let mut rest = row;
             for level in &self.levels {
                 let out;

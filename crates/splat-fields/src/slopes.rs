@@ -105,7 +105,7 @@ impl Planes {
             out.resize(width, CacheLine([0.0; LANES]));
         }
         for (lane, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
-            let u = self.space.normalised([x, y, z]);
+            let u = self.space.normalized([x, y, z]);
             let mut before = 0;
             for (level, lines) in self.levels.iter().zip(lines) {
                 let n = level.channels;

@@ -115,22 +115,22 @@ pub(super) trait BlendSink {
 }
 
 /// Accumulates color: three planes.
-pub(super) struct Colour {
+pub(super) struct Color {
     pub(super) planes: [TilePlane; 3],
 }
 
-impl BlendSink for Colour {
+impl BlendSink for Color {
     type Drop<V: Lanes> = [V; 3];
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> [V; 3] {
-        [V::splat(splat.colour[0]), V::splat(splat.colour[1]), V::splat(splat.colour[2])]
+        [V::splat(splat.color[0]), V::splat(splat.color[1]), V::splat(splat.color[2])]
     }
     #[inline(always)]
-    fn add<V: Lanes>(&mut self, colour: [V; 3], group: usize, Fragment { weight, .. }: Fragment<V>) -> [V; 3] {
-        for (plane, colour) in self.planes.iter_mut().zip(colour) {
-            V::load(plane, group).add(colour.mul(weight)).store(plane, group);
+    fn add<V: Lanes>(&mut self, color: [V; 3], group: usize, Fragment { weight, .. }: Fragment<V>) -> [V; 3] {
+        for (plane, color) in self.planes.iter_mut().zip(color) {
+            V::load(plane, group).add(color.mul(weight)).store(plane, group);
         }
-        colour
+        color
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, _: [V; 3], _: usize) {}

@@ -81,15 +81,15 @@ mod tests {
     }
 
     #[test]
-    fn features_that_are_colours_are_blended_as_these() {
+    fn features_that_are_colors_are_blended_as_these() {
         let (mut state, camera) = scene();
-        let mut colours = features(3);
-        colours.planes_mut().iter_mut().for_each(|x| *x = x.abs());
-        let harmonics = colours.planes().iter().map(|&x| harmonic(x.into())).collect();
+        let mut colors = features(3);
+        colors.planes_mut().iter_mut().for_each(|x| *x = x.abs());
+        let harmonics = colors.planes().iter().map(|&x| harmonic(x.into())).collect();
         state.sh = Column::from_planes(3, harmonics);
         let expected = render(&state, &camera, [0.0; 3]).data;
         assert!(expected.iter().any(|&x| x > 0.5));
-        let off = furthest(&blend_features(&state, &colours, &camera), expected.iter().copied());
+        let off = furthest(&blend_features(&state, &colors, &camera), expected.iter().copied());
         assert!(off < 1e-5, "{off}");
     }
 

@@ -1,6 +1,6 @@
 //! What a camera sees of one frame's Gaussians: EWA splatting on the CPU.
 //!
-//! Reads as a pipeline: `project` (footprints, with `colour`), `bin` (tiles, front to back), `blend` (pixels), and
+//! Reads as a pipeline: `project` (footprints, with `color`), `bin` (tiles, front to back), `blend` (pixels), and
 //! `backward` from there. Data in: [`Gaussians`](splat_core::Gaussians) in stored encoding and a
 //! [`Camera`](splat_core::Camera). Data out: an [`Image`], or the [`Contribution`] or [`RemovalError`] of every
 //! Gaussian, or the [`Gradients`](splat_core::Gradients) of a loss. Memory: [`BYTES_PER_VISIBLE`], and up to
@@ -15,7 +15,7 @@
 mod backward;
 mod bin;
 mod blend;
-mod colour;
+mod color;
 mod contribution;
 mod convention;
 mod features;

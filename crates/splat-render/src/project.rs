@@ -9,7 +9,7 @@
 use std::f64::consts::{LN_2, LOG2_E};
 use std::ops::Range;
 
-use super::colour::{self, Colours};
+use super::color::{self, Colors};
 use super::convention::{BLOCK, MIN_ALPHA, TILE};
 use splat_core::functions::exp;
 use splat_core::{Camera, Gaussians};
@@ -83,7 +83,7 @@ pub(super) struct Splat {
     /// View depth, scene units, added up in f32 as the reference kernel does: where Gaussians nearly tie
     /// its rounding decides which is in front (81 against 116 dB on one reference render).
     pub(super) order: f32,
-    pub(super) colour: [f32; 3],
+    pub(super) color: [f32; 3],
     /// Index among the Gaussians.
     pub(super) id: u32,
 }
@@ -116,38 +116,32 @@ impl Splats {
     }
 }
 
-/// Appends the visible Gaussians of `ids` to `out`; with `coloured`, their colors too (else black).
+/// Appends the visible Gaussians of `ids` to `out`; with `colored`, their colors too (else black).
 ///
 /// A Gaussian with a value that is not finite is not visible.
-pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, coloured: bool, out: &mut Splats) {
+pub(super) fn project(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
     #[cfg(target_arch = "x86_64")]
     {
         /// The same loops, compiled for wider registers; no fused arithmetic, so the same bits.
         #[target_feature(enable = "avx2")]
-        fn project_avx2(
-            gaussians: &Gaussians,
-            ids: Range<usize>,
-            view: &CameraTerms,
-            coloured: bool,
-            out: &mut Splats,
-        ) {
-            project_blocks(gaussians, ids, view, coloured, out);
+        fn project_avx2(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
+            project_blocks(gaussians, ids, view, colored, out);
         }
         if is_x86_feature_detected!("avx2") {
             // SAFETY: AVX2 was detected on the line above.
-            return unsafe { project_avx2(gaussians, ids, view, coloured, out) };
+            return unsafe { project_avx2(gaussians, ids, view, colored, out) };
         }
     }
-    project_blocks(gaussians, ids, view, coloured, out);
+    project_blocks(gaussians, ids, view, colored, out);
 }
 
 #[inline(always)]
-fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, coloured: bool, out: &mut Splats) {
+fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, colored: bool, out: &mut Splats) {
     // Room for all at once: growing would copy, and room that is never written takes no memory.
     out.splats.reserve_exact(ids.len());
     out.rects.reserve_exact(ids.len());
     let mut footprints = ProjectedSplats::default();
-    let mut colours: Colours = [[0.0; BLOCK]; 3];
+    let mut colors: Colors = [[0.0; BLOCK]; 3];
     for start in ids.clone().step_by(BLOCK) {
         let block = start..(start + BLOCK).min(ids.end);
         let logits = &gaussians.opacity_logit.plane(0)[block.clone()];
@@ -162,11 +156,11 @@ fn project_blocks(gaussians: &Gaussians, ids: Range<usize>, view: &CameraTerms, 
                 out.rects.push(rect);
             }
         }
-        if coloured && out.splats.len() > before {
-            colour::evaluate(gaussians, block, view.center, &mut colours);
+        if colored && out.splats.len() > before {
+            color::evaluate(gaussians, block, view.center, &mut colors);
             for splat in &mut out.splats[before..] {
                 let i = splat.id as usize - start;
-                splat.colour = [colours[0][i], colours[1][i], colours[2][i]];
+                splat.color = [colors[0][i], colors[1][i], colors[2][i]];
             }
         }
     }
@@ -268,7 +262,7 @@ impl ProjectedSplats {
             reach: reach as f32,
             opacity: opacity as f32,
             order: self.order[i],
-            colour: [0.0; 3],
+            color: [0.0; 3],
             id,
         };
         Some((splat, TileRect { x0, x1, y0, y1 }))

@@ -93,12 +93,12 @@ impl BlendSink for Removal<'_> {
     type Drop<V: Lanes> = ([V; 3], V::Sums);
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> ([V; 3], V::Sums) {
-        (splat.colour.map(V::splat), V::Sums::zero())
+        (splat.color.map(V::splat), V::Sums::zero())
     }
     #[inline(always)]
     fn add<V: Lanes>(
         &mut self,
-        (colour, sum): ([V; 3], V::Sums),
+        (color, sum): ([V; 3], V::Sums),
         group: usize,
         stroke: Fragment<V>,
     ) -> ([V; 3], V::Sums) {
@@ -107,14 +107,14 @@ impl BlendSink for Removal<'_> {
         let gain = weight.div(left);
         let floor = weight.mul(V::splat(self.contrast_floor));
         let mut squares = floor.mul(floor);
-        for (plane, colour) in self.rest.iter_mut().zip(colour) {
-            let own = colour.mul(weight);
+        for (plane, color) in self.rest.iter_mut().zip(color) {
+            let own = color.mul(weight);
             let behind = V::load(plane, group).sub(own);
             behind.store(plane, group);
             let change = own.sub(gain.mul(behind));
             squares = squares.add(change.mul(change));
         }
-        (colour, squares.add_to(sum))
+        (color, squares.add_to(sum))
     }
     #[inline(always)]
     fn end<V: Lanes>(&mut self, (_, sum): ([V; 3], V::Sums), pair: usize) {

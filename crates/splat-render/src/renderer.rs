@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::backward::sums::ImageGradientSums;
 use super::bin::{Bins, STRIP_PAIRS};
-use super::blend::{Blend, Colour, SampledPixels, TilePlane, Weight, Weights};
+use super::blend::{Blend, Color, SampledPixels, TilePlane, Weight, Weights};
 use super::contribution::Contribution;
 use super::convention::{BLOCK, TILE};
 use super::lanes::LANES;
@@ -220,7 +220,7 @@ impl Renderer {
     }
 
     /// Projects and sorts.
-    pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, coloured: bool) {
+    pub(super) fn prepare(&mut self, gaussians: &Gaussians, view: &CameraTerms, colored: bool) {
         let count = gaussians.len();
         self.splats.clear();
         if self.parallel {
@@ -228,13 +228,13 @@ impl Renderer {
                 .into_par_iter()
                 .map(|span| {
                     let mut splats = Splats::default();
-                    project(gaussians, span * SPAN..((span + 1) * SPAN).min(count), view, coloured, &mut splats);
+                    project(gaussians, span * SPAN..((span + 1) * SPAN).min(count), view, colored, &mut splats);
                     splats
                 })
                 .collect();
             spans.into_iter().for_each(|span| self.splats.append(span));
         } else {
-            project(gaussians, 0..count, view, coloured, &mut self.splats);
+            project(gaussians, 0..count, view, colored, &mut self.splats);
         }
         self.bins.begin(&self.splats, view.tiles);
     }
@@ -281,14 +281,14 @@ fn paint(
     lattice: &SampledPixels,
     background: [f32; 3],
 ) -> [TilePlane; 3] {
-    let mut colour = Colour { planes: [TilePlane::default(); 3] };
-    let left = blend.tile(splats, pairs, lattice, &mut colour);
-    for (plane, background) in colour.planes.iter_mut().zip(background) {
+    let mut color = Color { planes: [TilePlane::default(); 3] };
+    let left = blend.tile(splats, pairs, lattice, &mut color);
+    for (plane, background) in color.planes.iter_mut().zip(background) {
         for (pixel, left) in plane.as_flattened_mut().iter_mut().zip(left.as_flattened()) {
             *pixel += left.abs() * background;
         }
     }
-    colour.planes
+    color.planes
 }
 
 #[cfg(test)]

@@ -189,7 +189,7 @@ fn sparks_live_once_and_briefly_at_different_times_and_rest_while_dead() {
 }
 
 #[test]
-fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_colour() {
+fn doubles_lie_within_a_size_of_a_wall_gaussian_of_their_color() {
     let scene = usual();
     let walls = frame(&scene, Ids::Range(scene.members(DemoBody::Wall)), 0);
     let doubles = frame(&scene, Ids::Range(scene.members(DemoBody::Double)), 0);

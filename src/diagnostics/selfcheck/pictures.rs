@@ -27,8 +27,8 @@ pub(super) fn one_gaussian() -> Case {
             let [x, y] = [at % size as usize, at / size as usize].map(|k| k as f64 - middle);
             let alpha = opacity * (-0.5 * (x * x + y * y) / variance).exp();
             let alpha = if alpha < 1.0 / 255.0 { 0.0 } else { alpha };
-            for (&got, colour) in pixel.iter().zip([1.0, 0.5, 0.0]) {
-                worst.near(got.into(), alpha * colour + (1.0 - alpha) * 0.25, 1.0);
+            for (&got, color) in pixel.iter().zip([1.0, 0.5, 0.0]) {
+                worst.near(got.into(), alpha * color + (1.0 - alpha) * 0.25, 1.0);
             }
         }
         Ok(worst)
@@ -107,8 +107,8 @@ pub(super) fn harmonics() -> Case {
                 (0..3).for_each(|c| wall.sh.plane_mut(3 * k + c)[0] = 0.3 * (c as f32 - 1.0));
                 let image = render(&wall, &camera, [0.0; 3]);
                 for c in 0..3 {
-                    let colour = 0.5 + f64::from(0.3 * (c as f32 - 1.0)) * expected;
-                    worst.near(image.data[3 * (8 * 4 + 4) + c].into(), 0.99 * colour, 1.0);
+                    let color = 0.5 + f64::from(0.3 * (c as f32 - 1.0)) * expected;
+                    worst.near(image.data[3 * (8 * 4 + 4) + c].into(), 0.99 * color, 1.0);
                 }
             }
         }

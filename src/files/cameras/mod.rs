@@ -88,7 +88,7 @@ pub struct CameraOptions {
 pub enum Clock {
     /// Anything: they are divided by the largest, as the D-NeRF loaders do.
     #[default]
-    Normalised,
+    Normalized,
     /// What the model's time counts.
     Given,
 }

@@ -49,7 +49,7 @@ pub(super) fn load(file: &Path, with_others: bool, options: &CameraOptions) -> R
         add(&mut assembly, file, options)?;
     }
     let latest = assembly.latest(latest);
-    if latest > 0.0 && options.clock == Clock::Normalised {
+    if latest > 0.0 && options.clock == Clock::Normalized {
         assembly.divide_times(latest);
     }
     let names: Vec<String> = files.iter().map(|path| shown_name(path)).collect();

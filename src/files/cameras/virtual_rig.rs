@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn virtual_cameras_see_the_centre_in_the_middle_of_the_picture() {
+    fn virtual_cameras_see_the_center_in_the_middle_of_the_picture() {
         let center = DVec3::new(3.0, -2.0, 7.0);
         let rig = virtual_rig(center, 1.5);
         assert_eq!(rig.cameras.len(), 12);

@@ -33,10 +33,10 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
     let pair = |low: f32, high: f32| half(low) | half(high) << 16;
     // `as` truncates, saturates and turns NaN into 0.
     let byte = |value: f64| u32::from((255.0 * value) as u8);
-    let SplatvGaussian { position, motion: m, rotation: q, omega: o, scale: s, rgb: [r, g, b], opacity, centre, width } =
+    let SplatvGaussian { position, motion: m, rotation: q, omega: o, scale: s, rgb: [r, g, b], opacity, center, width } =
         *row;
     let [x, y, z] = position.map(f32::to_bits);
-    let colour = byte(r) | byte(g) << 8 | byte(b) << 16 | byte(opacity) << 24;
+    let color = byte(r) | byte(g) << 8 | byte(b) << 16 | byte(opacity) << 24;
     [
         x,
         y,
@@ -45,7 +45,7 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
         pair(q[2], q[3]),
         pair(s[0], s[1]),
         pair(s[2], 0.0),
-        colour,
+        color,
         pair(m[0], m[1]),
         pair(m[2], m[3]),
         pair(m[4], m[5]),
@@ -53,7 +53,7 @@ pub fn words(row: &SplatvGaussian) -> [u32; WORDS] {
         pair(m[8], 0.0),
         pair(o[0], o[1]),
         pair(o[2], o[3]),
-        pair(centre, width),
+        pair(center, width),
     ]
 }
 
@@ -138,7 +138,7 @@ mod tests {
             scale: std::array::from_fn(|k| value(40 + k as u16)),
             rgb: std::array::from_fn(|k| byte(k as u16)),
             opacity: byte(9),
-            centre: value(50),
+            center: value(50),
             width: value(51),
         }
     }

@@ -129,7 +129,7 @@ fn tensors_come_out_with_their_shapes_and_values() {
 }
 
 #[test]
-fn strides_and_offsets_are_honoured() {
+fn strides_and_offsets_are_honored() {
     let mut transposed = f32_entry("t", &[9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], &[3, 2], &[1, 3]);
     transposed.offset = 1;
     let tensors = Scratch::new().read(&state_dict(&[transposed])).unwrap();

@@ -259,9 +259,9 @@ fn states_of_sc_gs_follow_the_formulas() {
                 let more = if kind.all_heads { sum(&by.opacity, 0) } else { 0.0 };
                 let alpha = opacity(made.row::<1>("opacity", i)[0] as f32) + more;
                 assert!((opacity(state.opacity_logit.plane(0)[i]) - alpha.clamp(0.0, 1.0)).abs() < 1e-6);
-                let more = if kind.all_heads { sum(&by.colour, 1) } else { 0.0 };
-                let colour = made.row::<1>("f_dc_1", i)[0] + more;
-                assert!((f64::from(state.sh.plane(1)[i]) - colour).abs() < 1e-6);
+                let more = if kind.all_heads { sum(&by.color, 1) } else { 0.0 };
+                let color = made.row::<1>("f_dc_1", i)[0] + more;
+                assert!((f64::from(state.sh.plane(1)[i]) - color).abs() < 1e-6);
             }
         }
     }

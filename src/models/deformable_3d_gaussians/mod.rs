@@ -20,7 +20,7 @@ use crate::models::motion_model::{MotionModel, copy_stored};
 /// A model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a Deformable-3D-Gaussians model folder",
-    recognises: |found| found.is_folder && has_network(found.path),
+    recognizes: |found| found.is_folder && has_network(found.path),
     open: |path, options| Folder::open(path, options, DeformationKind::new),
 };
 

@@ -17,7 +17,7 @@ use crate::error::Result;
 use crate::files::digest::hash_file;
 use crate::files::npz::write::write_like;
 use crate::limits::Limits;
-use crate::model::{Columns, Gaussians, SH_C0, colour};
+use crate::model::{Columns, Gaussians, SH_C0, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::outputs::container::GAUSSIAN_BLOCK;
 use crate::outputs::kind::OutputKind;
@@ -32,7 +32,7 @@ const FILE: &str = "params.npz";
 /// A model's file, or its folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a Dynamic3DGaussians params.npz",
-    recognises: |found| {
+    recognizes: |found| {
         let named = |path: &Path| path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("npz"));
         match found.is_folder {
             true => found.path.join(FILE).is_file(),
@@ -155,7 +155,7 @@ impl Params {
                     // Segments are the leader's.
                     _ => return Ok(Vec::new()),
                 };
-                let (width, is_colour) = (column.width(0), column == Columns::SH);
+                let (width, is_color) = (column.width(0), column == Columns::SH);
                 if !places.is_empty() {
                     proxies.read(frame, column, &mut state)?;
                 }
@@ -163,7 +163,7 @@ impl Params {
                 for (proxy, &place) in places.iter().enumerate() {
                     for c in 0..width {
                         let value = state.column(column).plane(c)[proxy];
-                        values[place as usize * width + c] = if is_colour { colour(value) as f32 } else { value };
+                        values[place as usize * width + c] = if is_color { color(value) as f32 } else { value };
                     }
                 }
                 let by = by.column(column);
@@ -173,7 +173,7 @@ impl Params {
                         let more = by.plane(c)[row];
                         if more != 0.0 {
                             differs = true;
-                            values[row * width + c] += if is_colour { (SH_C0 * f64::from(more)) as f32 } else { more };
+                            values[row * width + c] += if is_color { (SH_C0 * f64::from(more)) as f32 } else { more };
                         }
                     }
                     if differs {

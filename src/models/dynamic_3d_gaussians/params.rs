@@ -30,7 +30,7 @@ pub(super) struct Params {
     info: SequenceInfo,
     means: Floats,
     rotations: Floats,
-    colours: Floats,
+    colors: Floats,
     log_scales: Floats,
     opacities: Floats,
     segments: Option<Floats>,
@@ -87,7 +87,7 @@ impl Params {
         Ok(Params {
             means: floats(MEANS)?,
             rotations: floats(ROTATIONS)?,
-            colours: floats(COLOURS)?,
+            colors: floats(COLOURS)?,
             log_scales: floats(LOG_SCALES)?,
             opacities: floats(OPACITIES)?,
             segments,
@@ -157,7 +157,7 @@ struct TrajectoryBlock<'a> {
 
 impl BlockReader for TrajectoryBlock<'_> {
     fn read(&mut self, frame: usize, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let Params { info, means, rotations, colours, log_scales, opacities, states, .. } = self.params;
+        let Params { info, means, rotations, colors, log_scales, opacities, states, .. } = self.params;
         if frame >= info.times.len() {
             return Err(Error::internal(format!("frame {frame} was asked for, of {}", info.times.len())));
         }
@@ -172,7 +172,7 @@ impl BlockReader for TrajectoryBlock<'_> {
                     Columns::ROTATION => out.rotation.set_row(row, rotations.row::<4>(4 * at)),
                     Columns::LOG_SCALE => out.log_scale.set_row(row, log_scales.row::<3>(3 * id)),
                     Columns::OPACITY => out.opacity_logit.set_row(row, opacities.row::<1>(id)),
-                    _ => out.sh.set_row(row, colours.row::<3>(3 * at).map(|colour| harmonic(colour.into()))),
+                    _ => out.sh.set_row(row, colors.row::<3>(3 * at).map(|color| harmonic(color.into()))),
                 }
             }
         }
@@ -181,7 +181,7 @@ impl BlockReader for TrajectoryBlock<'_> {
             for (floats, width, row) in [
                 (means, 3, frame * info.count),
                 (rotations, 4, frame * info.count),
-                (colours, 3, frame * info.count),
+                (colors, 3, frame * info.count),
                 (log_scales, 3, 0),
                 (opacities, 1, 0),
             ] {

@@ -71,8 +71,8 @@ fn states_are_the_arrays_values_compressed_or_not() {
             assert_eq!(state.rotation.row::<4>(id), arrays[3].2[4 * at..][..4]);
             assert_eq!(state.opacity_logit.row::<1>(id), arrays[4].2[id..][..1]);
             assert_eq!(state.log_scale.row::<3>(id), arrays[5].2[3 * id..][..3]);
-            let colours = state.sh.row::<3>(id).map(colour);
-            colours
+            let colors = state.sh.row::<3>(id).map(color);
+            colors
                 .iter()
                 .zip(&arrays[1].2[3 * at..])
                 .for_each(|(a, b)| assert!((a - f64::from(*b)).abs() < 1e-7, "{a} {b}"));

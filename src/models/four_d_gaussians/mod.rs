@@ -36,7 +36,7 @@ pub use model_folder::ModelFolder;
 /// A model folder.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a 4DGaussians model folder",
-    recognises: |found| {
+    recognizes: |found| {
         found.is_folder && (found.path.join("cfg_args").exists() || found.path.join("point_cloud").is_dir())
     },
     open: |path, options| Ok(Box::new(ModelFolder::open_with(path, options.iteration, &options.ply())?)),

@@ -68,21 +68,21 @@ impl MotionModel for FreeTime {
     #[inline(always)]
     fn state(&self, time: f64, raw: &Raw, windows: &Windows, want: Columns, out: &mut Gaussians) -> Result<()> {
         copy_stored(raw, want.difference(self.varying()), out);
-        let centres = raw.own.plane(TIME);
+        let centers = raw.own.plane(TIME);
         if want.contains(Columns::POSITION) {
             for c in 0..3 {
                 let (from, velocity) = (raw.gaussians.position.plane(c), raw.own.plane(VELOCITY + c));
-                let to = out.position.plane_mut(c).iter_mut().zip(from).zip(velocity).zip(centres);
-                to.for_each(|(((to, &x), &v), &centre)| {
-                    *to = (f64::from(x) + f64::from(v) * (time - f64::from(centre))) as f32;
+                let to = out.position.plane_mut(c).iter_mut().zip(from).zip(velocity).zip(centers);
+                to.for_each(|(((to, &x), &v), &center)| {
+                    *to = (f64::from(x) + f64::from(v) * (time - f64::from(center))) as f32;
                 });
             }
         }
         if want.contains(Columns::OPACITY) {
             let least = least();
-            let to = out.opacity_logit.plane_mut(0).iter_mut().zip(centres).zip(&windows.rates).zip(&windows.odds);
-            to.for_each(|(((to, &centre), &rate), &odds)| {
-                let exponent = -rate * (time - f64::from(centre)).powi(2);
+            let to = out.opacity_logit.plane_mut(0).iter_mut().zip(centers).zip(&windows.rates).zip(&windows.odds);
+            to.for_each(|(((to, &center), &rate), &odds)| {
+                let exponent = -rate * (time - f64::from(center)).powi(2);
                 *to = faded(odds, exponent).max(least) as f32;
             });
         }
@@ -93,9 +93,9 @@ impl MotionModel for FreeTime {
         let mut jacobian = Jacobian::default();
         if want.contains(Columns::OPACITY) {
             let least = least();
-            let centres = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.odds);
-            let slopes = centres.map(|((&centre, &rate), &odds)| {
-                let exponent = -rate * (time - f64::from(centre)).powi(2);
+            let centers = raw.own.plane(TIME).iter().zip(&windows.rates).zip(&windows.odds);
+            let slopes = centers.map(|((&center, &rate), &odds)| {
+                let exponent = -rate * (time - f64::from(center)).powi(2);
                 if exponent < least || faded(odds, exponent) <= least { 0.0 } else { slope(odds, exponent) as f32 }
             });
             *jacobian.column_mut(Columns::OPACITY) = Column::from_planes(1, slopes.collect());
@@ -112,11 +112,11 @@ impl ProxyRule for FreeTime {
             LinearPath {
                 position: raw.gaussians.position.row::<3>(id).map(f64::from),
                 velocity: [0, 1, 2].map(|c| f64::from(raw.own.plane(VELOCITY + c)[id])),
-                centre: raw.own.plane(TIME)[id].into(),
+                center: raw.own.plane(TIME)[id].into(),
                 deviation: deviation(raw.own.plane(DURATION)[id]),
             }
         };
-        let fades = |line: &LinearPath, time: f64| (-0.5 * ((time - line.centre) / line.deviation).powi(2)).exp();
+        let fades = |line: &LinearPath, time: f64| (-0.5 * ((time - line.center) / line.deviation).powi(2)).exp();
         let mut sh = vec![Vec::new(); clusters.len()];
         let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
             // The same at every frame.
@@ -131,7 +131,7 @@ impl ProxyRule for FreeTime {
             let line = matched.line;
             let Raw { gaussians, own } = &mut proxies;
             gaussians.position.set_row(row, line.position.map(|x| x as f32));
-            own.plane_mut(TIME)[row] = line.centre as f32;
+            own.plane_mut(TIME)[row] = line.center as f32;
             own.plane_mut(DURATION)[row] = (line.deviation - DEVIATION[1]).max(DEVIATION[0]).ln() as f32;
             (0..3).for_each(|c| own.plane_mut(VELOCITY + c)[row] = line.velocity[c] as f32);
             let Some((opacity, covariance)) = matched.seen else { continue };

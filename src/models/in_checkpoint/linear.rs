@@ -25,7 +25,7 @@ const OPACITIES: [f64; 2] = [1e-3, 1.0 - 1e-4];
 pub(in crate::models) struct LinearPath {
     pub(in crate::models) position: [f64; 3],
     pub(in crate::models) velocity: [f64; 3],
-    pub(in crate::models) centre: f64,
+    pub(in crate::models) center: f64,
     pub(in crate::models) deviation: f64,
 }
 
@@ -36,13 +36,13 @@ impl LinearPath {
         let mean = |of: &dyn Fn(&LinearPath) -> f64| {
             members.iter().map(|(weight, line)| weight * line.deviation / lasting * of(line)).sum::<f64>()
         };
-        let centre = mean(&|line| line.centre);
-        let variance = mean(&|line| line.deviation.powi(2) + (line.centre - centre).powi(2));
+        let center = mean(&|line| line.center);
+        let variance = mean(&|line| line.deviation.powi(2) + (line.center - center).powi(2));
         let sum = |of: &dyn Fn(&LinearPath) -> f64| members.iter().map(|(weight, line)| weight * of(line)).sum::<f64>();
         LinearPath {
-            position: [0, 1, 2].map(|c| sum(&|line| line.position[c] + line.velocity[c] * (centre - line.centre))),
+            position: [0, 1, 2].map(|c| sum(&|line| line.position[c] + line.velocity[c] * (center - line.center))),
             velocity: [0, 1, 2].map(|c| sum(&|line| line.velocity[c])),
-            centre,
+            center,
             deviation: variance.sqrt(),
         }
     }
@@ -162,7 +162,7 @@ mod tests {
         let line = |k: f64| LinearPath {
             position: [k, 1.0 - k * k, 0.3],
             velocity: [0.2 * k, -1.0 / (1.0 + k), 5.0],
-            centre: 0.1 * k,
+            center: 0.1 * k,
             deviation: 0.05 + 0.02 * k,
         };
         let members = [(0.5, line(1.0)), (0.2, line(2.5)), (0.3, line(-0.7))];
@@ -170,7 +170,7 @@ mod tests {
         for k in 0..20 {
             let time = -0.5 + 0.1 * f64::from(k);
             for c in 0..3 {
-                let at = |line: &LinearPath| line.position[c] + line.velocity[c] * (time - line.centre);
+                let at = |line: &LinearPath| line.position[c] + line.velocity[c] * (time - line.center);
                 let mean: f64 = members.iter().map(|(weight, line)| weight * at(line)).sum();
                 assert!((at(&blended) - mean).abs() < 1e-12, "{time} {c}: {} {mean}", at(&blended));
             }
@@ -178,6 +178,6 @@ mod tests {
         // One alone, and one beside its like, are themselves.
         assert_eq!(LinearPath::blended(&[(1.0, line(2.0))]), line(2.0));
         let twice = LinearPath::blended(&[(0.25, line(2.0)), (0.75, line(2.0))]);
-        assert!((twice.deviation - line(2.0).deviation).abs() < 1e-15 && (twice.centre - 0.2).abs() < 1e-15);
+        assert!((twice.deviation - line(2.0).deviation).abs() < 1e-15 && (twice.center - 0.2).abs() < 1e-15);
     }
 }

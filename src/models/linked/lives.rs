@@ -19,7 +19,7 @@ const LEAST_DB: f64 = 40.0;
 /// Views of each frame that is looked at.
 const VIEWS: usize = 3;
 /// What may change along a track and be held: no more than trainers leave between lives, or half of that.
-const BOUNDS: [Bound; 2] = [Bound { colour: 0.04, other: 0.02 }, Bound { colour: 0.02, other: 0.01 }];
+const BOUNDS: [Bound; 2] = [Bound { color: 0.04, other: 0.02 }, Bound { color: 0.02, other: 0.01 }];
 
 /// Joins the lives of `tracks` that `joiner` has seen as loosely as pictures allow, if any may be; gives what a person should
 /// know of that.
@@ -72,10 +72,10 @@ pub(super) fn hold(tracks: &mut LinkedTracks, scratch: &Path) -> Result<Option<S
         let after = looked_at(&frames).map(|frame| states(tracks, frame)).collect::<Result<Vec<_>>>()?;
         let psnr = likeness(&before, &after);
         if psnr >= LEAST_DB {
-            let [colours, scales, rotations, opacities] = parts.map(|part| format!("{:.0}%", 100.0 * part));
-            let Bound { colour, other } = bound;
+            let [colors, scales, rotations, opacities] = parts.map(|part| format!("{:.0}%", 100.0 * part));
+            let Bound { color, other } = bound;
             return Ok(Some(format!(
-                "what hardly changes along a track is held: {colours} of the colours (within {colour}), {scales} of the \
+                "what hardly changes along a track is held: {colors} of the colours (within {color}), {scales} of the \
                  scales, {rotations} of the rotations and {opacities} of the opacities (within {other}): {}",
                 within(psnr)
             )));

@@ -26,7 +26,7 @@ pub(super) const BATCH: usize = 1 << 16;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bound {
     /// Of colors from 0 to 1.
-    pub(super) colour: f64,
+    pub(super) color: f64,
     /// Of natural logs of scales, of radians, and of opacities.
     pub(super) other: f64,
 }
@@ -134,7 +134,7 @@ pub(super) struct TrackSums {
     /// Σ α·v² of the scales.
     scales: Vec<[f64; 3]>,
     /// Σ α·Σₖ vₖ² of the channels.
-    colours: Vec<[f64; 3]>,
+    colors: Vec<[f64; 3]>,
     /// The first quaternion, which says the sign of the others.
     first: Vec<[f32; 4]>,
 }
@@ -148,7 +148,7 @@ impl TrackSums {
             values: vec![0.0; HELD.width(sh_degree) * len],
             turns: vec![[0.0; 4]; len],
             scales: vec![[0.0; 3]; len],
-            colours: vec![[0.0; 3]; len],
+            colors: vec![[0.0; 3]; len],
             first: vec![[0.0; 4]; len],
         }
     }
@@ -195,7 +195,7 @@ impl TrackSums {
         for (c, sum) in others[1..].iter_mut().enumerate() {
             let value = f64::from(state.sh.plane(c)[at]);
             *sum += alpha * value;
-            self.colours[track][c % 3] += alpha * value * value;
+            self.colors[track][c % 3] += alpha * value * value;
         }
     }
 
@@ -211,19 +211,19 @@ impl TrackSums {
         let [frames, weight, squares] = self.opacity[track];
         let width = self.values.len() / self.opacity.len();
         let mean: Vec<f64> = self.values[track * width..][..width].iter().map(|sum| sum / weight).collect();
-        let (scales, colours) = (&mean[4..7], &mean[width - self.sh_width..]);
+        let (scales, colors) = (&mean[4..7], &mean[width - self.sh_width..]);
         let turn = 4.0 * (1.0 - self.turns[track].iter().map(|sum| (sum / weight).powi(2)).sum::<f64>());
         let within = |variance: f64, bound: f64| variance <= bound * bound;
         let are_scales = (0..3).all(|c| within(self.scales[track][c] / weight - scales[c].powi(2), bound.other));
-        let are_colours = (0..3).all(|channel| {
-            let of_mean: f64 = colours.iter().skip(channel).step_by(3).map(|value| value * value).sum();
-            within((self.colours[track][channel] / weight - of_mean) / (4.0 * PI), bound.colour)
+        let are_colors = (0..3).all(|channel| {
+            let of_mean: f64 = colors.iter().skip(channel).step_by(3).map(|value| value * value).sum();
+            within((self.colors[track][channel] / weight - of_mean) / (4.0 * PI), bound.color)
         });
         let mut steady = Columns::empty();
         steady.set(Columns::ROTATION, within(turn, bound.other));
         steady.set(Columns::LOG_SCALE, are_scales);
         steady.set(Columns::OPACITY, within(squares / frames - (weight / frames).powi(2), bound.other));
-        steady.set(Columns::SH, are_colours);
+        steady.set(Columns::SH, are_colors);
         steady
     }
 }

@@ -61,8 +61,8 @@ pub(super) trait Shading: Sync {
     /// Those of `raw` at `time`, a plane for each.
     fn features(&self, time: f64, raw: &Raw) -> Column;
 
-    /// The color of a pixel that has blended `features`, seen from `centre` along the unit `ray`.
-    fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3];
+    /// The color of a pixel that has blended `features`, seen from `center` along the unit `ray`.
+    fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3];
 }
 
 /// A model of a law.
@@ -188,8 +188,8 @@ impl<L: MotionModel> FeatureDecoder for MotionModelFrames<L> {
         Ok(())
     }
 
-    fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
-        self.law.shading().map_or([0.0; 3], |shading| shading.colour(features, centre, ray))
+    fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+        self.law.shading().map_or([0.0; 3], |shading| shading.color(features, center, ray))
     }
 }
 

@@ -89,14 +89,14 @@ impl Native {
     }
 
     /// What is left at `time` of a Gaussian with that center and Σ_tt.
-    pub(super) fn marginal(&self, time: f64, centre: f64, variance: f64) -> f64 {
-        let m = (self.rate(variance) * (time - centre).powi(2)).exp();
+    pub(super) fn marginal(&self, time: f64, center: f64, variance: f64) -> f64 {
+        let m = (self.rate(variance) * (time - center).powi(2)).exp();
         if m > CUT { m } else { 0.0 }
     }
 
     /// cos(2π(μ − t)/L) and its double.
-    pub(super) fn waves(&self, time: f64, centre: f64) -> [f64; 2] {
-        let wave = (TAU * (centre - time) / self.period).cos();
+    pub(super) fn waves(&self, time: f64, center: f64) -> [f64; 2] {
+        let wave = (TAU * (center - time) / self.period).cos();
         [wave, 2.0 * wave * wave - 1.0]
     }
 }
@@ -127,8 +127,8 @@ impl MotionModel for Native {
     }
 
     fn varying(&self) -> Columns {
-        let colours = if self.terms > 0 { Columns::SH } else { Columns::empty() };
-        Columns::POSITION | Columns::OPACITY | colours
+        let colors = if self.terms > 0 { Columns::SH } else { Columns::empty() };
+        Columns::POSITION | Columns::OPACITY | colors
     }
 
     /// Scales and rotations follow from those of four dimensions together.
@@ -139,7 +139,7 @@ impl MotionModel for Native {
 
     #[inline(always)]
     fn state(&self, time: f64, raw: &Raw, slices: &Slices, want: Columns, out: &mut Gaussians) -> Result<()> {
-        let centres = raw.own.plane(TIME);
+        let centers = raw.own.plane(TIME);
         let mixed = if self.turns { Columns::ROTATION | Columns::LOG_SCALE } else { Columns::empty() };
         copy_stored(raw, want.difference(Columns::POSITION | Columns::OPACITY | mixed), out);
         if (want & mixed).contains(Columns::ROTATION) {
@@ -150,23 +150,23 @@ impl MotionModel for Native {
         }
         if want.contains(Columns::POSITION) {
             for (c, velocity) in slices.velocity.iter().enumerate() {
-                let from = raw.gaussians.position.plane(c).iter().zip(velocity).zip(centres);
-                out.position.plane_mut(c).iter_mut().zip(from).for_each(|(to, ((&x, &velocity), &centre))| {
-                    *to = (f64::from(x) + velocity * (time - f64::from(centre))) as f32;
+                let from = raw.gaussians.position.plane(c).iter().zip(velocity).zip(centers);
+                out.position.plane_mut(c).iter_mut().zip(from).for_each(|(to, ((&x, &velocity), &center))| {
+                    *to = (f64::from(x) + velocity * (time - f64::from(center))) as f32;
                 });
             }
         }
         if want.contains(Columns::OPACITY) {
             let cut = CUT.ln();
-            let from = centres.iter().zip(&slices.rates).zip(&slices.odds);
-            out.opacity_logit.plane_mut(0).iter_mut().zip(from).for_each(|(to, ((&centre, &rate), &odds))| {
-                let exponent = rate * (time - f64::from(centre)).powi(2);
+            let from = centers.iter().zip(&slices.rates).zip(&slices.odds);
+            out.opacity_logit.plane_mut(0).iter_mut().zip(from).for_each(|(to, ((&center, &rate), &odds))| {
+                let exponent = rate * (time - f64::from(center)).powi(2);
                 let drawn = faded(odds, exponent);
                 *to = if exponent > cut { drawn } else { -MOST } as f32;
             });
         }
         if want.contains(Columns::SH) && self.terms > 0 {
-            let waves = centres.iter().map(|&centre| self.waves(time, f64::from(centre)));
+            let waves = centers.iter().map(|&center| self.waves(time, f64::from(center)));
             let waves: (Vec<f64>, Vec<f64>) = waves.map(|[first, second]| (first, second)).unzip();
             for (term, waves) in [waves.0, waves.1].iter().enumerate().take(self.terms) {
                 for c in 0..out.sh.width() {
@@ -185,8 +185,8 @@ impl MotionModel for Native {
         if want.contains(Columns::OPACITY) {
             let cut = CUT.ln();
             let of = raw.own.plane(TIME).iter().zip(&slices.rates).zip(&slices.odds);
-            let slopes = of.map(|((&centre, &rate), &odds)| {
-                let exponent = rate * (time - f64::from(centre)).powi(2);
+            let slopes = of.map(|((&center, &rate), &odds)| {
+                let exponent = rate * (time - f64::from(center)).powi(2);
                 if exponent > cut { slope(odds, exponent) as f32 } else { 0.0 }
             });
             *jacobian.column_mut(Columns::OPACITY) = Column::from_planes(1, slopes.collect());

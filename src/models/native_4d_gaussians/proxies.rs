@@ -27,14 +27,14 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
         LinearPath {
             position: raw.gaussians.position.row::<3>(id as usize).map(f64::from),
             velocity: slice.velocity,
-            centre: raw.own.plane(TIME)[id as usize].into(),
+            center: raw.own.plane(TIME)[id as usize].into(),
             deviation: slice.variance.sqrt(),
         }
     };
-    let fades = |line: &LinearPath, time: f64| law.marginal(time, line.centre, line.deviation.powi(2));
+    let fades = |line: &LinearPath, time: f64| law.marginal(time, line.center, line.deviation.powi(2));
     let mut fits = vec![ThreeFunctionFit::default(); clusters.len()];
     let matched = match_all(model, clusters, rule, line, fades, Columns::SH, |seen| {
-        let [first, second] = law.waves(seen.time, seen.line.centre);
+        let [first, second] = law.waves(seen.time, seen.line.center);
         let of = &seen.state.sh;
         let values = (0..of.width()).map(|c| f64::from(of.plane(c)[seen.row]));
         fits[seen.proxy].add(seen.weight, [1.0, first, second], values);
@@ -44,11 +44,11 @@ pub(super) fn proposed(model: &MotionModelFrames<Native>, clusters: &[Cluster], 
     for (row, (matched, fit)) in matched.iter().zip(&fits).enumerate() {
         let Some((opacity, covariance)) = matched.seen else { continue };
         let Raw { gaussians, own } = &mut proxies;
-        let LinearPath { position, velocity, centre, deviation } = matched.line;
+        let LinearPath { position, velocity, center, deviation } = matched.line;
         let variance = deviation.powi(2);
         gaussians.position.set_row(row, position.map(|x| x as f32));
         gaussians.opacity_logit.set_row(row, [opacity]);
-        own.plane_mut(TIME)[row] = centre as f32;
+        own.plane_mut(TIME)[row] = center as f32;
         if law.turns {
             let [xx, xy, xz, yy, yz, zz] = covariance;
             let space = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
@@ -119,8 +119,8 @@ mod tests {
 
     #[test]
     fn waves_are_found_where_frames_show_them_and_small_where_they_do_not() {
-        let wave = |k: i32, centre: f64| {
-            let turn = std::f64::consts::TAU * (centre - 0.05 * f64::from(k));
+        let wave = |k: i32, center: f64| {
+            let turn = std::f64::consts::TAU * (center - 0.05 * f64::from(k));
             [1.0, turn.cos(), (2.0 * turn).cos()]
         };
         let (mut whole, mut short) = (ThreeFunctionFit::default(), ThreeFunctionFit::default());

@@ -24,7 +24,7 @@ use nodes::Nodes;
 /// A model folder, told from the other family of such by a key of its configuration or by its nodes.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "an SC-GS model folder",
-    recognises: |found| {
+    recognizes: |found| {
         let typed = || {
             let arguments = Arguments::read(&found.path.join("cfg_args")).ok();
             arguments.is_some_and(|arguments| arguments.get("deform_type").string().is_ok_and(|kind| kind.is_some()))
@@ -206,7 +206,7 @@ impl Control {
                     rotation: of(Columns::ROTATION, &of_nodes.rotation),
                     scaling: of(Columns::LOG_SCALE, &of_nodes.scaling),
                     opacity: of(Columns::OPACITY, &of_nodes.opacity),
-                    colour: of(Columns::SH, &of_nodes.colour),
+                    color: of(Columns::SH, &of_nodes.color),
                 };
             }
             (PreparedNodes::Shares(_), None) => {
@@ -258,7 +258,7 @@ impl MotionModel for Control {
                     ln((exp(log) + f64::from(by)).abs().max(LEAST_SCALE)) as f32
                 }),
                 Columns::OPACITY => each(&motion.opacity, to, |logit, by| added(logit, by) as f32),
-                _ => add(&motion.colour, to),
+                _ => add(&motion.color, to),
             }
         }
         Ok(())

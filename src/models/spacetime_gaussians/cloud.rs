@@ -103,7 +103,7 @@ impl Cloud {
     ///
     /// # Errors
     /// A file cut short since it was opened.
-    pub(super) fn colours(&self) -> Result<[Vec<f32>; 3]> {
+    pub(super) fn colors(&self) -> Result<[Vec<f32>; 3]> {
         let of = |name: &str| -> Result<Vec<f32>> { Ok(self.ply.values(name)?.unwrap_or_default()) };
         Ok([of("f_dc_0")?, of("f_dc_1")?, of("f_dc_2")?])
     }
@@ -185,7 +185,7 @@ fn paint(raw: &mut Raw, act: Option<Act>) {
     for c in 0..3 {
         let features = raw.own.width() > FEATURES;
         let from: Vec<f32> = if features { raw.own.plane(FEATURES + c) } else { raw.gaussians.sh.plane(c) }.to_vec();
-        let colour = |x: f32| act.map_or(f64::from(x), |act| act.apply(f64::from(x)));
-        raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = harmonic(colour(x)));
+        let color = |x: f32| act.map_or(f64::from(x), |act| act.apply(f64::from(x)));
+        raw.gaussians.sh.plane_mut(c).iter_mut().zip(from).for_each(|(to, x)| *to = harmonic(color(x)));
     }
 }

@@ -92,10 +92,10 @@ impl ColorDecoder {
         })
     }
 
-    /// The color of a pixel whose [`FEATURES`] are `features`, seen from `centre` along the unit `ray`.
-    pub(super) fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+    /// The color of a pixel whose [`FEATURES`] are `features`, seen from `center` along the unit `ray`.
+    pub(super) fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
         let mut inputs = [0.0; INPUTS];
-        let all = features[3..].iter().chain(&centre).chain(&ray);
+        let all = features[3..].iter().chain(&center).chain(&ray);
         inputs.iter_mut().zip(all).for_each(|(to, &of)| *to = of.into());
         let sum = |weights: &[f64], of: &[f64]| weights.iter().zip(of).map(|(w, x)| w * x).sum::<f64>();
         let hidden = self.first.map(|row| sum(&row, &inputs).max(0.0));
@@ -124,11 +124,11 @@ pub(crate) mod tests {
         let mut tensors = weights();
         tensors.get_mut("mlp2.weight").unwrap().data.fill(0.0);
         let features = [0.5, -1.0, 2.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0];
-        let colour =
-            |act| ColorDecoder::new(&tensors, act, Path::new("x.pt")).unwrap().colour(&features, [1.0; 3], [1.0; 3]);
-        assert_eq!(colour(Act::None), [0.5, -1.0, 2.0]);
-        assert_eq!(colour(Act::Clamp), [0.5, 0.0, 1.0]);
-        let sigmoid = colour(Act::Sigmoid);
+        let color =
+            |act| ColorDecoder::new(&tensors, act, Path::new("x.pt")).unwrap().color(&features, [1.0; 3], [1.0; 3]);
+        assert_eq!(color(Act::None), [0.5, -1.0, 2.0]);
+        assert_eq!(color(Act::Clamp), [0.5, 0.0, 1.0]);
+        let sigmoid = color(Act::Sigmoid);
         assert!((0..3).all(|c| (f64::from(sigmoid[c]) - opacity(features[c])).abs() < 1e-7), "{sigmoid:?}");
     }
 
@@ -145,8 +145,8 @@ pub(crate) mod tests {
         let decoder = ColorDecoder::new(&tensors, Act::None, Path::new("x.pt")).unwrap();
         let mut features = [0.0; 9];
         features[3] = 0.25;
-        assert_eq!(decoder.colour(&features, [0.0; 3], [0.0, 0.0, 1.0]), [0.5 + 30.0, -3.0, 0.0]);
-        assert_eq!(decoder.colour(&features, [0.0; 3], [0.0, 0.0, -1.0]), [0.5, 0.0, 0.0]);
+        assert_eq!(decoder.color(&features, [0.0; 3], [0.0, 0.0, 1.0]), [0.5 + 30.0, -3.0, 0.0]);
+        assert_eq!(decoder.color(&features, [0.0; 3], [0.0, 0.0, -1.0]), [0.5, 0.0, 0.0]);
     }
 
     #[test]

@@ -33,7 +33,7 @@ impl SpacetimeMotion {
         let own = |plane: usize| f64::from(raw.own.plane(plane)[row]);
         let path = |k: usize| std::array::from_fn(|c| own(MOTION + 3 * k + c));
         SpacetimeMotion {
-            centre: own(CENTRE),
+            center: own(CENTRE),
             log_width: own(LOG_WIDTH),
             path: [raw.gaussians.position.row::<3>(row).map(f64::from), path(0), path(1), path(2)],
             rotation: raw.gaussians.rotation.row::<4>(row).map(f64::from),
@@ -44,7 +44,7 @@ impl SpacetimeMotion {
     /// Makes it that of Gaussian `row`, rounded to f32.
     pub(super) fn write(&self, raw: &mut Raw, row: usize) {
         let mut own = |plane: usize, value: f64| raw.own.plane_mut(plane)[row] = value as f32;
-        own(CENTRE, self.centre);
+        own(CENTRE, self.center);
         own(LOG_WIDTH, self.log_width);
         for (k, terms) in self.path[1..].iter().enumerate() {
             terms.iter().enumerate().for_each(|(c, &term)| own(MOTION + 3 * k + c, term));
@@ -106,15 +106,15 @@ impl MotionModel for Spacetime {
         want: Columns,
         out: &mut Gaussians,
     ) -> Result<()> {
-        let (stored, own, centres) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
-        let since = |centre: &f32| time - f64::from(*centre);
+        let (stored, own, centers) = (&raw.gaussians, &raw.own, raw.own.plane(CENTRE));
+        let since = |center: &f32| time - f64::from(*center);
         if want.contains(Columns::POSITION) {
             for c in 0..3 {
                 let [m1, m2, m3] = [0, 1, 2].map(|k| own.plane(MOTION + 3 * k + c));
                 let terms = stored.position.plane(c).iter().zip(m1).zip(m2).zip(m3);
-                let to = out.position.plane_mut(c).iter_mut().zip(terms).zip(centres);
-                to.for_each(|((to, (((&p0, &m1), &m2), &m3)), centre)| {
-                    let (dt, [p0, m1, m2, m3]) = (since(centre), [p0, m1, m2, m3].map(f64::from));
+                let to = out.position.plane_mut(c).iter_mut().zip(terms).zip(centers);
+                to.for_each(|((to, (((&p0, &m1), &m2), &m3)), center)| {
+                    let (dt, [p0, m1, m2, m3]) = (since(center), [p0, m1, m2, m3].map(f64::from));
                     *to = (p0 + dt * (m1 + dt * (m2 + dt * m3))) as f32;
                 });
             }
@@ -122,16 +122,16 @@ impl MotionModel for Spacetime {
         if want.contains(Columns::ROTATION) {
             for c in 0..4 {
                 let terms = stored.rotation.plane(c).iter().zip(own.plane(OMEGA + c));
-                let to = out.rotation.plane_mut(c).iter_mut().zip(terms).zip(centres);
-                to.for_each(|((to, (&start, &omega)), centre)| {
-                    *to = (f64::from(start) + since(centre) * f64::from(omega)) as f32;
+                let to = out.rotation.plane_mut(c).iter_mut().zip(terms).zip(centers);
+                to.for_each(|((to, (&start, &omega)), center)| {
+                    *to = (f64::from(start) + since(center) * f64::from(omega)) as f32;
                 });
             }
         }
         if want.contains(Columns::OPACITY) {
-            let of = centres.iter().zip(&prepared.inverse_squared).zip(&prepared.odds);
-            out.opacity_logit.plane_mut(0).iter_mut().zip(of).for_each(|(to, ((centre, &inverse_squared), &odds))| {
-                *to = faded(odds, exponent(since(centre), inverse_squared)) as f32;
+            let of = centers.iter().zip(&prepared.inverse_squared).zip(&prepared.odds);
+            out.opacity_logit.plane_mut(0).iter_mut().zip(of).for_each(|(to, ((center, &inverse_squared), &odds))| {
+                *to = faded(odds, exponent(since(center), inverse_squared)) as f32;
             });
         }
         copy_stored(raw, want.difference(self.varying()), out);
@@ -141,9 +141,9 @@ impl MotionModel for Spacetime {
     fn jacobian(&self, time: f64, raw: &Raw, prepared: &PreparedGaussian, want: Columns) -> Result<Jacobian> {
         let mut found = Jacobian::default();
         if want.contains(Columns::OPACITY) {
-            let centres = raw.own.plane(CENTRE);
+            let centers = raw.own.plane(CENTRE);
             let of = |row: usize| {
-                let dt = time - f64::from(centres[row]);
+                let dt = time - f64::from(centers[row]);
                 slope(prepared.odds[row], exponent(dt, prepared.inverse_squared[row])) as f32
             };
             *found.column_mut(Columns::OPACITY) = Column::from_planes(1, (0..raw.len()).map(of).collect());
@@ -160,20 +160,20 @@ impl Shading for Spacetime {
     /// Six that do not change, and three that grow with the time since the center.
     fn features(&self, time: f64, raw: &Raw) -> Column {
         let mut found = Column::zeros(decoder::FEATURES, raw.len());
-        let centres = raw.own.plane(CENTRE);
+        let centers = raw.own.plane(CENTRE);
         for plane in 0..FEATURES_IN_TIME - FEATURES {
             found.plane_mut(plane).copy_from_slice(raw.own.plane(FEATURES + plane));
         }
         for c in 0..FULL_WIDTH - FEATURES_IN_TIME {
             let by_time = raw.own.plane(FEATURES_IN_TIME + c);
             for (row, to) in found.plane_mut(FEATURES_IN_TIME - FEATURES + c).iter_mut().enumerate() {
-                *to = ((time - f64::from(centres[row])) * f64::from(by_time[row])) as f32;
+                *to = ((time - f64::from(centers[row])) * f64::from(by_time[row])) as f32;
             }
         }
         found
     }
 
-    fn colour(&self, features: &[f32], centre: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
-        self.decoder.as_ref().map_or([0.0; 3], |decoder| decoder.colour(features, centre, ray))
+    fn color(&self, features: &[f32], center: [f32; 3], ray: [f32; 3]) -> [f32; 3] {
+        self.decoder.as_ref().map_or([0.0; 3], |decoder| decoder.color(features, center, ray))
     }
 }

@@ -31,7 +31,7 @@ use crate::files::python_literal::{Literal, parse_call};
 use crate::files::state_dict::read_state_dict;
 use crate::files::text::read_text;
 use crate::limits::Limits;
-use crate::model::{Raw, colour};
+use crate::model::{Raw, color};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, OpenOptions, Timing};
 use crate::models::motion_model::{MotionModelFrames, left, solve};
 use crate::outputs::kind::OutputKind;
@@ -53,7 +53,7 @@ const CAMERAS: &str = "cameras.json";
 /// A model's folder, or its PLY.
 pub(super) const ENTRY: ModelFormat = ModelFormat {
     expected: "a SpacetimeGaussians model folder",
-    recognises: |found| match found.is_folder {
+    recognizes: |found| match found.is_folder {
         true => iteration(&found.path.join(CLOUDS), None).is_ok_and(|(_, folder)| is_marked(&folder.join(CLOUD))),
         false => found.is_file_of(b"ply", "ply") && is_marked(found.path),
     },
@@ -204,7 +204,7 @@ impl SpacetimeGaussians {
 
 /// How many Gaussians have a color that the authors' renderer adds and that others cut.
 fn dark(raw: &Raw) -> Option<String> {
-    let is_dark = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| colour(harmonic) < 0.0);
+    let is_dark = |row: usize| raw.gaussians.sh.row::<3>(row).iter().any(|&harmonic| color(harmonic) < 0.0);
     let count = (0..raw.len()).filter(|&row| is_dark(row)).count();
     (count > 0).then(|| {
         format!("{count} Gaussians have a colour below 0, which darkens in the authors' renderer and is 0 in others and here")
@@ -319,11 +319,11 @@ impl InputModel for SpacetimeGaussians {
             OutputKind::Splatv => {
                 let raw = left(self.model.raw(), reduction);
                 // Those that did not change, as they stand: there and back a last digit can be lost.
-                let (own, colours) = (&self.model.raw().gaussians.sh, self.cloud.colours()?);
+                let (own, colors) = (&self.model.raw().gaussians.sh, self.cloud.colors()?);
                 let known = |i: usize| {
                     let id = reduction.kept[i] as usize;
                     let is_own = raw.gaussians.sh.row::<3>(i) == own.row::<3>(id);
-                    is_own.then(|| colours.each_ref().map(|plane| plane[id]))
+                    is_own.then(|| colors.each_ref().map(|plane| plane[id]))
                 };
                 splatv::write(&raw, known, self.files.of_root(CAMERAS).as_deref(), path)?;
             }

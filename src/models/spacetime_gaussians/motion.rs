@@ -10,7 +10,7 @@ use crate::fit::polynomial;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SpacetimeMotion {
     /// Unit of time.
-    pub(super) centre: f64,
+    pub(super) center: f64,
     /// Natural log of √2 × the standard deviation in time.
     pub(super) log_width: f64,
     /// Coefficients of 1, dt, dt², dt³.
@@ -24,38 +24,38 @@ pub(super) struct SpacetimeMotion {
 impl SpacetimeMotion {
     /// Where it is at `time`.
     pub(super) fn position(&self, time: f64) -> [f64; 3] {
-        let (dt, [p0, p1, p2, p3]) = (time - self.centre, self.path);
+        let (dt, [p0, p1, p2, p3]) = (time - self.center, self.path);
         std::array::from_fn(|c| p0[c] + dt * (p1[c] + dt * (p2[c] + dt * p3[c])))
     }
 
     /// How it is turned at `time`, wxyz of any length.
     pub(super) fn rotation(&self, time: f64) -> [f64; 4] {
-        let dt = time - self.centre;
+        let dt = time - self.center;
         std::array::from_fn(|c| self.rotation[c] + dt * self.omega[c])
     }
 
     /// What its opacity is multiplied by at `time`.
     pub(super) fn window(&self, time: f64) -> f64 {
-        let dt = (time - self.centre) / self.log_width.exp();
+        let dt = (time - self.center) / self.log_width.exp();
         (-dt * dt).exp()
     }
 
-    /// The same motion, of another window, told from `centre`: positions are those that they were to rounding, and so are
+    /// The same motion, of another window, told from `center`: positions are those that they were to rounding, and so are
     /// rotations, but that `rotation` has length 1 where it has any.
-    pub(super) fn about(&self, centre: f64) -> SpacetimeMotion {
-        let (by, [_, p1, p2, p3]) = (centre - self.centre, self.path);
+    pub(super) fn about(&self, center: f64) -> SpacetimeMotion {
+        let (by, [_, p1, p2, p3]) = (center - self.center, self.path);
         let path = [
-            self.position(centre),
+            self.position(center),
             std::array::from_fn(|c| p1[c] + by * (2.0 * p2[c] + by * 3.0 * p3[c])),
             std::array::from_fn(|c| p2[c] + by * 3.0 * p3[c]),
             p3,
         ];
         // The state depends on the ratio of both alone.
-        let rotation = self.rotation(centre);
+        let rotation = self.rotation(center);
         let length = dot(&rotation, &rotation).sqrt();
         let length = if length.is_normal() { length } else { 1.0 };
         let [rotation, omega] = [rotation, self.omega].map(|q| q.map(|x| x / length));
-        SpacetimeMotion { centre, path, rotation, omega, ..*self }
+        SpacetimeMotion { center, path, rotation, omega, ..*self }
     }
 }
 
@@ -81,14 +81,14 @@ pub(super) fn merged_window(members: &[(f64, SpacetimeMotion)]) -> (f64, f64) {
     let area = |(weight, motion): &(f64, SpacetimeMotion)| weight * (motion.log_width - longest).exp();
     let total: f64 = members.iter().map(area).sum();
     let share = |member: &(f64, SpacetimeMotion)| area(member) / total;
-    let centre: f64 = members.iter().map(|member| share(member) * member.1.centre).sum();
+    let center: f64 = members.iter().map(|member| share(member) * member.1.center).sum();
     let unit = longest.exp();
     let second = |(_, motion): &(f64, SpacetimeMotion)| {
-        let [width, off] = [(motion.log_width - longest).exp(), (motion.centre - centre) / unit];
+        let [width, off] = [(motion.log_width - longest).exp(), (motion.center - center) / unit];
         width * width + 2.0 * off * off
     };
     let squared: f64 = members.iter().map(|member| share(member) * second(member)).sum();
-    (centre, longest + 0.5 * squared.ln())
+    (center, longest + 0.5 * squared.ln())
 }
 
 /// The weighted mean of motions that are told from one center: at every time its state is the weighted mean of theirs,
@@ -131,7 +131,7 @@ pub(super) fn fitted(about: &SpacetimeMotion, wanted: &[TargetState]) -> Spaceti
         let [x, at] = [of.position, about.position(of.time)];
         let [q, turned] = [of.rotation, about.rotation(of.time)];
         (
-            (of.time - about.centre) / unit,
+            (of.time - about.center) / unit,
             std::array::from_fn(|c| x[c] - at[c]),
             std::array::from_fn(|c| q[c] - turned[c]),
         )
@@ -158,9 +158,9 @@ mod tests {
 
     fn motion() -> impl Strategy<Value = SpacetimeMotion> {
         let values = |most: f64, count: usize| prop::collection::vec(-most..most, count);
-        (-0.5..1.5f64, -3.0..2.0f64, values(3.0, 12), values(1.0, 8)).prop_map(|(centre, log_width, path, turn)| {
+        (-0.5..1.5f64, -3.0..2.0f64, values(3.0, 12), values(1.0, 8)).prop_map(|(center, log_width, path, turn)| {
             SpacetimeMotion {
-                centre,
+                center,
                 log_width,
                 path: std::array::from_fn(|k| std::array::from_fn(|c| path[3 * k + c])),
                 // Away from no direction at all.
@@ -181,9 +181,9 @@ mod tests {
 
     proptest! {
         #[test]
-        fn told_from_another_centre_a_motion_is_the_same(motion in motion(), centre in -0.5..1.5f64) {
-            let about = motion.about(centre);
-            prop_assert_eq!(about.centre, centre);
+        fn told_from_another_center_a_motion_is_the_same(motion in motion(), center in -0.5..1.5f64) {
+            let about = motion.about(center);
+            prop_assert_eq!(about.center, center);
             prop_assert!((dot(&about.rotation, &about.rotation) - 1.0).abs() < 1e-12);
             for k in 0..=10 {
                 let time = f64::from(k) / 10.0;
@@ -201,9 +201,9 @@ mod tests {
             flip in 0..4usize,
         ) {
             let total: f64 = some.iter().map(|member| member.0).sum();
-            let centre = merged_window(&some).0;
+            let center = merged_window(&some).0;
             let mut about: Vec<(f64, SpacetimeMotion)> =
-                some.iter().map(|(weight, motion)| (weight / total, motion.about(centre))).collect();
+                some.iter().map(|(weight, motion)| (weight / total, motion.about(center))).collect();
             let expected = mean(&about).unwrap();
             // The same turns under the other sign.
             let other = flip % about.len();
@@ -224,20 +224,20 @@ mod tests {
         fn windows_have_the_second_moments_of_the_sum_of_theirs(
             some in prop::collection::vec((0.1..1.0f64, motion()), 1..5),
         ) {
-            let (centre, log_width) = merged_window(&some);
+            let (center, log_width) = merged_window(&some);
             // By sums over time, of windows as they are.
             let widest = some.iter().fold(0.0f64, |most, (_, motion)| most.max(motion.log_width.exp()));
             // As far as the furthest is, and the widest reaches.
             let (mut sums, step) = ([0.0; 3], (8.0 * widest + 2.0) / 20000.0);
             for k in -20000..=20000 {
-                let time = centre + f64::from(k) * step;
+                let time = center + f64::from(k) * step;
                 let height: f64 = some.iter().map(|(weight, motion)| weight * motion.window(time)).sum();
                 let terms = [1.0, time, time * time];
                 sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += height * term);
             }
             let mean = sums[1] / sums[0];
             let variance = sums[2] / sums[0] - mean * mean;
-            prop_assert!((mean - centre).abs() < 1e-6 * (1.0 + widest), "{} for {}", centre, mean);
+            prop_assert!((mean - center).abs() < 1e-6 * (1.0 + widest), "{} for {}", center, mean);
             // The width is √2 times the standard deviation.
             let expected = (2.0 * variance).sqrt();
             prop_assert!((log_width.exp() / expected - 1.0).abs() < 1e-4, "{} for {}", log_width.exp(), expected);
@@ -246,7 +246,7 @@ mod tests {
         #[test]
         fn a_path_is_fitted_to_states_that_follow_one(about in motion(), motion in motion()) {
             let about = SpacetimeMotion { log_width: 0.0, ..about };
-            let motion = SpacetimeMotion { log_width: 0.0, ..motion.about(about.centre) };
+            let motion = SpacetimeMotion { log_width: 0.0, ..motion.about(about.center) };
             let times = (0..20).map(|k| f64::from(k) / 20.0);
             let state = |time| {
                 TargetState { time, weight: 1.0 + time, position: motion.position(time), rotation: motion.rotation(time) }

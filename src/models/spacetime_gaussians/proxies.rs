@@ -81,7 +81,7 @@ impl ClusterMembers<'_> {
         let open: Vec<f64> = times.iter().copied().filter(|&time| of.window(time) >= OPEN).collect();
         let count = open.len().min(SAMPLED_TIMES);
         match count {
-            0 => vec![of.centre],
+            0 => vec![of.center],
             1 => open,
             _ => (0..count).map(|k| open[k * (open.len() - 1) / (count - 1)]).collect(),
         }
@@ -90,12 +90,12 @@ impl ClusterMembers<'_> {
 
 fn proxy(model: &MotionModelFrames<Spacetime>, cluster: &Cluster, rule: &MergeParams, act: Act) -> Result<Raw> {
     let members = ClusterMembers::new(model, cluster);
-    let (centre, log_width) = merged_window(&members.motions);
+    let (center, log_width) = merged_window(&members.motions);
     let about: Vec<(f64, SpacetimeMotion)> =
-        members.motions.iter().map(|(weight, motion)| (*weight, motion.about(centre))).collect();
+        members.motions.iter().map(|(weight, motion)| (*weight, motion.about(center))).collect();
     let mut out = members.raw.pick(&[members.leader]);
     let Some(mean) = mean(&about) else { return Ok(out) };
-    let mut motion = SpacetimeMotion { centre, log_width, ..mean };
+    let mut motion = SpacetimeMotion { center, log_width, ..mean };
     if differ(&members.motions, &motion) {
         motion = fitted(&motion, &wanted(&members, &about, &motion));
     }
@@ -132,7 +132,7 @@ fn average(members: &ClusterMembers<'_>, plane: &[f32]) -> f64 {
 fn differ(members: &[(f64, SpacetimeMotion)], proxy: &SpacetimeMotion) -> bool {
     members.iter().any(|(_, member)| {
         let wider = (member.log_width - proxy.log_width).abs() > MOST_WIDER.ln();
-        wider || (member.centre - proxy.centre).abs() > 0.5 * proxy.log_width.exp()
+        wider || (member.center - proxy.center).abs() > 0.5 * proxy.log_width.exp()
     })
 }
 

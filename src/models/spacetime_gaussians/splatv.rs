@@ -20,7 +20,7 @@ use crate::files::json::read_json;
 use crate::files::splatv::write::{measure, seen_whole, words, write as write_file};
 use crate::files::splatv::{MAGIC, Splatv, SplatvGaussian};
 use crate::limits::{Limits, ReadLimit};
-use crate::model::{Column, Columns, Gaussians, Raw, colour, harmonic, logit, opacity};
+use crate::model::{Column, Columns, Gaussians, Raw, color, harmonic, logit, opacity};
 use crate::models::input_model::{InputModel, MemoryProfile, ModelFormat, Timing};
 use crate::models::motion_model::window::MOST;
 use crate::models::motion_model::{MotionModelFrames, left, solve};
@@ -38,7 +38,7 @@ const LEAST_LENGTH: f64 = 1e-7;
 /// A `.splatv`.
 pub(in super::super) const SPLATV: ModelFormat = ModelFormat {
     expected: "a .splatv",
-    recognises: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
+    recognizes: |found| found.is_file_of(&MAGIC.to_le_bytes(), "splatv"),
     open: |path, options| {
         options.refuse_for(path)?;
         Ok(Box::new(SplatvModel::open(path, options.memory)?))
@@ -62,7 +62,7 @@ impl SplatvModel {
         for i in 0..count {
             let row = SplatvGaussian::of_words(&file.words(i));
             let numbers =
-                [&row.position[..], &row.motion, &row.rotation, &row.omega, &row.scale, &[row.centre, row.width]];
+                [&row.position[..], &row.motion, &row.rotation, &row.omega, &row.scale, &[row.center, row.width]];
             if let Some(x) = numbers.concat().iter().find(|x| !x.is_finite()) {
                 return Err(Error::input(path, format!("Gaussian {i}"), "finite numbers", x.to_string()));
             }
@@ -81,7 +81,7 @@ fn set(raw: &mut Raw, i: usize, row: &SplatvGaussian) {
     raw.gaussians.opacity_logit.set_row(i, [logit(row.opacity).clamp(-MOST, MOST) as f32]);
     raw.gaussians.sh.set_row(i, row.rgb.map(harmonic));
     let mut own = |plane: usize, value: f32| raw.own.plane_mut(plane)[i] = value;
-    own(CENTRE, row.centre);
+    own(CENTRE, row.center);
     own(LOG_WIDTH, log(row.width));
     row.motion.into_iter().enumerate().for_each(|(k, x)| own(MOTION + k, x));
     row.omega.into_iter().enumerate().for_each(|(k, x)| own(OMEGA + k, x));
@@ -96,9 +96,9 @@ fn row(raw: &Raw, i: usize) -> SplatvGaussian {
         rotation: raw.gaussians.rotation.row(i),
         omega: std::array::from_fn(|k| own(OMEGA + k)),
         scale: raw.gaussians.log_scale.row::<3>(i).map(|log| f64::from(log).exp() as f32),
-        rgb: raw.gaussians.sh.row::<3>(i).map(colour),
+        rgb: raw.gaussians.sh.row::<3>(i).map(color),
         opacity: opacity(raw.gaussians.opacity_logit.row::<1>(i)[0]),
-        centre: own(CENTRE),
+        center: own(CENTRE),
         width: f64::from(own(LOG_WIDTH)).exp() as f32,
     }
 }

@@ -125,7 +125,7 @@ fn states_are_those_of_the_formulas_in_either_variant() {
                     assert_eq!(state.log_scale.plane(c)[i], value(&format!("scale_{c}"), i));
                     let feature = of(&format!("f_dc_{c}"));
                     let expected = if is_full { 1.0 / (1.0 + (-feature).exp()) } else { feature };
-                    assert!((crate::model::colour(state.sh.plane(c)[i]) - expected).abs() < 1e-6);
+                    assert!((crate::model::color(state.sh.plane(c)[i]) - expected).abs() < 1e-6);
                 }
                 for c in 0..4 {
                     let expected = of(&format!("rot_{c}")) + dt * of(&format!("omega_{c}"));

@@ -165,7 +165,7 @@ impl Emit {
     }
 
     /// Writes the result and the files beside it. They get their names at the end: a folder in one step, a file after the
-    /// files beside it. `summarise` is told the size of the result.
+    /// files beside it. `summarize` is told the size of the result.
     ///
     /// # Errors
     /// Frames that cannot be read, a failed write; nothing is left behind then.
@@ -176,7 +176,7 @@ impl Emit {
         (map, archive): (&[Option<u32>], Option<&Archived>),
         recipe: &str,
         mut journal: Journal,
-        summarise: impl FnOnce(Journal, Size) -> Summary,
+        summarize: impl FnOnce(Journal, Size) -> Summary,
     ) -> Result<Summary> {
         let mut write = |path: &Path| -> Result<Size> {
             journal.stage(NAME, reduction.len(), scene.source(), |journal| {
@@ -204,7 +204,7 @@ impl Emit {
             let size = write(staged.path())?;
             write_text(&staged.path().join(RECIPE), recipe)?;
             write_index_map(map, &staged.path().join(INDEX_MAP))?;
-            let summary = summarise(journal, size);
+            let summary = summarize(journal, size);
             write_text(&staged.path().join(MARKER), &summary.json())?;
             staged.commit()?;
             return Ok(summary);
@@ -214,7 +214,7 @@ impl Emit {
         let size = write(staged.path())?;
         write_text(&recipe_file, recipe)?;
         write_index_map(map, &index_map)?;
-        let summary = summarise(journal, size);
+        let summary = summarize(journal, size);
         write_text(&marker, &summary.json())?;
         staged.commit()?;
         Ok(summary)

@@ -1,5 +1,5 @@
 #version 300 es
-// From one Gaussian per texel to its footprint in the picture, as crates/splat-render/src/project.rs and colour.rs have it: the same near
+// From one Gaussian per texel to its footprint in the picture, as crates/splat-render/src/project.rs and color.rs have it: the same near
 // plane, widening, cut of the directions, tiles that 3 sigma reach, and smallest alpha.
 precision highp float;
 precision highp int;

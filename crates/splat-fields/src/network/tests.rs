@@ -59,8 +59,8 @@ impl Oracle {
 }
 
 fn row(motion: &PredictedMotion, i: usize) -> Vec<f64> {
-    let PredictedMotion { warp, rotation, scaling, opacity, colour } = motion;
-    let columns = [warp, rotation, scaling, opacity, colour];
+    let PredictedMotion { warp, rotation, scaling, opacity, color } = motion;
+    let columns = [warp, rotation, scaling, opacity, color];
     columns.into_iter().flat_map(|column| (0..column.width()).map(|c| f64::from(column.plane(c)[i]))).collect()
 }
 

@@ -7,7 +7,7 @@
 
 use std::ops::Range;
 
-use super::super::colour;
+use super::super::color;
 use super::super::convention::BLOCK;
 use super::super::project::{CameraTerms, LOGARITHM_LIMIT, ProjectedShape, Splat, cross, dot, opacity};
 use super::sums::SplatSums;
@@ -79,7 +79,7 @@ fn add_blocks(
         block.fill(&splats[..of_block], &sums[..of_block], start);
         (splats, sums) = (&splats[of_block..], &sums[of_block..]);
         let columns = out.columns();
-        let turns = columns.contains(Columns::POSITION) && colour::coefficients(gaussians) > 1;
+        let turns = columns.contains(Columns::POSITION) && color::coefficients(gaussians) > 1;
         if turns || columns.contains(Columns::SH) {
             let directions = Directions::new(gaussians, ids.clone(), view);
             if columns.contains(Columns::SH) {
@@ -109,7 +109,7 @@ impl Directions {
         let mut directions = Directions { unit: [[0.0; BLOCK]; 3], per_distance: [0.0; BLOCK] };
         let Directions { unit: [x, y, z], per_distance } = &mut directions;
         for i in 0..n {
-            let (unit, inverse) = colour::direction([position[0][i], position[1][i], position[2][i]], view.center);
+            let (unit, inverse) = color::direction([position[0][i], position[1][i], position[2][i]], view.center);
             (x[i], y[i], z[i]) = (unit[0], unit[1], unit[2]);
             per_distance[i] = inverse as f32;
         }
@@ -128,13 +128,13 @@ struct GradientBlock {
     first: [[f64; BLOCK]; 2],
     second: [[f64; BLOCK]; 3],
     /// Without channels cut off at 0, which move nothing.
-    colour: [[f32; BLOCK]; 3],
+    color: [[f32; BLOCK]; 3],
 }
 
 impl Default for GradientBlock {
     fn default() -> Self {
         let zero = [0.0; BLOCK];
-        GradientBlock { p: zero, first: [zero; 2], second: [zero; 3], colour: [[0.0; BLOCK]; 3] }
+        GradientBlock { p: zero, first: [zero; 2], second: [zero; 3], color: [[0.0; BLOCK]; 3] }
     }
 }
 
@@ -146,7 +146,7 @@ impl GradientBlock {
             self.p[i] = sums.p;
             (0..2).for_each(|k| self.first[k][i] = sums.first[k]);
             (0..3).for_each(|k| self.second[k][i] = sums.second[k]);
-            (0..3).filter(|&c| splat.colour[c] > 0.0).for_each(|c| self.colour[c][i] = sums.colour[c] as f32);
+            (0..3).filter(|&c| splat.color[c] > 0.0).for_each(|c| self.color[c][i] = sums.color[c] as f32);
         }
     }
 
@@ -162,13 +162,13 @@ impl GradientBlock {
         let n = ids.len().min(BLOCK);
         let mut values = [[0.0f32; BLOCK]; sh_coefficients(3)];
         for i in 0..n {
-            for (values, value) in values.iter_mut().zip(colour::basis(directions.at(i))) {
+            for (values, value) in values.iter_mut().zip(color::basis(directions.at(i))) {
                 values[i] = value;
             }
         }
-        for (k, values) in values.iter().enumerate().take(colour::coefficients(gaussians)) {
-            for (c, colour) in self.colour.iter().enumerate() {
-                let parts = values[..n].iter().zip(&colour[..n]).map(|(value, colour)| value * colour);
+        for (k, values) in values.iter().enumerate().take(color::coefficients(gaussians)) {
+            for (c, color) in self.color.iter().enumerate() {
+                let parts = values[..n].iter().zip(&color[..n]).map(|(value, color)| value * color);
                 out.add(Columns::SH, 3 * k + c, ids.start, parts);
             }
         }
@@ -186,18 +186,17 @@ impl GradientBlock {
         let n = ids.len().min(BLOCK);
         // By value of Y_k: what the color takes times the coefficients.
         let mut by_value = [[0.0f32; BLOCK]; sh_coefficients(3)];
-        for (k, by_value) in by_value.iter_mut().enumerate().take(colour::coefficients(gaussians)).skip(1) {
+        for (k, by_value) in by_value.iter_mut().enumerate().take(color::coefficients(gaussians)).skip(1) {
             let sh: [&[f32]; 3] = std::array::from_fn(|c| &gaussians.sh.plane(3 * k + c)[ids.clone()][..n]);
             for i in 0..n {
-                by_value[i] =
-                    sh[0][i] * self.colour[0][i] + sh[1][i] * self.colour[1][i] + sh[2][i] * self.colour[2][i];
+                by_value[i] = sh[0][i] * self.color[0][i] + sh[1][i] * self.color[1][i] + sh[2][i] * self.color[2][i];
             }
         }
         let mut parts = [[0.0f32; BLOCK]; 3];
         for i in 0..n {
             let d = directions.at(i);
             let mut sum = [0.0; 3];
-            let slopes = colour::basis_gradient(d);
+            let slopes = color::basis_gradient(d);
             // Not zipped and skipped: that does not run in vectors.
             for k in 1..slopes.len() {
                 let (of, slope) = (by_value[k][i], slopes[k]);

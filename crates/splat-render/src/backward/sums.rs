@@ -13,7 +13,7 @@ pub(super) struct SplatSums<T> {
     /// Σ p·x², Σ p·x·y and Σ p·y².
     pub(super) second: [T; 3],
     /// Σ weight · ∂L/∂ pixel, by channel.
-    pub(super) colour: [T; 3],
+    pub(super) color: [T; 3],
 }
 
 impl SplatSums<f64> {
@@ -22,7 +22,7 @@ impl SplatSums<f64> {
         self.p += f64::from(tile.p);
         (0..2).for_each(|k| self.first[k] += f64::from(tile.first[k]));
         (0..3).for_each(|k| self.second[k] += f64::from(tile.second[k]));
-        (0..3).for_each(|k| self.colour[k] += f64::from(tile.colour[k]));
+        (0..3).for_each(|k| self.color[k] += f64::from(tile.color[k]));
     }
 }
 

@@ -26,13 +26,13 @@ impl Pull {
     /// Of tile `tile` of `picture`. A pixel that is not finite, itself or in `pull`, takes nothing.
     pub(super) fn new(picture: &Image, pull: &Image, tile: [u32; 2]) -> Self {
         // Copied first: the copies wait for memory together, one pixel after the other would wait alone.
-        let (colours, pulls) = (picture.tile(tile), pull.tile(tile));
+        let (colors, pulls) = (picture.tile(tile), pull.tile(tile));
         let (mut pixel, mut rest) = ([TilePlane::default(); 3], TilePlane::default());
         for group in 0..GROUPS {
             let (v, first) = (group % TILE as usize, group / TILE as usize * LANES);
             for lane in 0..LANES {
-                let (colour, pull) = (colours[v][first + lane], pulls[v][first + lane]);
-                let product = colour[0] * pull[0] + colour[1] * pull[1] + colour[2] * pull[2];
+                let (color, pull) = (colors[v][first + lane], pulls[v][first + lane]);
+                let product = color[0] * pull[0] + color[1] * pull[1] + color[2] * pull[2];
                 if product.is_finite() {
                     rest[group][lane] = product;
                     (0..3).for_each(|c| pixel[c][group][lane] = pull[c]);
@@ -53,7 +53,7 @@ pub(super) struct Pulled<'a, const SHAPE: bool> {
 /// A splat that is walked over.
 #[derive(Clone, Copy)]
 pub(super) struct Walked<V: Lanes> {
-    colour: [V; 3],
+    color: [V; 3],
     p: V::Twins,
     first: [V::Twins; 2],
     second: [V::Twins; 3],
@@ -65,20 +65,20 @@ impl<const SHAPE: bool> BlendSink for Pulled<'_, SHAPE> {
     #[inline(always)]
     fn begin<V: Lanes>(&self, splat: &Splat) -> Walked<V> {
         let zero = V::Twins::zero();
-        Walked { colour: splat.colour.map(V::splat), p: zero, first: [zero; 2], second: [zero; 3], taken: [zero; 3] }
+        Walked { color: splat.color.map(V::splat), p: zero, first: [zero; 2], second: [zero; 3], taken: [zero; 3] }
     }
     #[inline(always)]
     fn add<V: Lanes>(&mut self, mut walked: Walked<V>, group: usize, stroke: Fragment<V>) -> Walked<V> {
         let Fragment { alpha, blended, weight, across, down, .. } = stroke;
-        let by_colour: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c], group)));
-        for (taken, by_colour) in walked.taken.iter_mut().zip(by_colour) {
-            *taken = by_colour.add_to_own(*taken);
+        let by_color: [V; 3] = std::array::from_fn(|c| weight.mul(V::load(&self.pull.pixel[c], group)));
+        for (taken, by_color) in walked.taken.iter_mut().zip(by_color) {
+            *taken = by_color.add_to_own(*taken);
         }
         if !SHAPE {
             return walked;
         }
-        let [red, green, blue] = walked.colour;
-        let own = red.mul(by_colour[0]).add(green.mul(by_colour[1])).add(blue.mul(by_colour[2]));
+        let [red, green, blue] = walked.color;
+        let own = red.mul(by_color[0]).add(green.mul(by_color[1])).add(blue.mul(by_color[2]));
         let rest = V::load(&self.pull.rest, group).sub(own);
         rest.store(&mut self.pull.rest, group);
         // alpha · (transmittance · own − rest / (1 − alpha)); an alpha that was cut moves nothing. The division waits
@@ -97,9 +97,9 @@ impl<const SHAPE: bool> BlendSink for Pulled<'_, SHAPE> {
     #[inline(always)]
     fn turn<V: Lanes>(&self, walked: Walked<V>) -> Walked<V> {
         // Not `array::map`, here and below: it is compiled apart, for the plainest machine.
-        let Walked { colour, p, first: [x, y], second: [xx, xy, yy], taken: [red, green, blue] } = walked;
+        let Walked { color, p, first: [x, y], second: [xx, xy, yy], taken: [red, green, blue] } = walked;
         Walked {
-            colour,
+            color,
             p: p.turned(),
             first: [x.turned(), y.turned()],
             second: [xx.turned(), xy.turned(), yy.turned()],
@@ -113,10 +113,10 @@ impl<const SHAPE: bool> BlendSink for Pulled<'_, SHAPE> {
             let (x, y, xx, xy, yy) = (x.together(), y.together(), xx.together(), xy.together(), yy.together());
             let (red, green, blue) = (red.together(), green.together(), blue.together());
             let [x, y, xx, xy, yy, red, green, blue] = V::Sums::totals([x, y, xx, xy, yy, red, green, blue]);
-            SplatSums { p: p.together().total(), first: [x, y], second: [xx, xy, yy], colour: [red, green, blue] }
+            SplatSums { p: p.together().total(), first: [x, y], second: [xx, xy, yy], color: [red, green, blue] }
         } else {
-            let colour = [red.together().total(), green.together().total(), blue.together().total()];
-            SplatSums { colour, ..SplatSums::default() }
+            let color = [red.together().total(), green.together().total(), blue.together().total()];
+            SplatSums { color, ..SplatSums::default() }
         };
     }
 }

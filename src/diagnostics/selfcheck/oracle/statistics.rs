@@ -27,9 +27,9 @@ pub(crate) fn row(i: usize, frames: &[Gaussians], schedule: &Schedule, scan: &Sc
     let (d, kappa) = match scan.motion {
         MotionParams::Literal => {
             let steps: f64 = life.iter().filter(|&&t| t > 0).map(|&t| step(t).powi(2)).sum();
-            let centres = life.get(1..life.len().max(2) - 1).unwrap_or(&[]);
-            let turns: f64 = centres.iter().map(|&t| turn(t)).sum();
-            ((steps / life.len().max(1) as f64).sqrt(), turns / centres.len().max(1) as f64)
+            let centers = life.get(1..life.len().max(2) - 1).unwrap_or(&[]);
+            let turns: f64 = centers.iter().map(|&t| turn(t)).sum();
+            ((steps / life.len().max(1) as f64).sqrt(), turns / centers.len().max(1) as f64)
         }
         MotionParams::Runs => {
             let steps: Vec<f64> = (1..=last).filter(|&t| alive(t) && alive(t - 1)).map(|t| step(t).powi(2)).collect();

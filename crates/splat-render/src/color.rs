@@ -9,12 +9,12 @@ use super::convention::BLOCK;
 use splat_core::{Gaussians, HIGHEST_DEGREE, SH_C0, sh_coefficients};
 
 /// Red, green and blue of one block.
-pub(super) type Colours = [[f32; BLOCK]; 3];
+pub(super) type Colors = [[f32; BLOCK]; 3];
 
 /// Writes the colors of the Gaussians `ids`, at most [`BLOCK`], seen from `center`: `0.5 + Σ Y_k c_k`
 /// clamped at 0 (NaN becomes 0). Coefficients beyond degree 3, or short of a whole degree, are not read.
 #[inline(always)]
-pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colours) {
+pub(super) fn evaluate(gaussians: &Gaussians, ids: Range<usize>, center: [f64; 3], out: &mut Colors) {
     let n = ids.len().min(BLOCK);
     for channel in out.iter_mut() {
         channel[..n].fill(0.5);
