@@ -3,6 +3,7 @@
 //! Frames stream: at a time one state of either model, and per thread one picture of each. For the error
 //! of what moves, the last pictures of every view that is seen again stay: 12 bytes per pixel, two or,
 //! with ground truth, three pictures per view. A part of the pictures begins by making these of the views before it again.
+
 pub mod baseline;
 pub mod cost;
 pub mod found;

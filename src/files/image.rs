@@ -3,6 +3,7 @@
 //! In: a PNG of any color type and depth, and the size it must have. Out: an [`Image`] in [0, 1], with
 //! transparency over a background. Memory: the decoded rows beside the result; the size is checked
 //! before either is allocated.
+
 pub mod write;
 
 use std::io::BufReader;

@@ -2,6 +2,7 @@
 //!
 //! In: a path. Out: the shape of every array, and values of those asked for. Memory: 2 MiB of a map of the file. An array
 //! that is compressed or not f32 is decoded once, into a scratch file without a name that is mapped in its place.
+
 pub(crate) mod write;
 
 use std::fs::File;

@@ -3,6 +3,7 @@
 //! u32 [`MAGIC`], u32 length of a JSON text, that text, the texture it describes; all little-endian. The text is a list whose
 //! entry of type `splat` has `size` (bytes of the texture), `texwidth`, `texheight` and `cameras`. The texture holds
 //! [`ROW_BYTES`] per Gaussian ([`SplatvGaussian`]), then zeros. Source: antmatter15/splaTV.
+
 pub mod write;
 
 use std::ops::Range;

@@ -1,5 +1,6 @@
 //! What happens in a run, written down where it happens: stages with their time, memory and reads, what was left out
 //! and why, and notes.
+
 pub(crate) mod as_toml;
 pub mod records;
 

@@ -124,7 +124,7 @@ fn reduce(
     let recipe = recipe.text(request, &job.emit.recipe_folder());
 
     let sh_degree = match request.recipe.bands.bands {
-        WhichBands::UpTo(degree) => crate::pipeline::stages::bands::highest(scene, degree, &mut journal),
+        WhichBands::UpTo(degree) => stages::bands::highest(scene, degree, &mut journal),
         WhichBands::All | WhichBands::Needed => ALL_HARMONICS,
     };
     let mut like = CompressedModel { sh_degree, ..CompressedModel::pruned(Vec::new(), &request.recipe.merge) };

@@ -1,4 +1,5 @@
 //! The scan: every Gaussian at every frame once, blocks of Gaussians on all threads.
+
 pub(crate) mod blocks;
 pub(crate) mod staged;
 

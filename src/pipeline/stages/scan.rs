@@ -10,7 +10,7 @@ use crate::recipe;
 use crate::scene::Scene;
 use crate::statistics;
 use crate::statistics::ScanPlan;
-use crate::statistics::pass::Scanned;
+use crate::statistics::pass::{Scanned, scan_blocks, scan_units};
 
 /// What the stage is called.
 pub(crate) const NAME: &str = "scan";
@@ -60,9 +60,9 @@ impl ScanStage {
         let source = scene.source();
         let info = source.info();
         let plan = ScanPlan::new(&self.recipe, &info.times, &scene.schedule)?;
-        let compute = |blocks| crate::statistics::pass::scan_blocks(source, &scene.schedule, &plan, blocks);
+        let compute = |blocks| scan_blocks(source, &scene.schedule, &plan, blocks);
         journal.stage(NAME, info.count, source, |_| {
-            let units = crate::statistics::pass::scan_units(info);
+            let units = scan_units(info);
             let found = scene.work.divided(NAME, scene.work.key(&plan), units, compute, |parts| {
                 let mut all = Scanned { alive_per_frame: vec![0; info.times.len()], ..Scanned::default() };
                 for part in parts {
