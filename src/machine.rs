@@ -50,7 +50,7 @@ fn add_job(variable: &impl Fn(&str) -> Option<String>, limits: &mut Vec<(u64, St
     }
 }
 
-/// Parses a size of Slurm into bytes: mebibytes, or another unit if K, M, G or T follows.
+/// Parses a memory size as Slurm writes it and returns bytes: a number of mebibytes, or a number followed by K, M, G or T.
 fn slurm_size(text: &str) -> Option<u64> {
     let text = text.trim();
     let digits = text.trim_end_matches(|unit: char| unit.is_ascii_alphabetic());

@@ -55,7 +55,8 @@ impl MappedFile {
         self.map.len() as u64
     }
 
-    /// Fills `out` from `offset`. Never touches the map, under which a file may shrink.
+    /// Reads `out.len()` bytes at byte `offset` with a system call. Does not use the memory map: if another process shortens
+    /// the file, this returns an error, whereas touching a mapped page would end the process.
     pub(crate) fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<()> {
         splat_platform::read_exact_at(&self.file, out, offset).map_err(|error| match error.kind() {
             io::ErrorKind::UnexpectedEof => self.too_short(offset, out.len() as u64),

@@ -34,9 +34,9 @@ pub struct PrecisionDiagram {
     pub kept: usize,
     /// Threads at work, but where threads are turned.
     pub threads: usize,
-    /// Every setting is run so often at most, and not again once its runs took [`PrecisionDiagram::enough`] seconds.
+    /// Maximum number of runs of each setting; fewer where the runs so far took [`PrecisionDiagram::enough`] seconds in all.
     pub runs: usize,
-    /// See [`PrecisionDiagram::runs`].
+    /// Total time of the runs of one setting after which it is not run again, seconds.
     pub enough: f64,
     /// What was turned.
     pub knobs: Vec<PrecisionKnob>,

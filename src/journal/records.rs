@@ -150,7 +150,7 @@ pub struct BandsSummary {
     /// Mean PSNR of pictures with all bands against the original's, dB.
     #[serde(deserialize_with = "number")]
     pub result: f64,
-    /// What a degree was to have at least, dB.
+    /// Minimum PSNR that a lower degree needed to be chosen, dB.
     #[serde(deserialize_with = "number")]
     pub least: f64,
 }

@@ -220,7 +220,8 @@ mod tests {
             let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
             let regular = sigma + DMat3::from_diagonal(DVec3::splat(REGULARIZATION * trace));
             let delta = DVec3::from(delta);
-            // The inverse by cofactors loses about cond(Σ) ≤ 1e6 ulp; normalized, as determinants overflow.
+            // Inverting by cofactors loses about cond(Σ) ≤ 1e6 ulp. Σ is divided by its trace first, because its
+            // determinant may overflow.
             let expected = (delta.dot((regular * trace.recip()).inverse() * delta) / trace).sqrt();
             let got = mahalanobis(delta, &sigma);
             prop_assert!((got / expected - 1.0).abs() < 1e-8, "got {got:e}, expected {expected:e}");

@@ -249,11 +249,12 @@ impl<'a> MergeNodes<'a> {
     }
 }
 
-/// Hands on the pairs (leader, member) of nodes that coincide, alike in all that `gates` look at, and pass them: of each
-/// such crowd the first in rank with all others, whatever their number. By leader, `most` (at least 1) at a time.
+/// Calls `take` with the pairs (leader, member) of coincident nodes: nodes that are equal in every attribute that `gates`
+/// compare, and that pass them. The leader of such a crowd is its first node in rank, and all others are its members,
+/// however many. Pairs come ordered by leader, `most` (at least 1) at a time.
 ///
-/// The nearest neighbors of a crowd are some of itself, the same ones for all: without this it would stay many, and
-/// hide who is near.
+/// Needed because the neighbor search returns a fixed number of nearest Gaussians: where more coincide, all their neighbors
+/// are members of the same crowd, so that it would neither merge into one nor meet the Gaussians around it.
 fn each_coincident<E>(
     nodes: &MergeNodes<'_>,
     rank: &[u32],

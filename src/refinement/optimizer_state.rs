@@ -211,7 +211,7 @@ impl<'a> OptimizerState<'a> {
         Ok(())
     }
 
-    /// What is needed to go on from here, for [`OptimizerState::go_on`].
+    /// Returns the state that a checkpoint stores and [`OptimizerState::go_on`] resumes from.
     pub(super) fn standing(&self) -> impl Serialize + '_ {
         let found = self.found.then_some((&self.stored, &self.before));
         let course = self.course.iter().map(Descent::standing).collect();

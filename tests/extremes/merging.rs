@@ -344,7 +344,7 @@ fn a_crowd_in_one_voxel_is_cut_and_said_to_be() {
     let summary = workplace.summary(&format!("crowd.ply -o out.ply {MERGE} --length-unit scene"));
     let pass = &summary["merge"]["passes"][0];
     assert_eq!(pass["truncated"], N, "{pass}");
-    // As many pairs at most as neighbors that are looked at.
+    // The search returns at most 32 neighbors of each Gaussian, so there are at most 32 pairs for each.
     assert!(pass["candidates"].as_u64().unwrap() <= 32 * N as u64 && pass["joins"].as_u64().unwrap() > 0, "{pass}");
 }
 

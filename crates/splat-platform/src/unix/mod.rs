@@ -21,7 +21,7 @@ pub use signals::end_on_signals;
 /// Permissions of a folder that only its owner may enter, read or write.
 const PRIVATE: u32 = 0o700;
 
-/// Fills `bytes` from byte `offset` of `file`. Threads may read one file at the same time.
+/// Reads `bytes.len()` bytes at byte `offset` of `file`. Several threads may read one file at the same time.
 ///
 /// # Errors
 /// A failed read; a file that ends before.

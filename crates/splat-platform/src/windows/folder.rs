@@ -151,7 +151,7 @@ impl FolderHandle {
         Ok(())
     }
 
-    /// Path of the entry `name`, after [`FolderHandle::check`].
+    /// Returns the path of the entry `name`, once [`FolderHandle::check`] has confirmed the path of the folder.
     fn place(&self, name: impl AsRef<OsStr>) -> io::Result<PathBuf> {
         self.check()?;
         Ok(self.path.join(name.as_ref()))

@@ -23,8 +23,8 @@ use crate::{CutShortMessage, FileIdentity, FileStatus};
 pub use folder::FolderHandle;
 pub use memory::{memory_limits, peak_memory_bytes, reset_peak_memory};
 
-/// Fills `bytes` from byte `offset` of `file`. Threads may read one file at the same time. The file's own position, from
-/// which `Read` goes on, moves.
+/// Reads `bytes.len()` bytes at byte `offset` of `file`. Several threads may read one file at the same time. Changes the
+/// position at which `Read` continues.
 ///
 /// # Errors
 /// A failed read; a file that ends before.
