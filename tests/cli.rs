@@ -434,6 +434,17 @@ fn every_verb_answers_on_stdout_and_keeps_quiet_elsewhere_when_asked_to() {
 }
 
 #[test]
+fn a_demo_without_an_output_names_no_place() {
+    let workplace = Workplace::new();
+    let text = workplace.done("demo --gaussians 400 --frames 4 --quiet");
+    assert!(!text.contains("lies in"), "{text}");
+    workplace.done("demo --gaussians 400 --frames 4 --quiet -o demo");
+    let summary = fs::read_to_string(workplace.path("demo/summary.json")).unwrap();
+    let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+    assert_eq!(summary.get("output"), None, "{summary}");
+}
+
+#[test]
 fn printed_recipes_are_recipes() {
     let workplace = Workplace::new();
     for preset in ["paper", "default"] {

@@ -201,6 +201,7 @@ pub struct Summary {
     /// From where it was looked at.
     pub cameras: CameraSummary,
     /// Last name of the output in files; its path as given on standard output.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub output: String,
     /// Gaussians in the output.
     pub gaussians: usize,
@@ -335,7 +336,9 @@ impl Summary {
         let (seconds, peak) = self.taken();
         let memory = peak.map_or(String::new(), |bytes| format!(", at most {} MiB of memory", bytes >> 20));
         writeln!(out, "took    {}{memory}", duration(seconds))?;
-        writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
+        if !self.output.is_empty() {
+            writeln!(out, "lies in {}", Path::new(&self.output).shown())?;
+        }
         let shown = match detail {
             Detail::All => self.notes.len(),
             Detail::Most => self.notes.len().min(NOTES),
