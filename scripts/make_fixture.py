@@ -9,7 +9,7 @@ tight groups that move together, loners, needles, dead and fading Gaussians.
 
 Written, beside the files of a model folder and its cameras:
   states.npz          states at FRAMES_KEPT as float64 PyTorch evaluates them, SH at the last of those
-  statistics_f64.npz  life, V, D and kappa over all frames, by the definitions of tests/trained_models.rs
+  statistics_f64.npz  life, V, D and kappa over all frames, by the definitions of tests/compression/trained_models.rs
 """
 
 import plainly  # noqa: F401 (first: what fails after it ends with a sentence)

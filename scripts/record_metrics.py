@@ -1,4 +1,4 @@
-"""Records PSNR, SSIM and FLIP of small pictures, for tests/metrics_recorded.rs.
+"""Records PSNR, SSIM and FLIP of small pictures, for tests/rendering/metrics_recorded.rs.
 
     python scripts/record_metrics.py tests/fixtures/metrics
 

@@ -28,23 +28,23 @@
 //! | 23 | equal diagonal | `merging::a_covariance_with_equal_diagonal_has_its_axes`; selfcheck "mixture" |
 //! | 24 | zero quaternion | `merging::a_zero_quaternion_is_the_identity_and_flagged` |
 //! | 25 | offsets 1e2 … 1e7 | `motion::far_from_the_origin_noise_is_snapped_…`; selfcheck "motion far away" |
-//! | 26 | camera inside, Gaussian behind | `tests/render_oracle.rs: what_is_nearer_than_0_2_or_behind_is_not_drawn` |
-//! | 27 | near plane | `tests/render_oracle.rs: a_giant_across_the_near_plane_covers_the_image_and_no_more`, `merging::scales_…` |
+//! | 26 | camera inside, Gaussian behind | `tests/rendering/render_oracle.rs: what_is_nearer_than_0_2_or_behind_is_not_drawn` |
+//! | 27 | near plane | `tests/rendering/render_oracle.rs: a_giant_across_the_near_plane_covers_the_image_and_no_more`, `merging::scales_…` |
 //! | 28 | no cameras | `clouds::without_cameras_a_virtual_rig_is_used_and_said` |
-//! | 29 | wholly occluded | `tests/render_oracle.rs: what_is_wholly_occluded_contributes_exactly_nothing`, `merging::what_is_hidden_goes_first_…` |
+//! | 29 | wholly occluded | `tests/rendering/render_oracle.rs: what_is_wholly_occluded_contributes_exactly_nothing`, `merging::what_is_hidden_goes_first_…` |
 //! | 30 | giant background | `merging::what_is_hidden_goes_first_and_a_giant_background_stays_and_swallows_nothing` |
 //! | 31 | exact duplicates | `clouds::exact_duplicates_merge_to_one_…`, `clouds::duplicates_merge_to_one_whatever_their_number`; selfcheck "duplicates" |
 //! | 32 | a crowd in one voxel | `merging::a_crowd_in_one_voxel_is_cut_and_said_to_be` |
 //! | 33 | sorted chain | `merging::a_sorted_chain_merges_as_the_sequential_rule_says` |
-//! | 34 | partitions 1, 7, 64 | `tests/merging.rs: partitions_of_the_pairs_change_no_byte` |
+//! | 34 | partitions 1, 7, 64 | `tests/compression/merging.rs: partitions_of_the_pairs_change_no_byte` |
 //! | 35 | black beside gray | `merging::what_looks_otherwise_never_merges` |
 //! | 36 | ΣC·Vis = 0 | `merging::what_nobody_sees_merges_by_opacity_times_area` |
-//! | 37 | threads, memory, tiles | `tests/compress.rs: threads_change_no_byte`, `tests/memory.rs: the_least_that_is_named_works_…`; selfcheck "1 and 2 threads" |
+//! | 37 | threads, memory, tiles | `tests/compression/compress.rs: threads_change_no_byte`, `tests/command_line/memory.rs: the_least_that_is_named_works_…`; selfcheck "1 and 2 threads" |
 //! | 38 | opposite, 10 v | `merging::what_moves_or_lives_otherwise_never_merges` |
-//! | 39 | killed at any moment | `tests/memory.rs: a_run_killed_at_any_moment_…`, `tests/beside_others.rs: whenever_a_run_is_ended_…` |
+//! | 39 | killed at any moment | `tests/command_line/memory.rs: a_run_killed_at_any_moment_…`, `tests/command_line/beside_others.rs: whenever_a_run_is_ended_…` |
 //! | 40 | translated, rotated, scaled | `laws::*`, `clouds::without_cameras_what_stays_does_not_depend_on_the_unit_of_length` |
 //! | 41 | time stamps | `streams::time_stamps_that_do_not_increase_are_named` |
-//! | 42 | T = 1,000,000; N = 10,000,000 | `tests/long.rs` |
+//! | 42 | T = 1,000,000; N = 10,000,000 | `tests/command_line/long.rs` |
 //! | 43 | another N, another column set | `clouds::frames_that_disagree_are_named`, `streams::frames_of_another_size_or_columns_are_named` |
 //!
 //! C, E and Vis, which no row names, have their slow definitions in selfcheck "projected area", "needle on screen" and

@@ -1,0 +1,300 @@
+//! Runs beside other runs, other programs and other people's files: what is not a run's own it leaves alone, and what
+//! is its own it takes away, however it ends.
+
+#![cfg(unix)]
+
+use std::fs;
+use std::io::Write;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::scene::{Workplace, files, lasting_files, program, tiny};
+
+/// The tiny model as a frame stream.
+fn stream(workplace: &Workplace) -> Vec<u8> {
+    let output = Command::new(program()).arg("unpack").arg(tiny()).arg("--stream").output().unwrap();
+    assert!(output.status.success(), "{}", workplace.path("").display());
+    output.stdout
+}
+
+/// Starts a command in the workplace, all of whose streams are pipes.
+fn started(workplace: &Workplace, mut command: Command) -> Child {
+    let piped = command.current_dir(workplace.path("")).stdin(Stdio::piped());
+    piped.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
+/// Starts the program; it waits for what comes on standard input. Signals end it even where they are ignored in this
+/// process, as in one that a shell started in the background.
+fn waiting(workplace: &Workplace, arguments: &str) -> Child {
+    let mut command = Command::new(program());
+    command.args(arguments.split_whitespace());
+    let reset = || {
+        for signal in [libc::SIGINT, libc::SIGTERM, libc::SIGHUP] {
+            // SAFETY: the default action is a valid disposition of each of these signals.
+            unsafe { libc::signal(signal, libc::SIG_DFL) };
+        }
+        Ok(())
+    };
+    // SAFETY: `signal` may be called between fork and exec, and nothing else is.
+    unsafe { command.pre_exec(reset) };
+    started(workplace, command)
+}
+
+fn told(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Waits until `folder` holds anything, for a run that goes on.
+fn wait_for_temporaries(folder: &Path, child: &mut Child) {
+    let start = Instant::now();
+    while files(folder).is_empty() {
+        assert!(start.elapsed() < Duration::from_secs(60), "nothing appeared in {}", folder.display());
+        assert!(child.try_wait().unwrap().is_none(), "the run ended");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn send(signal: &str, child: &Child) {
+    assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+}
+
+/// The program in a namespace of process ids of its own, as in a container, with a number above `before`.
+fn contained(workplace: &Workplace, before: usize, arguments: &str) -> Command {
+    let alone = ["-p", "--fork", "--mount-proc"];
+    let rootless = ["-U", "-r", "-p", "--fork", "--mount-proc"];
+    let works = |flags: &[&str]| {
+        let quiet = Command::new("unshare").args(flags).arg("true").stderr(Stdio::null()).status();
+        quiet.is_ok_and(|status| status.success())
+    };
+    let flags = [&alone[..], &rootless[..]].into_iter().find(|flags| works(flags));
+    let flags = flags.expect("a machine that allows namespaces of process ids");
+    let mut command = Command::new("unshare");
+    // Every number up to `before` is taken by a process that has ended.
+    let script = format!("for i in $(seq {before}); do /bin/true; done; {} {arguments}; exit $?", program().display());
+    command.args(flags).args(["sh", "-c", &script]).current_dir(workplace.path(""));
+    command
+}
+
+#[test]
+#[ignore = "needs namespaces of process ids"]
+fn runs_in_different_containers_share_their_folders_and_both_succeed() {
+    let workplace = Workplace::new();
+    let stream = stream(&workplace);
+    fs::create_dir(workplace.path("scratch")).unwrap();
+    for (first, second) in [
+        ("compress - -o a.gseq --scratch-dir scratch", "compress - -o b.gseq --scratch-dir scratch"),
+        // The same name: whoever is last is refused, and takes nothing from the other meanwhile.
+        ("pack - -o c.gseq", "pack - -o c.gseq"),
+    ] {
+        let command = contained(&workplace, 12, first);
+        let before = files(&workplace.path("")).len();
+        let mut victim = started(&workplace, command);
+        let mut pipe = victim.stdin.take().unwrap();
+        pipe.write_all(&stream[..stream.len() / 2]).unwrap();
+        let start = Instant::now();
+        // The scratch file, or what the output is called meanwhile.
+        while files(&workplace.path("")).len() == before {
+            assert!(start.elapsed() < Duration::from_secs(60) && victim.try_wait().unwrap().is_none());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        std::thread::sleep(Duration::from_millis(100));
+        let mut other = started(&workplace, contained(&workplace, 2, second));
+        other.stdin.take().unwrap().write_all(&stream).unwrap();
+        let other = other.wait_with_output().unwrap();
+        assert!(other.status.success(), "{second}: {}", told(&other));
+        let finished = pipe.write_all(&stream[stream.len() / 2..]);
+        drop(pipe);
+        let victim = victim.wait_with_output().unwrap();
+        if first == second {
+            assert!(told(&victim).contains("exists already"), "{first}: {}", told(&victim));
+            assert_eq!(victim.status.code(), Some(2));
+        } else {
+            assert!(victim.status.success() && finished.is_ok(), "{first}: {}", told(&victim));
+        }
+    }
+    let left = lasting_files(&workplace.path(""));
+    assert!(left[Path::new("a.gseq")] == left[Path::new("b.gseq")], "the same stream gives the same result");
+    assert!(left.keys().all(|name| !name.to_str().unwrap().contains(".splatsieve")), "{:?}", left.keys());
+}
+
+#[test]
+fn a_signal_takes_away_what_the_run_has_begun_and_ends_it_with_its_own_status() {
+    let workplace = Workplace::new();
+    let half = stream(&workplace);
+    let half = &half[..half.len() / 2];
+    for (signal, code) in [("-INT", 130), ("-TERM", 143), ("-HUP", 129)] {
+        for (arguments, input) in [
+            ("compress - -o out --scratch-dir scratch", half),
+            ("pack - -o out.gseq", half),
+            ("demo --gaussians 100000 --frames 400 -o demo", &[]),
+        ] {
+            fs::create_dir(workplace.path("scratch")).unwrap();
+            let mut child = waiting(&workplace, arguments);
+            let mut pipe = child.stdin.take().unwrap();
+            pipe.write_all(input).unwrap();
+            let place = if arguments.contains("scratch") { "scratch" } else { "" };
+            if place.is_empty() {
+                fs::remove_dir(workplace.path("scratch")).unwrap();
+            }
+            wait_for_temporaries(&workplace.path(place), &mut child);
+            std::thread::sleep(Duration::from_millis(100));
+            send(signal, &child);
+            let output = child.wait_with_output().unwrap();
+            assert_eq!(output.status.code(), Some(code), "{signal} {arguments}: {}", told(&output));
+            _ = fs::remove_dir(workplace.path("scratch"));
+            let left = files(&workplace.path(""));
+            assert!(left.is_empty(), "{signal} {arguments}: left {:?}", left.keys());
+        }
+    }
+}
+
+#[test]
+fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
+    let workplace = Workplace::new();
+    let stream = stream(&workplace);
+    let mut command = Command::new("sh");
+    command.args(["-c", &format!("trap '' HUP INT; exec {} pack - -o out.gseq", program().display())]);
+    let mut child = started(&workplace, command);
+    let mut pipe = child.stdin.take().unwrap();
+    pipe.write_all(&stream[..stream.len() / 2]).unwrap();
+    wait_for_temporaries(&workplace.path(""), &mut child);
+    send("-HUP", &child);
+    send("-INT", &child);
+    std::thread::sleep(Duration::from_millis(200));
+    pipe.write_all(&stream[stream.len() / 2..]).unwrap();
+    drop(pipe);
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", told(&output));
+    assert_eq!(files(&workplace.path("")).len(), 1);
+}
+
+#[test]
+fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
+    let workplace = Workplace::new();
+    workplace.done("compress {tiny} -o out");
+    // What evaluation code of other people writes into a model folder.
+    let foreign = ["results.json", "test/ours_7/renders/00000.png", "point_cloud/iteration_7/notes.txt"];
+    for name in foreign {
+        fs::create_dir_all(workplace.path("out").join(name).parent().unwrap()).unwrap();
+        fs::write(workplace.path("out").join(name), "precious").unwrap();
+    }
+    workplace.done("compress {tiny} -o out --target-count 50 --overwrite");
+    for name in foreign {
+        assert_eq!(fs::read(workplace.path("out").join(name)).ok().as_deref(), Some(&b"precious"[..]), "{name}");
+    }
+    workplace.done("compress {tiny} -o fresh --target-count 50");
+    let [mut left, mut expected] = ["out", "fresh"].map(|name| lasting_files(&workplace.path(name)));
+    left.retain(|name, bytes| !bytes.is_empty() && !foreign.contains(&name.to_str().unwrap()));
+    expected.retain(|_, bytes| !bytes.is_empty());
+    assert!(left == expected, "{:?}, not {:?}", left.keys(), expected.keys());
+    // Of frames that the new result does not have nothing stays.
+    workplace.done("unpack {tiny} -o frames");
+    fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
+    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("unpack shorter/scene.gseq -o frames --overwrite");
+    let plys = fs::read_dir(workplace.path("frames")).unwrap().map(|entry| entry.unwrap().path());
+    assert_eq!(plys.filter(|path| path.extension().is_some_and(|e| e == "ply")).count(), 3);
+    assert_eq!(fs::read(workplace.path("frames/notes.txt")).unwrap(), b"precious");
+    workplace.done("unpack {tiny} -o frames --force");
+    assert!(!workplace.path("frames/notes.txt").exists(), "--force replaces the folder with all in it");
+    let hidden = fs::read_dir(workplace.path("")).unwrap().map(|entry| entry.unwrap().file_name());
+    assert_eq!(hidden.filter(|name| name.to_str().unwrap().starts_with('.')).count(), 0);
+}
+
+#[test]
+fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_foreign_file_is_lost() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 400 --frames 3 -o shorter");
+    workplace.done("unpack shorter/scene.gseq -o old");
+    let start = Instant::now();
+    workplace.done("unpack {tiny} -o new");
+    let whole = start.elapsed();
+    let [old, new] = ["old", "new"].map(|name| lasting_files(&workplace.path(name)));
+    let reset = || workplace.done("unpack shorter/scene.gseq -o frames --overwrite");
+    reset();
+    fs::write(workplace.path("frames/notes.txt"), "precious").unwrap();
+    const ENDS: u32 = 24;
+    for end in 0..ENDS {
+        let mut child = waiting(&workplace, &format!("unpack {} -o frames --overwrite", tiny().display()));
+        std::thread::sleep(whole * end / ENDS);
+        let is_told = end % 2 == 0;
+        if is_told {
+            // It may have ended already.
+            _ = Command::new("kill").arg(child.id().to_string()).stderr(Stdio::null()).status();
+        } else {
+            child.kill().unwrap();
+        }
+        child.wait().unwrap();
+        let output = workplace.path("frames");
+        let mut found = if output.exists() { lasting_files(&output) } else { Default::default() };
+        let notes = found.remove(Path::new("notes.txt"));
+        assert!(found == old || found == new || (found.is_empty() && !is_told), "{end}: {:?}", found.keys());
+        if is_told {
+            assert_eq!(notes.as_deref(), Some(&b"precious"[..]), "{end}");
+            let mut left = files(&workplace.path(""));
+            left.retain(|name, _| name.to_str().unwrap().starts_with('.'));
+            assert!(left.is_empty(), "{end}: {:?}", left.keys());
+        }
+        reset();
+        assert_eq!(fs::read(workplace.path("frames/notes.txt")).unwrap(), b"precious", "{end}");
+    }
+}
+
+#[test]
+fn files_that_nothing_knows_as_results_are_replaced_by_force_alone() {
+    let workplace = Workplace::new();
+    workplace.done("pack {tiny} -o scene.gseq");
+    for (verb, name) in [
+        ("pack {tiny} -o", "a.gseq"),
+        ("compress {tiny} --as ply -o", "a.ply"),
+        ("score {tiny} -o", "a.csv"),
+        ("score {tiny} -o", "a.npz"),
+        ("render {tiny} --cameras {tiny} --frame 0 --view 0 -o", "a.png"),
+        ("evaluate {tiny} scene.gseq --cameras {tiny} --max-frames 1 --csv", "b.csv"),
+        ("recover scene.gseq -o", "b.gseq"),
+    ] {
+        fs::write(workplace.path(name), "precious").unwrap();
+        workplace.refused(2, &format!("{verb} {name}"), &[name, "exists already", "--overwrite", "--force"]);
+        workplace.refused(2, &format!("{verb} {name} --overwrite"), &[name, "nothing says", "--force"]);
+        workplace.done(&format!("{verb} {name} --force"));
+        assert_ne!(fs::read(workplace.path(name)).unwrap(), b"precious");
+    }
+    // What says itself that it is ours, or lies beside a summary that names it.
+    workplace.done("pack {tiny} -o a.gseq --overwrite");
+    workplace.done("compress {tiny} --as ply -o a.ply --overwrite --target-count 100");
+    fs::write(workplace.path("a.ply.mine"), "precious").unwrap();
+    workplace.done("compress {tiny} --as ply -o a.ply --overwrite");
+    assert_eq!(fs::read(workplace.path("a.ply.mine")).unwrap(), b"precious");
+}
+
+#[test]
+fn a_log_gets_a_line_per_stage_and_a_quiet_run_none() {
+    let workplace = Workplace::new();
+    let run = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq");
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    for stage in ["scan", "visible", "score", "refine", "emit"] {
+        let lines: Vec<&str> = run.stderr.lines().filter(|line| line.contains(&format!("] {stage}  "))).collect();
+        assert_eq!(lines.len(), 1, "{stage}: {}", run.stderr);
+        assert!(lines[0].starts_with('[') && lines[0].contains("/s, ") && lines[0].ends_with(" s"), "{}", lines[0]);
+    }
+    assert!(!run.stderr.contains('\r') && !run.stderr.contains('\x1b'), "{:?}", run.stderr);
+    let quiet = workplace.run("compress {tiny} -o quiet.gseq --quiet");
+    assert_eq!((quiet.code, quiet.stderr.as_str()), (0, ""));
+}
+
+#[test]
+fn a_run_says_what_it_will_take_before_anything_else_is_done() {
+    let workplace = Workplace::new();
+    let real = workplace.run("compress {tiny} --cameras {tiny} -o real.gseq --no-refine");
+    let first: Vec<&str> = real.stderr.lines().take(2).collect();
+    assert!(first[0].starts_with("time: ") && first[1].starts_with("memory: at most "), "{}", real.stderr);
+    let run = workplace.done("compress {tiny} --cameras {tiny} -o out.gseq --dry-run");
+    assert!(run.contains("\ntime: ") && run.contains("\nwould write out.gseq, out.gseq.recipe.toml"), "{run}");
+    let explained = workplace.run("compress {tiny} --cameras {tiny} -o out.gseq --explain");
+    let place = |what: &str| explained.stderr.find(what).unwrap_or_else(|| panic!("{what}: {}", explained.stderr));
+    assert!(place("\ntime: ") < place("] scan  ") && place("\ncore-seconds: scan ") < place("] scan  "));
+    let quiet = workplace.run("compress {tiny} -o other.gseq --dry-run --quiet");
+    assert_eq!((quiet.code, quiet.stderr.as_str()), (0, ""));
+}

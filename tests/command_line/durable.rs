@@ -1,0 +1,109 @@
+//! Every result is written through to the disk before it gets its name, and so is the name: what a power failure would
+//! tell, seen as the order of the system's calls. A library that notes them stands between the program and the system.
+#![cfg(all(target_os = "linux", target_env = "gnu"))]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::scene::{Workplace, files, tiny};
+
+/// `fsync` and `rename` as they are, each noted in the file that NOTES names, in their order.
+const NOTES: &str = r#"
+#define _GNU_SOURCE
+#include <fcntl.h>
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+static void note(const char *what, const char *from, const char *to) {
+    int notes = open(getenv("NOTES"), O_WRONLY | O_APPEND | O_CREAT | O_CLOEXEC, 0600);
+    dprintf(notes, "%s\t%s\t%s\n", what, from, to);
+    close(notes);
+}
+
+int fsync(int fd) {
+    char link[64], path[PATH_MAX + 1];
+    snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
+    ssize_t length = readlink(link, path, PATH_MAX);
+    path[length < 0 ? 0 : length] = 0;
+    note("sync", path, "");
+    return syscall(SYS_fsync, fd);
+}
+
+int rename(const char *from, const char *to) {
+    char real[PATH_MAX + 1];
+    note("rename", realpath(from, real) ? real : from, to);
+    return syscall(SYS_renameat2, AT_FDCWD, from, AT_FDCWD, to, 0);
+}
+"#;
+
+/// What the program asked of the system.
+#[derive(Debug, PartialEq)]
+enum Call {
+    Sync(PathBuf),
+    Rename(PathBuf, PathBuf),
+}
+
+/// Runs the program with all its `fsync` and `rename` noted.
+fn noted(workplace: &Workplace, shim: &Path, arguments: &str) -> Vec<Call> {
+    let notes = workplace.path("notes");
+    let _ = fs::remove_file(&notes);
+    let words = arguments.split_whitespace().map(|word| if word == "{tiny}" { tiny() } else { workplace.path(word) });
+    let output = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+        .args(arguments.split_whitespace().zip(words).map(|(word, path)| match word {
+            word if word.starts_with('{') || word.contains('.') || word == "out" => path.into_os_string(),
+            word => word.into(),
+        }))
+        .env("LD_PRELOAD", shim)
+        .env("NOTES", &notes)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{arguments}: {}", String::from_utf8_lossy(&output.stderr));
+    let text = fs::read_to_string(&notes).unwrap_or_else(|_| panic!("{arguments}: neither syncs nor renames"));
+    let call = |line: &str| match line.split('\t').collect::<Vec<_>>()[..] {
+        ["sync", path, _] => Call::Sync(path.into()),
+        ["rename", from, to] => Call::Rename(from.into(), to.into()),
+        _ => panic!("{line:?}"),
+    };
+    text.lines().map(call).collect()
+}
+
+#[test]
+fn what_gets_a_name_is_on_the_disk_before_and_its_name_after() {
+    let workplace = Workplace::new();
+    let (source, shim) = (workplace.path("notes.c"), workplace.path("notes.so"));
+    fs::write(&source, NOTES).unwrap();
+    let compiler = std::env::var_os("CC").unwrap_or_else(|| "cc".into());
+    let compiled = Command::new(compiler).args(["-shared", "-fPIC", "-o"]).args([&shim, &source]).status().unwrap();
+    assert!(compiled.success(), "a C compiler is needed to build this program and to test it");
+    for (arguments, results) in [
+        ("pack {tiny} -o packed.gseq", &["packed.gseq"][..]),
+        ("compress {tiny} -o out --no-refine", &["out"]),
+        ("compress {tiny} -o out --no-refine --overwrite", &["out"]),
+        (
+            "compress packed.gseq -o small.gseq --no-refine",
+            &["small.gseq", "small.gseq.recipe.toml", "small.gseq.index_map.npy", "small.gseq.summary.json"],
+        ),
+    ] {
+        let calls = noted(&workplace, &shim, arguments);
+        for result in results.iter().map(|name| workplace.path(name)) {
+            let named = |call: &Call| matches!(call, Call::Rename(_, to) if *to == result);
+            let at = calls.iter().position(named).unwrap_or_else(|| panic!("{arguments}: {result:?} got no name"));
+            let Call::Rename(from, _) = &calls[at] else { unreachable!() };
+            let mut parts = vec![from.clone()];
+            if result.is_dir() {
+                parts.extend(files(&result).into_keys().map(|name| from.join(name)));
+                assert!(parts.len() > 4, "{arguments}: {parts:?}");
+            }
+            for part in parts {
+                let before = calls[..at].contains(&Call::Sync(part.clone()));
+                assert!(before, "{arguments}: {part:?} is not synced before it gets its name");
+            }
+            let folder = result.parent().unwrap().canonicalize().unwrap();
+            assert!(calls[at..].contains(&Call::Sync(folder)), "{arguments}: the name of {result:?} is not synced");
+        }
+    }
+}

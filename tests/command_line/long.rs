@@ -1,0 +1,150 @@
+//! Sequences that are all length or all width, as files and as streams of which nobody knows how long they will be
+//! (EXTREMES 42): a budget holds for as many frames as there is room for, and what there is no room for is refused by name.
+//!
+//! `SPLATSIEVE_PROGRAM` names another program to run than the one built with this test: an optimized one.
+
+use std::fs;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+use std::process::Output;
+
+use crate::scene::Workplace;
+use splatsieve::files::frame_stream::StreamHeader;
+use splatsieve::model::{Columns, Gaussians};
+use splatsieve::outputs::frame_stream::StreamWriter;
+
+/// Scores and prunes by formula: what looks at pictures takes time, not memory that grows with frames.
+const REQUEST: &str = "--coverage projected --prune-only --no-refine --choose-by-views=false --target-ratio 0.5 \
+     --bands all";
+
+/// A sequence of which positions alone move, to and fro: the first component of Gaussian 0 at frame t is sin(t / 50).
+#[derive(Clone, Copy)]
+struct Walk {
+    gaussians: usize,
+    frames: usize,
+}
+
+impl Walk {
+    /// Writes it as a stream; whoever reads may stop early.
+    fn write(self, to: impl Write) {
+        let header =
+            StreamHeader { count: self.gaussians, sh_degree: 0, varying: Columns::POSITION, is_unlinked: false };
+        let mut state = Gaussians::zeros(self.gaussians, 0);
+        let value = |i: usize, k: f32| (i as f32 * k).fract();
+        for c in 0..3 {
+            for (i, x) in state.log_scale.plane_mut(c).iter_mut().enumerate() {
+                *x = -4.0 - value(i, 0.618_034);
+            }
+        }
+        state.rotation.plane_mut(0).fill(1.0);
+        state.opacity_logit.plane_mut(0).iter_mut().enumerate().for_each(|(i, x)| *x = 3.0 * value(i, 0.754_877) - 1.0);
+        let Ok(mut stream) = StreamWriter::new(BufWriter::new(to), Path::new("pipe"), header, &state) else { return };
+        let at_rest: Vec<[f32; 3]> =
+            (0..self.gaussians).map(|i| [0.618_034, 0.754_877, 0.569_84].map(|k| value(i, k))).collect();
+        for frame in 0..self.frames {
+            let wave = (frame as f32 / 50.0).sin();
+            for (c, weight) in [1.0, 0.3, 0.0].into_iter().enumerate() {
+                let to = state.position.plane_mut(c).iter_mut();
+                to.zip(&at_rest).for_each(|(x, rest)| *x = rest[c] + weight * wave);
+            }
+            if stream.frame(frame as f64, &state).is_err() {
+                return;
+            }
+        }
+        let _ = stream.finish();
+    }
+}
+
+/// Runs the program on `walk` as it arrives.
+fn piped(workplace: &Workplace, arguments: &str, walk: Walk) -> Output {
+    crate::scene::piped(&mut workplace.command(arguments), move |pipe| walk.write(pipe))
+}
+
+/// Runs the program without an input.
+fn ran(workplace: &Workplace, arguments: &str) -> Output {
+    piped(workplace, arguments, Walk { gaussians: 0, frames: 0 })
+}
+
+fn told(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// What follows `before` up to `after`, as a number.
+fn number(text: &str, before: &str, after: &str) -> f64 {
+    let (_, rest) = text.split_once(before).unwrap_or_else(|| panic!("{before:?} is not in {text:?}"));
+    rest.split_once(after).unwrap().0.trim().parse().unwrap()
+}
+
+/// A run that must succeed and, where the system says what it took, have taken at most `budget` MiB.
+fn keeps_to(output: &Output, what: &str, budget: f64) {
+    let text = told(output);
+    assert!(output.status.success(), "{what}: {text}");
+    if let Some(taken) = crate::scene::taken(&text) {
+        println!("{what}: {taken} of {budget} MiB");
+        assert!(taken <= budget, "{what}: {taken} MiB resident, {budget} promised");
+    }
+}
+
+/// Packs `walk`, compresses it as a container and as a stream, all within `budget` MiB, and holds results together.
+fn both_ways(walk: Walk, budget: u64) {
+    let workplace = Workplace::new();
+    let limits = format!("--memory {budget}MiB --explain");
+    let output = piped(&workplace, &format!("pack - -o walk.gseq {limits}"), walk);
+    keeps_to(&output, "pack", budget as f64);
+    let output = ran(&workplace, &format!("compress walk.gseq -o file.gseq {REQUEST} {limits}"));
+    keeps_to(&output, "container", budget as f64);
+    fs::remove_file(workplace.path("walk.gseq")).unwrap();
+    let output = piped(&workplace, &format!("compress - -o stream.gseq {REQUEST} {limits}"), walk);
+    keeps_to(&output, "stream", budget as f64);
+    for name in [".gseq", ".gseq.index_map.npy"] {
+        let [file, stream] = ["file", "stream"].map(|of| fs::read(workplace.path(&format!("{of}{name}"))).unwrap());
+        assert!(file == stream, "{name}: other bytes");
+    }
+}
+
+#[test]
+fn a_hundred_thousand_frames_fit_where_few_do() {
+    both_ways(Walk { gaussians: 10, frames: 100_000 }, 40);
+}
+
+#[test]
+fn a_million_gaussians_in_two_frames_fit() {
+    both_ways(Walk { gaussians: 1_000_000, frames: 2 }, 700);
+}
+
+/// EXTREMES 42.
+#[test]
+#[ignore = "slow: minutes unless optimised"]
+fn slow_a_million_frames_of_ten_gaussians_fit_64_mib() {
+    both_ways(Walk { gaussians: 10, frames: 1_000_000 }, 64);
+}
+
+/// EXTREMES 42.
+#[test]
+#[ignore = "slow: minutes unless optimised"]
+fn slow_ten_million_gaussians_in_two_frames_fit() {
+    both_ways(Walk { gaussians: 10_000_000, frames: 2 }, 7000);
+}
+
+#[test]
+fn a_stream_longer_than_there_is_room_for_is_refused_and_the_memory_that_is_named_is_enough() {
+    let walk = Walk { gaussians: 10, frames: 60_000 };
+    for (verb, rest) in [("compress", REQUEST), ("pack", "")] {
+        let workplace = Workplace::new();
+        let request = |memory: u64| format!("{verb} - -o out.gseq {rest} --memory {memory}MiB --explain");
+        let output = piped(&workplace, &request(1), walk);
+        let least = number(&told(&output), "expected at least ", "MiB") as u64;
+        let output = piped(&workplace, &request(least), walk);
+        let text = told(&output);
+        assert_eq!(output.status.code(), Some(1), "{verb} in {least} MiB: {text}");
+        for part in ["standard input, frame ", "at most ", &format!("{least}.0 MiB, as asked for"), "send fewer frames"]
+        {
+            assert!(text.contains(part), "{verb}: {part:?} is not in {text:?}");
+        }
+        assert!(fs::read_dir(workplace.path("")).unwrap().next().is_none(), "{verb}: something was left behind");
+        let enough = number(&text, "MiB, which is enough for ", ",") as usize;
+        let named = number(&text, "give it --memory ", "MiB") as u64;
+        let as_said = Walk { frames: enough, ..walk };
+        keeps_to(&piped(&workplace, &request(named), as_said), verb, named as f64);
+    }
+}

@@ -1,0 +1,170 @@
+//! What a run says about itself is true: its recipe repeats it, its summary reads back, its plan of reads holds, and a
+//! dry run says what the run would say.
+
+use crate::scene::{Run, Workplace, lasting_files, shared};
+use serde_json::Value;
+use splatsieve::pipeline::summary::{SCHEMA, Summary};
+
+/// Runs a compression twice: as asked, then by the recipe it wrote, and expects the same files.
+fn repeats(workplace: &Workplace, name: &str, arguments: &str) -> Run {
+    let first = workplace.run(&format!("compress {arguments} -o {name}_first"));
+    assert_eq!(first.code, 0, "{}", first.stderr);
+    let input = arguments.split_whitespace().next().unwrap();
+    let recipe = match workplace.path(&format!("{name}_first")).is_dir() {
+        true => format!("{name}_first/recipe.toml"),
+        false => format!("{name}_first.recipe.toml"),
+    };
+    // A recipe names no folder far from itself, so cameras that lie elsewhere are given again.
+    let cameras = if arguments.contains("--cameras {tiny}") { "--cameras {tiny}" } else { "" };
+    let again = workplace.run(&format!("compress {input} --recipe {recipe} {cameras} -o {name}_again"));
+    assert_eq!(again.code, 0, "{}", again.stderr);
+    let [first, second] = ["first", "again"].map(|turn| lasting_files(&workplace.path(&format!("{name}_{turn}"))));
+    assert!(first == second, "{arguments}: the recipe does not repeat the run");
+    assert!(!first.is_empty());
+    again
+}
+
+#[test]
+fn the_recipe_beside_a_result_repeats_its_run() {
+    let workplace = Workplace::new();
+    for (k, options) in [
+        "--cameras {tiny} --target-ratio 0.4",
+        "--cameras {tiny} --target-count 77 --split test --preset paper",
+        "--cameras {tiny} --prune-only --mu 2",
+        "--cameras {tiny} --merge-only --preset strong --split all",
+        "--cameras {tiny} --keep-ids 3,10-20 --drop-ids 200-210",
+        "--cameras {tiny} --keep-box -1,-1,-1,0,0,0.5",
+        "--cameras {tiny} --as ply-sequence",
+    ]
+    .iter()
+    .enumerate()
+    {
+        let run = repeats(&workplace, &format!("run{k}"), &format!("{{tiny}} {options}"));
+        assert!(!run.stdout.contains("another input"), "{}", run.stdout);
+    }
+}
+
+#[test]
+fn a_recipe_of_another_input_is_noted_and_flags_go_before_it() {
+    let workplace = Workplace::new();
+    workplace.done("compress {tiny} --cameras {tiny} --target-ratio 0.5 -o half");
+    workplace.done("demo --gaussians 600 --frames 4 -o demo");
+    let demo = "demo/scene.gseq --cameras demo/cameras.json --recipe half/recipe.toml";
+    let summary = workplace.summary(&format!("{demo} -o other.gseq"));
+    assert_eq!(summary["gaussians"], 300);
+    let notes = summary["notes"].to_string();
+    assert!(notes.contains("another input"), "{notes}");
+    let summary = workplace.summary(&format!("{demo} --target-count 123 -o third.gseq"));
+    assert_eq!(summary["gaussians"], 123);
+}
+
+#[test]
+fn a_summary_reads_back_as_it_was_written_and_says_its_schema() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 900 --frames 6 -o demo");
+    for (k, options) in ["", "--preset strong", "--preset paper", "--prune-only"].iter().enumerate() {
+        workplace.done(&format!("compress demo/scene.gseq --cameras demo/cameras.json {options} -o out{k}.gseq"));
+        let text = std::fs::read_to_string(workplace.path(&format!("out{k}.gseq.summary.json"))).unwrap();
+        let summary: Summary = serde_json::from_str(&text).unwrap();
+        assert_eq!(summary.schema, SCHEMA);
+        let (before, after): (Value, Value) =
+            (serde_json::from_str(&text).unwrap(), serde_json::from_str(&summary.json()).unwrap());
+        assert_eq!(after, before, "{options}");
+    }
+}
+
+#[test]
+fn every_field_of_a_summary_is_described() {
+    let workplace = Workplace::new();
+    let summary = workplace.summary("{tiny} --cameras {tiny} --preset strong -o out");
+    let described = include_str!("../../format/SUMMARY.md");
+    let mut pending = vec![("".to_owned(), &summary)];
+    while let Some((name, value)) = pending.pop() {
+        // Counts of a pass are described where they are counted.
+        let inner: Vec<(String, &Value)> = match value {
+            Value::Object(fields) if name != "passes" => fields.iter().map(|(k, v)| (k.clone(), v)).collect(),
+            Value::Array(values) => values.iter().map(|value| (name.clone(), value)).collect(),
+            _ => Vec::new(),
+        };
+        for (field, value) in inner {
+            assert!(described.contains(&format!("`{field}`")), "{field} is not described");
+            pending.push((field, value));
+        }
+    }
+}
+
+#[test]
+fn a_dry_run_says_what_the_run_would_say() {
+    let workplace = Workplace::new();
+    let options = "{tiny} --cameras {tiny} --target-ratio 0.5 -o out";
+    let dry = workplace.summary(&format!("{options} --dry-run"));
+    assert!(lasting_files(&workplace.path("")).is_empty(), "a dry run makes nothing");
+    let wet = workplace.summary(options);
+    for field in ["gaussians", "cameras", "output"] {
+        assert_eq!(dry[field], wet[field], "{field}");
+    }
+    // What something would have taken is expected, by measurements that differ.
+    let said = |summary: &Value| -> Vec<String> {
+        let left_out = summary["left_out"].as_array().unwrap().iter().map(|left| left["what"].to_string());
+        left_out.chain(summary["notes"].as_array().unwrap().iter().map(Value::to_string)).collect()
+    };
+    let in_the_end = said(&wet);
+    assert!(said(&dry).iter().all(|said| in_the_end.contains(said)), "{:?} {in_the_end:?}", said(&dry));
+    for written in dry["would_write"].as_array().unwrap() {
+        assert!(workplace.path(written.as_str().unwrap()).exists(), "{written}");
+    }
+    let names = |stages: &Value| -> Vec<String> {
+        stages.as_array().unwrap().iter().map(|stage| stage["name"].as_str().unwrap().to_owned()).collect()
+    };
+    let (foreseen, done) = (names(&dry["forecast"]["stages"]), names(&wet["stages"]));
+    assert!(done.iter().all(|stage| foreseen.contains(stage) || stage == "read" || stage == "prune"), "{done:?}");
+    let described = include_str!("../../format/SUMMARY.md");
+    for field in dry.as_object().unwrap().keys() {
+        assert!(described.contains(&format!("`{field}`")), "{field} is not described");
+    }
+}
+
+/// Runs a compression of a container, and expects no more reads than its plan named; gives what it read.
+fn reads_as_planned(workplace: &Workplace, arguments: &str) -> f64 {
+    let summary = workplace.summary(arguments);
+    let planned = summary["planned_reads"].as_f64().unwrap();
+    let read: f64 =
+        summary["stages"].as_array().unwrap().iter().map(|stage| stage["full_reads"].as_f64().unwrap()).sum();
+    // What stays in memory since the machine was measured by it is not read again.
+    assert!(read > 0.2 && read <= 1.1 * planned, "{arguments}: read {read} times, planned at most {planned}");
+    read
+}
+
+#[test]
+fn no_preset_reads_more_than_its_plan_named_however_little_memory_there_is() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 3000 --frames 64 -o demo");
+    for preset in ["default", "paper", "gentle", "strong"] {
+        for (k, options) in ["", "--memory 48MiB", "--merge-only --memory 48MiB", "--target-ratio 0.2 --memory 48MiB"]
+            .iter()
+            .enumerate()
+        {
+            if preset == "gentle" && options.contains("merge-only") {
+                continue;
+            }
+            let output = format!("{preset}{k}.gseq");
+            let arguments = format!(
+                "demo/scene.gseq --cameras demo/cameras.json --preset {preset} {options} --refine-steps 60 --refine-cut-steps 10 -o {output}"
+            );
+            let read = reads_as_planned(&workplace, &arguments);
+            // What fits into memory is read once; two threads may begin the same tile at once.
+            assert!(k > 0 || read <= 1.1, "{preset}: {read}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs the trained models"]
+fn a_default_run_reads_the_container_of_a_trained_model_at_most_two_and_a_half_times() {
+    let model = shared("deform2");
+    let workplace = Workplace::new();
+    let model = model.display();
+    workplace.done(&format!("pack {model} --cameras {model} -o packed.gseq"));
+    let read = reads_as_planned(&workplace, &format!("packed.gseq --cameras {model} -o small.gseq"));
+    assert!(read <= 2.5, "{read}");
+}

@@ -1,0 +1,327 @@
+//! The Python scripts against the program: what one writes the other reads, to the bit.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::scene::{Workplace, state, tiny};
+use splatsieve::files::container::Container;
+use splatsieve::model::Columns;
+use splatsieve::source::FrameSource;
+
+/// A Python, which must have `modules`. `PYTHON` names another than python3.
+fn python(modules: &str) -> PathBuf {
+    let python = std::env::var_os("PYTHON").map_or_else(|| PathBuf::from("python3"), PathBuf::from);
+    let found = Command::new(&python).args(["-c", &format!("import {modules}")]).stderr(Stdio::null()).status();
+    assert!(found.is_ok_and(|status| status.success()), "{} cannot import {modules}", python.display());
+    python
+}
+
+fn script(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts").join(name)
+}
+
+/// Runs Python in the workplace, which must succeed; gives its standard output.
+fn run(command: &mut Command, workplace: &Workplace) -> Vec<u8> {
+    let output = command.current_dir(workplace.path("")).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    output.stdout
+}
+
+/// Packs the stream that `exporter` writes.
+fn packed(workplace: &Workplace, exporter: &mut Command, name: &str) -> Container {
+    let stream = run(exporter, workplace);
+    fs::write(workplace.path("stream"), stream).unwrap();
+    let status = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+        .args(["pack", "-", "-o", name])
+        .current_dir(workplace.path(""))
+        .stdin(fs::File::open(workplace.path("stream")).unwrap())
+        .output()
+        .unwrap();
+    assert!(status.status.success(), "{}", String::from_utf8_lossy(&status.stderr));
+    Container::open(&workplace.path(name)).unwrap()
+}
+
+/// Values of the scene at `frame` as float32 files, one per column, Gaussian after Gaussian.
+fn write_columns(workplace: &Workplace, scene: &Container, frame: usize) {
+    let state = state(scene, frame);
+    for column in Columns::all().iter() {
+        let values = state.column(column);
+        let bytes: Vec<u8> = (0..values.len())
+            .flat_map(|i| (0..values.width()).flat_map(move |c| values.plane(c)[i].to_le_bytes()))
+            .collect();
+        fs::write(workplace.path(&format!("{}_{frame}.f32", column.name())), bytes).unwrap();
+    }
+}
+
+#[test]
+#[ignore = "needs numpy and zstandard"]
+fn lives_that_a_script_cuts_are_linked_and_it_says_how_well() {
+    let python = python("numpy, zstandard");
+    let workplace = Workplace::new();
+    workplace.done("pack {tiny} --frames 9 -o tiny.gseq");
+    workplace.done("unpack tiny.gseq -o frames");
+    let cut = script("cut_lives.py");
+    let mut command = Command::new(&python);
+    let said = run(
+        command.arg(&cut).args(["frames", "cut", "--lives", "3-5", "--overlap", "1", "--noise", "0.01"]),
+        &workplace,
+    );
+    let said = String::from_utf8(said).unwrap();
+    assert!(said.contains("in 9 frames"), "{said}");
+    workplace.done("pack cut -o linked.gseq --link apart");
+    let score = run(Command::new(&python).arg(&cut).args(["--score", "cut", "linked.gseq"]), &workplace);
+    let score = String::from_utf8(score).unwrap();
+    assert!(score.contains("by gaussian: ") && score.contains(" tracks, "), "{score}");
+}
+
+#[test]
+#[ignore = "needs numpy"]
+fn arrays_exported_as_a_stream_arrive_bit_for_bit() {
+    let python = python("numpy");
+    let workplace = Workplace::new();
+    workplace.done("pack {tiny} -o scene.gseq");
+    let scene = Container::open(&workplace.path("scene.gseq")).unwrap();
+    (0..10).for_each(|frame| write_columns(&workplace, &scene, frame));
+    let times: Vec<String> = scene.info().times.iter().map(|time| format!("{time:?}")).collect();
+    // Only what moves has a row per frame; single arrays in an .npz or a folder of .npy files.
+    let varying = scene.info().varying;
+    let make = format!(
+        "import numpy as np, os\n\
+         read = lambda n, t, w: np.fromfile(f'{{n}}_{{t}}.f32', '<f4').reshape((300, *w))\n\
+         widths = dict(position=(3,), rotation=(4,), log_scale=(3,), opacity_logit=(1,), sh=(-1, 3))\n\
+         varying = {:?}.split()\n\
+         a = {{n: np.array([read(n, t, w) for t in range(10)]) if n in varying else read(n, 0, w) for n, w in widths.items()}}\n\
+         a['times'] = np.array([{}])\n\
+         np.savez('model.npz', **a)\n\
+         os.mkdir('folder')\n\
+         [np.save(f'folder/{{n}}.npy', x) for n, x in a.items()]",
+        varying.iter().map(Columns::name).collect::<Vec<_>>().join(" "),
+        times.join(", ")
+    );
+    run(Command::new(&python).args(["-c", &make]), &workplace);
+    for from in ["model.npz", "folder"] {
+        let mut exporter = Command::new(&python);
+        exporter.arg(script("export_arrays.py")).arg(from);
+        let found = packed(&workplace, &mut exporter, &format!("{from}.gseq"));
+        assert_eq!(found.info(), scene.info(), "{from}");
+        assert!((0..10).all(|frame| state(&found, frame) == state(&scene, frame)), "{from}");
+    }
+}
+
+#[test]
+#[ignore = "needs numpy"]
+fn an_exporter_that_fails_writes_no_end_mark() {
+    let python = python("numpy");
+    let workplace = Workplace::new();
+    let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
+        from stream_writer import StreamWriter\n\
+        with StreamWriter(sys.stdout.buffer, 1, 0, dict(rotation=[[1, 0, 0, 0]], log_scale=[[0] * 3], opacity_logit=[0], sh=[[[0] * 3]])) as s:\n    \
+            s.frame(0.0, dict(position=[[1, 2, 3]]))\n    \
+            raise SystemExit(1)";
+    let output = Command::new(python).args(["-c", code]).arg(script("")).output().unwrap();
+    fs::write(workplace.path("stream"), output.stdout).unwrap();
+    let output = Command::new(assert_cmd::cargo::cargo_bin("splatsieve"))
+        .args(["pack", "-", "-o", "a.gseq"])
+        .current_dir(workplace.path(""))
+        .stdin(fs::File::open(workplace.path("stream")).unwrap())
+        .output()
+        .unwrap();
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(message.contains("after 1 complete frame, without its end mark"), "{message}");
+}
+
+#[test]
+#[ignore = "needs numpy"]
+fn a_stream_of_no_gaussians_is_written_and_read() {
+    let python = python("numpy");
+    let workplace = Workplace::new();
+    let code = "import sys; sys.path.insert(0, sys.argv[1])\n\
+        import numpy as np\n\
+        from stream_writer import StreamWriter\n\
+        none = dict(rotation=np.zeros((0, 4)), log_scale=np.zeros((0, 3)), opacity_logit=[], sh=np.zeros((0, 4, 3)))\n\
+        with StreamWriter(sys.stdout.buffer, 0, 1, none) as s:\n    \
+            s.frame(0.0, dict(position=np.zeros((0, 3))))\n    \
+            s.frame(1.0, dict(position=np.zeros((0, 3))))";
+    let mut exporter = Command::new(python);
+    exporter.args(["-c", code]).arg(script(""));
+    let found = packed(&workplace, &mut exporter, "none.gseq");
+    assert_eq!((found.info().count, &found.info().times[..]), (0, &[0.0, 1.0][..]));
+}
+
+#[test]
+#[ignore = "needs numpy and zstandard"]
+fn the_container_reader_gives_every_bit_of_every_column() {
+    let python = python("numpy, zstandard");
+    let workplace = Workplace::new();
+    workplace.done("pack {tiny} -o zstd.gseq");
+    workplace.done("pack {tiny} -o raw.gseq --raw");
+    workplace.done("demo --gaussians 2500 --frames 70 -o demo");
+    workplace.done("pack {tiny} -o tiny.gseq --max-error position=1e-2,rotation=1e-2,log_scale=1e-2,sh=1e-2");
+    workplace.done("pack demo/scene.gseq -o demo.gseq --max-error position=0.05%,rotation=1e-3,opacity_logit=0.1");
+    for (path, frames) in [
+        ("zstd.gseq", vec![0, 9]),
+        ("raw.gseq", vec![3]),
+        ("demo/scene.gseq", vec![0, 1, 33, 69]),
+        ("tiny.gseq", vec![0, 5]),
+        ("demo.gseq", vec![0, 1, 2, 40, 69]),
+    ] {
+        let scene = Container::open(&workplace.path(path)).unwrap();
+        for frame in frames {
+            write_columns(&workplace, &scene, frame);
+            let check = format!(
+                "import sys; sys.path.insert(0, sys.argv[1])\n\
+                 import numpy as np\n\
+                 from read_gseq import Gseq\n\
+                 g = Gseq('{path}')\n\
+                 assert len(g.times) == {}, g.times\n\
+                 for name in 'position rotation log_scale opacity_logit sh'.split():\n    \
+                     expected = np.fromfile(f'{{name}}_{frame}.f32', '<u4')\n    \
+                     found = np.ascontiguousarray(g.column(name, {frame}), '<f4').view('<u4').ravel()\n    \
+                     assert np.array_equal(found, expected), name",
+                scene.info().times.len()
+            );
+            run(Command::new(&python).args(["-c", &check]).arg(script("")), &workplace);
+        }
+    }
+}
+
+/// Stand-ins for the classes of the 4DGaussians repository, with their names, signatures and chatter: the real ones
+/// need its CUDA extensions. The deformation moves positions by the time.
+const REPOSITORY: [(&str, &str); 3] = [
+    (
+        "arguments.py",
+        "from argparse import Namespace\n\
+         class ModelParams:\n    \
+             def __init__(self, parser, sentinel=False):\n        \
+                 parser.add_argument('--model_path', '-m')\n    \
+             def extract(self, args): return Namespace(sh_degree=args.sh_degree)\n\
+         class ModelHiddenParams:\n    \
+             def __init__(self, parser): pass\n    \
+             def extract(self, args): return Namespace()\n\
+         def get_combined_args(parser):\n    \
+             print('Looking for config file')\n    \
+             given = {k: v for k, v in vars(parser.parse_args()).items() if v is not None}\n    \
+             return Namespace(**{'sh_degree': 1, **given})\n",
+    ),
+    ("scene/__init__.py", ""),
+    (
+        "scene/gaussian_model.py",
+        "import torch\n\
+         class GaussianModel:\n    \
+             def __init__(self, sh_degree, args): self.max_sh_degree = sh_degree\n    \
+             def load_ply(self, path):\n        \
+                 print('loading', path)\n        \
+                 n = torch.arange(7.)[:, None]\n        \
+                 self._xyz, self._scaling, self._rotation, self._opacity = n.repeat(1, 3), -n.repeat(1, 3), n.repeat(1, 4), n\n        \
+                 self._features = torch.arange(7 * 4 * 3.).reshape(7, 4, 3)\n    \
+             def load_model(self, path): print('loading model from exists' + path)\n    \
+             @property\n    \
+             def get_xyz(self): return self._xyz\n    \
+             @property\n    \
+             def get_features(self): return self._features\n    \
+             def _deformation(self, point, scales, rotations, opacity, shs, times_sel):\n        \
+                 print('deforming')\n        \
+                 assert times_sel.shape == (7, 1)\n        \
+                 return point + times_sel, scales, rotations, opacity, shs\n",
+    ),
+];
+
+#[test]
+#[ignore = "needs numpy and PyTorch"]
+fn the_4dgaussians_exporter_streams_what_the_repository_evaluates_whatever_it_prints() {
+    let python = python("numpy, torch");
+    let workplace = Workplace::new();
+    for (name, text) in REPOSITORY {
+        fs::create_dir_all(workplace.path("scene")).unwrap();
+        fs::write(workplace.path(name), text).unwrap();
+    }
+    for iteration in ["iteration_9", "iteration_30"] {
+        fs::create_dir_all(workplace.path("model/point_cloud").join(iteration)).unwrap();
+    }
+    let transforms = tiny().join("transforms_train.json");
+    let mut exporter = Command::new(python);
+    exporter.arg(script("export_4dgaussians.py")).args(["-m", "model", "--device", "cpu", "--cameras"]).arg(transforms);
+    let found = packed(&workplace, &mut exporter, "a.gseq");
+    assert_eq!((found.info().count, found.info().times.len(), found.info().sh_degree), (7, 10, 1));
+    for frame in [0, 9] {
+        let state = state(&found, frame);
+        for i in 0..7 {
+            let x = i as f32 + found.info().times[frame] as f32;
+            assert_eq!(state.position.row(i), [x; 3]);
+            assert_eq!(state.log_scale.row(i), [-(i as f32); 3]);
+            assert_eq!(state.rotation.row(i), [i as f32; 4]);
+            assert_eq!(state.opacity_logit.row(i), [i as f32]);
+            assert_eq!(state.sh.row::<12>(i), std::array::from_fn(|c| (12 * i + c) as f32));
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs numpy"]
+fn a_generated_stream_moves_every_gaussian_in_every_frame_and_is_the_same_again() {
+    let python = python("numpy");
+    let workplace = Workplace::new();
+    let exporter = |arguments: &[&str]| {
+        let mut command = Command::new(&python);
+        command.arg(script("generate_stream.py")).args(arguments);
+        command
+    };
+    let found = packed(&workplace, &mut exporter(&["500", "70"]), "a.gseq");
+    let again = packed(&workplace, &mut exporter(&["500", "70"]), "b.gseq");
+    let info = found.info();
+    assert_eq!((info.count, info.times.len(), info.sh_degree), (500, 70, 3));
+    assert_eq!(info.varying, Columns::all().difference(Columns::SH));
+    // A period apart the curves are where they were, but for the noise.
+    for (frame, other) in [(0, 1), (33, 34), (5, 65)] {
+        let (one, two) = (state(&found, frame), state(&found, other));
+        assert!(one == state(&again, frame), "frame {frame}");
+        for column in info.varying.iter() {
+            let values = one.column(column).planes().iter().zip(two.column(column).planes());
+            let (all, equal) = values.fold((0, 0), |(all, equal), (a, b)| (all + 1, equal + usize::from(a == b)));
+            // Noise of 2e-5 falls on the same float of size 4 once in a hundred.
+            assert!(equal * 50 < all, "{}: {equal} of {all} values of frames {frame} and {other}", column.name());
+        }
+    }
+    let moved = packed(&workplace, &mut exporter(&["40", "3", "--varying", "position", "--sh-degree", "0"]), "c.gseq");
+    assert_eq!((moved.info().varying, moved.info().sh_degree), (Columns::POSITION, 0));
+}
+
+#[test]
+#[ignore = "needs numpy"]
+fn the_scale_script_compresses_every_size_and_says_what_it_took() {
+    let python = python("numpy");
+    let workplace = Workplace::new();
+    let mut scale = Command::new(python);
+    scale.arg(script("scale.py")).arg(assert_cmd::cargo::cargo_bin("splatsieve")).arg("here");
+    scale.args(["--sizes", "300x20", "3000x20", "--budgets", "none", "--preset", "paper"]);
+    let printed = String::from_utf8(run(&mut scale, &workplace)).unwrap();
+    assert!(printed.contains("\n| 3,000 | 20 |"), "{printed}");
+    assert!(printed.contains("bytes of peak for each further one"), "{printed}");
+    let kept: Vec<_> = fs::read_dir(workplace.path("here")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(kept.len(), 2, "only cameras.json and scale.json stay, not {kept:?}");
+}
+
+/// A sweep's bar stands above those of its runs: none is longer than its terminal, or stays behind.
+#[test]
+#[ignore = "needs Python"]
+fn bars_fit_terminals_of_60_to_120_columns_and_leave_nothing_behind() {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 2000 --frames 16 -o demo --no-refine");
+    let program = assert_cmd::cargo::cargo_bin("splatsieve");
+    let mut terminal = Command::new(python("pty"));
+    terminal.arg(script("terminal.py")).args(["--columns", "60,100,120"]).arg(program);
+    let sweep =
+        "sweep demo/scene.gseq --cameras demo/cameras.json -o curves --methods default --fractions 0.3 --overwrite";
+    let said = run(terminal.args(sweep.split(' ')), &workplace);
+    assert_eq!(String::from_utf8(said).unwrap().matches("all fit").count(), 3);
+}
+
+/// The script's own tests: compress, streams, containers and refusals, through the module that is installed.
+#[test]
+#[ignore = "needs maturin, numpy and zstandard"]
+fn what_the_python_package_promises_holds_of_the_installed_wheel() {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/tests/installed.py");
+    let output = Command::new(python("maturin, numpy, zstandard")).arg(script).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}

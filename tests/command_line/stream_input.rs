@@ -1,0 +1,230 @@
+//! A sequence on standard input: what comes of it is what comes of the same frames in a file, whatever breaks
+//! off leaves nothing, and other programs can write and read it.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::scene::{Workplace, files, lasting_files, state};
+use gseq::{Reader, TileId};
+use splatsieve::files::container::Container;
+use splatsieve::source::FrameSource;
+
+fn splatsieve(workplace: &Workplace, arguments: &str) -> Command {
+    let mut command = workplace.command(arguments);
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn done(output: Output) -> Vec<u8> {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    output.stdout
+}
+
+/// The tiny model as a stream.
+fn streamed(workplace: &Workplace) -> Vec<u8> {
+    done(workplace.piped("unpack {tiny} --stream", b""))
+}
+
+/// Names of everything in a folder that is no result: hidden ones, and those of scratch files.
+fn left_over(folder: &Path) -> Vec<PathBuf> {
+    files(folder).into_keys().filter(|name| name.to_str().unwrap().contains("splatsieve")).collect()
+}
+
+#[test]
+fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
+    let workplace = Workplace::new();
+    let stream = streamed(&workplace);
+    done(workplace.piped("pack - -o packed.gseq", &stream));
+    // The frames are scanned once, as they arrive, and all pictures are looked at then; only the end tells which a
+    // hundred are spread evenly.
+    let (as_it_arrives, at_the_end): (&[&str], &[&str]) = (&["receive", "score"], &["receive", "visible", "score"]);
+    for (name, rest, first) in [
+        ("default", "--cameras {tiny}", at_the_end),
+        ("all", "--cameras {tiny} --look-pictures 0", as_it_arrives),
+        ("paper", "--cameras {tiny} --preset paper", as_it_arrives),
+        (
+            "merged",
+            "--cameras {tiny} --target-ratio 0.3 --frame-stride 3 --view-stride 2 --look-pictures 0",
+            as_it_arrives,
+        ),
+        ("rig", "", as_it_arrives),
+    ] {
+        workplace.done(&format!("compress packed.gseq -o {name}.gseq {rest}"));
+        let map = fs::read(workplace.path(&format!("{name}.gseq.index_map.npy"))).unwrap();
+        let expected = [".gseq", ".gseq.recipe.toml", ".gseq.index_map.npy"]
+            .map(|ending| fs::read(workplace.path(&format!("{name}{ending}"))).unwrap());
+        assert_eq!(expected[2], map);
+        for threads in [1, 3] {
+            let arguments = format!("compress - -o {name}{threads}.gseq {rest} --threads {threads} --json");
+            let summary: serde_json::Value =
+                serde_json::from_slice(&done(workplace.piped(&arguments, &stream))).unwrap();
+            for (ending, expected) in [".gseq", ".gseq.recipe.toml", ".gseq.index_map.npy"].iter().zip(&expected) {
+                let found = fs::read(workplace.path(&format!("{name}{threads}{ending}"))).unwrap();
+                assert!(found == *expected, "{name}{ending} on {threads} threads");
+            }
+            let stages: Vec<&str> =
+                summary["stages"].as_array().unwrap().iter().map(|stage| stage["name"].as_str().unwrap()).collect();
+            assert!(stages.starts_with(first), "{name}: {stages:?}");
+        }
+    }
+    assert!(left_over(&workplace.path("")).is_empty());
+}
+
+#[test]
+fn a_stream_is_packed_within_bounds_like_a_file_and_told_of_where_that_is_larger() {
+    let workplace = Workplace::new();
+    let stream = streamed(&workplace);
+    let bounds = "--max-error position=2e-3,sh=1e-2";
+    done(workplace.piped(&format!("pack - -o stream.gseq {bounds}"), &stream));
+    workplace.done(&format!("pack {{tiny}} -o file.gseq {bounds}"));
+    let [stream_of, file] =
+        ["stream", "file"].map(|name| Reader::open(workplace.path(&format!("{name}.gseq"))).unwrap());
+    for column in 0..5 {
+        let at = TileId { column, gaussian_block: 0, frame_block: 0 };
+        assert_eq!(stream_of.tile_info(at).unwrap().checksum, file.tile_info(at).unwrap().checksum, "{at:?}");
+    }
+    // Raw tiles and what says where they lie.
+    let larger = String::from_utf8(done(workplace.piped("pack - -o raw.gseq --raw", &stream))).unwrap();
+    assert!(larger.contains(&format!("bytes of {}: the input holds its values in fewer", stream.len())), "{larger}");
+    let refused = workplace.piped("pack - -o x.gseq --max-error position=1%", &stream);
+    let message = String::from_utf8_lossy(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && message.contains("expected scene units"), "{message}");
+    assert!(!workplace.path("x.gseq").exists());
+}
+
+#[test]
+fn rows_of_a_stream_are_those_of_the_packed_frames() {
+    let workplace = Workplace::new();
+    let stream = streamed(&workplace);
+    done(workplace.piped("pack - -o packed.gseq", &stream));
+    workplace.done("score packed.gseq --cameras {tiny} -o expected.npz");
+    done(workplace.piped("score - --cameras {tiny} -o found.npz", &stream));
+    assert!(fs::read(workplace.path("expected.npz")).unwrap() == fs::read(workplace.path("found.npz")).unwrap());
+}
+
+/// The stream with its time stamps changed.
+fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
+    let mut bytes = stream.to_owned();
+    let (mut frame, mut at) = (0, 0);
+    while let Some(found) = bytes[at..].windows(4).position(|window| window == b"FRAM") {
+        let start = at + found;
+        if bytes[start + 4..start + 8] == (frame as u32).to_le_bytes() {
+            bytes[start + 8..start + 16].copy_from_slice(&time(frame).to_le_bytes());
+            frame += 1;
+        }
+        at = start + 4;
+    }
+    assert_eq!(frame, 10);
+    bytes
+}
+
+#[test]
+fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
+    let workplace = Workplace::new();
+    let stream = retimed(&streamed(&workplace), |frame| (frame * frame) as f64);
+    done(workplace.piped("pack - -o packed.gseq", &stream));
+    workplace.done("compress packed.gseq -o expected");
+    let output = done(workplace.piped("compress - -o found", &stream));
+    assert!(String::from_utf8_lossy(&output).contains("not evenly spaced"), "{}", String::from_utf8_lossy(&output));
+    assert!(lasting_files(&workplace.path("expected")) == lasting_files(&workplace.path("found")));
+}
+
+#[test]
+fn what_is_unpacked_as_a_stream_packs_to_the_same_frames_and_chains() {
+    let workplace = Workplace::new();
+    workplace.done("pack {tiny} -o a.gseq");
+    let stream = done(workplace.piped("unpack a.gseq --stream", b""));
+    done(workplace.piped("pack - -o b.gseq", &stream));
+    let [a, b] = ["a.gseq", "b.gseq"].map(|name| Container::open(&workplace.path(name)).unwrap());
+    assert_eq!(a.info(), b.info());
+    assert!((0..10).all(|frame| state(&a, frame) == state(&b, frame)));
+    assert!(done(workplace.piped("unpack - --stream", &stream)) == stream, "a stream of a stream is that stream");
+    done(workplace.piped("unpack - -o frames", &stream));
+    workplace.done("unpack a.gseq -o expected");
+    assert!(lasting_files(&workplace.path("frames")) == lasting_files(&workplace.path("expected")));
+
+    let mut unpack = splatsieve(&workplace, "unpack a.gseq --stream").spawn().unwrap();
+    let output = splatsieve(&workplace, "compress - -o c.gseq --cameras {tiny}")
+        .stdin(unpack.stdout.take().unwrap())
+        .output()
+        .unwrap();
+    done(output);
+    assert!(unpack.wait().unwrap().success());
+    workplace.done("compress a.gseq -o d.gseq --cameras {tiny}");
+    // Recipes differ in the digest of their inputs.
+    assert!(fs::read(workplace.path("c.gseq")).unwrap() == fs::read(workplace.path("d.gseq")).unwrap());
+    let info = String::from_utf8(done(workplace.piped("info -", &stream))).unwrap();
+    assert!(info.contains("frame stream") && info.contains("10 frames"), "{info}");
+}
+
+#[test]
+fn broken_streams_end_in_an_error_and_leave_nothing() {
+    let workplace = Workplace::new();
+    let stream = streamed(&workplace);
+    let refused = |arguments: &str, stdin: &[u8], code: i32, part: &str| {
+        let before = files(&workplace.path(""));
+        let output = workplace.piped(arguments, stdin);
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{arguments}: {message}");
+        assert!(message.contains(part), "{arguments}: {part:?} is not in {message:?}");
+        assert!(files(&workplace.path("")) == before, "{arguments}: something was left behind");
+    };
+    for arguments in ["compress - -o out", "compress - -o out.gseq", "score - -o rows.npz", "pack - -o a.gseq"] {
+        refused(arguments, &stream[..stream.len() - 24], 1, "after 10 complete frames, without its end mark");
+        refused(arguments, b"Loading model\n", 1, "standard input");
+        refused(arguments, b"", 1, "before its first frame");
+        refused(&format!("{arguments} --frames 3"), &stream, 2, "--frames");
+    }
+    let backwards = retimed(&stream, |frame| -(frame as f64));
+    refused("compress - -o out", &backwards, 1, "expected a time stamp above");
+    refused("compress - -o missing/out", &stream, 2, "missing");
+    refused("compress - -o out --keep-ids 300", &stream, 2, "below 300");
+    refused("compress - -o out.ply", &stream, 2, "10 frames do not fit");
+    refused("compress - -o out --scratch-dir nowhere", &stream, 1, "nowhere");
+}
+
+#[test]
+fn a_reader_that_has_seen_enough_of_a_stream_is_no_failure() {
+    let workplace = Workplace::new();
+    let mut child = splatsieve(&workplace, "unpack {tiny} --stream --quiet").spawn().unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+/// Waits until `folder` holds what a run left, or gives up.
+fn wait_for_scratch(folder: &Path, child: &mut Child) {
+    let start = Instant::now();
+    while left_over(folder).is_empty() {
+        assert!(start.elapsed() < Duration::from_secs(60), "no scratch file appeared");
+        assert!(child.try_wait().unwrap().is_none(), "the run ended");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn what_a_killed_run_leaves_is_gone_after_the_next_one() {
+    let workplace = Workplace::new();
+    let stream = streamed(&workplace);
+    for (scratch, next) in [("", "pack {tiny} -o other.gseq --overwrite"), ("scratch", "compress - -o out --overwrite")]
+    {
+        let flag = if scratch.is_empty() { String::new() } else { format!(" --scratch-dir {scratch}") };
+        let folder = workplace.path(scratch);
+        fs::create_dir_all(&folder).unwrap();
+        let mut child = splatsieve(&workplace, &format!("compress - -o out{flag}")).spawn().unwrap();
+        let mut pipe = child.stdin.take().unwrap();
+        pipe.write_all(&stream[..stream.len() / 2]).unwrap();
+        wait_for_scratch(&folder, &mut child);
+        // SIGKILL.
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert!(!workplace.path("out").exists());
+        assert!(!left_over(&folder).is_empty(), "a kill leaves the scratch file");
+        done(workplace.piped(&format!("{next}{flag}"), &stream));
+        assert!(left_over(&folder).is_empty());
+    }
+}

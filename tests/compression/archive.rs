@@ -1,0 +1,242 @@
+//! Archives as a user meets them: written, unpacked, read as inputs, damaged.
+
+use std::fs;
+use std::path::Path;
+
+use crate::scene::{PlyRows, Workplace, bits, files, index_map, lasting_files, state, tiny};
+use splatsieve::model::{Columns, Gaussians};
+use splatsieve::models::{InputModel, ModelFolder};
+use splatsieve::outputs::container::write_container;
+
+/// How to have the tiny model archived without refining anything.
+const TINY: &str = "{tiny} --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only --archive-psnr 50";
+
+/// A workplace with `small.gsz` of the tiny model, and its summary.
+fn with_archive() -> (Workplace, serde_json::Value) {
+    let workplace = Workplace::new();
+    let summary = workplace.summary(&format!("{TINY} -o small.gsz"));
+    (workplace, summary)
+}
+
+fn model(folder: &Path) -> ModelFolder {
+    ModelFolder::open(folder, None).unwrap().with_times(vec![0.0, 0.4, 1.0]).unwrap()
+}
+
+fn cloud(folder: &Path) -> PlyRows {
+    let found = files(folder).into_keys().find(|name| name.ends_with("point_cloud.ply")).unwrap();
+    PlyRows::read(&folder.join(found))
+}
+
+#[test]
+fn an_archive_unpacks_to_a_model_folder_whose_pictures_are_as_close_as_was_asked_for() {
+    let (workplace, summary) = with_archive();
+    let archive = &summary["archive"];
+    assert!(archive["psnr"].as_f64().unwrap() >= 50.0, "{archive}");
+    let bytes = fs::metadata(workplace.path("small.gsz")).unwrap().len();
+    let parts = ["cloud", "field", "rest"].map(|part| archive["parts"][part].as_u64().unwrap());
+    assert_eq!((parts.iter().sum::<u64>(), summary["output_bytes"].as_u64()), (bytes, Some(bytes)));
+
+    workplace.done("unpack small.gsz -o small");
+    let names =
+        |folder: &Path| -> Vec<_> { files(folder).into_keys().filter(|name| name.extension().is_some()).collect() };
+    let unpacked = workplace.path("small");
+    let has = |name: &str| names(&unpacked).iter().any(|found| found.ends_with(name));
+    assert!(has("point_cloud.ply") && has("deformation.pth"), "{:?}", names(&unpacked));
+    // Archives are made to be sent: of the folders that the training machine had they keep the last names alone.
+    let trained = fs::read_to_string(tiny().join("cfg_args")).unwrap();
+    let expected = trained.replace("model_path='output/tiny'", "model_path='tiny'");
+    assert!(expected != trained);
+    assert_eq!(fs::read_to_string(unpacked.join("cfg_args")).unwrap(), expected);
+    let (before, after) = (cloud(&tiny()), cloud(&unpacked));
+    assert_eq!(before.names, after.names);
+    assert_eq!(summary["gaussians"], after.rows.len());
+
+    // Every Gaussian is where the map says, and other columns than attributes came along.
+    let map = index_map(&workplace.path("small.gsz.index_map.npy"));
+    let extent = (0..before.rows.len()).map(|i| before.value(i, "x").abs()).fold(0.0, f32::max);
+    let mut places: Vec<i64> = map.iter().copied().filter(|&place| place >= 0).collect();
+    for (id, &place) in map.iter().enumerate().filter(|(_, place)| **place >= 0) {
+        for name in ["x", "y", "z"] {
+            let off = (before.value(id, name) - after.value(place as usize, name)).abs();
+            assert!(off < 0.02 * extent, "{name} of Gaussian {id}, now {place}: off by {off} of {extent}");
+        }
+        assert_eq!(before.value(id, "nx").to_bits(), after.value(place as usize, "nx").to_bits());
+    }
+    places.sort_unstable();
+    assert!(places.iter().copied().eq(0..after.rows.len() as i64));
+}
+
+#[test]
+fn an_archive_is_read_like_the_folder_that_it_unpacks_to() {
+    let (workplace, _) = with_archive();
+    workplace.done("unpack small.gsz -o small");
+    let folder = model(&workplace.path("small"));
+    let archive = splatsieve::models::open(&workplace.path("small.gsz"), &Default::default()).unwrap();
+    assert_eq!(archive.kind(), "gsz archive");
+    let archive = archive.with_times(vec![0.0, 0.4, 1.0]).unwrap();
+    for frame in 0..3 {
+        let (a, b) = (state(archive.source(), frame), state(InputModel::source(&folder), frame));
+        assert!((0..a.len()).all(|i| bits(&a, i) == bits(&b, i)), "frame {frame}");
+    }
+    drop(archive);
+    let evaluated = |of: &str| -> serde_json::Value {
+        serde_json::from_str(&workplace.done(&format!("evaluate {{tiny}} {of} --cameras {{tiny}} --json"))).unwrap()
+    };
+    assert_eq!(evaluated("small.gsz")["psnr"], evaluated("small")["psnr"]);
+    workplace.done("render small.gsz --cameras {tiny} --all -o pictures");
+    workplace.done("info small.gsz");
+    workplace.done("compress small.gsz --cameras {tiny} --target-ratio 0.5 --no-refine --prune-only -o smaller");
+    assert_eq!(cloud(&workplace.path("smaller")).rows.len(), cloud(&workplace.path("small")).rows.len().div_ceil(2));
+    // What it was decoded to is gone.
+    let left = files(&workplace.path(""));
+    assert!(left.keys().all(|name| !name.to_string_lossy().contains("scratch")), "{:?}", left.keys());
+}
+
+#[test]
+fn the_bytes_of_an_archive_do_not_depend_on_threads() {
+    let (one, two) = (Workplace::new(), Workplace::new());
+    one.done(&format!("--threads 1 compress {TINY} -o small.gsz"));
+    two.done(&format!("--threads 3 compress {TINY} -o small.gsz"));
+    assert!(lasting_files(&one.path("")) == lasting_files(&two.path("")));
+}
+
+#[test]
+fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_asked_for() {
+    let workplace = Workplace::new();
+    let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);
+    let raw = gseq::Compression::Raw;
+    write_container(&made, &workplace.path("frames.gseq"), raw, Default::default(), |_| ()).unwrap();
+    let how = "--target-ratio 0.5 --no-refine --prune-only";
+    let exact = workplace.summary(&format!("frames.gseq {how} -o exact.gseq"));
+    let summary = workplace.summary(&format!("frames.gseq {how} -o small.gsz --archive-psnr 45"));
+    let [exact_bytes, bytes] = [&exact, &summary].map(|summary| summary["output_bytes"].as_u64().unwrap());
+    assert!(4 * bytes < exact_bytes, "{bytes} of {exact_bytes}");
+    assert_eq!(fs::metadata(workplace.path("small.gsz")).unwrap().len(), bytes);
+    let archive = &summary["archive"];
+    assert!(archive["psnr"].as_f64().unwrap() >= 45.0 && archive.get("parts").is_none(), "{archive}");
+    // What was looked at before it was written is what is there.
+    let run = workplace.done("evaluate exact.gseq small.gsz --json");
+    let found: serde_json::Value = serde_json::from_str(&run).unwrap();
+    let psnr = found["psnr"].as_f64().unwrap_or_else(|| panic!("{found}"));
+    assert!((44.0..48.0).contains(&psnr), "{psnr} dB");
+    // Every value is within the bound that is named.
+    let open = |name: &str| splatsieve::models::open(&workplace.path(name), &Default::default()).unwrap();
+    let [before, after] = ["exact.gseq", "small.gsz"].map(open);
+    assert_eq!(after.kind(), "gseq container");
+    for frame in [0, 7, 19] {
+        let [before, after] = [&before, &after].map(|input| state(input.source(), frame));
+        for column in Columns::all().iter() {
+            let bound = archive["bounds"][column.name()].as_f64().unwrap();
+            let off = before.column(column).planes().iter().zip(after.column(column).planes());
+            let off = off.map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0.0, f64::max);
+            assert!(bound > 0.0 && off <= bound, "{} is {off} off, not {bound}", column.name());
+        }
+    }
+    // Threads change no byte, nor does the way that frames come.
+    workplace.done(&format!("--threads 3 compress frames.gseq {how} -o three.gsz --archive-psnr 45"));
+    let stream = workplace.piped("unpack frames.gseq --stream --quiet", b"").stdout;
+    let output = workplace.piped(&format!("compress - {how} -o piped.gsz --archive-psnr 45"), &stream);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let read = |name: &str| fs::read(workplace.path(name)).unwrap();
+    assert!(read("three.gsz") == read("small.gsz") && read("piped.gsz") == read("small.gsz"));
+    // A size, and one that is too small.
+    let most = bytes / 2;
+    let sized = workplace.summary(&format!("frames.gseq --no-refine --prune-only -o sized.gsz --target-size {most}"));
+    assert!((most / 2..=most).contains(&sized["output_bytes"].as_u64().unwrap()), "{sized}");
+    workplace.refused(2, "compress frames.gseq -o none.gsz --target-size 100", &["--target-size", "expected at least"]);
+    // Of what shines without end no picture tells a bound.
+    let mut broken = state(before.source(), 0);
+    broken.sh.planes_mut().fill(f32::INFINITY);
+    workplace.ply("broken/0.ply", &broken);
+    workplace.ply("broken/1.ply", &broken);
+    let refused = ["--non-finite drop", ".gseq"];
+    workplace.refused(2, "compress broken -o broken.gsz --non-finite keep --no-refine --link never", &refused);
+    workplace.done("unpack small.gsz -o back");
+    let plys = files(&workplace.path("back")).into_keys().filter(|name| name.extension().is_some_and(|e| e == "ply"));
+    assert_eq!(plys.count(), 20);
+}
+
+#[test]
+fn a_single_ply_comes_back_with_its_header_and_close_to_its_values() {
+    let workplace = Workplace::new();
+    let mut gaussians = Gaussians::zeros(400, 1);
+    let mut seed = 1u64;
+    for column in gaussians.columns_mut(splatsieve::model::Columns::all()) {
+        column.planes_mut().iter_mut().for_each(|value| {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            *value = (seed >> 40) as f32 / (1 << 24) as f32 - 0.5;
+        });
+    }
+    gaussians.log_scale.planes_mut().iter_mut().for_each(|value| *value -= 3.0);
+    gaussians.rotation.plane_mut(0).fill(1.0);
+    let path = workplace.ply("cloud.ply", &gaussians);
+    let summary =
+        workplace.summary("cloud.ply --no-refine --prune-only --target-ratio 1 --archive-psnr 45 -o cloud.gsz");
+    assert!(summary["archive"]["psnr"].as_f64().unwrap() >= 45.0, "{}", summary["archive"]);
+    workplace.done("unpack cloud.gsz -o back.ply");
+    let (before, after) = (PlyRows::read(&path), PlyRows::read(&workplace.path("back.ply")));
+    assert_eq!((&before.names, before.rows.len()), (&after.names, after.rows.len()));
+    let stored = fs::metadata(workplace.path("cloud.gsz")).unwrap().len();
+    assert!(4 * stored < fs::metadata(&path).unwrap().len(), "{stored} bytes");
+    let map = index_map(&workplace.path("cloud.gsz.index_map.npy"));
+    for (id, &place) in map.iter().enumerate() {
+        for (name, most) in [("x", 0.01), ("opacity", 0.5), ("f_dc_1", 0.2)] {
+            let off = (before.value(id, name) - after.value(place as usize, name)).abs();
+            assert!(off < most, "{name} of Gaussian {id}: {off}");
+        }
+    }
+}
+
+#[test]
+fn damaged_archives_and_what_no_archive_holds_are_refused_in_words() {
+    let (workplace, _) = with_archive();
+    let bytes = fs::read(workplace.path("small.gsz")).unwrap();
+    fs::write(workplace.path("cut.gsz"), &bytes[..bytes.len() - 100]).unwrap();
+    let mut flipped = bytes.clone();
+    flipped[bytes.len() / 2] ^= 4;
+    fs::write(workplace.path("flipped.gsz"), flipped).unwrap();
+    fs::write(workplace.path("other.gsz"), b"something else").unwrap();
+    workplace.refused(2, "compress {tiny} --cameras {tiny} --archive-psnr 40 -o a", &["--archive-psnr", ".gsz"]);
+    workplace.refused(1, "unpack cut.gsz -o out", &["cut.gsz", "section blobs", "bytes", "copy it again"]);
+    workplace.refused(1, "unpack flipped.gsz -o out", &["flipped.gsz", "checksum"]);
+    workplace.refused(1, "info other.gsz", &["other.gsz", "archive"]);
+    workplace.done("demo --gaussians 200 --frames 3 -o demo");
+    workplace.done("convert demo/scene.gseq curves.splatv");
+    workplace.refused(2, "compress curves.splatv --cameras demo/cameras.json -o a.gsz", &["archive", ".gseq"]);
+    workplace.refused(
+        2,
+        "compress {tiny} --cameras {tiny} --target-size 1MB --archive-psnr 45 -o a.gsz",
+        &["--target-size", "--archive-psnr", "one of them"],
+    );
+}
+
+#[test]
+fn a_quality_that_is_asked_for_counts_what_the_archive_loses() {
+    let workplace = Workplace::new();
+    let least = 30.0;
+    let summary = workplace.summary(&format!(
+        "{{tiny}} --cameras {{tiny}} --min-psnr {least}dB --refine-steps 40 --refine-cut-steps 10 -o small.gsz"
+    ));
+    let number = |name: &str| summary["goal"][name].as_f64().unwrap();
+    assert_eq!(number("asked"), least);
+    assert!(number("searched") >= least - 0.01, "{}", summary["goal"]);
+    assert!(summary["archive"]["loss"].as_f64().unwrap() > 0.0, "{}", summary["archive"]);
+}
+
+#[test]
+fn bytes_asked_for_are_filled_by_count_and_bits_together() {
+    let workplace = Workplace::new();
+    let how = "{tiny} --cameras {tiny} --no-refine --overwrite -o small.gsz --target-size";
+    let mut before = (0, 0.0);
+    for most in [5_000, 8_000] {
+        let summary = workplace.summary(&format!("{how} {most}"));
+        let bytes = fs::metadata(workplace.path("small.gsz")).unwrap().len();
+        let told = workplace.done("evaluate {tiny} small.gsz --cameras {tiny} --json");
+        let psnr = serde_json::from_str::<serde_json::Value>(&told).unwrap()["psnr"].as_f64().unwrap();
+        assert!((0.97 * most as f64..=most as f64).contains(&(bytes as f64)), "{most}: {bytes} bytes");
+        let count = summary["gaussians"].as_u64().unwrap();
+        assert!(count > before.0 && psnr > before.1 + 1.0, "{most}: {count} Gaussians at {psnr} dB, {before:?} before");
+        before = (count, psnr);
+    }
+    workplace.refused(2, &format!("compress {how} 1000"), &["--target-size", "expected at least"]);
+}

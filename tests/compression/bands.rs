@@ -1,0 +1,277 @@
+//! Bands of spherical harmonics that nobody sees: gone from a result, with the degree that its configuration names, as far
+//! as a bound on pictures says; and there where they matter, or where an SH head adds to them.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::scene::{PlyRows, Workplace, check_model_folder, index_map, lasting_files, tiny, without_sh_head};
+use serde_json::Value;
+
+/// What a stage that runs writes down where nothing goes.
+const WHAT: &str = "fewer bands of spherical harmonics";
+
+fn cloud_of(model: &Path) -> PathBuf {
+    let folders = fs::read_dir(model.join("point_cloud")).unwrap();
+    folders.map(|entry| entry.unwrap().path().join("point_cloud.ply")).next().unwrap()
+}
+
+fn why_left(summary: &Value) -> Option<String> {
+    let left = summary["left_out"].as_array().unwrap();
+    left.iter().find(|left| left["what"] == WHAT).map(|left| left["why"].as_str().unwrap().to_owned())
+}
+
+/// The tiny model without its SH head, and with harmonics above `degree` a millionth of what they were: `model` in the
+/// workplace.
+fn faint_above(workplace: &Workplace, degree: usize) -> PathBuf {
+    let model = workplace.path("model");
+    without_sh_head(&tiny(), &model);
+    let path = cloud_of(&model);
+    let PlyRows { names, rows } = PlyRows::read(&path);
+    let faint = |name: &str| {
+        let number = name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok());
+        number.is_some_and(|number| number % 15 + 1 >= (degree + 1) * (degree + 1))
+    };
+    let mut bytes = fs::read(&path).unwrap();
+    let start = bytes.len() - rows.iter().map(Vec::len).sum::<usize>();
+    for (k, value) in bytes[start..].chunks_exact_mut(4).enumerate() {
+        if faint(&names[k % names.len()]) {
+            let now = 1e-6 * f32::from_le_bytes((&*value).try_into().unwrap());
+            value.copy_from_slice(&now.to_le_bytes());
+        }
+    }
+    fs::write(&path, bytes).unwrap();
+    model
+}
+
+const QUICKLY: &str = "model --cameras {tiny} --no-refine --prune-only --field exact --overwrite";
+
+#[test]
+fn bands_that_nobody_sees_go_with_the_degree_that_the_configuration_names() {
+    for degree in [0, 1, 2] {
+        let workplace = Workplace::new();
+        let model = faint_above(&workplace, degree);
+        let summary = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands-margin 90 -o small"));
+        let bands = &summary["bands"];
+        assert_eq!((&bands["sh_degree"], why_left(&summary)), (&Value::from(degree), None), "{bands}");
+        let of_degree = |tried: &Value| tried[0] == degree && tried[1].as_f64() >= bands["least"].as_f64();
+        assert!(bands["tried"].as_array().unwrap().iter().any(of_degree), "{bands}");
+
+        let small = workplace.path("small");
+        let [before, after] = [&model, &small].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
+        assert_eq!(after, before.replace("sh_degree=3", &format!("sh_degree={degree}")));
+        let field = |model: &Path| fs::read(cloud_of(model).with_file_name("deformation.pth")).unwrap();
+        assert!(field(&small) == field(&model), "the field changed");
+
+        // What stays of a row is what it was, coefficient by coefficient of every channel.
+        let [before, after] = [&model, &small].map(|model| PlyRows::read(&cloud_of(model)));
+        let left = (degree + 1) * (degree + 1) - 1;
+        assert_eq!(after.names.iter().filter(|name| name.starts_with("f_rest_")).count(), 3 * left);
+        let map = index_map(&small.join("index_map.npy"));
+        assert_eq!(map.iter().filter(|&&place| place >= 0).count(), after.rows.len());
+        for (i, place) in map.into_iter().enumerate().filter(|(_, place)| *place >= 0) {
+            for name in &after.names {
+                let number = name.strip_prefix("f_rest_").map(|number| number.parse::<usize>().unwrap());
+                let was = number.map_or(name.clone(), |k| format!("f_rest_{}", 15 * (k / left) + k % left));
+                assert_eq!(after.value(place as usize, name), before.value(i, &was), "{i}: {name}, of {was}");
+            }
+        }
+        let looks = workplace.done("evaluate model small --cameras {tiny} --json");
+        let looks: Value = serde_json::from_str(&looks).unwrap();
+        assert!(looks["psnr"].as_f64().unwrap() > 15.0, "{looks}");
+    }
+}
+
+#[test]
+fn bands_that_matter_stay_and_are_said_to() {
+    let workplace = Workplace::new();
+    let model = faint_above(&workplace, 3);
+    let summary = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands-margin 90 -o small"));
+    let why = why_left(&summary).unwrap();
+    assert!(why.contains("dB at degree 2") && why.contains("at least 60.0 dB were asked for"), "{why}");
+    assert_eq!(summary["bands"]["sh_degree"], 3);
+    let configs = [&model, &workplace.path("small")].map(|model| fs::read(model.join("cfg_args")).unwrap());
+    assert!(configs[0] == configs[1]);
+    let [before, after] = [&model, &workplace.path("small")].map(|model| PlyRows::read(&cloud_of(model)).names);
+    assert_eq!(after, before);
+
+    // Without being asked to, nothing is looked for and nothing said.
+    let all = workplace.summary(&format!("{QUICKLY} --target-ratio 0.5 --bands all -o small"));
+    assert!(all["bands"].is_null() && why_left(&all).is_none());
+}
+
+#[test]
+fn bands_that_an_sh_head_adds_to_stay_and_so_does_color_without_any() {
+    let workplace = Workplace::new();
+    let quickly = QUICKLY.replacen("model", "{tiny}", 1);
+    let summary = workplace.summary(&format!("{quickly} --target-ratio 0.5 --bands-margin 0 -o small"));
+    assert!(why_left(&summary).unwrap().contains("SH head") && summary["bands"].is_null());
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
+
+    faint_above(&workplace, 0);
+    workplace.done(&format!("compress {QUICKLY} -o plain"));
+    let again = QUICKLY.replacen("model", "plain", 1);
+    let summary = workplace.summary(&format!("{again} --target-ratio 0.5 -o small"));
+    assert!(why_left(&summary).unwrap().contains("degree 0") && summary["bands"].is_null());
+}
+
+#[test]
+fn any_threads_write_the_same_bytes_of_fewer_bands() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 1);
+    let how = "--target-ratio 0.3 --refine-steps 40 --refine-cut-steps 10";
+    for threads in [1, 3] {
+        workplace.done(&format!("compress model --cameras {{tiny}} {how} --threads {threads} -o small{threads}"));
+    }
+    assert!(lasting_files(&workplace.path("small1")) == lasting_files(&workplace.path("small3")));
+    assert!(PlyRows::read(&cloud_of(&workplace.path("small1"))).names.len() < 62);
+}
+
+#[test]
+fn a_search_finds_its_size_with_the_bands_that_it_leaves() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 0);
+    let how = "--no-refine --min-psnr 25dB";
+    let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} -o small"));
+    assert_eq!(summary["bands"]["sh_degree"], 0, "{}", summary["bands"]);
+    assert!(summary["goal"]["searched"].as_f64().unwrap() >= 25.0, "{}", summary["goal"]);
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 17);
+}
+
+#[test]
+fn frames_and_single_files_lose_bands_too() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 1);
+    let cameras = "--cameras {tiny} --no-refine --prune-only --target-ratio 0.5";
+    workplace.done(&format!("compress model {cameras} -o one.ply"));
+    assert_eq!(PlyRows::read(&workplace.path("one.ply")).names.len(), 17 + 9);
+    for (output, again) in [("frames", "--as ply-sequence"), ("small.gseq", "")] {
+        let summary = workplace.summary(&format!("model {cameras} {again} -o {output}"));
+        assert_eq!(summary["bands"]["sh_degree"], 1);
+        let shown: Value = serde_json::from_str(&workplace.done(&format!("info {output} --json"))).unwrap();
+        assert_eq!(shown["sh_degree"], 1, "{shown}");
+    }
+}
+
+#[test]
+#[ignore = "needs Python"]
+fn the_original_loader_can_open_fewer_bands_and_the_check_refuses_a_degree_that_is_not_the_clouds() {
+    let workplace = Workplace::new();
+    let model = faint_above(&workplace, 1);
+    let small = workplace.path("small");
+    workplace.done(&format!("compress {QUICKLY} --target-ratio 0.4 -o small"));
+    let (accepted, text) = check_model_folder(&model, &small);
+    assert!(accepted && text.contains("SH degree 1 of 3") && text.contains("can open it"), "{text}");
+
+    let own = fs::read_to_string(small.join("cfg_args")).unwrap();
+    for (other, complaint) in [
+        (own.replace("sh_degree=1", "sh_degree=2"), "9 f_rest for SH degree 2"),
+        (own.replace("sh_degree=1", "sh_degree=4"), "SH degree 4"),
+        (own.replace("net_width=16", "net_width=32"), "but for sh_degree"),
+    ] {
+        assert_ne!(other, own);
+        fs::write(small.join("cfg_args"), other).unwrap();
+        let (accepted, text) = check_model_folder(&model, &small);
+        assert!(!accepted && text.lines().last().unwrap().contains(complaint), "{text}");
+    }
+    fs::write(small.join("cfg_args"), own).unwrap();
+
+    // Another channel's coefficient in the place of one.
+    let cloud = cloud_of(&small);
+    let PlyRows { names, rows } = PlyRows::read(&cloud);
+    let [one, other] = ["f_rest_1", "f_rest_3"].map(|name| 4 * names.iter().position(|of| of == name).unwrap());
+    let mut bytes = fs::read(&cloud).unwrap();
+    let start = bytes.len() - rows.iter().map(Vec::len).sum::<usize>();
+    for row in bytes[start..].chunks_exact_mut(rows[0].len()) {
+        (0..4).for_each(|k| row.swap(one + k, other + k));
+    }
+    fs::write(&cloud, bytes).unwrap();
+    let (accepted, text) = check_model_folder(&model, &small);
+    assert!(!accepted && text.lines().last().unwrap().contains("the original's f_rest"), "{text}");
+}
+
+#[test]
+fn a_degree_that_is_asked_for_is_refined_to_its_best() {
+    let workplace = Workplace::new();
+    let model = faint_above(&workplace, 3);
+    let how = "--target-ratio 0.3 --refine-steps 100 --refine-cut-steps 20 --field exact";
+    let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} --bands 0 -o small"));
+    assert!(
+        summary["notes"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .any(|note| note == "harmonics above degree 0 of 3 go, as asked for")
+    );
+    assert!(summary["bands"].is_null() && why_left(&summary).is_none());
+    let configs = [&model, &workplace.path("small")].map(|model| fs::read_to_string(model.join("cfg_args")).unwrap());
+    assert_eq!(configs[1], configs[0].replace("sh_degree=3", "sh_degree=0"));
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 17);
+
+    // As many whose bands went after they were refined are further away.
+    workplace.done(&format!("compress model --cameras {{tiny}} {how} --bands all -o whole"));
+    workplace.done(
+        "compress whole --cameras {tiny} --no-refine --prune-only --target-ratio 1 --field exact --bands 0 -o late",
+    );
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("late"))).names.len(), 17);
+    let psnr = |result: &str| {
+        let looks = workplace.done(&format!("evaluate model {result} --cameras {{tiny}} --json"));
+        serde_json::from_str::<Value>(&looks).unwrap()["psnr"].as_f64().unwrap()
+    };
+    let [small, late] = ["small", "late"].map(psnr);
+    assert!(small > late + 0.3, "{small:.2} dB refined at degree 0, {late:.2} dB cut down to it");
+}
+
+#[test]
+fn a_degree_that_is_asked_for_holds_in_every_output_and_search() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 3);
+    let cameras = "model --cameras {tiny} --no-refine --prune-only --bands 0";
+    for output in ["small.gsz", "small.gseq", "frames --as ply-sequence"] {
+        workplace.done(&format!("compress {cameras} --target-ratio 0.5 -o {output}"));
+        let path = output.split(' ').next().unwrap();
+        let shown: Value = serde_json::from_str(&workplace.done(&format!("info {path} --json"))).unwrap();
+        assert_eq!(shown["sh_degree"], 0, "{shown}");
+    }
+    let found = workplace.summary(&format!("{cameras} --min-psnr 20dB -o one.ply"));
+    assert!(found["goal"]["searched"].as_f64().unwrap() >= 20.0, "{}", found["goal"]);
+    assert_eq!(PlyRows::read(&workplace.path("one.ply")).names.len(), 17);
+
+    // What goes makes room.
+    let of_size = |bands: &str| {
+        let how = format!("--no-refine --target-size 80kB --field exact --bands {bands}");
+        let summary = workplace.summary(&format!("model --cameras {{tiny}} {how} -o fits{bands}"));
+        summary["gaussians"].as_u64().unwrap()
+    };
+    let [all, none] = ["all", "0"].map(of_size);
+    assert!(none > 2 * all, "{none} at degree 0, {all} at degree 3");
+}
+
+#[test]
+fn a_degree_that_cannot_be_had_is_named() {
+    let workplace = Workplace::new();
+    let summary = workplace.summary("{tiny} --cameras {tiny} --no-refine --target-ratio 0.5 --bands 1 -o small");
+    assert!(why_left(&summary).unwrap().contains("SH head"));
+    assert_eq!(PlyRows::read(&cloud_of(&workplace.path("small"))).names.len(), 62);
+    for wrong in ["4", "-1", "some"] {
+        let arguments = format!("compress {{tiny}} --bands {wrong} -o none");
+        workplace.refused(2, &arguments, &["--bands", wrong, "expected all, needed, or a degree from 0 to 3"]);
+    }
+}
+
+#[test]
+fn so_many_bytes_go_to_the_degree_at_which_they_show_most() {
+    let workplace = Workplace::new();
+    faint_above(&workplace, 0);
+    let how = "model --cameras {tiny} --target-size 85kB --field exact --refine-steps 100 --refine-cut-steps 20";
+    let chosen = workplace.summary(&format!("{how} -o chosen"));
+    let all = workplace.summary(&format!("{how} --bands all -o all"));
+    let names = |result: &str| PlyRows::read(&cloud_of(&workplace.path(result))).names.len();
+    assert_eq!([names("chosen"), names("all")], [17, 62]);
+    let stage = |summary: &Value| summary["stages"].as_array().unwrap().iter().any(|stage| stage["name"] == "degree");
+    assert_eq!([stage(&chosen), stage(&all)], [true, false]);
+    let said = |note: &&Value| note.as_str().unwrap().contains("those of SH degree 0 show most");
+    assert_eq!(chosen["notes"].as_array().unwrap().iter().filter(said).count(), 1, "{}", chosen["notes"]);
+    assert!(chosen["bands"].is_null() && chosen["output_bytes"].as_u64().unwrap() <= 85_000);
+    let of = |summary: &Value| summary["gaussians"].as_u64().unwrap();
+    assert!(of(&chosen) > 2 * of(&all), "{} at degree 0, {} at degree 3", of(&chosen), of(&all));
+}

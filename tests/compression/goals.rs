@@ -1,0 +1,120 @@
+//! Asking for quality or for bytes instead of a count, as a user does.
+
+use std::fs;
+use std::path::Path;
+
+use crate::scene::{Workplace, files};
+use serde_json::Value;
+
+/// A made-up scene, `demo/scene.gseq`, with its cameras.
+fn with_demo() -> Workplace {
+    let workplace = Workplace::new();
+    workplace.done("demo --gaussians 800 --frames 4 -o demo");
+    workplace
+}
+
+/// How to have it refined quickly.
+const QUICKLY: &str = "demo/scene.gseq --cameras demo/cameras.json --refine-steps 120 --refine-cut-steps 20";
+
+/// Bytes of everything below `folder`, or of `folder` and what lies beside it under its name.
+fn bytes_written(workplace: &Workplace, output: &str) -> u64 {
+    let of = |name: &Path| name.starts_with(output) || name.to_string_lossy().starts_with(&format!("{output}."));
+    files(&workplace.path("")).into_iter().filter(|(name, _)| of(name)).map(|(_, bytes)| bytes.len() as u64).sum()
+}
+
+#[test]
+fn the_fewest_that_keep_a_psnr_are_found_and_reported_by_pictures_that_nothing_was_searched_on() {
+    let workplace = with_demo();
+    let found = [32.0, 38.0].map(|least| {
+        let summary = workplace.summary(&format!("{QUICKLY} --min-psnr {least}dB --overwrite -o small.gseq"));
+        let goal = &summary["goal"];
+        let number = |name: &str| goal[name].as_f64().unwrap();
+        assert_eq!((goal["name"].as_str(), number("asked")), (Some("min_psnr"), least));
+        assert!(number("searched") >= least, "{goal}");
+        assert!((number("held") - number("searched")).abs() < 3.0, "{goal}");
+        assert!(goal["held_pictures"].as_array().unwrap().len() >= 100, "{goal}");
+        // Every size that was tried and does is at least as large.
+        let count = summary["gaussians"].as_u64().unwrap();
+        let does = |tried: &&Value| tried[1].as_f64().unwrap() >= least;
+        let tried = goal["tried"].as_array().unwrap();
+        assert_eq!(tried.iter().filter(does).map(|tried| tried[0].as_u64().unwrap()).min(), Some(count));
+        let recipe = fs::read_to_string(workplace.path("small.gseq.recipe.toml")).unwrap();
+        assert!(recipe.contains(&format!("min_psnr = {least:.1}")), "{recipe}");
+        count
+    });
+    assert!(found[0] < found[1] && found[1] < 800, "{found:?}");
+}
+
+#[test]
+fn what_cannot_be_had_with_less_is_everything_and_nothing_is_refined_where_nothing_may_move() {
+    let workplace = with_demo();
+    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --min-psnr 99 --overwrite -o small.gseq"));
+    assert!(summary["goal"]["searched"].as_f64().unwrap() >= 99.0, "{summary}");
+    let stages: Vec<&str> =
+        summary["stages"].as_array().unwrap().iter().map(|stage| stage["name"].as_str().unwrap()).collect();
+    assert!(stages.contains(&"search") && !stages.contains(&"refine"), "{stages:?}");
+    let other = workplace.summary(&format!("{QUICKLY} --no-refine --min-psnr 30 --overwrite -o small.gseq"));
+    assert!(other["gaussians"].as_u64() < summary["gaussians"].as_u64());
+}
+
+#[test]
+fn a_loss_is_that_of_what_photographs_show() {
+    let workplace = with_demo();
+    workplace.done("render demo/scene.gseq --cameras demo/cameras.json --all --split all -o photographs");
+    let summary = workplace.summary(&format!("{QUICKLY} --max-loss 60dB --ground-truth photographs -o small.gseq"));
+    let goal = &summary["goal"];
+    // Photographs that are renders of the original keep 59 dB for their 8 bits.
+    assert_eq!(goal["name"], "max_loss");
+    let (searched, held) = (goal["searched"].as_f64().unwrap(), goal["held"].as_f64().unwrap());
+    assert!(searched <= 60.0 && (searched - held).abs() < 3.0, "{goal}");
+    assert!(
+        goal["held_pictures"].as_array().unwrap().iter().all(|name| name.as_str().unwrap().contains("_v")),
+        "{goal}"
+    );
+    let tighter = workplace.summary(&format!(
+        "{QUICKLY} --no-refine --max-loss 22dB --ground-truth photographs --overwrite -o small.gseq"
+    ));
+    assert!(tighter["gaussians"].as_u64() > summary["gaussians"].as_u64(), "{}", tighter["goal"]);
+    assert!(tighter["goal"]["searched"].as_f64().unwrap() <= 22.0, "{}", tighter["goal"]);
+}
+
+#[test]
+fn everything_that_is_written_has_at_most_the_bytes_asked_for_and_hardly_less() {
+    let workplace = with_demo();
+    let model = "{tiny} --cameras {tiny} --refine-steps 40 --refine-cut-steps 10";
+    for (how, output, most) in
+        [(QUICKLY, "small.gseq", 90_000u64), (QUICKLY, "frames", 400_000), (model, "model", 110_000)]
+    {
+        let kind = if output == "frames" { "--as ply-sequence" } else { "" };
+        let summary = workplace.summary(&format!("{how} --target-size {most}B {kind} -o {output}"));
+        let written = bytes_written(&workplace, output);
+        assert!(written <= most && written > most * 9 / 10 - 24_576, "{output}: {written} of {most}, {summary}");
+        assert!(summary["gaussians"].as_u64().unwrap() > 30, "{summary}");
+    }
+    workplace.refused(2, &format!("compress {QUICKLY} --target-size 20KB -o none.gseq"), &["one Gaussian", "20000"]);
+}
+
+#[test]
+fn goals_that_contradict_each_other_are_refused() {
+    let workplace = Workplace::new();
+    for (arguments, part) in [
+        ("--max-loss 0.5", "--ground-truth"),
+        ("--ground-truth {tiny}", "--max-loss"),
+        ("--min-psnr 35 --target-ratio 0.5", "--target-ratio"),
+        ("--min-psnr 35 --target-size 5MB", "--target-size"),
+        ("--min-psnr many", "decibels"),
+        ("--min-psnr 0", "above 0"),
+        ("--min-psnr 35 --merge-only", "--merge-only"),
+    ] {
+        workplace.refused(2, &format!("compress {{tiny}} --cameras {{tiny}} -o out {arguments}"), &[part]);
+    }
+    let none = "compress {tiny} --cameras {tiny} -o out --max-loss 1 --ground-truth {tiny}";
+    workplace.refused(1, none, &["t000_v02.png", "no such file"]);
+}
+
+#[test]
+fn more_bytes_than_everything_takes_leave_out_what_is_to_be_dropped_alone() {
+    let workplace = with_demo();
+    let summary = workplace.summary(&format!("{QUICKLY} --no-refine --target-size 10MB --drop-ids 5-14 -o small.gseq"));
+    assert_eq!(summary["gaussians"], 790);
+}

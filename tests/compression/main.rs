@@ -1,0 +1,19 @@
+//! Compressed models: what the stages keep, merge, refine and write.
+
+mod archive;
+mod bands;
+mod bounded;
+mod compress;
+mod families;
+mod goals;
+mod half_field;
+mod linked;
+mod merging;
+mod model_families;
+mod precision;
+mod refine;
+#[path = "../scene/mod.rs"]
+mod scene;
+mod selection;
+mod sweep;
+mod trained_models;

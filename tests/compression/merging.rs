@@ -1,0 +1,528 @@
+//! Clusters and proxies of whole models against method.md, section 5 written down plainly: neighbors by looking
+//! at all pairs, gates by their formulas, leaders one after the other.
+
+use std::path::{Path, PathBuf};
+
+use crate::scene::{PlyRows, Workplace, by_formula, lasting_files, state, tiny};
+use glam::{DMat3, DQuat, DVec3};
+use splatsieve::limits::Limits;
+use splatsieve::merging::proxy::{ProxyState, merge_state};
+use splatsieve::model::{Columns, Gaussians, SH_C0};
+use splatsieve::pipeline::{Only, Request, Target, compress_scene, score_scene};
+use splatsieve::pruning::score::{Scored, UserOverrides};
+use splatsieve::recipe::{MergeParams, MergePass, MotionParams, Placement, ProxyOpacity, Recipe, ShHigh, Trajectory};
+use splatsieve::scene::{InputOptions, Scene, open_scene};
+
+/// Tightens a gate.
+type Edit = fn(&mut MergeParams);
+
+/// A model in memory, every frame of it.
+struct Whole {
+    frames: Vec<Gaussians>,
+    alive: Vec<Vec<bool>>,
+    reference: usize,
+    extent: f64,
+}
+
+impl Whole {
+    fn read(scene: &Scene) -> Whole {
+        let source = scene.source();
+        let frames: Vec<Gaussians> = (0..source.info().times.len()).map(|frame| state(source, frame)).collect();
+        let alive: Vec<Vec<bool>> = frames
+            .iter()
+            .map(|f| f.opacity_logit.plane(0).iter().map(|&x| 1.0 / (1.0 + (-f64::from(x)).exp()) >= 0.01).collect())
+            .collect();
+        let living = |frame: &[bool]| frame.iter().filter(|&&alive| alive).count();
+        let most = alive.iter().map(|frame| living(frame)).max().unwrap();
+        let reference = alive.iter().position(|frame| living(frame) == most).unwrap();
+        let extent = (0..3)
+            .map(|c| {
+                let mut plane = frames[reference].position.plane(c).to_vec();
+                plane.sort_by(f32::total_cmp);
+                let rank = |percent: usize| f64::from(plane[(percent * plane.len()).div_ceil(100) - 1]);
+                rank(99) - rank(1)
+            })
+            .fold(0.0, f64::max);
+        Whole { frames, alive, reference, extent }
+    }
+
+    fn at(&self, frame: usize, i: usize) -> DVec3 {
+        DVec3::from(self.frames[frame].position.row::<3>(i).map(f64::from))
+    }
+}
+
+fn rotation(state: &Gaussians, i: usize) -> DQuat {
+    let [w, x, y, z] = state.rotation.row::<4>(i).map(f64::from);
+    DQuat::from_xyzw(x, y, z, w).normalize()
+}
+
+fn covariance(state: &Gaussians, i: usize) -> DMat3 {
+    let axes = DMat3::from_quat(rotation(state, i));
+    let scale = DVec3::from(state.log_scale.row::<3>(i).map(|x| f64::from(x).exp()));
+    axes * DMat3::from_diagonal(scale * scale) * axes.transpose()
+}
+
+/// Tests 1 and 2 for two nodes with these states.
+fn alike(state: &Gaussians, i: usize, j: usize, merge: &MergeParams, pass: &MergePass) -> bool {
+    let sigma = (covariance(state, i) + covariance(state, j)) * 0.5;
+    let trace = sigma.x_axis.x + sigma.y_axis.y + sigma.z_axis.z;
+    let regular = sigma + DMat3::from_diagonal(DVec3::splat(1e-6 * trace));
+    let position = |i: usize| DVec3::from(state.position.row::<3>(i).map(f64::from));
+    let delta = position(i) - position(j);
+    let mahalanobis = delta.dot(regular.inverse() * delta).sqrt();
+
+    let sorted = |i: usize| {
+        let mut log = state.log_scale.row::<3>(i).map(f64::from);
+        log.sort_by(|a, b| b.partial_cmp(a).unwrap());
+        // Thinner than a tenth of its middle scale is flat, however flat.
+        log[2] = log[2].max(log[1] + 0.1f64.ln());
+        log
+    };
+    let ratio = sorted(i).iter().zip(sorted(j)).map(|(a, b)| (a - b).abs().exp()).fold(0.0, f64::max);
+
+    let dc = |i: usize| DVec3::from(state.sh.row::<3>(i).map(f64::from));
+    let cosine = dc(i).dot(dc(j)) / (dc(i).length() * dc(j).length() + 1e-8);
+    let color = |i: usize| (dc(i) * SH_C0 + DVec3::splat(0.5)).max(DVec3::ZERO);
+    mahalanobis < pass.d0
+        && cosine > pass.rho
+        && ratio <= merge.max_scale_ratio
+        && (color(i) - color(j)).length() <= merge.max_color_difference
+}
+
+/// Test 3 for two Gaussians.
+fn move_alike(whole: &Whole, i: usize, j: usize, recipe: &Recipe, pass: &MergePass) -> bool {
+    let merge = &recipe.merge;
+    let unit = merge.length_unit.in_scene_units(whole.extent);
+    let both = |t: usize| whole.alive[t][i] && whole.alive[t][j];
+    let common: Vec<usize> = (0..whole.frames.len()).filter(|&t| both(t)).collect();
+    let either = (0..whole.frames.len()).filter(|&t| whole.alive[t][i] || whole.alive[t][j]).count();
+    if common.is_empty() {
+        return false;
+    }
+    let steps: Vec<(DVec3, DVec3)> = common
+        .iter()
+        .filter(|&&t| t > 0 && (recipe.scan.motion == MotionParams::Literal || both(t - 1)))
+        .map(|&t| (whole.at(t, i) - whole.at(t - 1, i), whole.at(t, j) - whole.at(t - 1, j)))
+        .collect();
+    let similarity = match merge.trajectory {
+        Trajectory::Cosine => {
+            let sum: f64 = steps.iter().map(|(a, b)| a.dot(*b) / (a.length() * b.length() + 1e-8)).sum();
+            let terms = if recipe.scan.motion == MotionParams::Literal { common.len() } else { steps.len() };
+            if terms == 0 { 0.0 } else { sum / terms as f64 }
+        }
+        Trajectory::Alignment => {
+            let noise = 2.0 * steps.len() as f64 * (merge.motion_noise * unit).powi(2);
+            let dot: f64 = steps.iter().map(|(a, b)| a.dot(*b)).sum();
+            let squares: f64 = steps.iter().map(|(a, b)| a.length_squared() + b.length_squared()).sum();
+            if squares + noise == 0.0 { 1.0 } else { (2.0 * dot + noise) / (squares + noise) }
+        }
+    };
+    let offset = |t: usize| whole.at(t, i) - whole.at(t, j);
+    let drift = common.iter().map(|&t| (offset(t) - offset(whole.reference)).length()).fold(0.0, f64::max);
+    let dead = (either - common.len()) as f64 / either as f64;
+    similarity > pass.tau_m && drift <= merge.max_drift * unit && dead <= merge.max_dead_time
+}
+
+/// Members of every cluster by leader, the leader first, as ids; leaders ascending.
+fn clusters(whole: &Whole, scored: &Scored, kept: &[usize], recipe: &Recipe) -> Vec<Vec<usize>> {
+    let merge = &recipe.merge;
+    let unit = merge.length_unit.in_scene_units(whole.extent);
+    let mut groups: Vec<Vec<usize>> = kept.iter().map(|&id| vec![id]).collect();
+    for pass in &merge.passes {
+        // The state of a node: its Gaussian's own, or its proxy's so far.
+        let mut nodes = whole.frames[whole.reference].pick(&groups.iter().map(|g| g[0] as u32).collect::<Vec<_>>());
+        for (node, group) in groups.iter().enumerate().filter(|(_, group)| group.len() > 1) {
+            let members = weighted(scored, group);
+            merge_state(&members, &whole.frames[whole.reference], group[0] as u32, merge, Columns::all()).write(
+                Columns::all(),
+                node,
+                &mut nodes,
+            );
+        }
+        let rows = scored.rows().unwrap();
+        let size = |node: usize| groups[node].iter().map(|&id| rows.c[id]).sum::<f64>();
+        let hash = |node: usize| splatsieve::model::hash_id(groups[node][0] as u64);
+        let mut order: Vec<usize> = (0..groups.len()).collect();
+        order.sort_by(|&a, &b| size(b).partial_cmp(&size(a)).unwrap().then(hash(a).cmp(&hash(b))));
+        let position = |node: usize| DVec3::from(nodes.position.row::<3>(node).map(f64::from));
+        let mut leader: Vec<Option<usize>> = vec![None; groups.len()];
+        for &node in &order {
+            if leader[node].is_some() {
+                continue;
+            }
+            leader[node] = Some(node);
+            let mut near: Vec<(f64, usize)> = (0..groups.len())
+                .filter(|&other| other != node)
+                .map(|other| ((position(other) - position(node)).length_squared(), other))
+                .filter(|(squared, _)| *squared <= (pass.epsilon * unit).powi(2))
+                .collect();
+            near.sort_by(|a, b| a.partial_cmp(b).unwrap());
+            for (_, other) in near.into_iter().take(merge.max_neighbors) {
+                if leader[other].is_none()
+                    && alike(&nodes, node, other, merge, pass)
+                    && move_alike(whole, groups[node][0], groups[other][0], recipe, pass)
+                {
+                    leader[other] = Some(node);
+                }
+            }
+        }
+        let joined = |node: usize| {
+            let others = (0..groups.len()).filter(|&other| other != node && leader[other] == Some(node));
+            groups[node].iter().copied().chain(others.flat_map(|other| groups[other].clone())).collect()
+        };
+        groups = (0..groups.len()).filter(|&node| leader[node] == Some(node)).map(joined).collect();
+    }
+    groups.sort_by_key(|group| group[0]);
+    groups
+}
+
+/// Ids, ascending, with weights ∝ C·Vis.
+fn weighted(scored: &Scored, group: &[usize]) -> Vec<(u32, f64)> {
+    let mut ids = group.to_vec();
+    ids.sort_unstable();
+    let rows = scored.rows().unwrap();
+    let seen: Vec<f64> = ids.iter().map(|&id| rows.c[id] * rows.vis[id]).collect();
+    let total: f64 = seen.iter().sum();
+    assert!(total > 0.0, "a cluster that nobody saw");
+    ids.iter().zip(seen).map(|(&id, weight)| (id as u32, weight / total)).collect()
+}
+
+fn options(output: &Path, recipe: &Recipe, only: Only) -> Request {
+    let input = InputOptions { path: tiny(), ..InputOptions::default() };
+    Request { only, ..Request::new(input, output.to_owned(), recipe.clone()) }
+}
+
+/// Compresses the tiny model and compares clusters and proxies; gives how many Gaussians joined others.
+fn merges_as_method_says(recipe: &Recipe, only: Only) -> usize {
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("out");
+    let scene = crate::scene::scene(&tiny());
+    let (summary, map) = compress_scene(&scene, &options(&output, recipe, only)).unwrap();
+    let scored = score_scene(&scene, recipe, &UserOverrides::default()).unwrap();
+    let whole = Whole::read(&scene);
+    assert_eq!(summary.merge.unwrap().reference_frame, whole.reference);
+    let kept: Vec<usize> = (0..map.len()).filter(|&id| only == Only::Merge || scored.selection.keep[id]).collect();
+
+    let expected = clusters(&whole, &scored, &kept, recipe);
+    let mut expected_map = vec![None; map.len()];
+    for (place, group) in expected.iter().enumerate() {
+        group.iter().for_each(|&id| expected_map[id] = Some(place as u32));
+    }
+    assert_eq!(map, expected_map, "clusters differ from the sequential rule");
+
+    proxies_are_solved_at_their_leaders(&output, &scene, &whole, &scored, &expected, &recipe.merge);
+    kept.len() - expected.len()
+}
+
+/// Holds a merged state against the definitions over its members, weights w: μ = Σ w x, or the leader's place; covariance
+/// Σ w (Σᵢ + (xᵢ − μ)(xᵢ − μ)ᵀ); colors Σ w c; opacity by its rule, an area being a quarter of an ellipsoid's surface.
+fn is_the_mixture(merged: &ProxyState, members: &[(u32, f64)], states: &Gaussians, leader: usize, merge: &MergeParams) {
+    let position = |i: usize| DVec3::from(states.position.row::<3>(i).map(f64::from));
+    let mean = match merge.placement {
+        Placement::Leader => position(leader),
+        Placement::Mean => members.iter().map(|&(i, weight)| weight * position(i as usize)).sum(),
+    };
+    let spread: f64 = members.iter().map(|&(i, _)| (position(i as usize) - mean).length()).fold(0.0, f64::max);
+    assert!((merged.position - mean).length() <= 1e-12 * (mean.length() + spread), "{}, {mean}", merged.position);
+
+    let mut expected = DMat3::ZERO;
+    for &(i, weight) in members {
+        let off = position(i as usize) - mean;
+        let outer = DMat3::from_cols(off * off.x, off * off.y, off * off.z);
+        expected += (covariance(states, i as usize) + outer) * weight;
+    }
+    let [w, x, y, z] = merged.rotation;
+    let (axes, scales) = (DMat3::from_quat(DQuat::from_xyzw(x, y, z, w)), DVec3::from(merged.log_scale).exp());
+    let found = axes * DMat3::from_diagonal(scales * scales) * axes.transpose();
+    let trace = expected.x_axis.x + expected.y_axis.y + expected.z_axis.z;
+    let off = (found - expected).to_cols_array().iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+    assert!(off <= 1e-10 * trace, "covariance {found}, expected {expected}");
+
+    // Knud Thomsen's formula, p = 1.6075.
+    let surface = |s: DVec3| {
+        let sections = [s.x * s.y, s.y * s.z, s.z * s.x].map(|area| area.powf(1.6075));
+        4.0 * std::f64::consts::PI * (sections.iter().sum::<f64>() / 3.0).powf(1.0 / 1.6075)
+    };
+    let of = |i: u32| {
+        let scale = DVec3::from(states.log_scale.row::<3>(i as usize).map(|x| f64::from(x).exp()));
+        (1.0 / (1.0 + (-f64::from(states.opacity_logit.plane(0)[i as usize])).exp()), surface(scale))
+    };
+    let opacity = match merge.opacity {
+        ProxyOpacity::Sum => members.iter().map(|&(i, _)| of(i).0).sum::<f64>(),
+        ProxyOpacity::Union => 1.0 - members.iter().map(|&(i, _)| 1.0 - of(i).0).product::<f64>(),
+        ProxyOpacity::Area => members.iter().map(|&(i, _)| of(i).0 * of(i).1).sum::<f64>() / surface(scales),
+    };
+    let found = 1.0 / (1.0 + (-merged.opacity_logit).exp());
+    assert!((found - opacity.min(1.0)).abs() <= 1e-5, "opacity {found}, expected {opacity}");
+
+    let heaviest = members.iter().rev().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap().0;
+    for (k, &found) in merged.sh.iter().enumerate() {
+        let of = |i: u32| f64::from(states.sh.plane(k)[i as usize]);
+        let expected = match merge.sh_high {
+            ShHigh::Heaviest if k >= 3 => of(heaviest),
+            _ => members.iter().map(|&(i, weight)| weight * of(i)).sum::<f64>(),
+        };
+        assert!(
+            (found - expected).abs() <= 1e-12 * (1.0 + expected.abs()),
+            "coefficient {k}: {found}, expected {expected}"
+        );
+    }
+}
+
+/// The raw parameters of a proxy are its merged state at the reference frame minus what the field adds to
+/// its leader there; its quaternion is as long as the leader's in that frame. Then, if it was placed at its
+/// leader, its state at the reference frame is the merged one, and its path the leader's to the bit.
+fn proxies_are_solved_at_their_leaders(
+    output: &Path,
+    scene: &Scene,
+    whole: &Whole,
+    scored: &Scored,
+    clusters: &[Vec<usize>],
+    merge: &MergeParams,
+) {
+    let cloud = "point_cloud/iteration_7/point_cloud.ply";
+    let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
+    let result = splatsieve::models::ModelFolder::open(output, None).unwrap();
+    let result = result.with_times(scene.source().info().times.clone()).unwrap();
+    let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
+    let at_reference = &whole.frames[whole.reference];
+    for (place, group) in clusters.iter().enumerate().filter(|(_, group)| group.len() > 1) {
+        let leader = group[0];
+        let members = weighted(scored, group);
+        let merged = merge_state(&members, at_reference, leader as u32, merge, Columns::all());
+        is_the_mixture(&merged, &members, at_reference, leader, merge);
+        let length = at_reference.rotation.row::<4>(leader).iter().map(|x| f64::from(x * x)).sum::<f64>().sqrt();
+        // (property, merged state, state of the leader), then the state found in the result.
+        let mut columns: Vec<(String, f64, f32, f32)> = Vec::new();
+        let found = &frames[whole.reference];
+        for c in 0..3 {
+            let of = |state: &Gaussians, i: usize| state.position.plane(c)[i];
+            columns.push((["x", "y", "z"][c].into(), merged.position[c], of(at_reference, leader), of(found, place)));
+            let of = |state: &Gaussians, i: usize| state.log_scale.plane(c)[i];
+            columns.push((format!("scale_{c}"), merged.log_scale[c], of(at_reference, leader), of(found, place)));
+        }
+        for c in 0..4 {
+            let of = |state: &Gaussians, i: usize| state.rotation.plane(c)[i];
+            let rotation = merged.rotation[c] * length;
+            columns.push((format!("rot_{c}"), rotation, of(at_reference, leader), of(found, place)));
+        }
+        let of = |state: &Gaussians, i: usize| state.opacity_logit.plane(0)[i];
+        columns.push(("opacity".into(), merged.opacity_logit, of(at_reference, leader), of(found, place)));
+        for k in 0..16 {
+            for channel in 0..3 {
+                let name = if k == 0 { format!("f_dc_{channel}") } else { format!("f_rest_{}", 15 * channel + k - 1) };
+                let of = |state: &Gaussians, i: usize| state.sh.plane(3 * k + channel)[i];
+                columns.push((name, merged.sh[3 * k + channel], of(at_reference, leader), of(found, place)));
+            }
+        }
+        assert_eq!(columns.len(), 59);
+        for (name, merged, of_leader, found) in columns {
+            let (raw, raw_leader) = (after.value(place, &name), before.value(leader, &name));
+            let expected = merged - (f64::from(of_leader) - f64::from(raw_leader));
+            // Four f32 numbers of this size were rounded on the way.
+            let size = merged.abs().max(of_leader.abs().into()).max(raw_leader.abs().into()).max(1e-3);
+            let tolerance = 4.0 * f64::from(f32::EPSILON) * size;
+            let at = format!("{name} of the proxy at {place}, led by {leader}");
+            assert!((f64::from(raw) - expected).abs() <= tolerance, "raw {at}: got {raw}, expected {expected}");
+            if merge.placement == Placement::Leader {
+                assert!((f64::from(found) - merged).abs() <= tolerance, "{at}: got {found}, expected {merged}");
+            }
+        }
+        if merge.placement == Placement::Leader {
+            for (now, then) in frames.iter().zip(&whole.frames) {
+                assert_eq!(now.position.row::<3>(place), then.position.row::<3>(leader), "path of {place}");
+            }
+        }
+    }
+}
+
+#[test]
+fn presets_merge_as_the_sequential_rule() {
+    // `strong` prunes most of the tiny model first, so that little is left to join.
+    for (preset, least) in [("paper", 100), ("default", 30), ("strong", 20)] {
+        let joined = merges_as_method_says(&by_formula(preset), Only::Both);
+        assert!(joined >= least, "{preset}: only {joined} joined");
+    }
+}
+
+#[test]
+fn merging_alone_merges_as_the_sequential_rule() {
+    for preset in ["paper", "default"] {
+        assert!(merges_as_method_says(&by_formula(preset), Only::Merge) > 30);
+    }
+}
+
+#[test]
+fn later_passes_merge_groups_as_the_sequential_rule() {
+    let mut recipe = by_formula("paper");
+    let one = merges_as_method_says(&recipe, Only::Both);
+    recipe.merge.passes.push(MergePass { epsilon: 0.3, d0: 4.0, rho: 0.5, tau_m: 0.3 });
+    let two = merges_as_method_says(&recipe, Only::Both);
+    assert!(two > one, "{two} joined in two passes, {one} in one");
+}
+
+#[test]
+fn every_gate_binds_as_the_sequential_rule() {
+    let base = || {
+        let mut recipe = by_formula("default");
+        recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
+        (recipe.merge.max_drift, recipe.merge.max_dead_time) = (0.05, 0.5);
+        recipe
+    };
+    let all = merges_as_method_says(&base(), Only::Merge);
+    let edits: [(&str, Edit); 9] = [
+        ("epsilon", |m| m.passes[0].epsilon = 0.004),
+        ("d0", |m| m.passes[0].d0 = 0.2),
+        ("rho", |m| m.passes[0].rho = 0.9999),
+        ("tau_m", |m| m.passes[0].tau_m = 0.999),
+        ("max_neighbors", |m| m.max_neighbors = 2),
+        ("max_scale_ratio", |m| m.max_scale_ratio = 1.1),
+        ("max_color_difference", |m| m.max_color_difference = 0.01),
+        ("max_drift", |m| m.max_drift = 0.001),
+        ("max_dead_time", |m| m.max_dead_time = 0.0),
+    ];
+    for (gate, edit) in edits {
+        let mut recipe = base();
+        edit(&mut recipe.merge);
+        let joined = merges_as_method_says(&recipe, Only::Merge);
+        assert!(joined < all, "{gate} binds nothing: {joined} joined, {all} without");
+    }
+}
+
+/// A folder of eight frames of twelve pairs, each a tenth from the next; `offset`, from there, by frame and whether it
+/// is the second of a pair.
+fn pairs(workplace: &Workplace, offset: impl Fn(usize, bool) -> [f32; 3]) -> PathBuf {
+    for frame in 0..8 {
+        let mut cloud = Gaussians::zeros(24, 0);
+        for i in 0..24 {
+            let [x, y, z] = offset(frame, i % 2 == 1);
+            cloud.position.set_row(i, [x + 0.1 * (i / 2) as f32, y + 0.1 * (i / 2 % 5) as f32, z]);
+            cloud.rotation.set_row(i, [1.0, 0.0, 0.0, 0.0]);
+            cloud.log_scale.set_row(i, [-3.0; 3]);
+            cloud.opacity_logit.set_row(i, [0.3 * (i % 5) as f32]);
+        }
+        workplace.ply(&format!("frames/frame_{frame}.ply"), &cloud);
+    }
+    workplace.path("frames")
+}
+
+/// Merges explicit trajectories, without pruning; gives who joined whom and the number of proxies.
+fn merged(workplace: &Workplace, scene: &Scene, recipe: &Recipe) -> (Vec<Option<u32>>, usize) {
+    let (input, output) =
+        (InputOptions { path: workplace.path("frames"), ..InputOptions::default() }, workplace.path("out"));
+    let request = Request { only: Only::Merge, ..Request::new(input, output, recipe.clone()) };
+    let (summary, map) = compress_scene(scene, &request).unwrap();
+    (map, summary.merge.unwrap().proxies)
+}
+
+fn open(path: PathBuf) -> Scene {
+    open_scene(&InputOptions { path, ..InputOptions::default() }).unwrap()
+}
+
+#[test]
+fn a_proxy_of_trajectories_goes_the_way_of_the_weighted_mean_of_its_members() {
+    let workplace = Workplace::new();
+    // The second of a pair circles the first, which flies.
+    let flying = |frame: usize, second: bool| {
+        let (radius, (sin, cos)) = (if second { 0.003 } else { 0.0 }, (0.5 * frame as f32).sin_cos());
+        [0.025 * frame as f32 + radius * cos, 0.0, radius * sin]
+    };
+    let scene = open(pairs(&workplace, flying));
+    let mut recipe = by_formula("default");
+    recipe.merge.max_drift = 0.05;
+    let (map, proxies) = merged(&workplace, &scene, &recipe);
+    assert_eq!(proxies, 12);
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
+    let whole = Whole::read(&scene);
+    for frame in 0..8 {
+        let rows = PlyRows::read(&workplace.path(&format!("out/frame_{frame}.ply")));
+        for pair in 0..12 {
+            let members = weighted(&scored, &[2 * pair, 2 * pair + 1]);
+            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * whole.at(frame, id as usize)).sum();
+            let place = map[2 * pair].unwrap() as usize;
+            let found = DVec3::from(["x", "y", "z"].map(|axis| f64::from(rows.value(place, axis))));
+            // Coordinates up to 1.3, rounded to f32.
+            assert!((found - mean).length() < 2e-7, "pair {pair}, frame {frame}: {found}, expected {mean}");
+        }
+    }
+}
+
+#[test]
+fn jitter_below_the_noise_floor_is_no_motion() {
+    let mut recipe = by_formula("default");
+    // (where, by how much the second of a pair jitters, the floor in extents, proxies): a third of the floor; the same
+    // without one; and what is rounding at this distance, for which there always is a floor.
+    for (at, jitter, floor, expected) in [(0.0, 3e-5, 1e-4, 12), (0.0, 3e-5, 0.0, 0), (1024.0, 1.0 / 8192.0, 0.0, 12)] {
+        let workplace = Workplace::new();
+        let jittering = |frame: usize, second: bool| {
+            let moved = second && frame / 2 % 2 == 1;
+            [at + if moved { jitter } else { 0.0 }, if second { 0.003 } else { 0.0 }, 0.0]
+        };
+        let scene = open(pairs(&workplace, jittering));
+        recipe.merge.motion_noise = floor;
+        assert_eq!(merged(&workplace, &scene, &recipe).1, expected, "at {at}, floor {floor}");
+    }
+}
+
+#[test]
+fn proxies_that_stray_from_their_members_go_back_to_their_leaders() {
+    let mut recipe = by_formula("default");
+    recipe.merge.placement = Placement::Mean;
+    recipe.merge.passes = vec![MergePass { epsilon: 0.2, d0: 3.0, rho: 0.3, tau_m: 0.2 }];
+    recipe.merge.max_drift = 0.004;
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("out");
+    let scene = crate::scene::scene(&tiny());
+    let (_, map) = compress_scene(&scene, &options(&output, &recipe, Only::Merge)).unwrap();
+    let (scored, whole) = (score_scene(&scene, &recipe, &UserOverrides::default()).unwrap(), Whole::read(&scene));
+    let cloud = "point_cloud/iteration_7/point_cloud.ply";
+    let (before, after) = (PlyRows::read(&tiny().join(cloud)), PlyRows::read(&output.join(cloud)));
+    let result = splatsieve::models::ModelFolder::open(&output, None).unwrap();
+    let result = result.with_times(scene.source().info().times.clone()).unwrap();
+    let frames: Vec<Gaussians> = (0..whole.frames.len()).map(|frame| state(&result, frame)).collect();
+    let limit = recipe.merge.max_drift * whole.extent;
+    let (mut at_leaders, mut at_means) = (0, 0);
+    for place in 0..after.rows.len() {
+        let group: Vec<usize> = (0..map.len()).filter(|&id| map[id] == Some(place as u32)).collect();
+        let members = if group.len() > 1 { weighted(&scored, &group) } else { continue };
+        let raw = |rows: &PlyRows, i: usize| ["x", "y", "z"].map(|axis| rows.value(i, axis));
+        if group.iter().any(|&id| raw(&before, id) == raw(&after, place)) {
+            at_leaders += 1;
+            continue;
+        }
+        at_means += 1;
+        for (t, frame) in frames.iter().enumerate() {
+            let mean: DVec3 = members.iter().map(|&(id, weight)| weight * whole.at(t, id as usize)).sum();
+            let off = (DVec3::from(frame.position.row::<3>(place).map(f64::from)) - mean).length();
+            assert!(off <= limit * 1.001, "proxy {place} is {off} off at frame {t}, at most {limit} expected");
+        }
+    }
+    assert!(at_leaders > 0 && at_means > 0, "{at_leaders} at their leaders, {at_means} at their means");
+}
+
+#[test]
+fn partitions_of_the_pairs_change_no_byte() {
+    // Two passes, so that the second asks for pairs of which some are known; and a target, so that many sets of
+    // survivors are tried.
+    let mut recipe = by_formula("default");
+    recipe.merge.passes.push(MergePass { epsilon: 0.2, d0: 4.0, rho: 0.5, tau_m: 0.3 });
+    for target in [None, Some(Target::Count(180))] {
+        let folder = tempfile::tempdir().unwrap();
+        let merge = |pairs_together: usize| {
+            let (output, scratch) = (folder.path().join(format!("out{pairs_together}")), tempfile::tempdir().unwrap());
+            let mut scene = crate::scene::scene(&tiny());
+            scene.limits = Limits { pairs_together, frames_held: 3, ..Limits::NONE };
+            scene.scratch = scratch.path().to_owned();
+            let options = Request { target, ..options(&output, &recipe, Only::Both) };
+            let (summary, map) = compress_scene(&scene, &options).unwrap();
+            assert_eq!(std::fs::read_dir(scratch.path()).unwrap().count(), 0, "scratch files are left");
+            (lasting_files(&output), map, summary.merge.unwrap().passes)
+        };
+        let whole = merge(usize::MAX);
+        let pairs = whole.2[0].candidates;
+        assert!(pairs > 64 && whole.2.iter().all(|pass| pass.joins > 0), "{:?}", whole.2);
+        for partitions in [1, 7, 64] {
+            assert!(merge(pairs.div_ceil(partitions)) == whole, "{partitions} partitions, target {target:?}");
+        }
+    }
+}

@@ -1,0 +1,182 @@
+//! `precision` as a user runs it: what is exact has no error, what converges does so at the rate that theory predicts, and
+//! nothing but the diagrams stays.
+
+use std::fs;
+
+use crate::scene::{Workplace, files};
+use serde_json::{Value, json};
+
+fn read(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error}: {text}"))
+}
+
+/// Cameras as 3DGS writes them, the last of them held out.
+fn held_out(cameras: &Value) -> Value {
+    let cameras = cameras.as_array().unwrap();
+    let frame = |(view, camera): (usize, &Value)| {
+        let row = |axis: usize| -> [f64; 4] {
+            let along = [0, 1, 2].map(|k| camera["rotation"][k][axis].as_f64().unwrap());
+            let eye = [0, 1, 2].map(|k| camera["position"][k].as_f64().unwrap());
+            let [x, y, z] = along;
+            [x, y, z, -(x * eye[0] + y * eye[1] + z * eye[2])]
+        };
+        json!({"v": view, "split": if view + 1 == cameras.len() { "test" } else { "train" },
+               "width": camera["width"], "height": camera["height"], "fx": camera["fx"], "fy": camera["fy"],
+               "cx": 128.0, "cy": 96.0, "w2c": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]})
+    };
+    json!({"frames": cameras.iter().enumerate().map(frame).collect::<Vec<_>>()})
+}
+
+/// The curves of a knob.
+fn curves<'a>(found: &'a Value, knob: &str) -> &'a Vec<Value> {
+    let knobs = found["knobs"].as_array().unwrap();
+    knobs.iter().find(|of| of["name"] == knob).unwrap_or_else(|| panic!("no {knob}"))["curves"].as_array().unwrap()
+}
+
+/// An error of every mark of a curve.
+fn errors(curve: &Value, of: &str) -> Vec<f64> {
+    curve["marks"].as_array().unwrap().iter().map(|mark| mark["errors"][of].as_f64().unwrap()).collect()
+}
+
+fn observed(curve: &Value, of: &str) -> f64 {
+    let orders = curve["orders"].as_array().unwrap();
+    orders.iter().find(|order| order["of"] == of).unwrap()["observed"].as_f64().unwrap()
+}
+
+#[test]
+fn what_is_exact_has_no_error_and_what_converges_does_so_as_it_should() {
+    let place = Workplace::new();
+    let demo = "demo -o d --gaussians 1000 --frames 5";
+    place.done(demo);
+    let cameras = read(&fs::read_to_string(place.path("d/cameras.json")).unwrap());
+    fs::write(place.path("d/cameras.json"), held_out(&cameras).to_string()).unwrap();
+    let run = place.run(
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs look,rounds,percentiles,sums --repeat 1 --json",
+    );
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let found = read(&run.stdout);
+    assert_eq!(found, read(&fs::read_to_string(place.path("diagrams/precision.json")).unwrap()));
+    assert_eq!(found["kept"], 300);
+    // 5 frames of 6 cameras, of which one is held out.
+    assert_eq!((&found["pictures"], &found["judged"]), (&25.into(), &5.into()));
+
+    for curve in curves(&found, "look") {
+        for of in ["C", "W", "kept", "staying", "added"] {
+            assert_eq!(errors(curve, of).last(), Some(&0.0), "{of} of {}", curve["name"]);
+        }
+        let of_c = errors(curve, "C");
+        assert!(of_c[0] > 0.0, "{}: nothing is sampled", curve["name"]);
+        assert_ne!(of_c[0], of_c[of_c.len() - 2], "{}: nothing is turned", curve["name"]);
+        assert!(curve["name"] != "look_pictures" || errors(curve, "staying")[0] > 0.0, "as many stay");
+        let costs = curve["marks"].as_array().unwrap().iter().map(|mark| &mark["cost"]);
+        for cost in costs {
+            let seconds = ["least", "median", "most"].map(|of| cost["seconds"][of].as_f64().unwrap());
+            assert!(seconds.is_sorted() && seconds[0] > 0.0 && cost["runs"] == 1, "{cost}");
+        }
+    }
+    let rounds = curves(&found, "rounds");
+    for curve in rounds {
+        let of = errors(curve, "kept");
+        assert!(of[0] > 0.0 && of[0] > of[of.len() - 2] && of.last() == Some(&0.0), "{}: {of:?}", curve["name"]);
+    }
+
+    let percentiles = &curves(&found, "percentiles")[0];
+    // So few pictures are all looked at: exact percentiles keep what the finest look does.
+    let [exact, finest] = [percentiles, &curves(&found, "look")[0]]
+        .map(|curve| &curve["marks"].as_array().unwrap().last().unwrap()["psnr"]);
+    assert!(exact.is_number() && exact == finest, "{exact} {finest}");
+    let of = errors(percentiles, "percentiles");
+    // Half a bucket of 2⁻ᵇⁱᵗˢ at most; the exact ones have no error.
+    for (mark, error) in percentiles["marks"].as_array().unwrap().iter().zip(&of) {
+        assert!(*error <= 0.51 * mark["step"].as_f64().unwrap(), "{mark}");
+    }
+    let order = observed(percentiles, "percentiles");
+    assert!((0.6..1.4).contains(&order), "percentiles converge at order {order}, not 1");
+
+    let [plain, compensated, scan] = &curves(&found, "sums")[..] else { panic!("three ways to sum") };
+    for of in ["D", "kappa"] {
+        let last = |curve| *errors(curve, of).last().unwrap();
+        assert!(last(plain) > 1e-6, "{of}: f32 loses nothing: {}", last(plain));
+        assert!(last(compensated) < 1e-7 && last(scan) < 1e-11, "{of}: {} {}", last(compensated), last(scan));
+        assert!(errors(plain, of).is_sorted(), "{of}: errors of f32 do not grow with frames");
+    }
+
+    let page = fs::read_to_string(place.path("diagrams/precision.html")).unwrap();
+    for words in ["look: error added", "order of percentiles", "relative L2 error of kappa", "peak memory"] {
+        assert!(page.contains(words), "{words} is missing");
+    }
+    let csv = fs::read_to_string(place.path("diagrams/precision.csv")).unwrap();
+    let marks = found["knobs"].as_array().unwrap().iter().flat_map(|knob| knob["curves"].as_array().unwrap());
+    let lines: usize = marks
+        .flat_map(|curve| curve["marks"].as_array().unwrap())
+        .map(|mark| mark["errors"].as_object().unwrap().len())
+        .sum();
+    assert_eq!(csv.lines().count(), lines + 1);
+    let mut left: Vec<_> =
+        fs::read_dir(place.path("diagrams")).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["precision.csv", "precision.html", "precision.json", "summary.json"]);
+}
+
+#[test]
+fn threads_and_memory_change_no_byte_and_runs_are_those_of_compress() {
+    let place = Workplace::new();
+    place.done("demo -o d --gaussians 1500 --frames 4");
+    let found = read(&place.done(
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs machine,merging --target-ratio 0.4 --repeat 1 --json",
+    ));
+    for curve in curves(&found, "machine") {
+        let of = errors(curve, "bytes");
+        assert!(!of.is_empty() && of.iter().all(|&error| error == 0.0), "{curve}");
+    }
+    let marks = curves(&found, "merging")[0]["marks"].as_array().unwrap();
+    let ran = |options: &str| {
+        place.done(&format!(
+            "compress d/scene.gseq --cameras d/cameras.json -o small.gseq --overwrite --target-ratio 0.4 --no-refine {options}"
+        ));
+        let evaluated =
+            read(&place.done("evaluate d/scene.gseq small.gseq --cameras d/cameras.json --max-frames 12 --json"));
+        evaluated["psnr"].as_f64().unwrap()
+    };
+    // Radius 0: pruning alone. The largest: four times the recipe's own, whatever pictures say of it.
+    let [alone, widest] = [&marks[0], &marks[4]];
+    assert_eq!((&alone["value"], &widest["value"]), (&0.0.into(), &0.02.into()));
+    for (mark, options) in [(alone, "--prune-only"), (widest, "--choose-by-views=false --merge-pass 0.02,1,0.95,0.9")] {
+        let (got, expected) = (mark["psnr"].as_f64().unwrap(), ran(options));
+        assert!((got - expected).abs() < 1e-9, "{options}: {got} {expected}");
+    }
+    assert_ne!(alone["psnr"], widest["psnr"], "nothing merges");
+}
+
+#[test]
+fn what_cannot_be_turned_is_refused_before_anything_is_written() {
+    let place = Workplace::new();
+    place.done("demo -o d --gaussians 300 --frames 3");
+    let before = files(&place.path(""));
+    for (words, expected) in [
+        ("precision d/scene.gseq -o diagrams", "give --cameras"),
+        ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --target-ratio 0", "--target-ratio"),
+        ("precision d/scene.gseq --cameras d/cameras.json -o diagrams --knobs luck", "luck"),
+        ("precision - --cameras d/cameras.json -o diagrams", "pack the stream first"),
+    ] {
+        let run = place.run(words);
+        assert!(run.code == 2 && run.stderr.contains(expected), "{words}: {} {}", run.code, run.stderr);
+        assert_eq!(files(&place.path("")), before, "{words}");
+    }
+}
+
+#[test]
+fn a_recipe_that_looks_at_nothing_and_refines_nothing_has_less_to_turn_and_says_so() {
+    let place = Workplace::new();
+    place.done("demo -o d --gaussians 300 --frames 3");
+    let found = read(&place.done(
+        "precision d/scene.gseq --cameras d/cameras.json -o diagrams --preset paper --knobs look,rounds,percentiles,refining \
+         --repeat 1 --json",
+    ));
+    let names: Vec<&Value> = found["knobs"].as_array().unwrap().iter().map(|knob| &knob["name"]).collect();
+    assert_eq!(names, ["percentiles"]);
+    let notes = found["notes"].to_string();
+    for words in ["look: left out", "rounds: left out", "refining: left out"] {
+        assert!(notes.contains(words), "{notes}");
+    }
+}

@@ -1,0 +1,162 @@
+//! Norm, scores, thresholds and the kept set against method.md, sections 2 to 4 written down plainly: sorted
+//! values for percentiles, loops for sums, a sort for each stage.
+
+use crate::scene::{by_formula, scene, tiny};
+use splatsieve::model::Rows;
+use splatsieve::pipeline::score_scene;
+use splatsieve::pruning::score::{Scored, UserOverrides};
+use splatsieve::recipe::{Anisotropy, LowPriority, Recipe};
+
+const N: usize = 300;
+const FRAMES: f64 = 10.0;
+
+fn scored(recipe: &Recipe) -> Scored {
+    score_scene(&scene(&tiny()), recipe, &UserOverrides::default()).unwrap()
+}
+
+/// Nearest rank: the smallest value that at least `percent` of all do not exceed.
+fn percentile(values: &[f64], percent: usize) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(|a, b| a.partial_cmp(b).unwrap());
+    sorted[(percent * sorted.len()).div_ceil(100) - 1]
+}
+
+fn norm(values: &[f64], epsilon: f64, clip: bool) -> Vec<f64> {
+    let (p1, p99) = (percentile(values, 1), percentile(values, 99));
+    let scaled = |x: f64| {
+        if p99 <= p1 {
+            return if x > p99 { 1.0 } else { 0.0 };
+        }
+        let y = (x - p1) / (p99 - p1 + epsilon);
+        if clip { y.clamp(0.0, 1.0) } else { y }
+    };
+    values.iter().map(|&x| scaled(x)).collect()
+}
+
+/// The published SplitMix64 step from state `id` (Steele, Lea and Flood 2014).
+fn hash(id: usize) -> u64 {
+    let mut z = (id as u64).wrapping_mul(0x9e3779b97f4a7c15).wrapping_add(0x9e3779b97f4a7c15);
+    z = (z ^ z >> 30).wrapping_mul(0xbf58476d1ce4e5b9);
+    z = (z ^ z >> 27).wrapping_mul(0x94d049bb133111eb);
+    z ^ z >> 31
+}
+
+struct Direct {
+    static_score: Vec<f64>,
+    dynamic_score: Vec<f64>,
+    score: Vec<f64>,
+    keep: Vec<bool>,
+}
+
+fn directly(rows: &Rows, recipe: &Recipe) -> Direct {
+    let (score, select) = (&recipe.score, &recipe.select);
+    let norm = |values: &[f64]| norm(values, score.norm_epsilon, score.clip_norm);
+    let life: Vec<f64> = rows.life.iter().map(|&frames| f64::from(frames) / FRAMES).collect();
+    let moved = |values: &[f64]| -> Vec<f64> {
+        values.iter().zip(&life).map(|(x, life)| if score.weigh_motion_by_life { x * life } else { *x }).collect()
+    };
+    let weigh = |terms: &[(f64, Vec<f64>)]| -> Vec<f64> {
+        let norms: Vec<(f64, Vec<f64>)> = terms.iter().map(|(weight, values)| (*weight, norm(values))).collect();
+        (0..N).map(|i| norms.iter().map(|(weight, norm)| weight * norm[i]).sum()).collect()
+    };
+    let static_score = weigh(&[(1.0, rows.c.clone()), (score.lambda, rows.e.clone())]);
+    let dynamic_score = weigh(&[
+        (1.0, moved(&rows.d)),
+        (score.mu, moved(&rows.kappa)),
+        (score.eta, rows.v.clone()),
+        (score.xi, life.clone()),
+    ]);
+    let sum: Vec<f64> = (0..N).map(|i| score.w_static * static_score[i] + score.w_dynamic * dynamic_score[i]).collect();
+
+    let mut best: Vec<usize> = (0..N).collect();
+    best.sort_by(|&a, &b| sum[b].partial_cmp(&sum[a]).unwrap().then(hash(a).cmp(&hash(b))));
+    let candidates = &best[..(select.keep_fraction * N as f64).round() as usize];
+    let (of_static, of_dynamic) = (norm(&static_score), norm(&dynamic_score));
+    let keep = (0..N)
+        .map(|i| {
+            let passes = of_static[i] >= select.tau_static || of_dynamic[i] >= select.tau_dynamic;
+            passes && (select.low_priority == LowPriority::Rescue || candidates.contains(&i))
+        })
+        .collect();
+    Direct { static_score, dynamic_score, score: sum, keep }
+}
+
+/// Compares a run with the formulas; gives how many were kept.
+fn agrees(recipe: Recipe) -> usize {
+    let scored = scored(&recipe);
+    let expected = directly(&scored.rows().unwrap(), &recipe);
+    let scores = scored.scores(&recipe.score).unwrap();
+    for (what, got, expected) in [
+        ("S_static", &scores.static_score, &expected.static_score),
+        ("S_dynamic", &scores.dynamic_score, &expected.dynamic_score),
+        ("S", &scores.score, &expected.score),
+    ] {
+        for i in 0..N {
+            // A few sums of f64, in another order.
+            let tolerance = 1e-13 * (1.0 + expected[i].abs());
+            assert!(
+                (got[i] - expected[i]).abs() <= tolerance,
+                "{what} of {i}: got {}, expected {}",
+                got[i],
+                expected[i]
+            );
+        }
+    }
+    assert_eq!(scored.selection.keep, expected.keep);
+    let kept = expected.keep.iter().filter(|&&keep| keep).count();
+    assert_eq!(scored.selection.counts.kept, kept);
+    kept
+}
+
+#[test]
+fn presets_score_and_keep_as_method_says() {
+    assert_eq!(agrees(by_formula("paper")), 240);
+    for preset in ["default", "gentle", "strong"] {
+        let kept = agrees(by_formula(preset));
+        assert!((100..N).contains(&kept), "{preset}: {kept} kept");
+    }
+}
+
+#[test]
+fn every_parameter_of_the_scores_and_stages_acts_as_method_says() {
+    let edits: [fn(&mut Recipe); 9] = [
+        |r| (r.score.w_static, r.score.w_dynamic) = (2.0, 0.3),
+        |r| (r.score.lambda, r.score.anisotropy) = (1.5, Anisotropy::Log),
+        |r| (r.score.mu, r.score.eta, r.score.xi) = (0.0, 2.0, 0.7),
+        |r| r.score.weigh_motion_by_life = true,
+        |r| (r.score.norm_epsilon, r.score.clip_norm) = (0.1, false),
+        |r| r.score.clip_norm = !r.score.clip_norm,
+        |r| r.select.keep_fraction = 0.355,
+        |r| (r.select.tau_static, r.select.tau_dynamic) = (0.4, 0.6),
+        |r| (r.select.low_priority, r.select.tau_static, r.select.tau_dynamic) = (LowPriority::Drop, 0.2, 0.3),
+    ];
+    for preset in ["paper", "default"] {
+        let counts: Vec<usize> = edits
+            .iter()
+            .map(|edit| {
+                let mut recipe = by_formula(preset);
+                edit(&mut recipe);
+                agrees(recipe)
+            })
+            .collect();
+        let (fraction, thresholds, both) = (counts[6], counts[7], counts[8]);
+        assert!(thresholds < 230 && both < 240 && both > 20, "{preset}: the thresholds bind nothing: {counts:?}");
+        assert!(preset == "default" || fraction <= 107, "{preset}: stage 1 binds nothing: {counts:?}");
+    }
+}
+
+#[test]
+fn smaller_targets_keep_a_part_of_what_larger_ones_keep() {
+    for preset in ["paper", "default"] {
+        let selection = scored(&by_formula(preset)).selection;
+        let own: Vec<u32> = (0..N as u32).filter(|&i| selection.keep[i as usize]).collect();
+        assert_eq!(selection.ranking.take(own.len()), own, "the recipe's own count gives the recipe's own set");
+        let mut larger = selection.ranking.take(N);
+        for m in (0..N).rev() {
+            let smaller = selection.ranking.take(m);
+            assert_eq!(smaller.len(), m);
+            assert!(smaller.iter().all(|id| larger.binary_search(id).is_ok()), "{preset}: {m}");
+            larger = smaller;
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! Trained models as the whole program reads them, against PyTorch in float64: states and statistics.
+
+use std::fmt::{self, Display, Formatter};
+use std::path::Path;
+
+use crate::scene::{arrays, shared, state, tiny};
+use splatsieve::model::{Gaussians, Rows, Schedule};
+use splatsieve::pipeline::score_scene;
+use splatsieve::pruning::score::UserOverrides;
+use splatsieve::recipe::{MotionParams, Recipe};
+
+fn close(what: impl Display, got: f64, expected: f64, tolerance: f64) {
+    assert!((got - expected).abs() <= tolerance, "{what}: got {got}, expected {expected}, tolerance {tolerance:e}");
+}
+
+/// A place in a model, put into words only when something is wrong there: millions of values are looked at.
+struct At<'a, F> {
+    model: &'a Path,
+    what: &'a str,
+    i: usize,
+    frame: F,
+}
+
+impl<F: Display> Display for At<'_, F> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "{}, {} of Gaussian {}, frame {}", self.model.display(), self.what, self.i, self.frame)
+    }
+}
+
+/// The largest side of the box of all positions.
+fn extent(state: &Gaussians) -> f64 {
+    let side = |plane: &[f32]| {
+        f64::from(plane.iter().copied().fold(f32::MIN, f32::max) - plane.iter().copied().fold(f32::MAX, f32::min))
+    };
+    (0..3).map(|c| side(state.position.plane(c))).fold(0.0, f64::max)
+}
+
+/// Reads the scene through point cloud, configuration, field and cameras, and compares the frames that
+/// `states.npz` names by their number: so the cameras' times are those the model was trained at.
+fn frames_agree(model: &Path) {
+    let expected = arrays(&model.join("states.npz"));
+    let scene = crate::scene::scene(model);
+    let source = scene.source();
+    for (row, &frame) in expected["frames"].iter().enumerate() {
+        let frame = frame as usize;
+        close("time", source.info().times[frame], expected["times"][row], 1e-12);
+        let state = state(source, frame);
+        let (n, extent) = (state.len(), extent(&state));
+        let values = |name: &str, width: usize| &expected[name][row * n * width..(row + 1) * n * width];
+        for i in 0..n {
+            let at = |what| At { model, what, i, frame };
+            let q = state.rotation.row::<4>(i).map(f64::from);
+            let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+            for c in 0..3 {
+                let position = f64::from(state.position.plane(c)[i]);
+                close(at("position"), position, values("xyz", 3)[3 * i + c], 1e-5 * extent);
+                let scale = f64::from(state.log_scale.plane(c)[i]).exp();
+                let wanted = values("scales", 3)[3 * i + c];
+                close(at("scale"), scale, wanted, 1e-5 * wanted);
+            }
+            for (found, wanted) in q.iter().zip(&values("rotation", 4)[4 * i..]) {
+                close(at("rotation"), found / length, *wanted, 2e-5);
+            }
+            let opacity = 1.0 / (1.0 + (-f64::from(state.opacity_logit.plane(0)[i])).exp());
+            close(at("opacity"), opacity, values("opacity", 1)[i], 1e-5 * values("opacity", 1)[i]);
+            if let Some(sh) = expected.get(&format!("sh_t{frame}")) {
+                for k in 0..48 {
+                    close(at("SH"), f64::from(state.sh.plane(k)[i]), sh[48 * i + k], 2e-5);
+                }
+            }
+        }
+    }
+}
+
+fn rows(model: &Path, motion: MotionParams) -> (Rows, f64) {
+    let mut recipe = Recipe::preset("default").unwrap();
+    recipe.scan.motion = motion;
+    recipe.scan.snap_noise = false;
+    let mut scene = crate::scene::scene(model);
+    // Motion and opacity do not look at cameras; those of one frame tell that the scene is in view.
+    let first = scene.schedule.views(0).to_vec();
+    scene.schedule = Schedule::new(scene.schedule.cameras.clone());
+    scene.schedule.push(1, &first);
+    scene.schedule.push(scene.source().info().times.len() - 1, &[]);
+    let scored = score_scene(&scene, &recipe, &UserOverrides::default()).unwrap();
+    (scored.rows().unwrap().into_owned(), scored.position_ulp)
+}
+
+/// All frames, both ways to count motion.
+///
+/// Tolerances follow from the f32 of the states. A position is off by its own rounding, half an ulp of the
+/// largest coordinate, and by that of the field's sums, which are smaller numbers: e ≤ 1 ulp on each axis. A
+/// step is off by at most 2√3·e, and so is the root mean square D; a second difference by 4√3·e, and so is κ
+/// (measured: D 0.7 ulp, κ 1.2 ulp). An opacity is off by a ≤ 1e-6, hence V, a mean of squares of deviations d,
+/// by 2·mean|d|·2a + 4a² ≤ 4a·√V + 4a².
+fn statistics_agree(model: &Path) {
+    let expected = arrays(&model.join("statistics_f64.npz"));
+    for (motion, name) in [(MotionParams::Literal, "literal"), (MotionParams::Runs, "runs")] {
+        let (rows, ulp) = rows(model, motion);
+        let (e, a) = (ulp, 1e-6);
+        let (of_d, of_kappa) = (&expected[&format!("D_{name}")], &expected[&format!("kappa_{name}")]);
+        let mut worst = [0f64; 3];
+        for (i, &v) in expected["V"].iter().enumerate() {
+            let at = |what| At { model, what, i, frame: name };
+            let (d, kappa) = (of_d[i], of_kappa[i]);
+            // No opacity of these models lies within f32 rounding of the threshold.
+            assert_eq!(f64::from(rows.life[i]), expected["life_frames"][i], "{}", at("life"));
+            close(at("D"), rows.d[i], d, 2.0 * 3f64.sqrt() * e);
+            close(at("kappa"), rows.kappa[i], kappa, 4.0 * 3f64.sqrt() * e);
+            close(at("V"), rows.v[i], v, 4.0 * a * v.sqrt() + 4.0 * a * a);
+            let errors = [(rows.d[i] - d) / ulp, (rows.kappa[i] - kappa) / ulp, rows.v[i] - v];
+            (0..3).for_each(|k| worst[k] = worst[k].max(errors[k].abs()));
+        }
+        eprintln!("{}, {name}: worst D and kappa in ulp, V: {worst:?}", model.display());
+    }
+}
+
+fn on_shared(name: &str, test: fn(&Path)) {
+    test(&shared(name));
+}
+
+#[test]
+fn frames_of_the_tiny_model_are_those_of_pytorch() {
+    frames_agree(&tiny());
+}
+
+#[test]
+#[ignore = "needs the trained models"]
+fn frames_of_deform2_are_those_of_pytorch() {
+    // The field is held against all three models beside its code; here it is cameras and point cloud as well.
+    on_shared("deform2", frames_agree);
+}
+
+#[test]
+fn statistics_of_the_tiny_model_are_those_of_float64_states() {
+    statistics_agree(&tiny());
+}
+
+#[test]
+#[ignore = "needs the trained models"]
+fn statistics_of_deform2_are_those_of_float64_states() {
+    on_shared("deform2", statistics_agree);
+}
+
+#[test]
+#[ignore = "needs the trained models"]
+fn statistics_of_room2_dynerf_are_those_of_float64_states() {
+    on_shared("room2_dynerf", statistics_agree);
+}
+
+#[test]
+#[ignore = "needs the trained models"]
+fn statistics_of_room2_big_are_those_of_float64_states() {
+    on_shared("room2_big", statistics_agree);
+}

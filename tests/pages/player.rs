@@ -1,0 +1,360 @@
+//! The page that `view` writes: its bytes, and in a real browser its pictures against this program's own rasteriser.
+#![cfg(unix)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::browser::{self, Browser};
+use crate::models;
+use crate::scene::{Workplace, state};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::json;
+use splatsieve::render::render;
+use splatsieve::scene::{InputOptions, Scene, open_scene};
+
+/// Least PSNR of the page's pictures against the rasteriser's; 35 dB were promised, 52 to 61 seen.
+const LEAST_DB: f64 = 50.0;
+
+fn opened(path: &Path, cameras: &Path) -> Scene {
+    let options = InputOptions { path: path.to_owned(), cameras: Some(cameras.to_owned()), ..InputOptions::default() };
+    open_scene(&options).unwrap()
+}
+
+/// Goes where `hash` says and waits until the picture is there.
+fn go(page: &mut Browser, hash: &str) {
+    page.value(&format!(
+        "new Promise(done => {{ addEventListener('hashchange', () => splatsieve.settled().then(done), {{ once: true }}); \
+         location.hash = '{hash}'; }})"
+    ));
+    assert_eq!(page.value("document.getElementById('status').textContent"), json!(""));
+}
+
+/// The canvas: width, height, bytes.
+fn pixels(page: &mut Browser) -> (u32, u32, Vec<u8>) {
+    let found = page.value("splatsieve.pixels()");
+    let number = |name: &str| found[name].as_u64().unwrap() as u32;
+    (number("width"), number("height"), STANDARD.decode(found["rgb"].as_str().unwrap()).unwrap())
+}
+
+/// PSNR in dB of the page's picture of `view` at `frame` against the rasteriser's.
+fn decibels(page: &mut Browser, scene: &Scene, show: &str, view: u32, frame: usize) -> f64 {
+    go(page, &format!("show={show}&camera={view}&frame={frame}&paused&exact"));
+    let (width, height, found) = pixels(page);
+    let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
+    let picture = render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
+    assert_eq!((width, height), (picture.width, picture.height));
+    assert_eq!(found.len(), picture.data.len());
+    let square = |(a, b): (&u8, &f32)| (f64::from(*a) / 255.0 - f64::from(b.clamp(0.0, 1.0))).powi(2);
+    let mean = found.iter().zip(&picture.data).map(square).sum::<f64>() / found.len() as f64;
+    assert!(picture.data.iter().any(|x| (x - picture.data[0]).abs() > 0.2), "an empty picture tells nothing");
+    -10.0 * mean.log10()
+}
+
+/// Complaints but for the worker, which the page makes of its own text, files of the page's own folder, and what a driver says
+/// of the reading back that only tests do.
+fn complaints(page: &Browser, folder: Option<&Path>) -> Vec<String> {
+    let own = folder.map(|folder| format!("request: file://{}/frames_", fs::canonicalize(folder).unwrap().display()));
+    let is_own = |text: &String| {
+        text.starts_with("request: blob:")
+            || text.contains("due to ReadPixels")
+            || own.as_ref().is_some_and(|own| text.starts_with(own))
+    };
+    page.complaints().into_iter().filter(|text| !is_own(text)).collect()
+}
+
+/// The demo in `d`, and its page.
+fn demo() -> (Workplace, PathBuf) {
+    let at = Workplace::new();
+    at.done("demo -o d --gaussians 1500 --frames 30");
+    at.done("view d/scene.gseq d/compressed.gseq --cameras d/cameras.json -o scene.html");
+    let page = at.path("scene.html");
+    (at, page)
+}
+
+#[test]
+#[ignore = "needs a browser"]
+fn the_page_draws_what_the_rasteriser_does_and_asks_for_nothing() {
+    let program = browser::installed();
+    let (at, whole) = demo();
+    at.done("view d/scene.gseq d/compressed.gseq --cameras d/cameras.json -o scene --max-frames 30");
+    let cameras = at.path("d/cameras.json");
+    let [original, compressed] = ["d/scene.gseq", "d/compressed.gseq"].map(|name| opened(&at.path(name), &cameras));
+    let mut of_forms = Vec::new();
+    for (file, folder) in [(whole, None), (at.path("scene/index.html"), Some(at.path("scene")))] {
+        let mut page = Browser::start_drawing(&program);
+        page.open(&file);
+        let mut pictures = Vec::new();
+        for (view, frame) in [(0, 0), (2, 17), (1, 29)] {
+            for (show, scene) in [("original", &original), ("compressed", &compressed)] {
+                let found = decibels(&mut page, scene, show, view, frame);
+                eprintln!("{show}, view {view}, frame {frame}: {found:.1} dB");
+                assert!(found >= LEAST_DB, "{show}, view {view}, frame {frame}: {found} dB");
+                pictures.push(pixels(&mut page));
+            }
+        }
+        assert_eq!(complaints(&page, folder.as_deref()), Vec::<String>::new());
+        of_forms.push(pictures);
+    }
+    assert!(of_forms[0] == of_forms[1], "a folder shows something else than a page");
+}
+
+#[test]
+#[ignore = "needs a browser"]
+fn what_is_between_frames_is_between_their_pictures_and_a_wipe_joins_both_models() {
+    let program = browser::installed();
+    let (_at, whole) = demo();
+    let mut page = Browser::start_drawing(&program);
+    page.open(&whole);
+    let mut shown = |hash: &str| {
+        go(&mut page, &format!("camera=1&paused&exact&{hash}"));
+        pixels(&mut page)
+    };
+    let [left, right] = ["original", "compressed"].map(|show| shown(&format!("show={show}&frame=12")));
+    let (width, height, wipe) = shown("show=wipe&cut=0.25&frame=12");
+    let row = |of: &[u8], y: u32, x: std::ops::Range<u32>| {
+        of[3 * (y * width + x.start) as usize..3 * (y * width + x.end) as usize].to_vec()
+    };
+    let cut = width / 4;
+    for y in (0..height).step_by(7) {
+        assert_eq!(row(&wipe, y, 0..cut), row(&left.2, y, 0..cut), "row {y}");
+        assert_eq!(row(&wipe, y, cut + 1..width), row(&right.2, y, cut + 1..width), "row {y}");
+    }
+    let (beside_width, _, beside) = shown("show=beside&frame=12");
+    assert_eq!(beside_width, 2 * width);
+    let half = |y: u32| beside[6 * (y * width) as usize..][..3 * width as usize].to_vec();
+    assert_eq!(half(height / 2), row(&left.2, height / 2, 0..width));
+    let (_, _, difference) = shown("show=difference&frame=12");
+    // Four times what differs, of pictures that are rounded to bytes.
+    let expected = |k: usize| (4 * left.2[k].abs_diff(right.2[k]) as u32).min(255);
+    assert!((0..difference.len()).all(|k| u32::from(difference[k]).abs_diff(expected(k)) <= 5));
+    assert!(difference.iter().any(|&x| x > 20), "both models look the same");
+    let off = |a: &[u8], b: &[u8]| a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>();
+    let [before, after] = [12, 13].map(|frame| shown(&format!("show=original&frame={frame}")).2);
+    let end = page.value("Number(document.getElementById('scrub').max)").as_f64().unwrap();
+    // Its frames are evenly spaced.
+    let middle = end * 12.5 / 29.0;
+    go(&mut page, &format!("camera=1&paused&exact&show=original&time={middle}"));
+    let between = pixels(&mut page).2;
+    let [a, b, whole] = [off(&between, &before), off(&between, &after), off(&before, &after)];
+    assert!(a > 0.0 && b > 0.0 && a < whole && b < whole, "{a} and {b} of {whole}");
+    assert_eq!(complaints(&page, None), Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs a browser"]
+fn it_plays_seeks_turns_and_jumps_and_odd_names_are_text() {
+    let program = browser::installed();
+    let (at, _) = demo();
+    let odd = "<img src=x onerror=window.ran=1>\"'&.gseq";
+    fs::copy(at.path("d/compressed.gseq"), at.path(odd)).unwrap();
+    let words = [
+        "view",
+        "d/scene.gseq",
+        odd,
+        "--cameras",
+        "d/cameras.json",
+        "-o",
+        "odd.html",
+        "--original-frames",
+        "5",
+        "--original-degree",
+        "0",
+    ];
+    let run = at.run_words(words);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let mut page = Browser::start_drawing(&program);
+    page.open(&at.path("odd.html"));
+    let text = |page: &mut Browser, id: &str| {
+        page.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
+    };
+    let value = |page: &mut Browser, id: &str| {
+        page.value(&format!("Number(document.getElementById('{id}').value)")).as_f64().unwrap()
+    };
+    // It plays from the start on, without being asked.
+    let wait = "new Promise(done => setTimeout(done, 1500))";
+    page.value(wait);
+    let first = value(&mut page, "scrub");
+    page.value(wait);
+    assert!(first != value(&mut page, "scrub"), "it stands still");
+    // As soon as some pictures were drawn, which takes its time without a graphics card.
+    let rated = "new Promise(done => { const id = setInterval(() => { \
+                 if (document.getElementById('rate').textContent) { clearInterval(id); done(); } }, 100); })";
+    page.value(rated);
+    assert!(text(&mut page, "rate").ends_with("fps"), "{}", text(&mut page, "rate"));
+    page.value("document.getElementById('play').click()");
+    let stopped = value(&mut page, "scrub");
+    page.value(wait);
+    assert_eq!(value(&mut page, "scrub"), stopped);
+
+    go(&mut page, "show=compressed&camera=0&frame=7&paused");
+    assert!(text(&mut page, "now").starts_with("8/30"), "{}", text(&mut page, "now"));
+    let at_seven = pixels(&mut page);
+    page.value("document.getElementById('canvas').focus()");
+    page.key(".", 190);
+    page.value("splatsieve.settled()");
+    assert!(text(&mut page, "now").starts_with("9/30"), "{}", text(&mut page, "now"));
+    assert!(pixels(&mut page) != at_seven);
+    page.key(",", 188);
+    page.value("splatsieve.settled()");
+    assert!(pixels(&mut page) == at_seven, "back at the frame is another picture");
+    // A drag turns; the camera's number brings it back.
+    page.drag(&[[500.0, 300.0], [560.0, 320.0], [600.0, 330.0]]);
+    page.value("splatsieve.settled()");
+    assert!(pixels(&mut page) != at_seven && value(&mut page, "camera") == 0.0);
+    page.value("(s => { s.value = '0'; s.dispatchEvent(new Event('change')); })(document.getElementById('camera'))");
+    page.value("splatsieve.settled()");
+    assert!(pixels(&mut page) == at_seven, "the camera is not where it was");
+    // The handle of the wipe.
+    go(&mut page, "show=wipe&camera=0&frame=7&paused&cut=0.5");
+    let stage = page
+        .value("(b => [b.left, b.top, b.width, b.height])(document.getElementById('stage').getBoundingClientRect())");
+    let [left, top, width, height]: [f64; 4] = serde_json::from_value(stage).unwrap();
+    page.drag(&[[left + 0.5 * width, top + 0.3 * height], [left + 0.3 * width, top + 0.3 * height]]);
+    assert_eq!(page.value("document.getElementById('cut').getAttribute('aria-valuenow')"), json!("30"));
+    let left_label = text(&mut page, "left");
+    assert!(left_label.contains("5 of 30 frames") && left_label.contains("degree 0 of"), "{left_label}");
+    assert!(text(&mut page, "facts").contains(odd));
+    assert_eq!(page.value("typeof window.ran"), json!("undefined"), "a name ran");
+    assert_eq!(complaints(&page, None), Vec::<String>::new());
+}
+
+#[test]
+#[ignore = "needs a browser"]
+fn a_trained_model_looks_as_its_rasteriser_renders_it() {
+    let program = browser::installed();
+    let Some(folder) = models::found() else { return };
+    let at = Workplace::new();
+    for name in models::NAMES {
+        let model = folder.join(name);
+        let words = [
+            "view".as_ref(),
+            model.as_os_str(),
+            "--cameras".as_ref(),
+            model.as_os_str(),
+            "-o".as_ref(),
+            "scene.html".as_ref(),
+        ];
+        let run = at.run_words(words.into_iter().chain(["--max-frames", "4", "--force"].map(str::as_ref)));
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        let scene = opened(&model, &model);
+        let mut page = Browser::start_drawing(&program);
+        page.open(&at.path("scene.html"));
+        for (view, shown, frame) in [(0, 0, 0), (1, 2, 39), (8, 3, 59)] {
+            go(&mut page, &format!("camera={view}&frame={shown}&paused&exact&x={name}"));
+            let (_, _, found) = pixels(&mut page);
+            let shot = scene.rig.shots.iter().find(|shot| shot.view == view).unwrap();
+            let picture =
+                render(&state(scene.source(), frame), &scene.rig.cameras[shot.camera as usize], scene.background);
+            let square = |(a, b): (&u8, &f32)| (f64::from(*a) / 255.0 - f64::from(b.clamp(0.0, 1.0))).powi(2);
+            let mean = found.iter().zip(&picture.data).map(square).sum::<f64>() / found.len() as f64;
+            let decibels = -10.0 * mean.log10();
+            eprintln!("{name}, view {view}, frame {frame}: {decibels:.1} dB");
+            assert!(decibels >= LEAST_DB, "{name}, view {view}, frame {frame}: {decibels} dB");
+        }
+        assert_eq!(complaints(&page, None), Vec::<String>::new());
+    }
+}
+
+#[test]
+fn the_same_input_gives_the_same_page_for_any_number_of_threads() {
+    let at = Workplace::new();
+    at.done("demo -o d --gaussians 800 --frames 24");
+    let pages = [1, 4].map(|threads| {
+        at.done(&format!(
+            "view d/scene.gseq d/compressed.gseq --cameras d/cameras.json -o {threads}.html --threads {threads}"
+        ));
+        fs::read(at.path(&format!("{threads}.html"))).unwrap()
+    });
+    assert!(pages[0] == pages[1]);
+    // 44 bytes of position, rotation, scale and opacity as f32, and 192 of harmonics at the first frame.
+    let f32s = 800 * (24 * 44 + 192);
+    assert!(pages[0].len() < f32s / 3, "{} bytes, of {f32s} as f32", pages[0].len());
+}
+
+#[test]
+fn a_page_that_would_be_too_large_is_a_folder_and_what_is_there_stays() {
+    let at = Workplace::new();
+    at.done("demo -o d --gaussians 300 --frames 24");
+    let said = at.run("view d/scene.gseq -o scene.html --page-limit 10kB");
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    assert!(
+        said.stderr.contains("--page-limit") && said.stdout.starts_with("scene/index.html: 24 frames"),
+        "{}",
+        said.stdout
+    );
+    assert!(!at.path("scene.html").exists());
+    let index = fs::read_to_string(at.path("scene/index.html")).unwrap();
+    let chunks: Vec<String> = fs::read_dir(at.path("scene"))
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .filter(|name| name.starts_with("frames_"))
+        .collect();
+    assert!(chunks.len() > 1 && chunks.iter().all(|name| index.contains(name.as_str())), "{chunks:?}");
+    let again = at.run("view d/scene.gseq -o scene");
+    assert_eq!(again.code, 2);
+    assert!(again.stderr.contains("exists already"), "{}", again.stderr);
+    at.done("view d/scene.gseq -o scene --overwrite");
+    fs::write(at.path("mine.html"), "precious").unwrap();
+    assert_eq!(at.run("view d/scene.gseq -o mine.html --overwrite").code, 2);
+    assert_eq!(fs::read_to_string(at.path("mine.html")).unwrap(), "precious");
+    let gone = at.run("view nowhere -o other.html");
+    assert!(gone.code == 1 && gone.stderr.contains("nowhere") && !at.path("other.html").exists(), "{}", gone.stderr);
+}
+
+#[test]
+fn every_family_can_be_viewed_and_compress_writes_the_page_beside_its_result() {
+    let at = Workplace::new();
+    at.done("compress {tiny} --cameras {tiny} -o small --target-ratio 0.5 --view");
+    let told = fs::read_to_string(at.path("small.html")).unwrap();
+    assert!(told.contains("\"role\":\"original\"") && told.contains("\"role\":\"compressed\""));
+    at.done("compress {tiny} --cameras {tiny} -o small.gsz --target-ratio 0.5 --view=both.html");
+    assert!(at.path("both.html").exists());
+    at.done("unpack small --cameras {tiny} -o frames");
+    at.done("pack small --cameras {tiny} -o small.gseq");
+    fs::copy(at.path("frames/frame_00000.ply"), at.path("one.ply")).unwrap();
+    for (k, input) in ["small.gsz", "frames", "small.gseq", "one.ply"].iter().enumerate() {
+        at.done(&format!("view {input} -o {k}.html"));
+        let page = fs::read_to_string(at.path(&format!("{k}.html"))).unwrap();
+        assert!(page.contains("splatsieve.chunk(0,0,"), "{input}");
+    }
+    let refused = at.run("compress {tiny} --cameras {tiny} -o other --view=small.html");
+    assert!(refused.code == 2 && !at.path("other").exists(), "{}", refused.stderr);
+    let stream = at.run("compress - -o other.gseq --view");
+    assert!(stream.code == 2 && stream.stderr.contains("--view"), "{}", stream.stderr);
+}
+
+#[test]
+#[ignore = "needs a browser"]
+fn pages_of_hostile_names_break_no_policy_in_a_browser() {
+    let program = browser::installed();
+    let at = Workplace::new();
+    at.done("unpack {tiny} --cameras {tiny} -o frames --frames 2");
+    let name = "<script>window.ran=1<img src=x onerror=window.ran=2>'\"&";
+    fs::rename(at.path("frames"), at.path(name)).unwrap();
+    for output in ["page.html", "pages"] {
+        let run = at.run_words(["view", name, "-o", output]);
+        assert_eq!(run.code, 0, "{}", run.stderr);
+    }
+    let run = at.run_words(["report", name, name, "--max-frames", "1", "-o", "report"]);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    for file in ["page.html", "pages/index.html", "report/report.html"] {
+        let mut page = Browser::start_drawing(&program);
+        page.open(&at.path(file));
+        if !file.starts_with("report") {
+            go(&mut page, "frame=1&paused");
+        }
+        assert_eq!(page.value("typeof window.ran"), json!("undefined"), "{file}: a name ran");
+        assert_eq!(complaints(&page, Some(&at.path("pages"))), Vec::<String>::new(), "{file}");
+        // Were a text not escaped, the policy would still keep it from running.
+        let text = fs::read_to_string(at.path(file)).unwrap();
+        let broken = text.replace("</main>", "<script>window.ran=1</script><img src=x onerror=window.ran=2></main>");
+        let beside = at.path(file).with_file_name("broken.html");
+        fs::write(&beside, broken).unwrap();
+        let mut page = Browser::start_drawing(&program);
+        page.open(&beside);
+        assert_eq!(page.value("typeof window.ran"), json!("undefined"), "{file}: the policy lets scripts run");
+        let refused = complaints(&page, None).iter().any(|text| text.contains("Content Security Policy"));
+        assert!(refused, "{file}: nothing was refused");
+    }
+}

@@ -1,0 +1,9 @@
+//! The rasterizer, its gradients and metrics, and the commands that render.
+
+mod metrics_recorded;
+#[path = "../models/mod.rs"]
+mod models;
+mod render_cli;
+mod render_gradient;
+mod render_oracle;
+mod render_reference;
