@@ -171,6 +171,7 @@ fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
     let workplace = Workplace::new();
     workplace.done("compress {tiny} -o out");
@@ -204,6 +205,7 @@ fn overwriting_leaves_every_file_that_the_earlier_result_does_not_name() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn whenever_a_run_is_ended_its_output_is_the_old_or_the_new_one_whole_and_no_foreign_file_is_lost() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 400 --frames 3 -o shorter");

@@ -290,6 +290,7 @@ fn compressing_in_parts_gives_what_one_run_gives() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn pairs_measured_in_parts_merge_as_in_one_run() {
     let workplace = Workplace::new();
     workplace.done("--quiet demo -o demo --gaussians 40000 --frames 6 --no-refine");

@@ -34,6 +34,7 @@ fn left_over(folder: &Path) -> Vec<PathBuf> {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn a_stream_gives_the_bytes_of_packing_first_whatever_the_threads() {
     let workplace = Workplace::new();
     let stream = streamed(&workplace);
@@ -122,6 +123,7 @@ fn retimed(stream: &[u8], time: impl Fn(usize) -> f64) -> Vec<u8> {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn uneven_frames_are_measured_from_the_packed_ones_with_the_same_result() {
     let workplace = Workplace::new();
     let stream = retimed(&streamed(&workplace), |frame| (frame * frame) as f64);

@@ -101,6 +101,7 @@ fn the_bytes_of_an_archive_do_not_depend_on_threads() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn frames_become_a_container_within_bounds_whose_pictures_are_as_close_as_was_asked_for() {
     let workplace = Workplace::new();
     let made = splatsieve::diagnostics::demo_scene::Scene::new(1500, 20);

@@ -29,6 +29,7 @@ fn furthest(workplace: &Workplace, column: Columns) -> (f64, bool) {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn every_column_keeps_its_bound_and_the_file_says_it() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 3000 --frames 48 -o demo");

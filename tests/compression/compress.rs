@@ -247,6 +247,7 @@ fn explicit_trajectories_keep_the_bits_of_whoever_stays() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn threads_change_no_byte() {
     let workplace = Workplace::new();
     // More Gaussians than one block of work holds.

@@ -11,6 +11,7 @@ fn quality(workplace: &Workplace, original: &str, result: &str, cameras: &str) -
 }
 
 #[test]
+#[ignore = "needs time"]
 fn every_kind_of_input_comes_closer_to_the_original_at_the_same_count() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");
@@ -52,6 +53,7 @@ fn a_static_model_without_cameras_is_refined_by_virtual_ones() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn who_asks_for_similarity_gets_it_for_decibels() {
     let workplace = Workplace::new();
     workplace.done("demo --gaussians 1500 --frames 6 -o demo");

@@ -49,6 +49,7 @@ fn two_frames_have_one_step_and_no_curvature() {
 /// Row 5, for a sweep of periods and phases: D to 1e-6 of itself, κ to 1e-6 of the amplitude, which is what rounding
 /// positions to f32 leaves of second differences of 4e-5; against those of the rounded positions κ holds to 1e-6 of itself.
 #[test]
+#[ignore = "needs time"]
 fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
     const T: usize = 100_000;
     const PERIODS: [f64; 8] = [3.0, 10.0, 37.5, 100.0, 333.0, 365.25, 777.7, 1000.0];
@@ -75,6 +76,7 @@ fn sinusoids_over_100_000_frames_have_their_analytic_motion() {
 
 /// Row 11, for opacities up to the last that f32 tells from 1, stored once and stored anew in every frame.
 #[test]
+#[ignore = "needs time"]
 fn constant_opacity_has_variance_exactly_0_over_100_000_frames() {
     let logits: [f32; 6] = [-4.0, -0.847_297_9, 0.0, 0.3, 6.9, 16.1];
     for varying in [Columns::POSITION, Columns::POSITION | Columns::OPACITY] {

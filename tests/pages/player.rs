@@ -257,6 +257,7 @@ fn a_trained_model_looks_as_its_rasteriser_renders_it() {
 }
 
 #[test]
+#[ignore = "needs time"]
 fn the_same_input_gives_the_same_page_for_any_number_of_threads() {
     let at = Workplace::new();
     at.done("demo -o d --gaussians 800 --frames 24");
